@@ -1,0 +1,1 @@
+"""Fills the holes of free-viewpoint video, live."""

@@ -1,0 +1,1 @@
+"""Where frames come from: plain capture folders and the software studio."""

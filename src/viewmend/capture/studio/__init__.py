@@ -1,0 +1,1 @@
+"""A capture stage in software that gives exact truth."""

@@ -1,0 +1,1 @@
+"""Cameras, rigid motion, visual hull, surface, rasterisation, reprojection: pure functions on tensors."""

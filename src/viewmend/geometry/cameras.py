@@ -1,0 +1,149 @@
+"""Pinhole cameras in OpenCV axes: projection, unprojection, and changes of the image grid."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from viewmend.geometry.rigid import invert_rigid
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Calibrated pinhole cameras (with skew, without distortion: captures are undistorted when read).
+
+    Axes are OpenCV's: x right, y down, z forward. K is in pixels of an image whose top-left pixel has its centre
+    at (0.5, 0.5). Lengths are metres. One camera is a `Cameras` of one view.
+    """
+
+    names: tuple[str, ...]
+    K: Float[Tensor, "view 3 3"]
+    camera_from_world: Float[Tensor, "view 4 4"]
+    size_px: Int[Tensor, "view 2"]
+    """Width and height of each view's image. Stacks of images are padded right and below to the largest."""
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, views: int | slice | Sequence[int]) -> "Cameras":
+        """The cameras at these positions; an int gives a `Cameras` of one view."""
+        order = list(range(len(self)))
+        if isinstance(views, int):
+            chosen = [order[views]]
+        elif isinstance(views, slice):
+            chosen = order[views]
+        else:
+            chosen = [int(v) for v in views]
+        index = torch.tensor(chosen, dtype=torch.long, device=self.K.device)
+        return Cameras(
+            tuple(self.names[v] for v in chosen),
+            self.K[index],
+            self.camera_from_world[index],
+            self.size_px[index],
+        )
+
+    def select(self, names: Sequence[str]) -> "Cameras":
+        """The cameras of these names, in this order.
+
+        Raises:
+            ValueError: a name is not among `names`.
+        """
+        unknown = [n for n in names if n not in self.names]
+        if unknown:
+            raise ValueError(f"expected cameras among {list(self.names)}, got {unknown}; check the spelling")
+        return self[[self.names.index(n) for n in names]]
+
+    @property
+    def world_from_camera(self) -> Float[Tensor, "view 4 4"]:
+        """Inverse of `camera_from_world`."""
+        return invert_rigid(self.camera_from_world)
+
+    @property
+    def centers(self) -> Float[Tensor, "view 3"]:
+        """Camera centres in world coordinates, metres."""
+        return self.world_from_camera[:, :3, 3]
+
+    @property
+    def max_size_px(self) -> tuple[int, int]:
+        """Width and height that hold every view."""
+        width, height = self.size_px.amax(0).tolist()
+        return int(width), int(height)
+
+    def to(self, device: torch.device | str) -> "Cameras":
+        """The same cameras with their tensors on `device`."""
+        return replace(
+            self,
+            K=self.K.to(device),
+            camera_from_world=self.camera_from_world.to(device),
+            size_px=self.size_px.to(device),
+        )
+
+    def resized(self, width: int, height: int) -> "Cameras":
+        """Cameras whose images are resampled to width x height pixels (field of view unchanged)."""
+        scale = torch.tensor([width, height], device=self.K.device) / self.size_px
+        K = self.K.clone()
+        K[:, :2] *= scale[:, :, None].to(K)
+        size = torch.tensor([width, height], device=K.device).expand(len(self), 2).contiguous()
+        return replace(self, K=K, size_px=size)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> "Cameras":
+        """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image."""
+        K = self.K.clone()
+        K[:, 0, 2] -= left
+        K[:, 1, 2] -= top
+        size = torch.tensor([width, height], device=K.device).expand(len(self), 2).contiguous()
+        return replace(self, K=K, size_px=size)
+
+
+def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:
+    """All cameras of `parts`, in order."""
+    return Cameras(
+        tuple(name for part in parts for name in part.names),
+        torch.cat([part.K for part in parts]),
+        torch.cat([part.camera_from_world for part in parts]),
+        torch.cat([part.size_px for part in parts]),
+    )
+
+
+def project(
+    points_world: Float[Tensor, "point 3"], cameras: Cameras
+) -> tuple[Float[Tensor, "view point 2"], Float[Tensor, "view point"]]:
+    """Pixel coordinates and z-depth (metres) of world points in every camera.
+
+    A point behind a camera has z <= 0; its pixel coordinates are meaningless (but finite): test z.
+    """
+    P = cameras.K @ cameras.camera_from_world[:, :3]
+    homogeneous = torch.einsum("vij,pj->vpi", P[:, :, :3], points_world) + P[:, None, :, 3]
+    z = homogeneous[..., 2]
+    safe = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
+    return homogeneous[..., :2] / safe[..., None], z
+
+
+def unproject(
+    uv_px: Float[Tensor, "view point 2"], z_m: Float[Tensor, "view point"], cameras: Cameras
+) -> Float[Tensor, "view point 3"]:
+    """World points at these pixels and z-depths, each in its own camera; inverse of `project`."""
+    ones = torch.ones_like(uv_px[..., :1])
+    rays = torch.einsum("vij,vpj->vpi", torch.linalg.inv(cameras.K), torch.cat([uv_px, ones], -1))
+    world = cameras.world_from_camera
+    return torch.einsum("vij,vpj->vpi", world[:, :3, :3], rays * z_m[..., None]) + world[:, None, :3, 3]
+
+
+def pixel_centers(width: int, height: int, device: torch.device | str = "cpu") -> Float[Tensor, "height width 2"]:
+    """Image coordinates of every pixel's centre: (0.5, 0.5) at the top left."""
+    u = torch.arange(width, device=device, dtype=torch.float32) + 0.5
+    v = torch.arange(height, device=device, dtype=torch.float32) + 0.5
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
+
+
+def pinhole(
+    fov_y_rad: float, width: int, height: int, camera_from_world: Float[Tensor, "4 4"], name: str = "view"
+) -> Cameras:
+    """One camera with square pixels, its principal point in the middle, and this vertical field of view."""
+    f = 0.5 * height / float(torch.tan(torch.tensor(fov_y_rad / 2)))
+    K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
+    size = torch.tensor([[width, height]])
+    device = camera_from_world.device
+    return Cameras((name,), K[None].to(device), camera_from_world[None], size.to(device))

@@ -1,0 +1,29 @@
+"""A triangle mesh."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in world coordinates (metres); seen from outside, their corners run counter-clockwise."""
+
+    vertices: Float[Tensor, "vertex 3"]
+    faces: Int[Tensor, "face 3"]
+
+    def to(self, device: torch.device | str) -> "Mesh":
+        """The same mesh on `device`."""
+        return replace(self, vertices=self.vertices.to(device), faces=self.faces.to(device))
+
+
+def vertex_normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
+    """Unit normals at the vertices, outward: the area-weighted mean of the faces around each (zero where none)."""
+    a, b, c = mesh.vertices[mesh.faces.long()].unbind(1)
+    face_normals = torch.linalg.cross(b - a, c - a)
+    normals = torch.zeros_like(mesh.vertices)
+    for corner in range(3):
+        normals.index_add_(0, mesh.faces[:, corner].long(), face_normals)
+    return torch.nn.functional.normalize(normals, dim=-1)

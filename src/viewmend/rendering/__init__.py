@@ -1,0 +1,1 @@
+"""Frame and target camera to IncompleteView: view selection, blending, error map."""

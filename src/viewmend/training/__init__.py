@@ -1,0 +1,1 @@
+"""Samples, losses, recipes and the loop."""

@@ -1,0 +1,93 @@
+"""What travels between the rooms: frames in, incomplete views, completed views out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from viewmend.geometry.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class MultiViewFrame:
+    """What all cameras of a rig saw at one time: I[i,t] and M[i,t] of section 1.
+
+    Images are 8 bit, as cameras deliver them, undistorted, and padded with zeros right and below to the largest;
+    `cameras.size_px` says what is image. A camera without a frame at this time is absent.
+    """
+
+    cameras: Cameras
+    rgb: UInt8[Tensor, "view 3 height width"]
+    mask: UInt8[Tensor, "view height width"] | None
+    """Foreground, 0 to 255, in between soft; None for a capture without masks."""
+    time: int
+    """Index of the frame in its capture or stream; grows by one a frame."""
+    depth: Float[Tensor, "view height width"] | None = None
+    """True z-depth in metres where it is known (synthetic captures), 0 where there is no surface."""
+
+    def select(self, names: Sequence[str]) -> "MultiViewFrame":
+        """The same time seen by these cameras alone, in this order; ValueError for an unknown name."""
+        cameras = self.cameras.select(names)
+        index = torch.tensor([self.cameras.names.index(n) for n in names], device=self.rgb.device, dtype=torch.long)
+        return replace(
+            self,
+            cameras=cameras,
+            rgb=self.rgb[index],
+            mask=None if self.mask is None else self.mask[index],
+            depth=None if self.depth is None else self.depth[index],
+        )
+
+    def without(self, names: Sequence[str]) -> "MultiViewFrame":
+        """The same time without these cameras (absent ones are no error)."""
+        return self.select([n for n in self.cameras.names if n not in names])
+
+    def to(self, device: torch.device | str) -> "MultiViewFrame":
+        """The same frame on `device`."""
+        return replace(
+            self,
+            cameras=self.cameras.to(device),
+            rgb=self.rgb.to(device),
+            mask=None if self.mask is None else self.mask.to(device),
+            depth=None if self.depth is None else self.depth.to(device),
+        )
+
+
+@dataclass(frozen=True)
+class ContextViews:
+    """Camera images of one time together with the geometry proxy's depth in them: all that an inpainter sees of a rig."""
+
+    frame: MultiViewFrame
+    depth: Float[Tensor, "view height width"]
+    """z-depth of G[t] in each camera, metres; 0 where the proxy is not seen."""
+
+
+@dataclass(frozen=True)
+class IncompleteView:
+    """A rendered novel view and what is missing in it: F[t], M[t], E[t] of section 1."""
+
+    camera: Cameras
+    """The novel view's camera (one view)."""
+    rgb: Float[Tensor, "3 height width"]
+    """F, in [0, 1]; black where E is 1 and where there is no subject."""
+    mask: Float[Tensor, "height width"]
+    """M, in [0, 1]: 1 where the geometry proxy covers the pixel."""
+    error: Float[Tensor, "height width"]
+    """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where F is right."""
+    depth: Float[Tensor, "height width"]
+    """z-depth of the proxy, metres; 0 where there is none."""
+    chosen: tuple[str, ...]
+    """Names of the cameras that coloured the view."""
+    weights: Float[Tensor, "chosen height width"]
+    """Share of each chosen camera in each pixel; the sum is 1 where a pixel is coloured, else 0."""
+    time: int
+
+
+@dataclass(frozen=True)
+class CompletedView:
+    """A novel view without holes: Fhat = E * Ftilde + (1 - E) * F (section 1)."""
+
+    view: IncompleteView
+    rgb: Float[Tensor, "3 height width"]
+    """Fhat, in [0, 1]; equal to `view.rgb` bit for bit where E is 0."""
