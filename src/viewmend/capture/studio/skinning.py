@@ -10,7 +10,7 @@ def blend_transforms(
     weights: Float[Tensor, "vertex 4"],
     world_from_bind: Float[Tensor, "joint 4 4"],
 ) -> Float[Tensor, "vertex 3 4"]:
-    """The weighted mean of each vertex' four joint transforms, affine, as its top three rows.
+    """Average each vertex' four joint transforms by weight: affine maps, given as their top three rows.
 
     Weights are expected to sum to one per vertex; an unused slot has weight zero and any valid joint index.
     """
