@@ -56,7 +56,7 @@ class MultiViewFrame:
 
 @dataclass(frozen=True)
 class ContextViews:
-    """Camera images of one time together with the geometry proxy's depth in them: all that an inpainter sees of a rig."""
+    """Camera images of one time with the geometry proxy's depth in them: all that an inpainter sees of a rig."""
 
     frame: MultiViewFrame
     depth: Float[Tensor, "view height width"]

@@ -1,0 +1,34 @@
+# Two commands that do everything on a fresh machine; both may be run again and again, in either order.
+PYTHON ?= python3
+BIN := .venv/bin
+# Without a GPU, an open range would take a CUDA build of several gigabytes.
+CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
+
+.PHONY: demo test test-all gate format clean
+
+demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
+	$(BIN)/viewmend demo --out out/demo
+
+test: gate ## environment, install, the gate, the tests
+	$(BIN)/pytest
+
+test-all: gate ## the tests that take longer, too
+	$(BIN)/pytest -m ""
+
+gate: .venv/installed ## what CI, pre-commit and you run alike
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: .venv/installed
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+.venv/installed: pyproject.toml constraints-cpu.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,dev]'
+	touch $@
+
+clean:
+	rm -rf .venv out build
