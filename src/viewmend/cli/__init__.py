@@ -1,1 +1,96 @@
-"""Commands."""
+"""Commands: one thin file each, of one shape.
+
+`cli/<command>.py` holds a frozen, keyword-only dataclass `Options`, whose field docstrings are the command line's
+help (tyro) and whose own docstring's is the command's, and a function `run(options: Options) -> int` that gives the
+exit code. At module top it imports nothing heavy (no torch, cv2, rich): help must be instant. Results go to standard
+output, everything else to standard error (`console.py`); with `--json`, standard output is one JSON value.
+
+What a user can get wrong is a ValueError (`CaptureError` is one) or an OSError and ends here as one line on standard
+error with exit code 2; any other exception is our mistake and shows its traceback, exit code 1.
+"""
+
+import importlib
+import sys
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Command:
+    """A subcommand: the module that runs it and its line in the overview."""
+
+    name: str
+    module: str
+    summary: str
+
+
+COMMANDS = (
+    Command("demo", "viewmend.cli.demo", "Render and mend a moving procedural scene; needs nothing."),
+    Command("mend", "viewmend.cli.mend", "Mend novel views of a capture."),
+    Command("studio", "viewmend.cli.studio", "Write synthetic captures with exact truth."),
+    Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `viewmend` with these arguments (those of the process by default); the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else 2
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"viewmend {version('viewmend')}")
+        return 0
+    command = next((c for c in COMMANDS if c.name == arguments[0]), None)
+    if command is None:
+        names = ", ".join(c.name for c in COMMANDS)
+        return _fail(f"expected a command among {names}, got '{arguments[0]}'; see viewmend --help")
+    return _run(command, arguments[1:])
+
+
+def _run(command: Command, arguments: list[str]) -> int:
+    try:
+        import tyro
+
+        module = importlib.import_module(command.module)
+        flags = (tyro.conf.FlagCreatePairsOff,)
+        options = tyro.cli(module.Options, args=arguments, prog=f"viewmend {command.name}", config=flags)
+        return int(module.run(options) or 0)
+    except SystemExit as exit_request:  # tyro's: 0 after --help, 2 after a wrong option
+        return exit_request.code if isinstance(exit_request.code, int) else 2
+    except KeyboardInterrupt:
+        print("viewmend: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output left: nothing to say, and nobody to say it to
+        sys.stderr.close()
+        return 1
+    except (ValueError, OSError) as error:
+        return _fail(str(error))
+    except Exception:
+        traceback.print_exc()
+        return 1
+
+
+def _fail(message: str) -> int:
+    print("viewmend: error:", " ".join(message.split()), file=sys.stderr)
+    return 2
+
+
+def _overview() -> str:
+    width = max(len(c.name) for c in COMMANDS) + 2
+    lines = [f"  {c.name:<{width}}{c.summary}" for c in COMMANDS]
+    return "\n".join(
+        [
+            "usage: viewmend COMMAND [options]",
+            "",
+            "Fills the holes of free-viewpoint video of people captured by a few calibrated cameras.",
+            "",
+            "commands:",
+            *lines,
+            "",
+            "viewmend COMMAND --help shows a command's options; viewmend --version the version.",
+        ]
+    )

@@ -1,0 +1,64 @@
+"""What commands say to people: progress and messages on standard error, results on standard output."""
+
+import json
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+_Item = TypeVar("_Item")
+QUIET_S = 2.0
+"""A bar appears only after this long: what is quick needs none."""
+
+
+def track(items: Iterable[_Item], description: str, total: int | None = None) -> Iterator[_Item]:
+    """Pass `items` on, with a progress bar on standard error once two seconds went by, if that is a terminal.
+
+    `total` is the number of items; it is found by `len` where it is not given. A bar of an unknown total pulses.
+    """
+    if total is None and hasattr(items, "__len__"):
+        total = len(items)  # pyright: ignore[reportArgumentType]
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    start, bar, task = time.monotonic(), None, None
+    try:
+        for done, item in enumerate(items):
+            if bar is None and time.monotonic() - start > QUIET_S:
+                bar = _bar()
+                bar.start()
+                task = bar.add_task(description, total=total)
+            if bar is not None and task is not None:
+                bar.update(task, completed=done)
+            yield item
+    finally:
+        if bar is not None:
+            bar.stop()
+
+
+def _bar():
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+def say(message: str) -> None:
+    """A line for the person who watches, on standard error."""
+    print(message, file=sys.stderr, flush=True)
+
+
+def print_json(value: object) -> None:
+    """`value` as JSON on standard output; not-a-number becomes null, since JSON has none."""
+    print(json.dumps(_without_nan(value), indent=2, allow_nan=False))
+
+
+def _without_nan(value: object) -> object:
+    if isinstance(value, float):
+        return value if abs(value) < float("inf") else None
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return value
