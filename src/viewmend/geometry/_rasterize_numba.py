@@ -1,0 +1,67 @@
+"""The rasteriser's fast path on the CPU: scalar loops compiled by numba, image bands shared among threads."""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def project_vertices(vertices, P, out):
+    """Fill out[:, 0:3] with P [X; 1], in pixels times z, and out[:, 3:5] with the pixel coordinates, in float64."""
+    for i in range(vertices.shape[0]):
+        x, y, z = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
+        for row in range(3):
+            out[i, row] = P[row, 0] * x + P[row, 1] * y + P[row, 2] * z + P[row, 3]
+        w = out[i, 2] if out[i, 2] > 0 else np.inf
+        out[i, 3] = out[i, 0] / w
+        out[i, 4] = out[i, 1] / w
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, triangle):
+    """Draw all faces into rows [first_row, end_row) of one view's `depth` (as z) and `triangle`.
+
+    Homogeneous edge functions (Olano and Greer 1997): with q = P X of a corner, edge i is (q_j x q_k) . (u, v, 1).
+    They need no clipping, and two triangles compute exactly opposite values along the edge that they share.
+    `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
+    """
+    for f in range(faces.shape[0]):
+        a, b, c = projected[faces[f, 0]], projected[faces[f, 1]], projected[faces[f, 2]]
+        nearest = min(a[2], b[2], c[2])
+        left, right, top, bottom = 0, width - 1, first_row, end_row - 1
+        if nearest > near:
+            left = max(left, np.int64(np.ceil(max(min(a[3], b[3], c[3]) - 0.5, -1.0))))
+            right = min(right, np.int64(np.floor(min(max(a[3], b[3], c[3]) - 0.5, 1e6))))
+            top = max(top, np.int64(np.ceil(max(min(a[4], b[4], c[4]) - 0.5, -1.0))))
+            bottom = min(bottom, np.int64(np.floor(min(max(a[4], b[4], c[4]) - 0.5, 1e6))))
+            if left > right or top > bottom:
+                continue
+        elif max(a[2], b[2], c[2]) <= near:
+            continue
+        ax, ay, aw = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
+        determinant = a[0] * ax + a[1] * ay + a[2] * aw
+        if determinant == 0 or determinant * cull > 0:
+            continue
+        bx, by, bw = c[1] * a[2] - c[2] * a[1], c[2] * a[0] - c[0] * a[2], c[0] * a[1] - c[1] * a[0]
+        cx, cy, cw = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        sign = 1.0 if determinant > 0 else -1.0
+        for row in range(top, bottom + 1):
+            v = row + 0.5
+            a0, b0, c0 = ay * v + aw, by * v + bw, cy * v + cw
+            for column in range(left, right + 1):
+                u = column + 0.5
+                ea, eb, ec = ax * u + a0, bx * u + b0, cx * u + c0
+                if ea * sign >= 0 and eb * sign >= 0 and ec * sign >= 0:
+                    inverse = np.float32((ea + eb + ec) / determinant)
+                    if inverse * near < 1 and inverse > depth[row, column]:
+                        depth[row, column] = inverse
+                        triangle[row, column] = f
+    for row in range(first_row, end_row):
+        for column in range(width):
+            if triangle[row, column] >= 0:
+                depth[row, column] = np.float32(1) / depth[row, column]
