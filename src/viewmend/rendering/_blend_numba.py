@@ -1,0 +1,158 @@
+"""Image-based blending in numba, for the CPU; `_blend_torch` is its twin for any device."""
+
+from math import floor, sqrt
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.threads import share
+from viewmend.rendering._blend_torch import GRAZING
+from viewmend.views import ContextViews
+
+if TYPE_CHECKING:
+    from viewmend.rendering.blending import BlendConfig
+
+ROWS = 16
+"""Rows of the novel view that one thread takes at a time: the subject fills some and not others."""
+
+
+def blend_numba(
+    camera: Cameras,
+    depth: Float[Tensor, "height width"],
+    normals: Float[Tensor, "height width 3"],
+    sources: ContextViews,
+    bias_m: float,
+    config: "BlendConfig",
+) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "chosen height width"], Float[Tensor, "height width"]]:
+    """`blending.blend`: colour, raw weights and disagreement."""
+    frame, rig = sources.frame, sources.frame.cameras
+    height, width = depth.shape
+    rgb = torch.zeros(3, height, width)
+    weights = torch.zeros(len(rig), height, width)
+    disagreement = torch.zeros(height, width)
+
+    pose = camera.world_from_camera[0].double()
+    world_from_pixel = (pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())).numpy()
+    P = (rig.K.double() @ rig.camera_from_world[:, :3].double()).numpy()
+    mask = frame.mask if frame.mask is not None else torch.zeros(0, 0, 0, dtype=torch.uint8)
+    inputs = (
+        *(depth.numpy(), normals.numpy(), world_from_pixel, pose[:3, 3].numpy()),
+        *(frame.rgb.numpy(), mask.numpy(), sources.depth.numpy()),
+        *(P, rig.centers.double().numpy(), rig.K[:, 0, 0].double().numpy(), rig.size_px.numpy()),
+        np.array([bias_m, config.slope_px]),
+        np.array([config.normal_power, config.view_power, config.mask_power]),
+    )
+    outputs = (rgb.numpy(), weights.numpy(), disagreement.numpy())
+
+    def work(band: int) -> None:
+        _blend_rows(band * ROWS, min(height, (band + 1) * ROWS), *inputs, *outputs)
+
+    share(work, -(-height // ROWS))
+    return rgb, weights, disagreement
+
+
+@numba.njit(nogil=True, cache=True)
+def _blend_rows(
+    first, end, depth, normals, world_from_pixel, viewer, images, masks, depths, P, centers, focal, sizes,
+    tolerance, powers, rgb, weights, disagreement,
+):  # fmt: skip
+    count = P.shape[0]
+    colour = np.zeros((count, 3))
+    for row in range(first, end):
+        for column in range(depth.shape[1]):
+            z = depth[row, column]
+            if z <= 0:
+                continue
+            point = _backproject(column + 0.5, row + 0.5, z, world_from_pixel, viewer)
+            normal = _unit(normals[row, column, 0], normals[row, column, 1], normals[row, column, 2])
+            to_viewer = _unit(viewer[0] - point[0], viewer[1] - point[1], viewer[2] - point[2])
+            total = 0.0
+            for view in range(count):
+                weight = _weigh(
+                    point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes,
+                    tolerance, powers, colour,
+                )  # fmt: skip
+                weights[view, row, column] = weight
+                total += weight
+            if total > 0:
+                _average(colour, weights, total, row, column, rgb, disagreement)
+
+
+@numba.njit(nogil=True, cache=True)
+def _average(colour, weights, total, row, column, rgb, disagreement):
+    variance = 0.0
+    for channel in range(3):
+        mean = 0.0
+        for view in range(colour.shape[0]):
+            mean += weights[view, row, column] * colour[view, channel]
+        mean /= total
+        rgb[channel, row, column] = mean
+        for view in range(colour.shape[0]):
+            variance += weights[view, row, column] * (colour[view, channel] - mean) ** 2
+    disagreement[row, column] = sqrt(variance / (3 * total))
+
+
+@numba.njit(nogil=True, cache=True)
+def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour):
+    """Weight of one camera at a surface point; its sample goes into `colour[view]`."""
+    center = centers[view]
+    to_camera = _unit(center[0] - point[0], center[1] - point[1], center[2] - point[2])
+    facing = min(_dot(normal, to_camera), 1.0)
+    agreeing = min(_dot(to_viewer, to_camera), 1.0)
+    z = _dot(P[view, 2], point) + P[view, 2, 3]
+    if facing <= 0 or agreeing <= 0 or z <= 0:
+        return 0.0
+    u = (_dot(P[view, 0], point) + P[view, 0, 3]) / z
+    v = (_dot(P[view, 1], point) + P[view, 1, 3]) / z
+    width, height = sizes[view]
+    if not (0 <= u <= width and 0 <= v <= height):
+        return 0.0
+
+    per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, GRAZING)
+    nearest = z - (tolerance[0] + tolerance[1] * per_pixel)
+    left, top = floor(u - 0.5), floor(v - 0.5)
+    right_share, bottom_share = u - 0.5 - left, v - 0.5 - top
+    visible, inside = 0.0, 0.0
+    red, green, blue = 0.0, 0.0, 0.0
+    for tap in range(4):
+        row = min(max(int(top) + tap // 2, 0), height - 1)
+        column = min(max(int(left) + tap % 2, 0), width - 1)
+        part = (bottom_share if tap // 2 else 1 - bottom_share) * (right_share if tap % 2 else 1 - right_share)
+        there = depths[view, row, column]
+        if there == 0 or there >= nearest:
+            visible += part
+        if masks.shape[0]:
+            inside += part * masks[view, row, column]
+        red += part * images[view, 0, row, column]
+        green += part * images[view, 1, row, column]
+        blue += part * images[view, 2, row, column]
+    colour[view, 0], colour[view, 1], colour[view, 2] = red / 255, green / 255, blue / 255
+    weight = visible * facing ** powers[0] * agreeing ** powers[1]
+    return weight * (inside / 255) ** powers[2] if masks.shape[0] else weight
+
+
+@numba.njit(nogil=True, cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(nogil=True, cache=True)
+def _unit(x, y, z):
+    length = sqrt(x * x + y * y + z * z)
+    scale = 1 / length if length > 0 else 0.0
+    return x * scale, y * scale, z * scale
+
+
+@numba.njit(nogil=True, cache=True)
+def _backproject(u, v, z, world_from_pixel, center):
+    m = world_from_pixel
+    return (
+        (m[0, 0] * u + m[0, 1] * v + m[0, 2]) * z + center[0],
+        (m[1, 0] * u + m[1, 1] * v + m[1, 2]) * z + center[1],
+        (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * z + center[2],
+    )

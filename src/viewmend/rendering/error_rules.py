@@ -1,0 +1,48 @@
+"""E: which pixels of a rendered view must be inpainted. A rule is a function with a name."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.rendering.blending import Blend
+
+MIN_WEIGHT = 1e-5
+"""Sum of raw weights below which a pixel has no colour (RIFTCast)."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that a rule may look at."""
+
+    mask: Float[Tensor, "height width"]
+    """M: 1 where the geometry proxy covers the pixel."""
+    depth: Float[Tensor, "height width"]
+    """z-depth of the proxy, metres; 0 where there is none."""
+    blend: Blend
+
+
+class ErrorRule(Protocol):
+    """From the evidence to E, in [0, 1]; 0 outside the mask, and 1 where the blend has no colour."""
+
+    def __call__(self, evidence: Evidence) -> Float[Tensor, "height width"]:
+        """E of one view."""
+        ...
+
+
+def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
+    """1 on the pixels of the proxy that no chosen camera colours: the paper's E, by RIFTCast's threshold."""
+    return (evidence.blend.weights.sum(0) < MIN_WEIGHT).to(evidence.mask) * evidence.mask
+
+
+def error_rule(name: str) -> ErrorRule:
+    """The rule of this name; a new rule is a file with a function, and a line here.
+
+    Raises:
+        ValueError: there is none.
+    """
+    rules: dict[str, ErrorRule] = {"unseen": unseen}
+    if name not in rules:
+        raise ValueError(f"expected an error rule among {sorted(rules)}, got '{name}'; choose one of them")
+    return rules[name]
