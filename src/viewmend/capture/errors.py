@@ -1,5 +1,8 @@
-"""What is wrong with a capture, or with material for the studio."""
+"""What can be wrong with a capture."""
 
 
 class CaptureError(ValueError):
-    """Input that cannot be used: the message names the file, what was expected, what came, and the next step."""
+    """A capture that cannot be used.
+
+    The message names the file, the camera and the frame, what was expected, what came, and the next step.
+    """

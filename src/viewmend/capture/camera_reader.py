@@ -1,0 +1,99 @@
+"""One camera of a plain capture: its files, read and undistorted."""
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from viewmend.capture.errors import CaptureError
+from viewmend.capture.images import as_mask, read_depth, read_mask, read_rgb
+from viewmend.capture.plain_format import PlainCamera, Stream
+from viewmend.capture.videos import VideoFile, is_video
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """What one camera has of one time, undistorted."""
+
+    rgb: UInt8[np.ndarray, "height width 3"]
+    mask: UInt8[np.ndarray, "height width"] | None
+    depth: Float32[np.ndarray, "height width"] | None
+
+
+class CameraReader:
+    """Reads one camera's streams. Holds its open videos and its undistortion map; may be used from any thread."""
+
+    def __init__(self, folder: Path, camera: PlainCamera):
+        self.camera = camera
+        self._folder = folder
+        self._lock = threading.Lock()
+        self._undistortion: tuple[np.ndarray, np.ndarray] | None = None
+        streams = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
+        self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in streams)
+
+    def read(self, frame: str, index: int) -> CameraImages:
+        """The images at frame id `frame`, which is at `index` of the capture's frames.
+
+        Raises:
+            CaptureError: a file is missing, unreadable, or not of the camera's size.
+        """
+        camera = self.camera
+        path, where = self._locate("video" if camera.video else "image", frame)
+        rgb = self._video.read(index, where) if self._video else read_rgb(path, where)
+        self._check_size(rgb, where)
+        mask, depth = None, None
+        if camera.mask:
+            path, where = self._locate("mask", frame)
+            mask = as_mask(self._mask_video.read(index, where)) if self._mask_video else read_mask(path, where)
+            self._check_size(mask, where)
+        if camera.depth:
+            path, where = self._locate("depth", frame)
+            depth = read_depth(path, where)
+            self._check_size(depth, where)
+        return self._undistort(CameraImages(rgb, mask, depth)) if camera.dist.any() else CameraImages(rgb, mask, depth)
+
+    def _locate(self, stream: Stream, frame: str) -> tuple[Path, str]:
+        path = self._folder / self.camera.file(stream, frame)
+        return path, f"{path}: camera '{self.camera.name}', frame '{frame}'"
+
+    def _check_size(self, image: np.ndarray, where: str) -> None:
+        height, width = image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            raise CaptureError(
+                f"{where}: expected {self.camera.width} x {self.camera.height} pixels as cameras.json says, "
+                f"got {width} x {height}; correct width, height and K there, or the file"
+            )
+
+    def _undistort(self, images: CameraImages) -> CameraImages:
+        """Images of the pinhole camera of the same K and size.
+
+        Where such a pixel lies outside the image that was taken (the corners, when a lens with pincushion distortion
+        is straightened), the nearest pixel of its border stands in: the mask of a subject that the image cuts off then
+        goes on, and carves nothing away, as for all that lies outside an image. Depth there is unknown, 0.
+        """
+        import cv2
+
+        first, second = self._map()
+        border = cv2.BORDER_REPLICATE
+        rgb = cv2.remap(images.rgb, first, second, cv2.INTER_LINEAR, borderMode=border)
+        mask, depth = images.mask, images.depth
+        if mask is not None:
+            mask = cv2.remap(mask, first, second, cv2.INTER_LINEAR, borderMode=border)
+        if depth is not None:  # no mean of two depths across an edge
+            depth = cv2.remap(depth, first, second, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        return CameraImages(rgb, mask, depth)
+
+    def _map(self) -> tuple[np.ndarray, np.ndarray]:
+        import cv2
+
+        with self._lock:
+            if self._undistortion is None:
+                camera = self.camera
+                K = camera.K.copy()
+                K[:2, 2] -= 0.5  # OpenCV puts the first pixel's centre at 0
+                size, fixed = (camera.width, camera.height), cv2.CV_16SC2  # 1/32 pixel, thrice as fast as floats
+                first, second = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, fixed)  # pyright: ignore
+                self._undistortion = first, second
+            return self._undistortion

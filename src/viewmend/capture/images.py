@@ -1,0 +1,133 @@
+"""Image files: colours, masks and depths, decoded from bytes and encoded to them."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from viewmend.capture.errors import CaptureError
+
+DEPTH_UNITS_PER_M = 1000
+"""Depth is stored in whole millimetres, 16 bit."""
+MAX_DEPTH_M = 65.535
+
+
+def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """An image file as RGB, 8 bit, exactly as its pixels are stored (no turning by EXIF: calibrations know none).
+
+    `where` begins the messages: file, camera, frame.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded.
+    """
+    import cv2
+
+    bgr = _decode(path, where, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
+    """An 8-bit mask file of any number of channels: alpha where it is used, else the largest colour.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or is not 8 bit.
+    """
+    import cv2
+
+    mask = _decode(path, where, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if mask.dtype != np.uint8:
+        raise CaptureError(f"{where}: expected a mask of 8 bit, got {mask.dtype}; write it as 8-bit PNG")
+    return as_mask(mask)
+
+
+def as_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "height width"]:
+    """The mask that an image of 1, 3 or 4 channels means."""
+    if image.ndim == 2:
+        return image
+    if image.shape[2] in (2, 4) and (image[..., -1] != 255).any():
+        return np.ascontiguousarray(image[..., -1])
+    colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
+    return colours.max(-1)
+
+
+def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
+    """A 16-bit PNG of millimetres as metres; 0 stays 0, no surface.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or is not one channel of 16 bit.
+    """
+    import cv2
+
+    depth = _decode(path, where, cv2.IMREAD_UNCHANGED)
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        got = f"{depth.dtype} of shape {depth.shape}"
+        raise CaptureError(f"{where}: expected one channel of 16 bit, millimetres, got {got}; write it as 16-bit PNG")
+    return depth.astype(np.float32) / DEPTH_UNITS_PER_M
+
+
+def _decode(path: Path, where: str, flags: int) -> np.ndarray:
+    import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _is_complete(data) else None
+    if image is None:
+        got = f"{len(data)} bytes that are none, or cut short"
+        raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")
+    return image
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether PNG and JPEG data have their end: some decoders fill up what is missing with grey."""
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-1024:]
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in data[len(data) // 2 :]
+    return True
+
+
+def write_image(
+    path: Path,
+    image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width 3"],
+    jpeg_quality: int = 95,
+) -> None:
+    """Write an RGB or grey image; the suffix (.png, .jpg, ...) says how.
+
+    Raises:
+        ValueError: the suffix names no image format.
+        OSError: the file cannot be written.
+    """
+    import cv2
+
+    # 4:4:4: coloured edges of cloth are what an inpainter is judged by.
+    jpeg = (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
+    options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)
+    _encode(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image, options)
+
+
+def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> None:
+    """Write z-depth in metres as a 16-bit PNG of millimetres, rounded.
+
+    Raises:
+        CaptureError: a depth is negative, not a number, or beyond 65.535 m.
+    """
+    if not ((depth_m >= 0) & (depth_m <= MAX_DEPTH_M)).all():
+        got = f"{np.nanmin(depth_m)} to {np.nanmax(depth_m)} m"
+        raise CaptureError(f"{path}: expected depths of 0 to {MAX_DEPTH_M} m, got {got}; check the scene's units")
+    _encode(path, np.rint(depth_m * DEPTH_UNITS_PER_M).astype(np.uint16), ())
+
+
+def _encode(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
+    import cv2
+
+    if not path.suffix or not cv2.haveImageWriter(path.suffix):
+        raise ValueError(f"expected a picture's file name, .png or .jpg, got {path}; give it such a suffix")
+    done, data = cv2.imencode(path.suffix, image, options)
+    if not done:
+        raise ValueError(
+            f"{path}: expected an image that the format can hold, got {image.shape} {image.dtype}; use .png"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.tobytes())

@@ -1,0 +1,205 @@
+"""Plain capture folders: `cameras.json` and the files that it names, as a source of frames."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from viewmend.capture.camera_reader import CameraImages, CameraReader
+from viewmend.capture.errors import CaptureError
+from viewmend.capture.folder_listing import FolderListing
+from viewmend.capture.plain_format import CALIBRATION, PlainCamera, read_calibration, stays_inside
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.rigid import rigid
+from viewmend.views import MultiViewFrame
+
+FOREGROUND = 127
+"""A mask above this is foreground where a yes or no is wanted."""
+
+
+def open_capture(path: Path | str, cameras: Sequence[str] | None = None) -> "PlainCapture":
+    """Open a plain capture: the folder, or its `cameras.json`; `cameras` are the names to use (default: all).
+
+    Raises:
+        CaptureError: the calibration is wrong, files are missing, or a name is unknown (see `PlainCapture`).
+    """
+    path = Path(path)
+    return PlainCapture(path.parent if path.name == CALIBRATION and path.is_file() else path, cameras)
+
+
+class PlainCapture:
+    """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
+
+    A camera whose image or mask is missing at a time is absent from that frame (a gap). Images and masks are
+    undistorted, K kept, and padded right and below to the largest camera's size.
+
+    Raises:
+        CaptureError: `cameras.json` is wrong; a camera never has its files; a frame has no camera; masks or depths are
+            there for some of the cameras only; a file lies outside the folder; `cameras` names one that is not there.
+    """
+
+    def __init__(self, folder: Path, cameras: Sequence[str] | None = None):
+        self.folder = folder
+        calibration = read_calibration(folder)
+        self._file = folder / CALIBRATION
+        self._plain = _select(calibration.cameras, cameras, self._file)
+        self._calibration = calibration
+        self.has_masks = self._all_or_none("mask")
+        self.has_depth = self._all_or_none("depth")
+        self.present = self._find_files()
+        """Whether each camera is there at each time."""
+        self._readers = tuple(CameraReader(folder, camera) for camera in self._plain)
+        self._cameras = _pinholes(self._plain)
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    @property
+    def cameras(self) -> Cameras:
+        """All cameras, after undistortion, in metres."""
+        return self._cameras
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Ids of the frames in order of time."""
+        return self._calibration.frames
+
+    @property
+    def fps(self) -> float | None:
+        """Frames a second, None where unknown or static."""
+        return self._calibration.fps
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """World up, unit length."""
+        up = self._calibration.up
+        return None if up is None else torch.tensor(up, dtype=torch.float32)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The volume that may hold the subject, metres."""
+        corners = self._calibration.bounds_m
+        return None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+
+    @property
+    def gaps(self) -> tuple[tuple[str, str], ...]:
+        """Camera and frame id of every frame that one camera lacks."""
+        missing = np.argwhere(~self.present)
+        return tuple((self._plain[camera].name, self.frame_ids[time]) for camera, time in missing)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """All cameras that are there at index `time` of `frame_ids`; decodes them in parallel.
+
+        Raises:
+            CaptureError: a file is unreadable or of the wrong size, or no camera's mask has any foreground.
+            IndexError: `time` is not in the capture.
+        """
+        if not 0 <= time < len(self.frame_ids):
+            raise IndexError(f"{self._file}: expected a time of 0 to {len(self.frame_ids) - 1}, got {time}")
+        views = [int(view) for view in np.flatnonzero(self.present[:, time])]
+        frame_id = self.frame_ids[time]
+        with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
+            images = list(pool.map(lambda view: self._readers[view].read(frame_id, time), views))
+        frame = self._stack(images, self._cameras[views], time)
+        if frame.mask is not None and int(frame.mask.max()) <= FOREGROUND:
+            raise CaptureError(self._no_foreground(self._plain[views[0]], frame_id, int(frame.mask.max())))
+        return frame
+
+    def _stack(self, images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
+        width, height = self._cameras.max_size_px
+        rgb = torch.zeros(len(images), 3, height, width, dtype=torch.uint8)
+        mask = torch.zeros(len(images), height, width, dtype=torch.uint8) if self.has_masks else None
+        depth = torch.zeros(len(images), height, width) if self.has_depth else None
+        for view, image in enumerate(images):
+            h, w = image.rgb.shape[:2]
+            rgb[view, :, :h, :w] = torch.from_numpy(image.rgb).permute(2, 0, 1)
+            if mask is not None:
+                mask[view, :h, :w] = torch.from_numpy(image.mask)
+            if depth is not None:
+                depth[view, :h, :w] = torch.from_numpy(image.depth)
+        return MultiViewFrame(cameras, rgb, mask, time, depth)
+
+    def _no_foreground(self, camera: PlainCamera, frame: str, highest: int) -> str:
+        return (
+            f"{self.folder / camera.file('mask', frame)}: camera '{camera.name}', frame '{frame}': expected foreground "
+            f"(255) in this or another camera's mask, got no value above {highest} in any; segment the images, scale "
+            f"masks of 0 and 1 by 255, or remove the frame from {CALIBRATION}"
+        )
+
+    def _all_or_none(self, stream: str) -> bool:
+        lacking = [camera.name for camera in self._plain if getattr(camera, stream) is None]
+        if lacking and len(lacking) < len(self._plain):
+            raise CaptureError(
+                f"{self._file}: camera '{lacking[0]}': expected '{stream}' for every camera or for none, got none for "
+                f"{lacking}; add it, or leave these cameras out"
+            )
+        return not lacking
+
+    def _find_files(self) -> Bool[np.ndarray, "view time"]:
+        listing = FolderListing(self.folder)
+        rows = [[_is_there(camera, frame, listing) for frame in self.frame_ids] for camera in self._plain]
+        present = np.array(rows, bool)
+        for camera, row in zip(self._plain, present, strict=True):
+            if not row.any():
+                raise CaptureError(_never(self.folder, camera, self.frame_ids, listing))
+        for frame, column in zip(self.frame_ids, present.T, strict=True):
+            if not column.any():
+                example = self.folder / self._plain[0].file(self._plain[0].streams[0], frame)
+                raise CaptureError(
+                    f"{example}: camera '{self._plain[0].name}', frame '{frame}': expected this file or another "
+                    f"camera's, got none of any camera; add them, or remove the frame from {self._file}"
+                )
+        return present
+
+
+def _select(cameras: tuple[PlainCamera, ...], names: Sequence[str] | None, file: Path) -> tuple[PlainCamera, ...]:
+    if names is None:
+        return cameras
+    by_name = {camera.name: camera for camera in cameras}
+    unknown = [name for name in names if name not in by_name]
+    if unknown or not names or len(set(names)) < len(names):
+        raise CaptureError(f"{file}: expected different cameras among {list(by_name)}, got {list(names)}; choose again")
+    return tuple(by_name[name] for name in names)
+
+
+def _is_there(camera: PlainCamera, frame: str, listing: FolderListing) -> bool:
+    return all(listing.has(_safe(camera.file(stream, frame), listing)) for stream in camera.streams)
+
+
+def _safe(path: str, listing: FolderListing) -> str:
+    if not stays_inside(path):
+        raise CaptureError(f"{listing.folder}: expected a file inside the folder, got {path}; rename the frame")
+    return path
+
+
+def _never(folder: Path, camera: PlainCamera, frames: Sequence[str], listing: FolderListing) -> str:
+    """What to say of a camera that is at no time there."""
+    for stream in camera.streams:
+        if not any(listing.has(camera.file(stream, frame)) for frame in frames):
+            missing, what = camera.file(stream, frames[0]), f"the camera's {stream}"
+            break
+    else:
+        missing, what = camera.file(camera.streams[0], frames[0]), "all of the camera's files at one frame"
+    return (
+        f"{folder / missing}: camera '{camera.name}', frame '{frames[0]}': expected {what}, got no such file at any of "
+        f"{len(frames)} frames; correct the path in {folder / CALIBRATION}, or leave the camera out"
+    )
+
+
+def _pinholes(cameras: Sequence[PlainCamera]) -> Cameras:
+    R = torch.tensor(np.stack([camera.R for camera in cameras]))
+    t = torch.tensor(np.stack([camera.t_m for camera in cameras]))
+    return Cameras(
+        names=tuple(camera.name for camera in cameras),
+        K=torch.tensor(np.stack([camera.K for camera in cameras])).float(),
+        camera_from_world=rigid(R, t).float(),
+        size_px=torch.tensor([[camera.width, camera.height] for camera in cameras]),
+    )
