@@ -1,0 +1,97 @@
+"""One padded batch from novel views and their contexts, with coordinates in each novel view (sections 2 and 5)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.context import ContextFrame
+from viewmend.inpainting.coordinates import reproject
+from viewmend.inpainting.patches import STEP_PX, centers_px
+from viewmend.inpainting.transformer import Placed
+from viewmend.views import IncompleteView
+
+
+@dataclass(frozen=True)
+class Target:
+    """A novel view's own kept patches. The incomplete ones are the input set P, the others join the context."""
+
+    view: IncompleteView
+    places: Int[Tensor, "patch 3"]
+    tokens: Float[Tensor, "patch dim"]
+    features: Float[Tensor, "patch feature 7 7"]
+    incomplete: Bool[Tensor, "patch"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What the transformer works on."""
+
+    queries: Float[Tensor, "sample query dim"]
+    at: Placed
+    keys_values: Float[Tensor, "block 2 sample key dim"]
+    context_at: Placed
+
+
+def assemble(
+    targets: Sequence[Target],
+    contexts: Sequence[Sequence[ContextFrame]],
+    own_keys_values: Sequence[Float[Tensor, "block 2 _ dim"]],
+    config: InpainterConfig,
+) -> Batch:
+    """Pads the targets' input tokens, and their context: the frames and then their own complete patches."""
+    queries, asking, keys, context = [], [], [], []
+    for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
+        uvs = _own_uvs(target)
+        queries.append(target.tokens[target.incomplete])
+        asking.append((uvs[target.incomplete], torch.ones_like(uvs[target.incomplete, 0], dtype=torch.bool)))
+        carried = [_carried(frame, frames, target.view, config) for frame in frames]
+        complete = uvs[~target.incomplete]
+        carried.append((complete, torch.ones_like(complete[:, 0], dtype=torch.bool)))
+        context.append((torch.cat([uvs for uvs, _ in carried]), torch.cat([valid for _, valid in carried])))
+        keys.append(torch.cat([*(frame.keys_values.to(own) for frame in frames), own], 2))
+    # One key at least, though it does not count: kernels dislike empty tensors.
+    most = max(1, *(key.shape[2] for key in keys))
+    return Batch(
+        torch.stack([_padded(q, max(len(q) for q in queries)) for q in queries]),
+        _placed(asking, targets, max(len(q) for q in queries)),
+        torch.stack([F.pad(key, (0, 0, 0, most - key.shape[2])) for key in keys], 2),
+        _placed(context, targets, most),
+    )
+
+
+def _own_uvs(target: Target) -> Float[Tensor, "patch 3"]:
+    """A novel view's patches are where they are, now."""
+    return F.pad(centers_px(target.places) / target.view.camera.size_px, (0, 1))
+
+
+def _carried(
+    frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: InpainterConfig
+) -> tuple[Float[Tensor, "patch 3"], Bool[Tensor, "patch"]]:
+    """(u, v, s) of a camera's patches in the novel view, and which of them count."""
+    points, valid = frame.points_world, frame.valid
+    if config.past_geometry == "current" and frame.time != view.time:
+        now = [f for f in frames if f.name == frame.name and f.time == view.time]
+        if now:
+            points, valid = frame.lifted_by(now[0])
+    uv, counts = reproject(points, valid, view.camera)
+    s = torch.full_like(uv[:, :1], (view.time - frame.time) / config.window)
+    return torch.cat([uv, s], 1), counts
+
+
+def _placed(
+    parts: Sequence[tuple[Float[Tensor, "_ 3"], Bool[Tensor, "_"]]], targets: Sequence[Target], length: int
+) -> Placed:
+    uvs = torch.stack([_padded(uvs, length) for uvs, _ in parts])
+    sizes = torch.stack([F.pad(t.view.camera.size_px[0] / STEP_PX, (0, 1), value=1.0) for t in targets])
+    return Placed(uvs, uvs * sizes[:, None], torch.stack([_padded(present, length) for _, present in parts]))
+
+
+def _padded(rows: Tensor, length: int) -> Tensor:
+    """Rows of zeros (or False) below, up to this length."""
+    missing = rows.new_zeros(length - len(rows), *rows.shape[1:])
+    return torch.cat([rows, missing])

@@ -1,0 +1,137 @@
+"""Inpainters on disk: model.safetensors, config.json and a model card, in the layout of huggingface_hub's mixin."""
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.inpainter import Inpainter
+
+FORMAT = 1
+"""Grows when an older program could no longer read what is written."""
+SHIPPED = Path(__file__).parents[1] / "weights"
+WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
+
+
+class CheckpointError(ValueError):
+    """An inpainter that cannot be loaded: which file, what was expected, what came, the next step."""
+
+
+class MissingCheckpointError(CheckpointError):
+    """No such model."""
+
+
+class DamagedCheckpointError(CheckpointError):
+    """A file that cannot be read, or is cut short."""
+
+
+class MismatchedCheckpointError(CheckpointError):
+    """Weights that belong to another config, or a config of another version."""
+
+
+def shipped_models() -> tuple[str, ...]:
+    """Names of the models that come with the package."""
+    return tuple(sorted(p.parent.name for p in SHIPPED.glob(f"*/{WEIGHTS}")))
+
+
+def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu") -> Inpainter:
+    """The inpainter in this folder, or the shipped one of this name, ready to infer.
+
+    Raises:
+        MissingCheckpointError: there is no such folder or name, or a file of it is missing.
+        DamagedCheckpointError: a file is unreadable or cut short.
+        MismatchedCheckpointError: weights and config do not belong together.
+    """
+    folder = _folder(name_or_path)
+    inpainter = Inpainter(_read_config(folder / CONFIG))
+    weights = _read_weights(folder / WEIGHTS, str(device))
+    expected = inpainter.state_dict()
+    missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
+    reshaped = [
+        f"{key} {tuple(weights[key].shape)} for {tuple(expected[key].shape)}"
+        for key in sorted(expected.keys() & weights.keys())
+        if weights[key].shape != expected[key].shape
+    ]
+    if missing or unknown or reshaped:
+        raise MismatchedCheckpointError(
+            f"{folder / WEIGHTS}: expected the weights of {CONFIG} beside it, got missing {missing[:3]}, "
+            f"unknown {unknown[:3]}, of another shape {reshaped[:3]}; use the {CONFIG} that was saved with them"
+        )
+    inpainter.load_state_dict(weights)
+    return inpainter.to(device).eval()
+
+
+def save_inpainter(inpainter: Inpainter, folder: str | Path, card: str) -> None:
+    """Writes the three files; each is whole or not there, also when the machine stops halfway.
+
+    `card` is the model card in Markdown: what trained the model and what it scores.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    config = {"viewmend_format": FORMAT} | inpainter.config.to_dict()
+    weights = {key: value.detach().cpu().contiguous() for key, value in inpainter.state_dict().items()}
+    _write_atomically(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
+    _write_atomically(folder / CARD, lambda path: path.write_text(card))
+    _write_atomically(folder / WEIGHTS, lambda path: save_file(weights, path, {"format": "pt"}))
+
+
+def _folder(name_or_path: str | Path) -> Path:
+    folder = Path(name_or_path)
+    if not folder.is_dir() and str(name_or_path) in shipped_models():
+        folder = SHIPPED / str(name_or_path)
+    if not folder.is_dir():
+        raise MissingCheckpointError(
+            f"expected a folder or one of the shipped models {list(shipped_models())}, got {str(name_or_path)!r}"
+        )
+    absent = [name for name in (WEIGHTS, CONFIG) if not (folder / name).is_file()]
+    if absent:
+        raise MissingCheckpointError(
+            f"{folder}: expected {WEIGHTS} and {CONFIG}, {' and '.join(absent)} missing; copy the whole folder"
+        )
+    return folder
+
+
+def _read_config(path: Path) -> InpainterConfig:
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise DamagedCheckpointError(f"{path}: expected JSON, got {error}; copy the file again") from error
+    version = values.pop("viewmend_format", None) if isinstance(values, dict) else None
+    if version != FORMAT:
+        raise MismatchedCheckpointError(
+            f"{path}: expected viewmend_format {FORMAT}, got {version}; use the version of viewmend that wrote it"
+        )
+    try:
+        return InpainterConfig.from_dict(values)
+    except (TypeError, ValueError) as error:
+        raise MismatchedCheckpointError(f"{path}: {error}") from error
+
+
+def _read_weights(path: Path, device: str) -> dict[str, torch.Tensor]:
+    try:
+        with safe_open(path, framework="pt", device=device) as file:
+            return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise DamagedCheckpointError(
+            f"{path}: expected a whole safetensors file, got {path.stat().st_size} bytes that do not read ({error}); "
+            "copy or download it again"
+        ) from error
+
+
+def _write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Writes beside the place, then renames: nobody ever sees half a file."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    os.close(handle)
+    beside = Path(name)
+    try:
+        write(beside)
+        beside.chmod(0o644)
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,114 @@
+"""The sizes and switches of the inpainter."""
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal
+
+ENCODER_GROUPS = (1, 1, 1, 1, 1, 2, 4, 8, 1)
+"""Groups of the encoder's nine convolutions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InpainterConfig:
+    """One architecture; `paper()` and `small()` are two sizes of it. Defaults follow the paper where it speaks."""
+
+    widths: tuple[int, ...] = (64, 64, 128, 256, 384, 512, 384, 256, 128)
+    """Output channels of the encoder's nine convolutions; the last is C, the channels of a patch."""
+    dim: int = 512
+    """D, the size of a token."""
+    heads: int = 8
+    groups: int = 2
+    """n_g, groups of blocks; each prunes its context once."""
+    blocks: int = 4
+    """n_b, blocks in a group."""
+    ffn_ratio: int = 4
+    """Hidden size of a block's feed-forward network, in tokens."""
+    use_mask: bool = True
+    """Show the encoder the foreground mask (the paper loses 5.6 dB in the holes without)."""
+    use_depth: bool = True
+    """Show the encoder the proxy's depth, relative to the image's median depth (so it fits any rig)."""
+    use_validity: bool = True
+    """Show the encoder where a view is right (1 - E), so that a hole is no black cloth. Ours."""
+    black_background: bool = True
+    """Blacken the background of camera images, as it is in a rendered view. Ours."""
+    rope: bool = True
+    """Rotary embedding of (u, v, s) in the attention's scores."""
+    rope_values: bool = False
+    """Rotate values by the offset between context patch and query as well, so that what is copied knows how far
+    it must shift. Ours."""
+    feature_skip: bool = False
+    """Add the input patch's own features to the ones its token decodes to. Ours."""
+    top_k: int | None = None
+    """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
+    attention_scale: Literal["model", "head"] = "model"
+    """Scores are divided by the root of D ("model", the paper's formula) or of a head's channels."""
+    past_geometry: Literal["own", "current"] = "own"
+    """Geometry that carries a past patch into the view: that of its own time, or of now (the paper's)."""
+    n_c: int = 3
+    """Frames just before the current one."""
+    n_w: int = 3
+    """Frames further back."""
+    k_w: int = 10
+    """Spacing of the frames further back."""
+    grid: Literal["relative", "absolute"] = "relative"
+    """Frames further back are t - k_w j (the paper's), or multiples of k_w (fewer to remember)."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "widths", tuple(self.widths))
+        positive = {n: getattr(self, n) for n in ("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w")}
+        wrong = [f"{n} = {v}" for n, v in positive.items() if v < 1]
+        wrong += [f"{n} = {getattr(self, n)}" for n in ("n_c", "n_w") if getattr(self, n) < 0]
+        if wrong:
+            raise ValueError(f"expected positive sizes, got {', '.join(wrong)}")
+        if self.dim % (16 * self.heads):
+            raise ValueError(
+                f"expected dim to be a multiple of 16 x heads (three axes of rotated pairs), got dim {self.dim} "
+                f"with {self.heads} heads; change one of them"
+            )
+        if len(self.widths) != len(ENCODER_GROUPS) or any(w % 8 for w in self.widths):
+            raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
+        if self.top_k is not None and self.top_k < 1:
+            raise ValueError(f"expected top_k of at least 1 or none, got {self.top_k}")
+
+    @property
+    def in_channels(self) -> int:
+        """Channels of the encoder's input."""
+        return 3 + self.use_mask + self.use_depth + self.use_validity
+
+    @property
+    def total_blocks(self) -> int:
+        """Blocks of all groups."""
+        return self.groups * self.blocks
+
+    @property
+    def window(self) -> int:
+        """k_w n_w, the frames that the relative window spans, which also scales time to s; at least 1."""
+        return max(self.k_w * self.n_w, self.n_c, 1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for config.json."""
+        return asdict(self) | {"widths": list(self.widths)}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> "InpainterConfig":
+        """Inverse of `to_dict`.
+
+        Raises:
+            ValueError: a key is missing or unknown, or a value is impossible.
+        """
+        expected = {f.name for f in fields(cls)}
+        if set(values) != expected:
+            raise ValueError(
+                f"expected the keys of InpainterConfig, missing {sorted(expected - set(values))}, "
+                f"unknown {sorted(set(values) - expected)}; was this written by another version?"
+            )
+        return cls(**values | {"widths": tuple(values["widths"])})
+
+
+def paper() -> InpainterConfig:
+    """The paper's size: encoder of FuseFormer's widths, D = 512, 8 heads, 2 groups of 4 blocks."""
+    return InpainterConfig()
+
+
+def small() -> InpainterConfig:
+    """About a quarter of the paper's widths: for two CPU cores."""
+    return InpainterConfig(widths=(16, 16, 32, 64, 96, 128, 96, 64, 32), dim=128, heads=4)

@@ -1,0 +1,55 @@
+"""From tokens to pixels, patch by patch, and the blend with what was known (section 7)."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.encoder import SLOPE
+from viewmend.inpainting.patches import PATCH_CELLS
+
+
+class Decoder(nn.Module):
+    """Each token becomes 7 x 7 x C by a linear layer, then 28 x 28 RGB by deconvolutions that see no other patch."""
+
+    def __init__(self, config: InpainterConfig) -> None:
+        super().__init__()
+        C = config.widths[-1]
+        self.norm = nn.LayerNorm(config.dim)
+        self.linear = nn.Linear(config.dim, C * PATCH_CELLS**2)
+        self.layers = nn.Sequential(
+            nn.LeakyReLU(SLOPE),
+            nn.ConvTranspose2d(C, C, 4, 2, 1),
+            nn.LeakyReLU(SLOPE),
+            nn.ConvTranspose2d(C, C // 2, 4, 2, 1),
+            nn.LeakyReLU(SLOPE),
+            nn.Conv2d(C // 2, 3, 3, 1, 1),
+        )
+        for layer in self.layers:
+            if isinstance(layer, nn.ConvTranspose2d):
+                # Each output pixel sees a quarter of the 4 x 4 kernel's taps.
+                nn.init.normal_(layer.weight, 0, (2 / (layer.in_channels * 4)) ** 0.5)
+            if isinstance(layer, nn.ConvTranspose2d | nn.Conv2d) and layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "patch dim"],
+        skipped: Float[Tensor, "patch feature 7 7"] | None = None,
+    ) -> Float[Tensor, "patch 3 28 28"]:
+        """RGB patches, about [0, 1] but not clamped; `skipped` features are added to the decoded ones."""
+        features = self.linear(self.norm(tokens)).unflatten(1, (-1, PATCH_CELLS, PATCH_CELLS))
+        if skipped is not None:
+            features = features + skipped
+        return self.layers(features)
+
+
+def blend(
+    known: Float[Tensor, "3 height width"],
+    error: Float[Tensor, "height width"],
+    inpainted: Float[Tensor, "3 height width"],
+    coverage: Float[Tensor, "height width"],
+) -> Float[Tensor, "3 height width"]:
+    """Fhat = E Ftilde + (1 - E) F; bit for bit F where E is 0 or where no patch was decoded."""
+    mended = error * inpainted.clamp(0, 1) + (1 - error) * known
+    return torch.where((error > 0) & (coverage > 0), mended, known)

@@ -1,0 +1,105 @@
+"""From images to tokens: what the encoder is shown, and which patches are kept (sections 3 and 4)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.coordinates import relative_depth
+from viewmend.inpainting.encoder import CELL_PX, Encoder
+from viewmend.inpainting.patches import (
+    PATCH_CELLS,
+    STEP_CELLS,
+    STEP_PX,
+    any_in_patch,
+    crop,
+    crop_windows,
+    split,
+)
+from viewmend.views import ContextViews, IncompleteView
+
+MIN_FOREGROUND = 0.1
+"""A camera's mask below this is background: recorded masks are never quite zero."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """Images of one size, as the encoder is shown them, and their foreground."""
+
+    channels: Float[Tensor, "view channel height width"]
+    foreground: Bool[Tensor, "view height width"]
+    kept: Bool[Tensor, "view rows cols"]
+    """Patches with any foreground: all others are discarded."""
+
+    @property
+    def places(self) -> Int[Tensor, "patch 3"]:
+        """View, row and column of each kept patch."""
+        return torch.nonzero(self.kept)
+
+
+def context_images(views: ContextViews, config: InpainterConfig) -> Images:
+    """Camera images of one time. Without masks, what the proxy covers is the foreground."""
+    frame = views.frame
+    rgb = frame.rgb.float() / 255
+    mask = (views.depth > 0).float() if frame.mask is None else frame.mask.float() / 255
+    if config.black_background:
+        rgb = rgb * mask[:, None]
+    inside = torch.ones_like(mask)
+    for image, (width, height) in zip(inside, frame.cameras.size_px.tolist(), strict=True):
+        image[height:], image[:, width:] = 0, 0
+    return _images(rgb, mask, views.depth, inside, mask > MIN_FOREGROUND, config)
+
+
+def target_images(view: IncompleteView, config: InpainterConfig) -> Images:
+    """The novel view, a stack of one."""
+    mask = view.mask[None]
+    return _images(view.rgb[None], mask, view.depth[None], 1 - view.error[None], mask > 0, config)
+
+
+def _images(
+    rgb: Tensor, mask: Tensor, depth: Tensor, validity: Tensor, foreground: Tensor, config: InpainterConfig
+) -> Images:
+    channels = [rgb]
+    if config.use_mask:
+        channels.append(mask[:, None])
+    if config.use_depth:
+        channels.append(relative_depth(depth)[:, None])
+    if config.use_validity:
+        channels.append(validity[:, None])
+    return Images(torch.cat(channels, 1), foreground, any_in_patch(foreground))
+
+
+class Tokeniser(nn.Module):
+    """Encoder, patches, and one linear layer, 7 x 7 x C -> D, with a norm."""
+
+    def __init__(self, config: InpainterConfig) -> None:
+        super().__init__()
+        self.encoder = Encoder(config)
+        self.linear = nn.Linear(config.widths[-1] * PATCH_CELLS**2, config.dim)
+        self.norm = nn.LayerNorm(config.dim)
+
+    def forward(
+        self, stacks: Sequence[Images]
+    ) -> tuple[Float[Tensor, "patch dim"], Float[Tensor, "patch feature 7 7"]]:
+        """Tokens and features of all kept patches of all stacks, in order: one batch for the encoder.
+
+        Only a crop around each image's kept patches is encoded, with the encoder's receptive radius in zeros
+        beyond the image: so nothing depends on the size of the crop, nor on what else is in the batch.
+        """
+        windows, places, first = [], [], 0
+        crops = [crop_windows(stack.kept) for stack in stacks]
+        size = (max(s[0] for _, s in crops), max(s[1] for _, s in crops))
+        for stack, (origins, _) in zip(stacks, crops, strict=True):
+            pixels = (origins * STEP_PX).tolist()
+            windows += [crop(image, top, left, size) for image, (top, left) in zip(stack.channels, pixels, strict=True)]
+            kept = stack.places
+            local = kept[:, 1:] - origins[kept[:, 0]]
+            places.append(torch.cat([kept[:, :1] + first, local], 1))
+            first += len(stack.channels)
+        features = self.encoder(torch.stack(windows))
+        assert features.shape[-1] * CELL_PX == size[1]
+        patches = split(features, torch.cat(places), PATCH_CELLS, STEP_CELLS)
+        return self.norm(self.linear(patches.flatten(1))), patches

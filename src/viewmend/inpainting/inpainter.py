@@ -1,0 +1,190 @@
+"""The inpainter: an incomplete view and its context to a complete view (sections 2 to 7 and 9)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from viewmend.inpainting.assembly import Target, assemble
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.context import ContextFrame, window_times
+from viewmend.inpainting.coordinates import lift, patch_depths
+from viewmend.inpainting.decoder import Decoder, blend
+from viewmend.inpainting.images import Images, Tokeniser, context_images, target_images
+from viewmend.inpainting.patches import STEP_PX, any_in_patch, centers_px, merge
+from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.transformer import Transformer
+from viewmend.views import CompletedView, ContextViews, IncompleteView
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the network made of one view."""
+
+    inpainted: Float[Tensor, "3 height width"]
+    """Ftilde: the decoded patches, blended; about [0, 1] but not clamped; 0 where not covered."""
+    coverage: Float[Tensor, "height width"]
+    """1 where a decoded patch covers the pixel, else 0."""
+    completed: Float[Tensor, "3 height width"]
+    """Fhat = E Ftilde + (1 - E) F, Ftilde clamped; F bit for bit where E is 0."""
+
+
+class Inpainter(nn.Module):
+    """T(F[t] | G[t], I[i, tau]) of section 1. Keeps no state between calls: streams pass theirs along."""
+
+    def __init__(self, config: InpainterConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.tokeniser = Tokeniser(config)
+        self.transformer = Transformer(config)
+        self.decoder = Decoder(config)
+        self.compute_dtype = torch.float32
+        """Set to torch.bfloat16 to run the networks under autocast; coordinates stay float32."""
+
+    def _autocast(self, device: torch.device) -> torch.autocast:
+        return torch.autocast(device.type, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+    def encode_context(self, views: ContextViews) -> tuple[ContextFrame, ...]:
+        """One frame to remember per camera of `views`, in their order."""
+        return self.encode_contexts([views])[0]
+
+    def encode_contexts(self, many: Sequence[ContextViews]) -> list[tuple[ContextFrame, ...]]:
+        """`encode_context` of each (several times, or several scenes), all images in one batch."""
+        if not many:
+            return []
+        stacks = [context_images(views, self.config) for views in many]
+        with self._autocast(stacks[0].channels.device):
+            tokens, _ = self.tokeniser(stacks)
+            keys_values = self.transformer.project_context(tokens)
+        counts = [len(stack.places) for stack in stacks]
+        parts = zip(many, stacks, tokens.split(counts), keys_values.split(counts, 2), strict=True)
+        return [_context_frames(*part) for part in parts]
+
+    def forward(
+        self,
+        views: Sequence[IncompleteView],
+        contexts: Sequence[Sequence[ContextFrame | ContextViews]],
+        top_k: int | None = None,
+    ) -> list[Prediction]:
+        """`predict`, whose contexts may also be camera images; these are encoded first, all in one batch."""
+        fresh = [item for context in contexts for item in context if isinstance(item, ContextViews)]
+        encoded = iter(self.encode_contexts(fresh))
+        frames = [
+            [f for item in context for f in (next(encoded) if isinstance(item, ContextViews) else (item,))]
+            for context in contexts
+        ]
+        return self.predict(views, frames, top_k)
+
+    def predict(
+        self,
+        views: Sequence[IncompleteView],
+        contexts: Sequence[Sequence[ContextFrame]],
+        top_k: int | None = None,
+    ) -> list[Prediction]:
+        """One prediction per view from its own context frames (any number, 0 included).
+
+        `top_k` context tokens survive pruning; None takes the config's. Gradients reach every parameter.
+        """
+        if len(views) != len(contexts):
+            raise ValueError(f"expected one context per view, got {len(views)} views and {len(contexts)} contexts")
+        targets = self._encode_targets(views)
+        asking = [i for i, target in enumerate(targets) if bool(target.incomplete.any())]
+        patches: dict[int, Tensor] = {}
+        if asking:
+            decoded = self._decode([targets[i] for i in asking], [contexts[i] for i in asking], top_k)
+            patches = dict(zip(asking, decoded, strict=True))
+        return [_prediction(target, patches.get(i)) for i, target in enumerate(targets)]
+
+    def _encode_targets(self, views: Sequence[IncompleteView]) -> list[Target]:
+        """Tokens of every kept patch of each view; those with any pixel of E > 0 are the input set P."""
+        stacks: list[Images] = [target_images(view, self.config) for view in views]
+        with self._autocast(stacks[0].channels.device):
+            tokens, features = self.tokeniser(stacks)
+        counts = [len(stack.places) for stack in stacks]
+        targets = []
+        for view, stack, own, maps in zip(views, stacks, tokens.split(counts), features.split(counts), strict=True):
+            incomplete = any_in_patch(view.error[None] > 0)[tuple(stack.places.unbind(1))]
+            targets.append(Target(view, stack.places, own, maps, incomplete))
+        return targets
+
+    def _decode(
+        self, targets: Sequence[Target], contexts: Sequence[Sequence[ContextFrame]], top_k: int | None
+    ) -> list[Float[Tensor, "patch 3 28 28"]]:
+        """RGB patches of each target's incomplete patches."""
+        with self._autocast(targets[0].tokens.device):
+            own = [self.transformer.project_context(t.tokens[~t.incomplete]) for t in targets]
+        batch = assemble(targets, contexts, own, self.config)
+        with self._autocast(targets[0].tokens.device):
+            tokens = self.transformer(
+                batch.queries,
+                batch.at,
+                batch.keys_values,
+                batch.context_at,
+                self.config.top_k if top_k is None else top_k,
+            )
+            features = torch.cat([t.features[t.incomplete] for t in targets]) if self.config.feature_skip else None
+            decoded = self.decoder(tokens[batch.at.present], features)
+        return list(decoded.float().split([int(t.incomplete.sum()) for t in targets]))
+
+    def initial_state(self) -> State:
+        """The state before the first view of a stream."""
+        return State()
+
+    @torch.no_grad()
+    def step(
+        self, view: IncompleteView, source: Source, state: State, top_k: int | None = None
+    ) -> tuple[CompletedView, State]:
+        """The completed view and the state for the next one (section 9).
+
+        `source` is asked only for frames of `view.chosen` that the window needs and the state has not; a view
+        without holes comes back at once, without asking it.
+        """
+        if not bool((view.error > 0).any()):
+            return CompletedView(view, view.rgb), state
+        times = window_times(view.time, self.config)
+        wanted = [(time, state.cache.missing(view.chosen, time)) for time in times]
+        found = [source(time, names) for time, names in wanted if names]
+        frames = [f for group in self.encode_contexts([v for v in found if v is not None]) for f in group]
+        cache = state.cache.add(frames, view.time, self.config)
+        prediction = self.predict([view], [cache.find(view.chosen, times)], top_k)[0]
+        return CompletedView(view, prediction.completed), State(cache)
+
+
+def _context_frames(
+    views: ContextViews, images: Images, tokens: Tensor, keys_values: Tensor
+) -> tuple[ContextFrame, ...]:
+    """The encoded patches of one time, lifted and split by camera."""
+    cameras, places = views.frame.cameras, images.places
+    depths = patch_depths(views.depth, images.foreground)
+    points, valid = lift(places, depths, cameras)
+    uv_px = centers_px(places)
+    frames, first = [], 0
+    for i, count in enumerate(images.kept.sum((1, 2)).tolist()):
+        own = slice(first, first + count)
+        frames.append(
+            ContextFrame(
+                camera=cameras[i],
+                time=views.frame.time,
+                places=places[own, 1:],
+                uv_px=uv_px[own],
+                points_world=points[own],
+                valid=valid[own],
+                depths=depths[i],
+                tokens=tokens[own],
+                keys_values=keys_values[:, :, own],
+            )
+        )
+        first += count
+    return tuple(frames)
+
+
+def _prediction(target: Target, patches: Float[Tensor, "patch 3 28 28"] | None) -> Prediction:
+    """Patches back in their places, blended, and the view completed; without patches it stays as it is."""
+    view = target.view
+    if patches is None:
+        return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb)
+    height, width = view.mask.shape
+    merged, coverage = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
+    return Prediction(merged[0], coverage[0], blend(view.rgb, view.error, merged[0], coverage[0]))

@@ -1,0 +1,60 @@
+"""Rotary embedding over the three axes u, v and s (section 6).
+
+A head's channels are pairs; a pair belongs to one axis and turns by coordinate x frequency. Three eighths of the
+pairs belong to u, three eighths to v and a quarter to s.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+LONGEST = 2.0
+"""Image widths (or windows of time) in one turn of the slowest pair."""
+SHORTEST = 0.1
+"""The same of the fastest: two patch steps of a 320 pixel image."""
+LONGEST_STEPS, SHORTEST_STEPS = 8.0, 0.75
+"""Patch steps in one turn of the slowest and the fastest pair of a value."""
+
+
+def pairs_per_axis(head_dim: int) -> tuple[int, int, int]:
+    """Pairs of channels that belong to u, v and s."""
+    pairs = head_dim // 2
+    return 3 * pairs // 8, 3 * pairs // 8, pairs - 2 * (3 * pairs // 8)
+
+
+def score_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
+    """Radians per unit of (u, v, s) by which each pair turns: geometric on its axis, zero for the other axes."""
+    return _frequencies(pairs_per_axis(head_dim), LONGEST, SHORTEST)
+
+
+def value_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
+    """Radians per patch step for values: pairs of u and v turn as a shift of the picture would, the rest stay."""
+    frequencies = _frequencies(pairs_per_axis(head_dim), LONGEST_STEPS, SHORTEST_STEPS)
+    frequencies[2] = 0
+    return frequencies
+
+
+def _frequencies(counts: tuple[int, ...], longest: float, shortest: float) -> Float[Tensor, "3 pair"]:
+    parts = [
+        2 * math.pi / longest * (longest / shortest) ** torch.linspace(0, 1, n, dtype=torch.float64) for n in counts
+    ]
+    return torch.block_diag(*parts).float()
+
+
+def angles(
+    coordinates: Float[Tensor, "*batch 3"], frequencies: Float[Tensor, "3 pair"]
+) -> Float[Tensor, "*batch pair"]:
+    """By how much each pair turns at these (u, v, s), radians."""
+    # A sum of products, not a matrix product: autocast would round the angles to bfloat16.
+    return (coordinates[..., None] * frequencies).sum(-2)
+
+
+def rotate(
+    x: Float[Tensor, "*batch channel"], angle: Float[Tensor, "*#batch channel/2"]
+) -> Float[Tensor, "*batch channel"]:
+    """Pairs (i, i + channel / 2) of x turned by these angles, in x's own precision."""
+    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
+    first, second = x.chunk(2, -1)
+    return torch.cat([first * cos - second * sin, second * cos + first * sin], -1)

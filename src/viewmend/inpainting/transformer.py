@@ -1,0 +1,168 @@
+"""Input tokens attend to context tokens (section 6): P <- P + A(W_Q norm(P), W_K R, W_V R); P <- P + FFN(norm(P))."""
+
+from dataclasses import dataclass
+
+import torch
+from einops import rearrange
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from viewmend.inpainting import rope
+from viewmend.inpainting.attention import attend, attend_and_sum, attend_weighted
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.pruning import most_attended, straight_through
+
+PRIOR_SPACE = (2.0, 0.5)
+"""How much a pair of u or v adds to the first and the last head's score of a patch at no distance, at the start."""
+PRIOR_TIME = 0.25
+"""The same of a pair of s, as a share."""
+CONTENT_GAIN = 0.5
+"""Size of the untrained content scores' weights, against the usual."""
+COPY_GAIN = 0.5
+"""How much of what it looks at an untrained block adds to a token."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where a padded batch of tokens is."""
+
+    uvs: Float[Tensor, "sample token 3"]
+    """(u, v, s) of section 5."""
+    steps: Float[Tensor, "sample token 3"]
+    """(u, v) in patch steps of the novel view, and s."""
+    present: Bool[Tensor, "sample token"]
+    """False for padding and for patches that do not count."""
+
+
+class Block(nn.Module):
+    """One layer's own parameters; its keys and values come from `Transformer.project_context`."""
+
+    def __init__(self, config: InpainterConfig) -> None:
+        super().__init__()
+        dim = config.dim
+        self.norm_query = nn.LayerNorm(dim)
+        self.query = nn.Linear(dim, dim)
+        self.norm_ffn = nn.LayerNorm(dim)
+        self.ffn = nn.Sequential(
+            nn.Linear(dim, config.ffn_ratio * dim), nn.GELU(), nn.Linear(config.ffn_ratio * dim, dim)
+        )
+
+
+class Transformer(nn.Module):
+    """n_g groups of n_b blocks. Keys and values of all blocks depend on the context tokens alone."""
+
+    score_frequencies: Tensor
+    value_frequencies: Tensor
+
+    def __init__(self, config: InpainterConfig) -> None:
+        super().__init__()
+        self.config = config
+        head_dim = config.dim // config.heads
+        self.scale = (config.dim if config.attention_scale == "model" else head_dim) ** -0.5
+        self.keys_values = nn.Linear(config.dim, config.total_blocks * 2 * config.dim)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.total_blocks))
+        self.register_buffer("score_frequencies", rope.score_frequencies(head_dim), persistent=False)
+        self.register_buffer("value_frequencies", rope.value_frequencies(head_dim), persistent=False)
+        self._initialise()
+
+    def _initialise(self) -> None:
+        """Start as a copier: look at what lands nearest, add half of it.
+
+        With RoPE, constant biases of queries and keys make the score contain the sum of cos(frequency x distance).
+        """
+        dim, heads = self.config.dim, self.config.heads
+        weights = self.keys_values.weight.data.unflatten(0, (-1, 2, dim))
+        biases = self.keys_values.bias.data.unflatten(0, (-1, 2, dim))
+        weights.normal_(0, 0.02)
+        weights[:, 0].normal_(0, CONTENT_GAIN * dim**-0.5)
+        weights[:, 1] += COPY_GAIN * torch.eye(dim)
+        biases.zero_()
+        counts = rope.pairs_per_axis(dim // heads)
+        share = torch.tensor([1.0] * (counts[0] + counts[1]) + [PRIOR_TIME] * counts[2])
+        strength = torch.logspace(0, 1, heads, PRIOR_SPACE[1] / PRIOR_SPACE[0])[:, None] * PRIOR_SPACE[0]
+        prior = (strength * share / self.scale).sqrt()
+        prior = torch.cat([prior, torch.zeros_like(prior)], 1).flatten() * self.config.rope
+        biases[:, 0] = prior
+        for block in self.blocks:
+            assert isinstance(block, Block)
+            nn.init.normal_(block.query.weight, 0, CONTENT_GAIN * dim**-0.5)
+            block.query.bias.data.copy_(prior)
+            last = block.ffn[-1]
+            assert isinstance(last, nn.Linear)
+            last.weight.data.mul_(0.2)
+            nn.init.zeros_(last.bias)
+
+    def project_context(self, tokens: Float[Tensor, "token dim"]) -> Float[Tensor, "block 2 token dim"]:
+        """K = W_K R and V = W_V R of every block, before any rotation: what a cache keeps."""
+        return rearrange(self.keys_values(tokens), "n (b two d) -> b two n d", two=2, d=self.config.dim).contiguous()
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "sample query dim"],
+        at: Placed,
+        keys_values: Float[Tensor, "block 2 sample key dim"],
+        context_at: Placed,
+        top_k: int | None,
+    ) -> Float[Tensor, "sample query dim"]:
+        """The input tokens after all blocks; only they change."""
+        turn = _Turns(self, at, context_at)
+        count = keys_values.shape[3]
+        prune = top_k is not None and top_k < count
+        for first in range(0, self.config.total_blocks, self.config.blocks):
+            kept: Tensor | None = None
+            weight: Tensor | None = None
+            for number in range(first, first + self.config.blocks):
+                block = self.blocks[number]
+                assert isinstance(block, Block)
+                KV = rearrange(keys_values[number], "two b n (h c) -> two b h n c", h=self.config.heads)
+                Q = rearrange(block.query(block.norm_query(tokens)), "b n (h c) -> b h n c", h=self.config.heads)
+                Q = turn.query(Q)
+                if number == first and prune and self.config.blocks > 1:
+                    assert top_k is not None
+                    K, V, present = turn.context(KV, None)
+                    looked, received = attend_and_sum(Q, K, V, present, at.present, self.scale)
+                    if torch.is_grad_enabled():
+                        weight = straight_through(received, present, top_k)
+                    else:
+                        kept = most_attended(received.masked_fill(~present, -1.0), top_k)
+                elif weight is not None:
+                    K, V, _ = turn.context(KV, None)
+                    looked = attend_weighted(Q, K, V, weight.to(Q.dtype), self.scale)
+                else:
+                    K, V, present = turn.context(KV, kept)
+                    looked = attend(Q, K, V, present, self.scale)
+                tokens = tokens + rearrange(turn.back(looked), "b h n c -> b n (h c)")
+                tokens = tokens + block.ffn(block.norm_ffn(tokens))
+        return tokens
+
+
+class _Turns:
+    """The rotations of one forward pass, which all blocks share."""
+
+    def __init__(self, transformer: Transformer, at: Placed, context_at: Placed) -> None:
+        config = transformer.config
+        self.present = context_at.present
+        self.score = self.value = None
+        if config.rope:
+            f = transformer.score_frequencies
+            self.score = tuple(rope.angles(x.uvs, f)[:, None] for x in (at, context_at))
+        if config.rope_values:
+            f = transformer.value_frequencies
+            self.value = tuple(rope.angles(x.steps, f)[:, None] for x in (at, context_at))
+
+    def query(self, Q: Tensor) -> Tensor:
+        return Q if self.score is None else rope.rotate(Q, self.score[0])
+
+    def back(self, looked: Tensor) -> Tensor:
+        return looked if self.value is None else rope.rotate(looked, -self.value[0])
+
+    def context(self, KV: Tensor, kept: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Rotated K and V of the kept keys and which of these count."""
+        present, turns = self.present, [None if t is None else t[1] for t in (self.score, self.value)]
+        if kept is not None:
+            present = present.gather(1, kept)
+            index = kept[:, None, :, None]
+            KV = KV.gather(3, index.expand(2, -1, KV.shape[2], -1, KV.shape[4]))
+            turns = [None if t is None else t.gather(2, index.expand(-1, -1, -1, t.shape[3])) for t in turns]
+        K, V = (x if t is None else rope.rotate(x, t) for x, t in zip(KV, turns, strict=True))
+        return K, V, present
