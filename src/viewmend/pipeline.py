@@ -1,0 +1,161 @@
+"""The whole system on one screen: camera images -> proxy -> incomplete view -> completed view, timed by stage."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import GeometryProxy, reconstruct
+from viewmend.inpainting.protocol import State, ViewInpainter
+from viewmend.rendering.view import RenderConfig, render_view
+from viewmend.views import CompletedView, ContextViews, MultiViewFrame
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineConfig:
+    """The system without its inpainter."""
+
+    hull: HullConfig = field(default_factory=HullConfig)
+    """How the geometry proxy is carved."""
+    render: RenderConfig = field(default_factory=RenderConfig)
+    """How views are rendered from the cameras."""
+    history: int = 30
+    """How many past frames a stream keeps for cameras that it chooses anew: k_w n_w, the inpainter's window."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One time of a stream, ready to be looked at; all viewers of that time share it."""
+
+    frame: MultiViewFrame
+    """What the cameras saw, with masks."""
+    proxy: GeometryProxy
+    """G[t]."""
+    geometry_ms: float
+    """What the proxy took."""
+    _depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False, compare=False)
+
+    def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
+        """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered once only."""
+        new = [name for name in names if name not in self._depths]
+        if new:
+            rendered = self.proxy.depth(self.frame.cameras.select(new))
+            right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
+            rendered = torch.nn.functional.pad(rendered, (0, right, 0, below))  # padded as the images are
+            self._depths.update(zip(new, rendered, strict=True))
+        return torch.stack([self._depths[name] for name in names])
+
+    def context(self, names: Sequence[str]) -> ContextViews | None:
+        """What an inpainter may see of these cameras; those without a frame are left out, None if all are."""
+        there = [name for name in names if name in self.frame.cameras.names]
+        return ContextViews(self.frame.select(there), self.depth(there)) if there else None
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """What one viewer's stream carries from one view to the next: a value, never changed in place."""
+
+    inpainter: State
+    chosen: tuple[str, ...] = ()
+    """The cameras of the last view."""
+    history: tuple[Observation, ...] = ()
+    """The last observations, at most `PipelineConfig.history` frames old."""
+
+
+@dataclass(frozen=True)
+class StageMs:
+    """Milliseconds of each stage, the device's work included."""
+
+    geometry: float
+    """Masks to proxy; shared by all viewers of the frame."""
+    rendering: float
+    """Proxy and images to the incomplete view."""
+    inpainting: float
+    """Incomplete to completed view."""
+
+
+@dataclass(frozen=True)
+class MendedView:
+    """What one viewer gets for one frame."""
+
+    completed: CompletedView
+    state: StreamState
+    stage_ms: StageMs
+
+
+def observe(frame: MultiViewFrame, bounds: Bounds | None, config: PipelineConfig) -> Observation:
+    """Reconstruct the geometry proxy of one time.
+
+    Args:
+        frame: what the cameras saw; leave a camera out of everything with `frame.without`.
+        bounds: the volume that may hold the subject; None to find it from the masks.
+        config: how.
+
+    Raises:
+        ValueError: the frame has no masks, no foreground, or a single camera.
+    """
+    if frame.mask is None:
+        raise ValueError(
+            "expected a capture with masks, got one without: the visual hull is carved from them; segment the "
+            "foreground and name the files as each camera's 'mask'"
+        )
+    start = _now(frame.rgb.device)
+    proxy = reconstruct(frame.mask, frame.cameras, bounds, config.hull)
+    return Observation(frame, proxy, _ms_since(start, frame.rgb.device))
+
+
+def mend_view(
+    observation: Observation,
+    target: Cameras,
+    state: StreamState,
+    inpainter: ViewInpainter,
+    config: PipelineConfig,
+    exclude: Sequence[str] = (),
+) -> MendedView:
+    """Render one novel view and fill what is missing in it.
+
+    Args:
+        observation: the time to look at; times of one stream do not run backwards.
+        target: the novel view's camera (one view), on the frame's device.
+        state: of the stream; `StreamState(inpainter.initial_state())` starts one.
+        inpainter: what fills the holes.
+        config: the pipeline's.
+        exclude: names of cameras whose images must not be used for this viewer.
+    """
+    frame, device = observation.frame, observation.frame.rgb.device
+    start = _now(device)
+    view = render_view(
+        frame, observation.proxy, target, config.render, state.chosen, exclude, source_depth=observation.depth
+    )
+    rendering_ms = _ms_since(start, device)
+
+    oldest = frame.time - config.history
+    past = tuple(o for o in state.history if oldest <= o.frame.time < frame.time)
+    at = {o.frame.time: o for o in (*past, observation)}
+
+    def source(time: int, names: tuple[str, ...]) -> ContextViews | None:
+        return at[time].context([n for n in names if n not in exclude]) if time in at else None
+
+    start = _now(device)
+    completed, inpainter_state = inpainter.step(view, source, state.inpainter)
+    inpainting_ms = _ms_since(start, device)
+
+    history = (*past, observation) if config.history else ()
+    stages = StageMs(observation.geometry_ms, rendering_ms, inpainting_ms)
+    return MendedView(completed, StreamState(inpainter_state, view.chosen, history), stages)
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _ms_since(start: float, device: torch.device) -> float:
+    return 1000 * (_now(device) - start)
