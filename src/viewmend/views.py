@@ -31,12 +31,14 @@ class MultiViewFrame:
         """The same time seen by these cameras alone, in this order; ValueError for an unknown name."""
         cameras = self.cameras.select(names)
         index = torch.tensor([self.cameras.names.index(n) for n in names], device=self.rgb.device, dtype=torch.long)
+        # Drop the padding that only the others needed: a stack is as large as its largest image.
+        width, height = cameras.max_size_px if names else (self.rgb.shape[-1], self.rgb.shape[-2])
         return replace(
             self,
             cameras=cameras,
-            rgb=self.rgb[index],
-            mask=None if self.mask is None else self.mask[index],
-            depth=None if self.depth is None else self.depth[index],
+            rgb=self.rgb[index, :, :height, :width],
+            mask=None if self.mask is None else self.mask[index, :height, :width],
+            depth=None if self.depth is None else self.depth[index, :height, :width],
         )
 
     def without(self, names: Sequence[str]) -> "MultiViewFrame":

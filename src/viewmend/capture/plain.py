@@ -37,7 +37,7 @@ class PlainCapture:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
     A camera whose image or mask is missing at a time is absent from that frame (a gap). Images and masks are
-    undistorted, K kept, and padded right and below to the largest camera's size.
+    undistorted, K kept, and padded right and below to the largest of the frame.
 
     Raises:
         CaptureError: `cameras.json` is wrong; a camera never has its files; a frame has no camera; masks or depths are
@@ -90,6 +90,11 @@ class PlainCapture:
         return None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
 
     @property
+    def metres_per_unit(self) -> float:
+        """Of the folder's own unit; everything that this class gives is metres."""
+        return self._calibration.metres_per_unit
+
+    @property
     def gaps(self) -> tuple[tuple[str, str], ...]:
         """Camera and frame id of every frame that one camera lacks."""
         missing = np.argwhere(~self.present)
@@ -114,7 +119,7 @@ class PlainCapture:
         return frame
 
     def _stack(self, images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
-        width, height = self._cameras.max_size_px
+        width, height = cameras.max_size_px
         rgb = torch.zeros(len(images), 3, height, width, dtype=torch.uint8)
         mask = torch.zeros(len(images), height, width, dtype=torch.uint8) if self.has_masks else None
         depth = torch.zeros(len(images), height, width) if self.has_depth else None

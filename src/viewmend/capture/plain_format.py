@@ -63,6 +63,7 @@ class PlainCalibration:
     """Unit length."""
     fps: float | None
     bounds_m: Float64[np.ndarray, "2 3"] | None
+    metres_per_unit: float
 
 
 def read_calibration(folder: Path) -> PlainCalibration:
@@ -99,6 +100,7 @@ def read_calibration(folder: Path) -> PlainCalibration:
         up=None if up is None else up / np.linalg.norm(up),
         fps=fps,
         bounds_m=None if bounds is None else bounds * scale,
+        metres_per_unit=scale,
     )
 
 

@@ -1,0 +1,44 @@
+"""An inpainting model in figures and in words."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from viewmend.inpainting.checkpoint import CARD, SHIPPED, load_inpainter
+
+
+@dataclass(frozen=True)
+class ModelDescription:
+    """What `viewmend info` says of a model."""
+
+    kind: str
+    path: str
+    parameters: int
+    config: dict[str, object]
+    card: str | None
+    """What trained the model and what it scores, Markdown; None where nobody wrote it down."""
+
+
+def describe_model(name_or_path: str) -> ModelDescription:
+    """Load a model, so that a damaged one shows, and describe it.
+
+    Raises:
+        CheckpointError: there is no such model, or it cannot be loaded.
+    """
+    inpainter = load_inpainter(name_or_path)
+    folder = Path(name_or_path) if Path(name_or_path).is_dir() else SHIPPED / name_or_path
+    card = folder / CARD
+    return ModelDescription(
+        kind="model",
+        path=str(folder),
+        parameters=sum(parameter.numel() for parameter in inpainter.parameters()),
+        config=inpainter.config.to_dict(),
+        card=card.read_text(encoding="utf-8") if card.is_file() else None,
+    )
+
+
+def in_words(model: ModelDescription) -> list[str]:
+    """The same for people, line by line."""
+    width = max(len(key) for key in model.config)
+    lines = [f"{model.path}: an inpainting model of {model.parameters / 1e6:.2f} million parameters", ""]
+    lines += [f"  {key:<{width}}  {value}" for key, value in model.config.items()]
+    return [*lines, "", model.card.strip() if model.card else "There is no model card: what trained it is not known."]
