@@ -37,7 +37,7 @@ class Character:
     uv: Float[Tensor, "vertex 2"]
     faces: Int[Tensor, "face 3"]
     texture_of_face: Int[Tensor, "face"]
-    textures: tuple[Float[Tensor, "3 texture_height texture_width"], ...]
+    textures: tuple[Float[Tensor, "3 _ _"], ...]
     joints: Int[Tensor, "vertex 4"]
     """Per vertex, positions in `node_of_joint`."""
     weights: Float[Tensor, "vertex 4"]

@@ -19,7 +19,7 @@ class TexturedMesh:
     uv: Float[Tensor, "vertex 2"]
     """Texture coordinates in [0, 1]: (0, 0) is the corner of the texture's top-left texel (as in glTF)."""
     texture_of_face: Int[Tensor, "face"]
-    textures: tuple[Float[Tensor, "3 texture_height texture_width"], ...]
+    textures: tuple[Float[Tensor, "3 _ _"], ...]
     """sRGB colours in [0, 1]; the sizes may differ."""
 
 

@@ -41,7 +41,7 @@ class StudioConfig:
     """Length of the capture."""
     size_px: int | tuple[int, int] = 512
     """Images' width and height, or side of square ones; a rig that is given keeps its own."""
-    fps: float = 30.0
+    fps: float | int = 30.0
     """Frames per second."""
     performers: Path | None = None
     """A glTF character (.glb, .gltf), or a folder of which one is picked; None for a procedural scene."""
@@ -112,7 +112,7 @@ class Studio:
     @property
     def fps(self) -> float | None:
         """Frames per second, None for a single frame."""
-        return self.config.fps if self.config.frames > 1 else None
+        return float(self.config.fps) if self.config.frames > 1 else None
 
     @property
     def up(self) -> Float[Tensor, "3"] | None:

@@ -37,7 +37,7 @@ def srgb_from_linear(linear: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
     return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
 
 
-def texture_pyramid(textures: Sequence[Float[Tensor, "3 ?h ?w"]]) -> TexturePyramid:
+def texture_pyramid(textures: Sequence[Float[Tensor, "3 _ _"]]) -> TexturePyramid:
     """Prepare sRGB textures of any sizes; costs about 50 ms for 1024 x 1024, so keep the result."""
     texels: list[Tensor] = []
     first: list[list[int]] = []

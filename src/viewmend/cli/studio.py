@@ -1,0 +1,77 @@
+"""`viewmend studio`: synthetic multi-camera captures with exact truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Write synthetic captures with exact truth: OUT/scene_SEED for each scene, as plain capture folders."""
+
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder for the captures; it is made if it is not there."""
+    scenes: int = 1
+    """How many captures; their seeds are --seed and the numbers after it."""
+    cameras: int = 12
+    """Cameras of each rig, 4 to 60."""
+    frames: int = 30
+    """Frames of each capture, 30 a second."""
+    size: int = 512
+    """Width and height of the images."""
+    seed: int = 0
+    """The first capture's; the same seed gives the same capture."""
+    rig: Literal["ring", "dome"] = "ring"
+    """How the cameras stand."""
+    performers: Path | None = None
+    """A glTF character (.glb, .gltf) or a folder of them, instead of the procedural people; needs --motions."""
+    motions: Path | None = None
+    """A BVH motion or a folder of them, for the characters."""
+    background: Literal["black", "stage"] = "black"
+    """What the cameras see behind the subject: nothing, or a plain wall and floor."""
+    imperfect: bool = False
+    """Add what real stages get wrong: noise, colour, compression, mask and calibration errors."""
+    images: Literal["jpeg", "png"] = "png"
+    """Image files: exact, or smaller."""
+    json: bool = False
+    """Write one JSON object to standard output: the folders and who performs in them."""
+
+
+def run(options: Options) -> int:
+    """Run the command; the exit code."""
+    wrong = [name for name in ("scenes", "cameras", "frames", "size") if getattr(options, name) < 1]
+    if wrong:
+        raise ValueError(f"expected positive numbers, got {wrong[0]} {getattr(options, wrong[0])}; see --help")
+    from viewmend.capture.errors import CaptureError
+    from viewmend.capture.plain_writer import write_capture
+    from viewmend.capture.studio.imperfections import Imperfections
+    from viewmend.capture.studio.stage import Studio, StudioConfig
+    from viewmend.cli.console import print_json, say, track
+
+    seeds = range(options.seed, options.seed + options.scenes)
+    folders = [options.out / f"scene_{seed:05d}" for seed in seeds]
+    taken = [folder for folder in folders if folder.exists()]
+    if taken:
+        raise CaptureError(f"{taken[0]}: expected no such folder, it exists; choose another --seed or folder")
+    report = []
+    for seed, folder in zip(seeds, folders, strict=True):
+        config = StudioConfig(
+            seed=seed,
+            cameras=options.cameras,
+            rig=options.rig,
+            frames=options.frames,
+            size_px=options.size,
+            performers=options.performers,
+            motions=options.motions,
+            background=options.background,
+            imperfections=Imperfections.typical() if options.imperfect else Imperfections(),
+        )
+        studio = Studio(config)
+        write_capture(studio, folder, images=options.images, progress=lambda times, f=folder: track(times, f.name))
+        say(f"{folder}: {studio.performer.description}")
+        report.append({"folder": str(folder), "seed": seed, "performer": studio.performer.description})
+    if options.json:
+        print_json({"captures": report})
+    return 0
