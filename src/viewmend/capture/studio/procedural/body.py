@@ -28,10 +28,11 @@ TORSO = np.array(
         (0.720, 0.096, 0.085, 0.064, 0.056, 0.058, -0.006),
         (0.750, 0.100, 0.089, 0.063, 0.056, 0.057, -0.009),
         (0.775, 0.100, 0.089, 0.056, 0.051, 0.053, -0.011),
-        (0.797, 0.094, 0.084, 0.046, 0.043, 0.047, -0.013),
-        (0.812, 0.078, 0.068, 0.039, 0.037, 0.043, -0.014),
-        (0.825, 0.057, 0.048, 0.034, 0.032, 0.039, -0.013),
-        (0.838, 0.041, 0.035, 0.032, 0.029, 0.036, -0.011),
+        (0.797, 0.100, 0.090, 0.046, 0.043, 0.047, -0.013),
+        (0.811, 0.092, 0.082, 0.039, 0.037, 0.043, -0.014),
+        (0.822, 0.072, 0.062, 0.035, 0.033, 0.040, -0.013),
+        (0.833, 0.051, 0.043, 0.032, 0.030, 0.037, -0.012),
+        (0.842, 0.040, 0.034, 0.032, 0.029, 0.036, -0.011),
         (0.852, 0.0355, 0.0300, 0.032, 0.029, 0.034, -0.008),
         (0.872, 0.0345, 0.0290, 0.032, 0.029, 0.034, -0.004),
         (0.900, 0.0340, 0.0285, 0.032, 0.029, 0.034, 0.000),
@@ -40,9 +41,9 @@ TORSO = np.array(
 # Place along the limb (0 shoulder or hip, 1 wrist or ankle), radius, shift backwards of the centre line.
 ARM_PROFILE = np.array(
     [
-        (-0.04, 0.026, 0.0),
-        (0.03, 0.0310, 0.0),
-        (0.14, 0.0305, 0.0),
+        (-0.04, 0.022, 0.0),
+        (0.03, 0.0270, 0.0),
+        (0.14, 0.0292, 0.0),
         (0.32, 0.0275, -0.001),
         (0.46, 0.0235, 0.0),
         (0.54, 0.0225, 0.001),
@@ -126,6 +127,11 @@ class Torso:
         radial = (np.hypot(x, z) - self.radius(np.arctan2(x, z), clamped)) / np.hypot(1.0, slope)
         return np.maximum(radial, np.abs(y - clamped)) + np.where(radial > 0, 0.3 * np.abs(y - clamped), 0.0)
 
+    def outside(self, other: "Torso", gap_m: float) -> "Torso":
+        """This torso, widened where it would come nearer than `gap_m` to `other` (on the same samples)."""
+        names = ("width", "front", "back")
+        return replace(self, **{n: np.maximum(getattr(self, n), getattr(other, n) + gap_m) for n in names})
+
     def eased(self, ease_m: float, hang: float = 0.0, flare: float = 0.0) -> "Torso":
         """The torso of a garment: `ease_m` wider; with `hang` 1 the cloth below the chest never comes back in."""
         tables = []
@@ -185,7 +191,8 @@ class Limb:
 
     def eased(self, ease_m: float, hang_from: float = 2.0, flare: float = 0.0) -> "Limb":
         """The sleeve or leg of a garment; beyond `hang_from` it hangs straight down and widens by `flare` metres."""
-        r = self.r + ease_m
+        # Close at the joint, where the garment's trunk begins.
+        r = self.r + ease_m * np.interp(self.t, [0.0, 0.25], [0.5, 1.0])
         hanging = self.t > hang_from
         held = float(np.interp(hang_from, self.t, r))
         far = np.clip((self.t - hang_from) / max(1 - hang_from, 1e-3), 0, 1)

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from viewmend.capture.studio.procedural.body import Body
+from viewmend.capture.studio.procedural.body import Body, Limb, Torso
 from viewmend.capture.studio.procedural.fabric import (
+    QUIET,
     WORDS,
     Canvas,
     Fabric,
@@ -67,7 +68,7 @@ def sample_outfit(rng: np.random.Generator, femininity: float) -> Outfit:
     outer = OUTERS[int(rng.choice(3, p=[0.72, 0.16, 0.12]))]
     lower = sample_fabric(rng, ("denim",) if bottom == "jeans" else LOWER)
     fabrics = (sample_fabric(rng), lower, sample_fabric(rng, LOOSE))
-    written = bottom != "dress" and outer == "none" and rng.random() < 0.4
+    written = bottom != "dress" and outer == "none" and fabrics[0].kind in QUIET and rng.random() < 0.6
     lettering = WORDS[int(rng.integers(len(WORDS)))] if written else ""
     light = rng.random() < 0.5
     upper = hsv(rng.random(), rng.uniform(0, 0.7) * (rng.random() < 0.5), rng.uniform(0.1, 0.95))
@@ -83,42 +84,94 @@ def neckline(around: Azimuths, height_m: float, depth: float, vee: bool = False,
 
 
 @dataclass(frozen=True)
+class Cut:
+    """The measures of an outfit: metres of ease, shares of the height for hems, shares of the limb for sleeves."""
+
+    loose_m: float
+    hang: float
+    sleeve: float
+    top_hem: float
+    neck: float
+    vee: bool
+    ease_m: float
+    leg: float
+    leg_hang: float
+    leg_flare_m: float
+
+
+def sample_cut(outfit: Outfit) -> Cut:
+    """Draw the measures that suit these garments."""
+    rng = np.random.default_rng(outfit.seed)
+    loose = {"sweater": 0.014, "shirt": 0.010, "t-shirt": 0.009}.get(outfit.top, 0.004) + 0.006 * rng.random()
+    sleeve = {"t-shirt": rng.uniform(0.2, 0.42), "tank top": 0.0}.get(outfit.top, rng.uniform(0.94, 1.0))
+    if outfit.top == "shirt" and outfit.outer == "none" and rng.random() < 0.3:
+        sleeve = rng.uniform(0.5, 0.6)
+    kind = outfit.bottom
+    tucked = kind == "dress" or (kind in ("trousers", "skirt") and rng.random() < 0.6)
+    end = {"shorts": rng.uniform(0.32, 0.5), "skirt": 0.0, "dress": 0.0}.get(kind, rng.uniform(0.95, 1.03))
+    flares: dict[str, float] = {"wide trousers": 0.02, "shorts": 0.004}
+    hangs = {"leggings": 2.0, "wide trousers": 0.3, "shorts": 0.2}
+    return Cut(
+        loose_m=float(loose),
+        hang=0.2 if outfit.top == "tank top" or kind == "dress" else float(rng.uniform(0.3, 0.9)),
+        sleeve=float(sleeve),
+        top_hem=0.598 if tucked else float(rng.uniform(0.49, 0.56)),
+        neck=float(rng.uniform(0.0, 0.012) if outfit.top == "sweater" else rng.uniform(0.008, 0.045)),
+        vee=bool(rng.random() < 0.35),
+        ease_m={"leggings": 0.002, "wide trousers": 0.010, "shorts": 0.011}.get(kind, 0.006 + 0.005 * rng.random()),
+        leg=float(end),
+        leg_hang=float(hangs.get(kind, rng.choice([0.5, 0.35, 0.72]))),
+        leg_flare_m=flares[kind] if kind in flares else float(rng.uniform(-0.012, 0.004)),
+    )
+
+
+@dataclass(frozen=True)
 class Tailor:
     """Cuts garments for one wearer."""
 
     wearer: Wearer
     outfit: Outfit
+    cut: Cut
 
     def folds(self, depth_m: float, along_m: float, around_m: float, number: int) -> Folds:
         """Creases with a seed of their own."""
         return Folds(depth_m, along_m, around_m, self.outfit.seed % 100_000 + 17 * number)
 
+    def lower_shape(self) -> Body:
+        """The body in what covers the legs."""
+        body, cut = self.wearer.body, self.cut
+        legs = [leg.eased(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs]
+        return Body(body.torso.eased(min(cut.ease_m, 0.006) - 0.001), body.arms, (legs[0], legs[1]), body.blend_m)
+
+    def _trunk(self, under: Torso) -> Torso:
+        """The trunk in the top, over what is tucked into it."""
+        return self.wearer.body.torso.eased(self.cut.loose_m, self.cut.hang, 0.004).outside(under, 0.005)
+
+    def _sleeves(self) -> tuple[Limb, Limb]:
+        short, ease = self.cut.sleeve < 0.7, self.cut.loose_m + 0.003
+        hang, flare = (0.10, 0.012) if short else (0.62, -0.006)
+        left, right = (arm.eased(ease, hang, flare) for arm in self.wearer.body.arms)
+        return left, right
+
     def top(self) -> list[Patch]:
         """Shirt, sweater or the like: trunk and sleeves."""
-        H, outfit, body = self.wearer.height_m, self.outfit, self.wearer.body
-        rng = np.random.default_rng(outfit.seed)
-        loose = {"sweater": 0.016, "shirt": 0.012, "t-shirt": 0.010}.get(outfit.top, 0.006) + 0.006 * rng.random()
-        hang = float(rng.uniform(0.35, 0.95)) if outfit.top != "tank top" else 0.2
-        torso = body.torso.eased(loose, hang, 0.004)
-        sleeve = {"t-shirt": rng.uniform(0.2, 0.42), "tank top": 0.0}.get(outfit.top, rng.uniform(0.93, 1.0))
-        if outfit.outer == "none" and outfit.top == "shirt" and rng.random() < 0.3:
-            sleeve = rng.uniform(0.5, 0.6)
-        wide = loose + 0.004
-        arms = [arm.eased(wide, 0.10 if sleeve < 0.5 else 0.55, 0.012 if sleeve < 0.5 else 0.0) for arm in body.arms]
-        shape = Body(torso, (arms[0], arms[1]), body.legs, body.blend_m)
-        around = azimuths(73)
-        dress = outfit.bottom == "dress"
-        tucked = dress or (outfit.bottom in ("trousers", "skirt") and rng.random() < 0.6)
-        hem = 0.598 if tucked else float(rng.uniform(0.49, 0.56))
-        depth = float(rng.uniform(0.0, 0.012)) if outfit.top == "sweater" else float(rng.uniform(0.008, 0.045))
-        low = np.full_like(around, hem * H)
-        high = neckline(around, H, depth, vee=bool(rng.random() < 0.35), wide=0.008 if outfit.top == "tank top" else 0)
-        patches = [
-            torso_sheet(self.wearer, shape, low, high, around, self._paint_top, self.folds(0.0035, 0.09, 0.13, 0))
-        ]
-        if sleeve > 0.05:
-            folds = self.folds(0.0035, 0.05, 0.10, 1)
-            patches += [limb_sheet(self.wearer, shape, 1 + i, -0.03, sleeve, self._paint_sleeve, folds) for i in (0, 1)]
+        H, outfit, body, cut = self.wearer.height_m, self.outfit, self.wearer.body, self.cut
+        lower, short = self.lower_shape(), cut.sleeve < 0.7
+        legs = [leg.eased(0.004) for leg in lower.legs]
+        shape = Body(self._trunk(lower.torso), self._sleeves(), (legs[0], legs[1]), body.blend_m)
+        around = azimuths(65)
+        wide = 0.008 if outfit.top == "tank top" else 0.0
+        high = neckline(around, H, cut.neck, cut.vee, wide)
+        low = np.full_like(around, cut.top_hem * H)
+        folds = self.folds(0.0022, 0.10, 0.16, 0)
+        patches = [torso_sheet(self.wearer, shape, low, high, around, self._paint_top, folds, 40)]
+        if cut.sleeve > 0.05:
+            folds = self.folds(0.0022, 0.06, 0.12, 1)
+            rows = 20 if short else 40
+            patches += [
+                limb_sheet(self.wearer, shape, 1 + i, -0.03, cut.sleeve, self._paint_sleeve, folds, rows, 25)
+                for i in (0, 1)
+            ]
         return patches
 
     def _paint_top(self, canvas: Canvas) -> Image:
@@ -142,27 +195,19 @@ class Tailor:
 
     def bottom(self) -> list[Patch]:
         """Trousers, shorts or skirt."""
-        H, outfit, body = self.wearer.height_m, self.outfit, self.wearer.body
-        rng = np.random.default_rng(outfit.seed + 1)
-        if outfit.bottom in ("skirt", "dress"):
-            return self._skirt(rng)
-        kind = outfit.bottom
-        ease = {"leggings": 0.002, "wide trousers": 0.012, "shorts": 0.011}.get(kind, 0.006 + 0.005 * rng.random())
-        hang = {"leggings": 2.0, "wide trousers": 0.12, "shorts": 0.14}.get(kind, float(rng.choice([0.5, 0.35, 0.72])))
-        flare = {"wide trousers": 0.01, "shorts": 0.008}.get(kind, float(rng.uniform(-0.012, 0.004)))
-        end = float(rng.uniform(0.32, 0.5)) if kind == "shorts" else float(rng.uniform(0.93, 1.02))
-        legs = [leg.eased(ease, hang, flare) for leg in body.legs]
-        shape = Body(body.torso.eased(min(ease, 0.006) - 0.001), body.arms, (legs[0], legs[1]), body.blend_m)
-        around = azimuths(73)
-        waist = np.full_like(around, float(rng.uniform(0.592, 0.606)) * H)
-        folds = self.folds(0.0 if kind == "leggings" else 0.0030, 0.06, 0.10, 2)
-        patches = [
-            torso_sheet(
-                self.wearer, shape, np.full_like(around, 0.470 * H), waist, around, self._paint_waist, folds, 30
-            )
-        ]
+        H, cut, kind = self.wearer.height_m, self.cut, self.outfit.bottom
+        if kind in ("skirt", "dress"):
+            return self._skirt()
+        shape = self.lower_shape()
+        around = azimuths(65)
+        # Under a hanging shirt the waistband is nowhere to be seen, and nothing can poke through.
+        waist = 0.602 if cut.top_hem > 0.58 else cut.top_hem + 0.035
+        folds = self.folds(0.0 if kind == "leggings" else 0.0020, 0.08, 0.12, 2)
+        low, high = (np.full_like(around, share * H) for share in (0.470, waist))
+        patches = [torso_sheet(self.wearer, shape, low, high, around, self._paint_waist, folds, 26)]
+        rows = 24 if kind == "shorts" else 44
         return patches + [
-            limb_sheet(self.wearer, shape, 3 + i, -0.02, end, self._paint_leg, folds, rows=48) for i in (0, 1)
+            limb_sheet(self.wearer, shape, 3 + i, -0.02, cut.leg, self._paint_leg, folds, rows) for i in (0, 1)
         ]
 
     def _paint_waist(self, canvas: Canvas) -> Image:
@@ -191,14 +236,16 @@ class Tailor:
         image = blend(image, 0.72 * image, edge(0.0016 - seam, canvas))
         return blend(image, 0.75 * image, edge(0.0014 - np.abs(canvas.y - 0.025), canvas))
 
-    def _skirt(self, rng: np.random.Generator) -> list[Patch]:
+    def _skirt(self) -> list[Patch]:
         H, outfit, body = self.wearer.height_m, self.outfit, self.wearer.body
+        rng = np.random.default_rng(outfit.seed + 1)
         fabric = outfit.fabrics[0] if outfit.bottom == "dress" else outfit.fabrics[1]
         hem = float(rng.uniform(0.17, 0.36))
         flare = float(rng.uniform(0.14, 0.42))
         pleats = (int(rng.integers(7, 15)), float(rng.uniform(0.002, 0.014)))
         shape = Body(body.torso.eased(0.014, 0.0), body.arms, body.legs, body.blend_m)
-        return skirt_sheets(self.wearer, shape, 0.606 * H, hem * H, azimuths(97), fabric.paint, flare, pleats)
+        waist = 0.606 if self.cut.top_hem > 0.58 else self.cut.top_hem + 0.02
+        return skirt_sheets(self.wearer, shape, waist * H, hem * H, azimuths(97), fabric.paint, flare, pleats)
 
     def outer(self) -> list[Patch]:
         """Jacket or coat, open in front."""
@@ -208,15 +255,15 @@ class Tailor:
         rng = np.random.default_rng(outfit.seed + 2)
         ease = float(rng.uniform(0.026, 0.034))
         torso = body.torso.eased(ease, float(rng.uniform(0.5, 0.9)))
-        arms = [arm.eased(ease - 0.004, 0.5) for arm in body.arms]
+        torso = torso.outside(self._trunk(self.lower_shape().torso), 0.012)
+        arms = [arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms]
         shape = Body(torso, (arms[0], arms[1]), body.legs, body.blend_m)
         gap = float(rng.uniform(0.12, 0.4))
-        around = azimuths(73, gap)
+        around = azimuths(65, gap)
         coat = outfit.outer == "coat"
         hem = 0.555 if coat else float(rng.uniform(0.50, 0.55))
         high = neckline(around, H, 0.05, vee=True)
-        folds = self.folds(0.004, 0.08, 0.12, 5)
-        # No periodic folds: the front is open.
+        folds = self.folds(0.0025, 0.09, 0.14, 5)
         patches = [
             torso_sheet(self.wearer, shape, np.full_like(around, hem * H), high, around, self._paint_outer, folds)
         ]
@@ -241,9 +288,12 @@ class Tailor:
 
 
 def lining(sheet: Patch) -> Patch:
-    """The inside of an open sheet: a dark copy a few millimetres within, turned round."""
+    """The inside of an open sheet near its front edges: a dark copy a few millimetres within, turned round."""
     inside = sheet.points[:, ::-1].copy()
     center = inside.mean(1, keepdims=True)
     inside = center + 0.975 * (inside - center)
+    edge_columns = np.arange(inside.shape[1])
+    near = np.minimum(edge_columns, edge_columns[::-1]) < 7
+    keep = np.broadcast_to(near, inside.shape[:2])
     dark = np.broadcast_to(0.45 * sheet.chart.mean((0, 1)), (8, 8, 3))
-    return Patch(inside, sheet.uv[:, ::-1], sheet.weights[:, ::-1], dark, closed=False)
+    return Patch(inside, sheet.uv[:, ::-1], sheet.weights[:, ::-1], dark, keep, closed=False)

@@ -123,6 +123,9 @@ def shoe_patch(
     cosine, sine = np.cos(phi), np.sin(phi)
     x = half[:, None] * np.sign(cosine) * np.abs(cosine) ** np.where(sine > 0, 0.85, 0.35)
     y = np.where(sine > 0, sole + (tall - sole)[:, None] * np.abs(sine) ** 0.9, sole * (1 - np.abs(sine) ** 0.35))
+    # Heel and tip close to a point just above the floor.
+    middle, close = 0.006 * H, np.clip(half / (0.012 * H), 0, 1)[:, None]
+    y = middle + (y - middle) * close
     z = np.broadcast_to(((s - 0.25) * 0.152 * H)[:, None], x.shape)
     splay = SIGN[side] * 0.04 * H * np.maximum(s - 0.25, 0)[:, None] * 0.7
     points = np.stack([ankle[0] + x + splay, y, ankle[2] + z], -1)

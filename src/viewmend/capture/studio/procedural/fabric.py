@@ -26,6 +26,8 @@ KINDS = (
     "knit",
     "letters",
 )
+QUIET = ("plain", "heather", "denim", "knit", "stripes", "gradient", "bands")
+"""Kinds that leave room for a word across the chest."""
 Image = Float[np.ndarray, "height width 3"]
 Plane = Float[np.ndarray, "height width"]
 
@@ -89,7 +91,9 @@ class Fabric:
 
 def sample_fabric(rng: np.random.Generator, kinds: tuple[str, ...] = KINDS) -> Fabric:
     """Draw a cloth among these kinds."""
-    kind = kinds[int(rng.integers(len(kinds)))]
+    quiet = tuple(k for k in kinds if k in QUIET)
+    pool = quiet if quiet and rng.random() < 0.3 else kinds
+    kind = pool[int(rng.integers(len(pool)))]
     hue = rng.random()
     muted = rng.random() < 0.45
     saturation = rng.uniform(0.0, 0.35) if muted else rng.uniform(0.4, 0.95)

@@ -68,24 +68,23 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Float[np.ndarray,
     rng = np.random.default_rng(hair.seed + 1)
     canvas = Canvas(0.6, 0.26, 600.0)
     chart = strands(hair, canvas)
-    azimuth, y = face_grid(56, 73)
+    azimuth, y = face_grid(48, 65)
     base = {"bald": 0.012, "cropped": 0.018, "short": 0.045, "parted": 0.06, "afro": 0.17, "bob": 0.075, "cap": 0.05}
     thick = base.get(hair.style, 0.05) * (0.75 + 0.5 * hair.volume)
     recede = float(rng.uniform(-0.4, 1.0))
     line = hairline(azimuth, recede)
-    if hair.style == "bald":
-        line = np.where(np.abs(azimuth) < 1.2, 1.3, line)
-        line = np.where(y > 0.72, 1.3, line)
     if hair.style == "cap":
         chart = np.clip(accent * (1 + 0.05 * canvas.noise(rng, 0.02, 0.02))[..., None], 0, 1)
         line = np.interp(np.abs(azimuth), [0, 1.2, np.pi], [0.70, 0.66, 0.52])
     inside = smoothstep(y - line, -0.03, 0.09 if hair.style != "cap" else 0.03)
+    if hair.style == "bald":
+        inside = inside * smoothstep(np.abs(azimuth), 1.3, 1.6) * smoothstep(-y, -0.74, -0.60)
     bumps = Canvas(0.6, 0.26, 100.0).noise(rng, 0.03, 0.03 if hair.style == "afro" else 0.06)
     rows, columns = bumps.shape
     curl = bumps[((1 - y) * (rows - 1)).astype(int), ((azimuth / (2 * np.pi) + 0.5) * (columns - 1)).astype(int)]
     curl = curl * np.clip((np.pi - np.abs(azimuth)) / 0.4, 0, 1) * (0.0 if hair.style == "cap" else 0.22)
     part = 0.3 * np.exp(-(((azimuth - 0.5) / 0.25) ** 2)) * (hair.style == "parted")
-    layer = np.where(inside > 0, thick * inside * (1 + curl - part) + 0.012 * (inside - 0.5), -0.03)
+    layer = thick * inside * (1 + curl - part) - 0.006 * (1 - inside)
     points = head.point(azimuth, y, layer)
     uv = np.stack([azimuth / (2 * np.pi) + 0.5, y], -1)
     patches = [Patch(points, uv, one_joint(points.shape[:2], "head"), chart, keep=inside > 0)]
@@ -102,10 +101,11 @@ def _curtain(head: Head, hair: Hair, torso: Torso, chart: Image, thick: float) -
     """Hair that falls behind the face to the neck or over the back, outside and inside."""
     low = -0.05 + 0.12 * hair.volume if hair.style == "bob" else -0.35 - 0.75 * hair.volume
     opening = 1.12 + 0.15 * (hair.style == "long")
-    theta, y = np.meshgrid(np.linspace(opening, 2 * np.pi - opening, 49), np.linspace(low, 0.86, 40))
+    theta, y = np.meshgrid(np.linspace(opening, 2 * np.pi - opening, 49), np.linspace(low, 0.86, 32))
     lock = 1 + 0.06 * np.sin(theta * 17 + hair.seed % 7) * smoothstep(-y, -0.6, 0.0)
     held = np.maximum(y, 0.42)
-    grow = thick * lock * (1.0 + 0.35 * smoothstep(-y, -0.6, 0.1))
+    # It comes out from under the layer on the crown.
+    grow = thick * lock * (0.75 + 0.6 * smoothstep(-y, -0.80, 0.1))
     points = head.point(theta, held, grow)
     points[..., 1] -= (held - y) * head.size_m
     outward = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], -1)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from viewmend.capture.studio.procedural.body import smooth_table
 from viewmend.capture.studio.procedural.fabric import Canvas, Image, blend, hsv
 from viewmend.capture.studio.procedural.patches import Patch
 from viewmend.capture.studio.procedural.physique import Physique
@@ -14,11 +15,11 @@ from viewmend.capture.studio.procedural.weights import one_joint, smoothstep
 # Height above the chin, half width, front depth, back depth: shares of the head's height.
 RINGS = np.array(
     [
-        (0.000, 0.020, 0.250, 0.000),
-        (0.012, 0.090, 0.355, 0.020),
-        (0.040, 0.150, 0.385, 0.090),
-        (0.100, 0.215, 0.400, 0.190),
-        (0.200, 0.262, 0.400, 0.290),
+        (0.000, 0.020, 0.250, 0.240),
+        (0.012, 0.090, 0.355, 0.250),
+        (0.040, 0.150, 0.385, 0.262),
+        (0.100, 0.215, 0.400, 0.280),
+        (0.200, 0.262, 0.400, 0.315),
         (0.330, 0.295, 0.400, 0.385),
         (0.420, 0.312, 0.395, 0.430),
         (0.500, 0.320, 0.390, 0.455),
@@ -50,7 +51,9 @@ class Head:
     def radius(self, azimuth: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Horizontal distance from the axis in head heights, with the face's features."""
         f, face = self.person.femininity, self.person.face
-        a, d, b = (np.interp(y, RINGS[:, 0], RINGS[:, k]) for k in (1, 2, 3))
+        heights, rings = smooth_table(RINGS[:, 0], RINGS[:, 1:])
+        close = np.sqrt(np.clip((1 - y) / 0.03, 0, 1))
+        a, d, b = (np.interp(y, heights, rings[:, k]) * close for k in range(3))
         jaw = np.exp(-(((y - 0.12) / 0.14) ** 2))
         a = a * (1 + jaw * (0.05 - 0.10 * f + 0.05 * face[0]) + 0.04 * self.person.weight * jaw)
         sine, cosine = np.abs(np.sin(azimuth)), np.cos(azimuth)
@@ -119,7 +122,7 @@ def head_patches(
     person: Physique, head: Head, rng: np.random.Generator, hair_rgb: Float[np.ndarray, "3"]
 ) -> list[Patch]:
     """The head with its painted face, and two ears."""
-    azimuth, y = face_grid(72, 81)
+    azimuth, y = face_grid(68, 73)
     points = head.point(azimuth, y)
     canvas = Canvas(0.56, head.size_m, 1000.0)
     chart = paint_face(person, canvas, rng, hair_rgb)
@@ -174,15 +177,15 @@ def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_
     image = blend(image, lip, 0.85 * crisp(lips, 0.5))
     image = blend(image, lip * 0.4, crisp(1 - (turn / (wide * 0.97)) ** 2 - ((y - 0.201) / 0.0055) ** 2, 0.8))
     x = turn - EYE_AZIMUTH - 0.01 * face[5]
-    lid = ((y - EYE_Y) / 0.030) ** 2 + (x / 0.155) ** 2
-    image = blend(image, np.array([0.93, 0.92, 0.90]), crisp(1 - lid, 0.3))
+    lid = ((y - EYE_Y) / 0.025) ** 2 + (x / 0.150) ** 2
+    image = blend(image, np.array([0.84, 0.82, 0.80]), crisp(1 - lid, 0.3))
     iris = np.array([hsv(0.07, 0.7, 0.25), hsv(0.08, 0.6, 0.4), hsv(0.57, 0.45, 0.55), hsv(0.3, 0.3, 0.4)])
     color = iris[int(rng.choice(4, p=[0.5, 0.25, 0.15, 0.1]))]
-    disc = np.hypot(x / 0.068, (y - EYE_Y) / 0.0275)
+    disc = np.hypot(x / 0.072, (y - EYE_Y) / 0.029)
     inside = crisp(1 - lid, 0.3)
     image = blend(image, color, inside * crisp(1 - disc, 0.2))
     image = blend(image, np.array([0.03, 0.03, 0.03]), inside * crisp(0.5 - disc, 0.15))
-    lash = np.exp(-(((y - EYE_Y - 0.030 * np.sqrt(np.clip(1 - (x / 0.165) ** 2, 0, 1))) / 0.006) ** 2))
+    lash = np.exp(-(((y - EYE_Y - 0.025 * np.sqrt(np.clip(1 - (x / 0.165) ** 2, 0, 1))) / 0.006) ** 2))
     image = blend(image, 0.25 * skin * 0.5, (0.6 + 0.4 * f) * lash * crisp(1 - (np.abs(x) / 0.17) ** 2))
     arch = 0.585 + 0.012 * face[6] + 0.018 * np.cos((x - 0.05) / 0.2 * 1.5)
     brow = 1 - ((y - arch) / (0.017 - 0.006 * f)) ** 2 - ((x - 0.02) / 0.21) ** 4

@@ -7,7 +7,7 @@ import torch
 
 from viewmend.capture.studio.performer import Performer, TexturedMesh
 from viewmend.capture.studio.procedural.body import build_body
-from viewmend.capture.studio.procedural.clothing import Tailor, sample_outfit
+from viewmend.capture.studio.procedural.clothing import Cut, Tailor, sample_cut, sample_outfit
 from viewmend.capture.studio.procedural.extremities import hand_patches, shoe_patch
 from viewmend.capture.studio.procedural.fabric import Canvas, Image
 from viewmend.capture.studio.procedural.grounds import Tempo
@@ -69,11 +69,11 @@ def procedural_performer(seed: int, *, style: PerformerStyle | None = None) -> P
     body = build_body(person, skeleton)
     head = build_head(person, skeleton)
     wearer = Wearer(body, skeleton, person.height_m)
-    tailor = Tailor(wearer, outfit)
+    tailor = Tailor(wearer, outfit, sample_cut(outfit))
     patches = tailor.top() + tailor.bottom() + tailor.outer()
     patches += head_patches(person, head, hair_rng, hair.color)
     patches += hair_patches(head, hair, body.torso, outfit.fabrics[1].colors[0])
-    patches += _skin_patches(person, wearer, hair_rng)
+    patches += _skin_patches(person, wearer, tailor.cut, hair_rng)
     shoes = tailor.shoes_rgb()
     patches += [shoe_patch(skeleton, person.height_m, side, shoes[0], shoes[1]) for side in SIDES]
     tempos: tuple[Tempo, ...] = ("calm", "dance", "fast")
@@ -85,7 +85,7 @@ def procedural_performer(seed: int, *, style: PerformerStyle | None = None) -> P
     return ProceduralPerformer(assemble(patches), skeleton, motion, words)
 
 
-def _skin_patches(person: Physique, wearer: Wearer, rng: np.random.Generator) -> list[Patch]:
+def _skin_patches(person: Physique, wearer: Wearer, cut: Cut, rng: np.random.Generator) -> list[Patch]:
     """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
     H = person.height_m
 
@@ -93,11 +93,18 @@ def _skin_patches(person: Physique, wearer: Wearer, rng: np.random.Generator) ->
         tone = 1 + 0.015 * canvas.noise(rng, 0.03, 0.03) + 0.012 * canvas.noise(rng, 0.004, 0.004)
         return np.clip(np.array(person.skin_rgb) * tone[..., None], 0, 1)
 
-    around = azimuths(57)
+    around = azimuths(49)
     low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
-    patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=30)]
-    patches += [limb_sheet(wearer, wearer.body, 1 + i, 0.1, 1.0, paint, columns=21) for i in (0, 1)]
-    patches += [limb_sheet(wearer, wearer.body, 3 + i, 0.2, 1.04, paint, columns=25) for i in (0, 1)]
+    patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=24)]
+    # Cloth covers what lies further in than a hand's breadth from its hem.
+    arm, leg = max(cut.sleeve - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
+    for i in (0, 1):
+        patches.append(
+            limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, rows=8 + int(24 * (1 - arm)), columns=21)
+        )
+        patches.append(
+            limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, rows=8 + int(28 * (1 - leg)), columns=25)
+        )
     skin = paint(Canvas(0.1, 0.1))
     girth = 1.05 - 0.13 * person.femininity + 0.05 * person.weight
     for side in SIDES:

@@ -84,7 +84,7 @@ def build_skeleton(person: Physique) -> Skeleton:
     for side in SIDES:
         s = SIGN[side]
         mirror = np.array([s, 1, 1])
-        start = np.array([shoulder, 0.797, -0.013])
+        start = np.array([shoulder, 0.795, -0.013])
         places[f"{side}_clavicle"] = (s * 0.018, 0.80, -0.004)
         for part, reach in (("upperarm", 0.0), ("forearm", 0.168), ("hand", 0.312), ("fingers", 0.366)):
             x, y, z = (start + reach * arm) * mirror

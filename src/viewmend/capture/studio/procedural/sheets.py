@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.capture.studio.procedural.body import Body
-from viewmend.capture.studio.procedural.fabric import Canvas, Image
+from viewmend.capture.studio.procedural.fabric import PX_PER_M, Canvas, Image
 from viewmend.capture.studio.procedural.patches import Patch
 from viewmend.capture.studio.procedural.skeleton import INDEX, SKIRT_COLUMNS, Skeleton
 from viewmend.capture.studio.procedural.weights import body_weights, mix, one_joint, smoothstep
@@ -39,6 +39,8 @@ class Folds:
     """Grain along the axis."""
     around_m: float
     seed: int
+    px_per_m: float = PX_PER_M
+    """Texels of the sheet's chart."""
 
     def height(self, canvas: Canvas) -> Float[np.ndarray, "height width"]:
         """Displacement on the canvas, metres, periodic from the right edge to the left one."""
@@ -51,10 +53,11 @@ class Folds:
     def shade(self, canvas: Canvas) -> Float[np.ndarray, "height width"]:
         """Factor on the colour: slopes that face down are darker."""
         slope = np.gradient(self.height(canvas), axis=0) * canvas.px_per_m
-        return np.clip(1 + 0.9 * slope, 0.6, 1.2)
+        return np.clip(1 + 0.8 * slope, 0.65, 1.2)
 
 
-NO_FOLDS = Folds(0.0, 0.1, 0.1, 0)
+BARE = Folds(0.0, 0.1, 0.1, 0, 220.0)
+"""Skin: smooth, and with little to show."""
 
 
 def azimuths(columns: int, gap: float = 0.0, aspect: float = 0.62) -> Azimuths:
@@ -63,7 +66,8 @@ def azimuths(columns: int, gap: float = 0.0, aspect: float = 0.62) -> Azimuths:
     With a gap they run from the front's left edge round the back to its right edge instead.
     """
     dense = np.linspace(-np.pi, np.pi, 1025) if gap == 0 else np.linspace(gap, 2 * np.pi - gap, 1025)
-    steps = np.hypot(np.diff(np.sin(dense)), aspect * np.diff(np.cos(dense)))
+    r = 1 / np.hypot(np.sin(dense), np.cos(dense) / aspect)
+    steps = np.hypot(np.diff(r * np.sin(dense)), np.diff(r * np.cos(dense)))
     arc = np.concatenate([[0], np.cumsum(steps)])
     return np.interp(np.linspace(0, arc[-1], columns), arc, dense)
 
@@ -93,7 +97,7 @@ def torso_sheet(
     high: Azimuths,
     around: Azimuths,
     painter: Painter,
-    folds: Folds = NO_FOLDS,
+    folds: Folds = BARE,
     rows: int = 44,
 ) -> Patch:
     """The torso of `shape` between the heights `low` and `high` (metres, per azimuth), with lips turned inwards."""
@@ -107,7 +111,7 @@ def torso_sheet(
     middle = float(np.interp((bottom + top) / 2, arc, torso.y))
     ring = torso.point(around, np.full_like(around, middle))
     girth = float(np.linalg.norm(np.diff(ring, axis=0), axis=1).sum())
-    canvas = Canvas(girth, top - bottom)
+    canvas = Canvas(girth, top - bottom, folds.px_per_m)
     uv = np.stack([np.broadcast_to(np.linspace(0, 1, len(around)), s.shape), (s - bottom) / (top - bottom)], -1)
     outward = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], -1)
     points = shape.settle(torso.point(theta, y), outward, 0)
@@ -130,7 +134,7 @@ def limb_sheet(
     low: float,
     high: float,
     painter: Painter,
-    folds: Folds = NO_FOLDS,
+    folds: Folds = BARE,
     rows: int = 36,
     columns: int = 29,
 ) -> Patch:
@@ -140,7 +144,7 @@ def limb_sheet(
     t = np.broadcast_to(np.linspace(high, low, rows)[:, None], (rows, columns))
     around = np.broadcast_to(theta, t.shape)
     radius = float(np.interp((low + high) / 2, limb.t, limb.r))
-    canvas = Canvas(2 * np.pi * radius, (high - low) * limb.length)
+    canvas = Canvas(2 * np.pi * radius, (high - low) * limb.length, folds.px_per_m)
     uv = np.stack([np.broadcast_to(np.linspace(0, 1, columns), t.shape), (high - t) / (high - low)], -1)
     on_limb = limb.point(around, t)
     outward = (on_limb - limb.center(t)) / np.interp(t, limb.t, limb.r)[..., None]
