@@ -23,7 +23,6 @@ class Target:
     view: IncompleteView
     places: Int[Tensor, "patch 3"]
     tokens: Float[Tensor, "patch dim"]
-    features: Float[Tensor, "patch feature 7 7"]
     incomplete: Bool[Tensor, "patch"]
 
 

@@ -35,8 +35,8 @@ class InpainterConfig:
     rope_values: bool = False
     """Rotate values by the offset between context patch and query as well, so that what is copied knows how far
     it must shift. Ours."""
-    feature_skip: bool = False
-    """Add the input patch's own features to the ones its token decodes to. Ours."""
+    colour_path: bool = False
+    """Let patches carry their colours at 1/4 besides their features, as waves that start out as a copy. Ours."""
     top_k: int | None = None
     """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
     attention_scale: Literal["model", "head"] = "model"
@@ -75,6 +75,11 @@ class InpainterConfig:
         return 3 + self.use_mask + self.use_depth + self.use_validity
 
     @property
+    def patch_channels(self) -> int:
+        """Channels of the map that is cut into patches."""
+        return self.widths[-1] + self.in_channels * self.colour_path
+
+    @property
     def total_blocks(self) -> int:
         """Blocks of all groups."""
         return self.groups * self.blocks
@@ -101,7 +106,9 @@ class InpainterConfig:
                 f"expected the keys of InpainterConfig, missing {sorted(expected - set(values))}, "
                 f"unknown {sorted(set(values) - expected)}; was this written by another version?"
             )
-        return cls(**values | {"widths": tuple(values["widths"])})
+        values = dict(values)
+        values["widths"] = tuple(values["widths"])
+        return cls(**values)
 
 
 def paper() -> InpainterConfig:
@@ -111,4 +118,6 @@ def paper() -> InpainterConfig:
 
 def small() -> InpainterConfig:
     """About a quarter of the paper's widths: for two CPU cores."""
-    return InpainterConfig(widths=(16, 16, 32, 64, 96, 128, 96, 64, 32), dim=128, heads=4)
+    return InpainterConfig(
+        widths=(16, 16, 32, 64, 96, 128, 96, 64, 32), dim=128, heads=4, rope_values=True, colour_path=True
+    )

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.encoder import SLOPE
-from viewmend.inpainting.patches import PATCH_CELLS
+from viewmend.inpainting.patches import PATCH_CELLS, PATCH_PX
 
 
 class Decoder(nn.Module):
@@ -16,7 +16,8 @@ class Decoder(nn.Module):
         super().__init__()
         C = config.widths[-1]
         self.norm = nn.LayerNorm(config.dim)
-        self.linear = nn.Linear(config.dim, C * PATCH_CELLS**2)
+        self.features = C
+        self.linear = nn.Linear(config.dim, (C + 3 * config.colour_path) * PATCH_CELLS**2)
         self.layers = nn.Sequential(
             nn.LeakyReLU(SLOPE),
             nn.ConvTranspose2d(C, C, 4, 2, 1),
@@ -31,17 +32,17 @@ class Decoder(nn.Module):
                 nn.init.normal_(layer.weight, 0, (2 / (layer.in_channels * 4)) ** 0.5)
             if isinstance(layer, nn.ConvTranspose2d | nn.Conv2d) and layer.bias is not None:
                 nn.init.zeros_(layer.bias)
+        if config.colour_path:
+            # Detail starts small upon the colours that are copied.
+            self.layers[-1].weight.data.mul_(0.1)
 
-    def forward(
-        self,
-        tokens: Float[Tensor, "patch dim"],
-        skipped: Float[Tensor, "patch feature 7 7"] | None = None,
-    ) -> Float[Tensor, "patch 3 28 28"]:
-        """RGB patches, about [0, 1] but not clamped; `skipped` features are added to the decoded ones."""
-        features = self.linear(self.norm(tokens)).unflatten(1, (-1, PATCH_CELLS, PATCH_CELLS))
-        if skipped is not None:
-            features = features + skipped
-        return self.layers(features)
+    def forward(self, tokens: Float[Tensor, "patch dim"]) -> Float[Tensor, "patch 3 28 28"]:
+        """RGB patches, about [0, 1] but not clamped."""
+        cells = self.linear(self.norm(tokens)).unflatten(1, (-1, PATCH_CELLS, PATCH_CELLS))
+        rgb = self.layers(cells[:, : self.features])
+        if cells.shape[1] > self.features:
+            rgb = rgb + nn.functional.interpolate(cells[:, self.features :], size=PATCH_PX, mode="bilinear")
+        return rgb
 
 
 def blend(

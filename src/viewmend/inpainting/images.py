@@ -78,13 +78,12 @@ class Tokeniser(nn.Module):
     def __init__(self, config: InpainterConfig) -> None:
         super().__init__()
         self.encoder = Encoder(config)
-        self.linear = nn.Linear(config.widths[-1] * PATCH_CELLS**2, config.dim)
+        self.linear = nn.Linear(config.patch_channels * PATCH_CELLS**2, config.dim)
+        self.colour_path = config.colour_path
         self.norm = nn.LayerNorm(config.dim)
 
-    def forward(
-        self, stacks: Sequence[Images]
-    ) -> tuple[Float[Tensor, "patch dim"], Float[Tensor, "patch feature 7 7"]]:
-        """Tokens and features of all kept patches of all stacks, in order: one batch for the encoder.
+    def forward(self, stacks: Sequence[Images]) -> Float[Tensor, "patch dim"]:
+        """Tokens of all kept patches of all stacks, in order: one batch for the encoder.
 
         Only a crop around each image's kept patches is encoded, with the encoder's receptive radius in zeros
         beyond the image: so nothing depends on the size of the crop, nor on what else is in the batch.
@@ -99,7 +98,9 @@ class Tokeniser(nn.Module):
             local = kept[:, 1:] - origins[kept[:, 0]]
             places.append(torch.cat([kept[:, :1] + first, local], 1))
             first += len(stack.channels)
-        features = self.encoder(torch.stack(windows))
-        assert features.shape[-1] * CELL_PX == size[1]
+        images = torch.stack(windows)
+        features = self.encoder(images)
+        if self.colour_path:
+            features = torch.cat([features, nn.functional.avg_pool2d(images, CELL_PX).to(features)], 1)
         patches = split(features, torch.cat(places), PATCH_CELLS, STEP_CELLS)
-        return self.norm(self.linear(patches.flatten(1))), patches
+        return self.norm(self.linear(patches.flatten(1)))

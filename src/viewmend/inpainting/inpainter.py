@@ -11,6 +11,7 @@ from viewmend.inpainting.assembly import Target, assemble
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextFrame, window_times
 from viewmend.inpainting.coordinates import lift, patch_depths
+from viewmend.inpainting.copying import start_as_copier
 from viewmend.inpainting.decoder import Decoder, blend
 from viewmend.inpainting.images import Images, Tokeniser, context_images, target_images
 from viewmend.inpainting.patches import STEP_PX, any_in_patch, centers_px, merge
@@ -40,6 +41,8 @@ class Inpainter(nn.Module):
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
         self.decoder = Decoder(config)
+        if config.colour_path:
+            start_as_copier(self.tokeniser.linear, self.decoder.linear, config)
         self.compute_dtype = torch.float32
         """Set to torch.bfloat16 to run the networks under autocast; coordinates stay float32."""
 
@@ -56,7 +59,7 @@ class Inpainter(nn.Module):
             return []
         stacks = [context_images(views, self.config) for views in many]
         with self._autocast(stacks[0].channels.device):
-            tokens, _ = self.tokeniser(stacks)
+            tokens = self.tokeniser(stacks)
             keys_values = self.transformer.project_context(tokens)
         counts = [len(stack.places) for stack in stacks]
         parts = zip(many, stacks, tokens.split(counts), keys_values.split(counts, 2), strict=True)
@@ -101,12 +104,12 @@ class Inpainter(nn.Module):
         """Tokens of every kept patch of each view; those with any pixel of E > 0 are the input set P."""
         stacks: list[Images] = [target_images(view, self.config) for view in views]
         with self._autocast(stacks[0].channels.device):
-            tokens, features = self.tokeniser(stacks)
-        counts = [len(stack.places) for stack in stacks]
+            tokens = self.tokeniser(stacks)
         targets = []
-        for view, stack, own, maps in zip(views, stacks, tokens.split(counts), features.split(counts), strict=True):
+        parts = zip(views, stacks, tokens.split([len(stack.places) for stack in stacks]), strict=True)
+        for view, stack, own in parts:
             incomplete = any_in_patch(view.error[None] > 0)[tuple(stack.places.unbind(1))]
-            targets.append(Target(view, stack.places, own, maps, incomplete))
+            targets.append(Target(view, stack.places, own, incomplete))
         return targets
 
     def _decode(
@@ -124,8 +127,7 @@ class Inpainter(nn.Module):
                 batch.context_at,
                 self.config.top_k if top_k is None else top_k,
             )
-            features = torch.cat([t.features[t.incomplete] for t in targets]) if self.config.feature_skip else None
-            decoded = self.decoder(tokens[batch.at.present], features)
+            decoded = self.decoder(tokens[batch.at.present])
         return list(decoded.float().split([int(t.incomplete.sum()) for t in targets]))
 
     def initial_state(self) -> State:

@@ -48,9 +48,12 @@ def split(
     maps: Float[Tensor, "view channel height width"], places: Int[Tensor, "patch 3"], size: int, step: int
 ) -> Float[Tensor, "patch channel size size"]:
     """The patches of size x size at these places, `step` apart; the maps must reach as far as the patches."""
-    windows = maps.unfold(2, size, step).unfold(3, size, step)
-    view, row, col = places.unbind(1)
-    return windows[view, :, row, col]
+    channels, height, width = maps.shape[1:]
+    offsets = torch.arange(size, device=maps.device)
+    view, row, col = places[:, :, None, None].unbind(1)
+    flat = (view * height + row * step + offsets[:, None]) * width + col * step + offsets
+    pixels = maps.movedim(1, -1).reshape(-1, channels).index_select(0, flat.flatten())
+    return pixels.unflatten(0, (-1, size, size)).movedim(-1, 1)
 
 
 def tent(size: int, device: torch.device | None = None) -> Float[Tensor, "size size"]:

@@ -14,8 +14,8 @@ LONGEST = 2.0
 """Image widths (or windows of time) in one turn of the slowest pair."""
 SHORTEST = 0.1
 """The same of the fastest: two patch steps of a 320 pixel image."""
-LONGEST_STEPS, SHORTEST_STEPS = 8.0, 0.75
-"""Patch steps in one turn of the slowest and the fastest pair of a value."""
+WAVE_STEPS = 2.5
+"""Patch steps in one turn of the slowest wave of values: a patch and its surroundings, 40 pixels."""
 
 
 def pairs_per_axis(head_dim: int) -> tuple[int, int, int]:
@@ -30,10 +30,16 @@ def score_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
 
 
 def value_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
-    """Radians per patch step for values: pairs of u and v turn as a shift of the picture would, the rest stay."""
-    frequencies = _frequencies(pairs_per_axis(head_dim), LONGEST_STEPS, SHORTEST_STEPS)
-    frequencies[2] = 0
-    return frequencies
+    """Radians per patch step of (u, v) for values: a constant, then plane waves from the longest on.
+
+    Where a pair holds a wave's cosine and sine, its turn is the wave's shift: see `copying`.
+    """
+    pairs = head_dim // 2
+    reach = range(-pairs, pairs + 1)
+    half_plane = [(u, v) for u in reach for v in reach if u > 0 or (u == 0 and v >= 0)]
+    waves = sorted(half_plane, key=lambda wave: (wave[0] ** 2 + wave[1] ** 2, -wave[0], wave[1]))[:pairs]
+    turns = torch.tensor([[u for u, _ in waves], [v for _, v in waves], [0] * pairs])
+    return turns.float() * (2 * math.pi / WAVE_STEPS)
 
 
 def _frequencies(counts: tuple[int, ...], longest: float, shortest: float) -> Float[Tensor, "3 pair"]:

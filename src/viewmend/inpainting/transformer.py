@@ -73,7 +73,7 @@ class Transformer(nn.Module):
         dim, heads = self.config.dim, self.config.heads
         weights = self.keys_values.weight.data.unflatten(0, (-1, 2, dim))
         biases = self.keys_values.bias.data.unflatten(0, (-1, 2, dim))
-        weights.normal_(0, 0.02)
+        weights.normal_(0, 0.005)
         weights[:, 0].normal_(0, CONTENT_GAIN * dim**-0.5)
         weights[:, 1] += COPY_GAIN * torch.eye(dim)
         biases.zero_()
