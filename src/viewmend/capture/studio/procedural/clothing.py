@@ -110,7 +110,8 @@ def sample_cut(outfit: Outfit) -> Cut:
     tucked = kind == "dress" or (kind in ("trousers", "skirt") and rng.random() < 0.6)
     end = {"shorts": rng.uniform(0.32, 0.5), "skirt": 0.0, "dress": 0.0}.get(kind, rng.uniform(0.95, 1.03))
     flares: dict[str, float] = {"wide trousers": 0.02, "shorts": 0.004}
-    hangs = {"leggings": 2.0, "wide trousers": 0.3, "shorts": 0.2}
+    eases: dict[str, float] = {"leggings": 0.002, "wide trousers": 0.010, "shorts": 0.011}
+    hangs: dict[str, float] = {"leggings": 2.0, "wide trousers": 0.3, "shorts": 0.2}
     return Cut(
         loose_m=float(loose),
         hang=0.2 if outfit.top == "tank top" or kind == "dress" else float(rng.uniform(0.3, 0.9)),
@@ -118,9 +119,9 @@ def sample_cut(outfit: Outfit) -> Cut:
         top_hem=0.598 if tucked else float(rng.uniform(0.49, 0.56)),
         neck=float(rng.uniform(0.0, 0.012) if outfit.top == "sweater" else rng.uniform(0.008, 0.045)),
         vee=bool(rng.random() < 0.35),
-        ease_m={"leggings": 0.002, "wide trousers": 0.010, "shorts": 0.011}.get(kind, 0.006 + 0.005 * rng.random()),
+        ease_m=eases[kind] if kind in eases else float(rng.uniform(0.006, 0.011)),
         leg=float(end),
-        leg_hang=float(hangs.get(kind, rng.choice([0.5, 0.35, 0.72]))),
+        leg_hang=hangs[kind] if kind in hangs else float(rng.choice([0.5, 0.35, 0.72])),
         leg_flare_m=flares[kind] if kind in flares else float(rng.uniform(-0.012, 0.004)),
     )
 
