@@ -1,12 +1,12 @@
 """Image-based blending in numba, for the CPU; `_blend_torch` is its twin for any device."""
 
 from math import floor, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, no_type_check
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float
+from numba import njit
 from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 ROWS = 16
 """Rows of the novel view that one thread takes at a time: the subject fills some and not others."""
+
+# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
 
 
 def blend_numba(
@@ -45,7 +47,7 @@ def blend_numba(
         *(frame.rgb.numpy(), mask.numpy(), sources.depth.numpy()),
         *(P, rig.centers.double().numpy(), rig.K[:, 0, 0].double().numpy(), rig.size_px.numpy()),
         np.array([bias_m, config.slope_px]),
-        np.array([config.normal_power, config.view_power, config.mask_power]),
+        np.array([config.normal_power, config.view_power]),
     )
     outputs = (rgb.numpy(), weights.numpy(), disagreement.numpy())
 
@@ -56,7 +58,8 @@ def blend_numba(
     return rgb, weights, disagreement
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
+@no_type_check
 def _blend_rows(
     first, end, depth, normals, world_from_pixel, viewer, images, masks, depths, P, centers, focal, sizes,
     tolerance, powers, rgb, weights, disagreement,
@@ -83,7 +86,8 @@ def _blend_rows(
                 _average(colour, weights, total, row, column, rgb, disagreement)
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
+@no_type_check
 def _average(colour, weights, total, row, column, rgb, disagreement):
     variance = 0.0
     for channel in range(3):
@@ -97,7 +101,8 @@ def _average(colour, weights, total, row, column, rgb, disagreement):
     disagreement[row, column] = sqrt(variance / (3 * total))
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
+@no_type_check
 def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour):
     """Weight of one camera at a surface point; its sample goes into `colour[view]`."""
     center = centers[view]
@@ -117,38 +122,43 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     nearest = z - (tolerance[0] + tolerance[1] * per_pixel)
     left, top = floor(u - 0.5), floor(v - 0.5)
     right_share, bottom_share = u - 0.5 - left, v - 0.5 - top
-    visible, inside = 0.0, 0.0
-    red, green, blue = 0.0, 0.0, 0.0
+    usable, red, green, blue = 0.0, 0.0, 0.0, 0.0
     for tap in range(4):
         row = min(max(int(top) + tap // 2, 0), height - 1)
         column = min(max(int(left) + tap % 2, 0), width - 1)
-        part = (bottom_share if tap // 2 else 1 - bottom_share) * (right_share if tap % 2 else 1 - right_share)
         there = depths[view, row, column]
-        if there == 0 or there >= nearest:
-            visible += part
+        if there > 0 and there < nearest:
+            continue
+        part = (bottom_share if tap // 2 else 1 - bottom_share) * (right_share if tap % 2 else 1 - right_share)
         if masks.shape[0]:
-            inside += part * masks[view, row, column]
+            part *= masks[view, row, column] / 255
+        usable += part
         red += part * images[view, 0, row, column]
         green += part * images[view, 1, row, column]
         blue += part * images[view, 2, row, column]
-    colour[view, 0], colour[view, 1], colour[view, 2] = red / 255, green / 255, blue / 255
-    weight = visible * facing ** powers[0] * agreeing ** powers[1]
-    return weight * (inside / 255) ** powers[2] if masks.shape[0] else weight
+    if usable <= 0:
+        return 0.0
+    scale = 1 / max(255 * usable, 1e-6)
+    colour[view, 0], colour[view, 1], colour[view, 2] = red * scale, green * scale, blue * scale
+    return usable * facing ** powers[0] * agreeing ** powers[1]
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
+@no_type_check
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
+@no_type_check
 def _unit(x, y, z):
     length = sqrt(x * x + y * y + z * z)
     scale = 1 / length if length > 0 else 0.0
     return x * scale, y * scale, z * scale
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
+@no_type_check
 def _backproject(u, v, z, world_from_pixel, center):
     m = world_from_pixel
     return (

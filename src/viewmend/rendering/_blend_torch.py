@@ -76,11 +76,12 @@ def _sample(
     per_pixel = z / camera.K[0, 0, 0] * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
     index, share = _taps(u, v, width, height)
     around = sources.depth[view][index]
-    in_front = (around == 0) | (z - around <= bias_m + config.slope_px * per_pixel)
-    weight = seen * (in_front * share).sum(0) * facing**config.normal_power * agreeing**config.view_power
+    share = share * ((around == 0) | (z - around <= bias_m + config.slope_px * per_pixel))
     if frame.mask is not None:
-        weight = weight * ((frame.mask[view][index] * share).sum(0) / 255) ** config.mask_power
-    colour = (frame.rgb[view][:, index[0], index[1]] * share).sum(1) / 255
+        share = share * (frame.mask[view][index] / 255)
+    usable = share.sum(0)
+    weight = seen * usable * facing**config.normal_power * agreeing**config.view_power
+    colour = (frame.rgb[view][:, index[0], index[1]] * share).sum(1) / (255 * usable).clamp(min=1e-6)
     return weight, colour
 
 

@@ -14,15 +14,15 @@ from viewmend.views import ContextViews
 class BlendConfig:
     """How a camera's colour counts at a surface point.
 
-    weight = visibility * mask^mask_power * (n . v)^normal_power * (cosine between camera and viewer)^view_power
+    weight = usable * (n . v)^normal_power * (cosine between camera and viewer)^view_power
+
+    where `usable` is the bilinear share of the four pixels around the sample that are foreground and not hidden.
     """
 
     normal_power: int = 2
     """Exponent of the cosine between the surface's normal and the direction to the camera."""
     view_power: int = 16
     """Exponent of the cosine between the directions to the camera and to the viewer."""
-    mask_power: int = 1
-    """Exponent of the camera's soft mask where it is sampled; 0 samples background as well."""
     depth_bias: float = 0.005
     """A point is hidden if it lies this much behind the proxy's depth, as a share of the subject's size."""
     slope_px: float = 1.0
@@ -51,8 +51,9 @@ def blend(
 ) -> Blend:
     """Colour the surface that `camera` sees from the images of `sources`.
 
-    Samples are bilinear. The depth test compares with the four depths around the sample, so visibility is a share,
-    soft over one pixel. A point behind a camera or outside its image gets nothing from it, nor where it faces away.
+    Samples are bilinear, and of the four pixels only those count that are foreground (by the soft mask) and that
+    nothing hides the point from: neither background nor an occluder's rim bleeds in. A point behind a camera or
+    outside its image gets nothing from it, nor where it faces away.
 
     Args:
         camera: the novel view (one).

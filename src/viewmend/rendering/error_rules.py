@@ -1,7 +1,7 @@
 """E: which pixels of a rendered view must be inpainted. A rule is a function with a name."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from jaxtyping import Float
 from torch import Tensor
@@ -23,12 +23,8 @@ class Evidence:
     blend: Blend
 
 
-class ErrorRule(Protocol):
-    """From the evidence to E, in [0, 1]; 0 outside the mask, and 1 where the blend has no colour."""
-
-    def __call__(self, evidence: Evidence) -> Float[Tensor, "height width"]:
-        """E of one view."""
-        ...
+ErrorRule = Callable[[Evidence], Float[Tensor, "height width"]]
+"""From the evidence to E, in [0, 1]: 0 outside the mask, 1 where the blend has no colour."""
 
 
 def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:

@@ -63,7 +63,7 @@ def select_covering(
     allowed = [name for name in closest if name in row]
     if not allowed:
         return ()
-    kept = [name for name in previous if name in allowed]
+    kept = [name for name in dict.fromkeys(previous) if name in allowed]
     if len(kept) == min(k, len(allowed)) and evidence.shape[1]:
         seen = (evidence[[row[n] for n in kept]] > 0).any(0).sum()
         seeable = (evidence[[row[n] for n in allowed]] > 0).any(0).sum()

@@ -1,0 +1,157 @@
+"""The blending rule: against its slow twin, and case by case."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from ball import camera_at, photograph, proxy, ring
+from reference.blend_twin import blend_twin
+
+from viewmend.geometry.rasterize import interpolate, rasterize
+from viewmend.rendering._blend_numba import blend_numba
+from viewmend.rendering._blend_torch import blend_torch
+from viewmend.rendering.blending import BlendConfig, blend
+from viewmend.views import ContextViews, MultiViewFrame
+
+BIAS_M = 0.01
+
+
+def scene(target, cameras):
+    """What `blend` wants, for the ball: target, depth, normals, sources."""
+    ball, frame = proxy(), photograph(cameras)
+    raster = rasterize(ball.mesh, target)
+    normals = interpolate(ball.normals, ball.mesh, target, raster)[0]
+    return target, raster.depth[0], normals, ContextViews(frame, ball.depth(cameras))
+
+
+@pytest.fixture(scope="module")
+def hard():
+    """Soft masks, noisy depths (edges everywhere), cameras of different sizes, one inside the subject."""
+    generator = torch.Generator().manual_seed(1)
+    cameras = ring(5, 32)
+    inside = camera_at(150, "inside", 32, distance_m=0.3)
+    cameras = replace(
+        cameras,
+        names=(*cameras.names[:4], "inside"),
+        camera_from_world=torch.cat([cameras.camera_from_world[:4], inside.camera_from_world]),
+        size_px=torch.tensor([[32, 32], [20, 30], [32, 25], [32, 32], [32, 32]]),
+    )
+    target, depth, normals, sources = scene(camera_at(25, "t", 24, 0.3), cameras)
+    frame = sources.frame
+    frame = replace(
+        frame,
+        rgb=torch.randint(0, 256, frame.rgb.shape, generator=generator, dtype=torch.uint8),
+        mask=torch.randint(0, 256, frame.rgb[:, 0].shape, generator=generator, dtype=torch.uint8),
+    )
+    noise = 1 + 0.02 * torch.randn(sources.depth.shape, generator=generator)
+    holes = torch.rand(sources.depth.shape, generator=generator) > 0.1
+    return target, depth, normals, ContextViews(frame, sources.depth * noise * holes)
+
+
+@pytest.mark.parametrize("fast", [blend_torch, blend_numba])
+@pytest.mark.parametrize("config", [BlendConfig(), BlendConfig(normal_power=1, view_power=4, slope_px=3.0)])
+def test_both_paths_equal_the_twin(hard, fast, config):
+    expected = blend_twin(*hard, BIAS_M, config)
+    for got, want in zip(fast(*hard, BIAS_M, config), expected, strict=True):
+        # A depth test that float32 decides the other way is a flip: rare, and all else is tight.
+        off = np.abs(got.numpy() - want) > 2e-4
+        assert off.mean() < 0.002
+    assert (expected[1].sum(0) > 0).sum() > 100
+
+
+def test_both_paths_equal_the_twin_without_masks(hard):
+    target, depth, normals, sources = hard
+    sources = ContextViews(replace(sources.frame, mask=None), sources.depth)
+    expected = blend_twin(target, depth, normals, sources, BIAS_M, BlendConfig())
+    for fast in (blend_torch, blend_numba):
+        got = fast(target, depth, normals, sources, BIAS_M, BlendConfig())
+        assert (np.abs(got[1].numpy() - expected[1]) > 2e-4).mean() < 0.002
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu(hard):
+    target, depth, normals, sources = hard
+    expected = blend(*hard, BIAS_M, BlendConfig())
+    on_gpu = ContextViews(sources.frame.to("cuda"), sources.depth.cuda())
+    got = blend(target.to("cuda"), depth.cuda(), normals.cuda(), on_gpu, BIAS_M, BlendConfig())
+    assert ((got.rgb.cpu() - expected.rgb).abs() > 2e-4).float().mean() < 0.002
+
+
+def test_a_camera_at_the_target_gives_its_own_image_back():
+    target = camera_at(0, "t")
+    given = scene(target, replace(target, names=("same",)))
+    result = blend(*given, BIAS_M, BlendConfig())
+    seen = result.weights[0] > 1e-5
+    assert seen.sum() > 500
+    torch.testing.assert_close(result.rgb[:, seen], given[3].frame.rgb[0][:, seen] / 255, atol=1e-3, rtol=0)
+
+
+def test_samples_are_between_pixels():
+    """A ramp of colour is reproduced at fractions of a pixel: shifting the camera by a third shifts the value."""
+    target = camera_at(0, "t")
+    camera = target.cropped(0, 0, 48, 48)
+    camera = replace(camera, names=("shifted",), K=camera.K + torch.tensor([[0, 0, 1 / 3], [0, 0, 0], [0, 0, 0]]))
+    _, depth, normals, sources = scene(target, camera)
+    ramp = (torch.arange(48, dtype=torch.uint8) * 5).expand(1, 3, 48, 48).contiguous()
+    sources = ContextViews(replace(sources.frame, rgb=ramp), sources.depth)
+    rgb = blend(target, depth, normals, sources, BIAS_M, BlendConfig()).rgb[0]
+    assert float(rgb[24, 24]) == pytest.approx((24 + 1 / 3) * 5 / 255, abs=1e-4)
+
+
+def weights_of_one(camera, **changes):
+    target, depth, normals, sources = scene(camera_at(0, "t"), camera)
+    frame = replace(sources.frame, **{k: v for k, v in changes.items() if k != "depth"})
+    sources = ContextViews(frame, changes.get("depth", sources.depth))
+    return blend(target, depth, normals, sources, BIAS_M, BlendConfig()).weights[0]
+
+
+def test_what_is_behind_a_camera_never_counts():
+    assert weights_of_one(camera_at(20, "before")).sum() > 1
+    away = camera_at(20, "away")
+    turn = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # about its own y axis: the ball is now behind it
+    assert weights_of_one(replace(away, camera_from_world=turn @ away.camera_from_world)).sum() == 0
+
+
+def test_what_is_outside_the_image_never_counts():
+    camera = camera_at(20, "c")
+    assert weights_of_one(camera.cropped(0, 0, 24, 48)).sum() > 0.1
+    assert weights_of_one(camera.cropped(100, 0, 48, 48)).sum() == 0
+
+
+def test_an_occluder_takes_the_weight():
+    camera = camera_at(20, "c")
+    depth = proxy().depth(camera)
+    seen = weights_of_one(camera)
+    barely = weights_of_one(camera, depth=depth - 0.5 * BIAS_M * (depth > 0))
+    hidden = weights_of_one(camera, depth=depth - 0.3 * (depth > 0))
+    assert barely.sum() > 0.99 * seen.sum() > 1
+    assert hidden.sum() == 0
+
+
+def test_background_samples_count_less_the_softer():
+    camera = camera_at(20, "c")
+    mask = torch.full((1, 48, 48), 255, dtype=torch.uint8)
+    full = weights_of_one(camera, mask=mask)
+    torch.testing.assert_close(weights_of_one(camera, mask=mask // 5), full / 5)
+    assert weights_of_one(camera, mask=mask * 0).sum() == 0
+
+
+def test_background_does_not_bleed_in():
+    """White cameras with black background: what is coloured is white up to the rim."""
+    target, depth, normals, sources = scene(camera_at(0, "t"), ring(12)[[0, 1]])
+    white = (sources.frame.mask[:, None] > 0).expand(-1, 3, -1, -1) * torch.tensor(255, dtype=torch.uint8)
+    sources = ContextViews(replace(sources.frame, rgb=white.contiguous()), sources.depth)
+    result = blend(target, depth, normals, sources, BIAS_M, BlendConfig())
+    seen = result.weights.sum(0) > 0
+    assert seen.sum() > 500
+    assert result.rgb[:, seen].min() > 0.999
+
+
+def test_disagreement_is_the_spread_of_the_samples():
+    target, depth, normals, sources = scene(camera_at(0, "t"), ring(12)[[0, 0]])
+    assert blend(target, depth, normals, sources, BIAS_M, BlendConfig()).disagreement.max() < 1e-6
+    rgb = torch.tensor([100, 150], dtype=torch.uint8)[:, None, None, None].expand(2, 3, 48, 48).contiguous()
+    sources = ContextViews(MultiViewFrame(sources.frame.cameras, rgb, None, 0), sources.depth)
+    spread = blend(target, depth, normals, sources, BIAS_M, BlendConfig()).disagreement
+    assert float(spread[24, 24]) == pytest.approx(25 / 255, abs=1e-4)

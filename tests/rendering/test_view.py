@@ -1,0 +1,77 @@
+"""Rendered views of an analytic ball."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from ball import camera_at, photograph, proxy, ring
+
+from viewmend.geometry.mesh import Mesh
+from viewmend.rendering.error_rules import error_rule
+from viewmend.rendering.view import RenderConfig, render_view
+
+BALL = proxy()
+
+
+@pytest.mark.parametrize("selection", ["closest", "covering"])
+def test_the_ball_is_rendered_as_it_is(selection):
+    target = camera_at(40, "t", 64, 0.4)
+    truth = photograph(target)
+    view = render_view(photograph(ring(12, 96)), BALL, target, RenderConfig(selection=selection))
+    right = (view.mask > 0) & (view.error == 0) & (truth.mask[0] > 0)
+    assert right.sum() > 0.97 * (truth.mask > 0).sum()
+    # The exact colour is a function of position; one source pixel is 1.5 cm, 3 % of the range, at the rim more.
+    assert (view.rgb - truth.rgb[0] / 255)[:, right].abs().mean() < 0.004
+    assert (view.mask - (truth.mask[0] > 0).float()).abs().mean() < 0.01
+
+
+@pytest.mark.parametrize("selection", ["closest", "covering"])
+def test_what_travels_is_consistent(selection):
+    cameras = ring(12)[[0, 2, 3]]  # nothing sees the back
+    view = render_view(photograph(cameras, 7), BALL, camera_at(135, "t"), RenderConfig(selection=selection))
+    missing, coloured = view.error == 1, (view.error == 0) & (view.mask == 1)
+    assert missing.sum() > 50 and coloured.sum() > 50
+    assert bool((view.mask[missing] == 1).all())
+    assert view.rgb[:, missing].abs().max() == 0
+    assert view.rgb[:, view.mask == 0].abs().max() == 0
+    assert view.rgb[:, coloured].min() > 0.02
+    torch.testing.assert_close(view.weights.sum(0), coloured.float())
+    assert torch.equal(view.mask > 0, view.depth > 0)
+    assert view.time == 7 and set(view.chosen) == set(cameras.names)
+
+
+def test_holes_are_where_the_weights_end():
+    cameras = ring(12)[[0]]
+    view = render_view(photograph(cameras), BALL, camera_at(45, "t", 96), RenderConfig(cameras=1))
+    rows = view.error[48]
+    # The camera is at the left: the ball's right rim is turned away from it.
+    assert rows[view.mask[48] > 0][0] == 0 and rows[view.mask[48] > 0][-1] == 1
+
+
+def test_an_unknown_rule_is_named():
+    with pytest.raises(ValueError, match="expected an error rule among"):
+        error_rule("unsen")
+
+
+@pytest.mark.parametrize("selection", ["closest", "covering"])
+def test_excluded_cameras_leave_no_trace(selection):
+    frame, target = photograph(ring(6)), camera_at(60, "t")
+    config = RenderConfig(selection=selection, keep_share=0.0)
+    marked = frame.rgb.clone()
+    marked[1] = 255
+    with_it = render_view(replace(frame, rgb=marked), BALL, target, config)
+    assert "c1" in with_it.chosen
+    without = render_view(replace(frame, rgb=marked), BALL, target, config, ("c1", "c2", "c0"), exclude=("c1",))
+    alone = render_view(frame.without(["c1"]), BALL, target, config)
+    assert set(without.chosen) == set(alone.chosen)
+    torch.testing.assert_close(without.rgb, alone.rgb)
+    with pytest.raises(ValueError, match="all of them excluded"):
+        render_view(frame, BALL, target, config, exclude=frame.cameras.names)
+
+
+@pytest.mark.parametrize("selection", ["closest", "covering"])
+def test_an_empty_proxy_gives_an_empty_view(selection):
+    empty = replace(BALL, mesh=Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32)), normals=torch.zeros(0, 3))
+    view = render_view(photograph(ring(4)), empty, camera_at(5, "t"), RenderConfig(selection=selection))
+    assert view.mask.sum() == 0 and view.error.sum() == 0 and view.rgb.sum() == 0
+    assert view.chosen[0] == "c0"
