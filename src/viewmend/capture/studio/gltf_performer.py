@@ -20,7 +20,7 @@ ROAM_M = 0.7
 """How far the slow part of a path may lead away from the stage's centre."""
 SLOW_S = 0.8
 """Standard deviation of the Gaussian that splits a path into a slow and a fast part."""
-FLOOR_SAMPLES = 24
+FLOOR_SAMPLES = 16
 FLIGHT_M = 0.03
 """Soles this much above their lowest few per cent count as flight, not as floor."""
 

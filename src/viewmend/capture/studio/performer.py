@@ -1,7 +1,7 @@
 """Who stands on the studio's stage: anything that is a textured mesh at each moment."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -23,6 +23,7 @@ class TexturedMesh:
     """sRGB colours in [0, 1]; the sizes may differ."""
 
 
+@runtime_checkable
 class Performer(Protocol):
     """A person, or several with their props, in motion."""
 

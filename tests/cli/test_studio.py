@@ -1,0 +1,36 @@
+import json
+
+import pytest
+
+from viewmend.capture.plain import open_capture
+from viewmend.cli import main
+
+
+def test_writes_captures_that_can_be_read(tmp_path, capsys):
+    out = tmp_path / "made"
+    options = ["--scenes", "2", "--cameras", "4", "--frames", "2", "--size", "48", "--seed", "10005"]
+    assert main(["studio", str(out), *options, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [c["seed"] for c in report["captures"]] == [10005, 10006]
+    for entry in report["captures"]:
+        capture = open_capture(entry["folder"])
+        frame = capture.read(1)
+        assert frame.rgb.shape == (4, 3, 48, 48) and len(capture.frame_ids) == 2 and capture.fps == 30
+        assert frame.mask is not None and frame.depth is not None and capture.bounds is not None
+    assert main(["studio", str(out), *options]) == 2
+    assert "scene_10005" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--frames", "0"], "frames 0"),
+        (["--performers", "nowhere", "--motions", "nowhere"], "nowhere"),
+        (["--performers", "nowhere"], "no motions"),
+    ],
+)
+def test_bad_options_leave_nothing_behind(tmp_path, capsys, options, message):
+    out = tmp_path / "made"
+    assert main(["studio", str(out), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not out.exists() or not any(out.iterdir())
