@@ -1,5 +1,6 @@
 """Image files: colours, masks and depths, decoded from bytes and encoded to them."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +43,17 @@ def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
 
 def as_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "height width"]:
     """The mask that an image of 1, 3 or 4 channels means."""
+    import cv2
+
     if image.ndim == 2:
         return image
-    if image.shape[2] in (2, 4) and (image[..., -1] != 255).any():
-        return np.ascontiguousarray(image[..., -1])
-    colours = image[..., :3] if image.shape[2] >= 3 else image[..., :1]
-    return colours.max(-1)
+    channels = cv2.split(image)
+    if len(channels) in (2, 4):
+        alpha = channels[-1]
+        if (alpha != 255).any():
+            return alpha
+        channels = channels[:-1]
+    return functools.reduce(cv2.max, channels)  # pyright: ignore[reportArgumentType]
 
 
 def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:

@@ -1,6 +1,7 @@
 """Values out of a JSON object, each checked, each error naming where it stood."""
 
 import difflib
+import json
 import math
 from collections.abc import Sequence
 from typing import overload
@@ -18,13 +19,13 @@ class Fields:
 
     def __init__(self, data: object, where: str):
         if not isinstance(data, dict):
-            raise CaptureError(f"{where}: expected an object of keys, got {_short(data)}; see the format's description")
+            raise CaptureError(f"{where}: expected an object of keys, got {shown(data)}; see the format's description")
         self.data: dict[str, object] = data
         self.where = where
 
-    def wrong(self, key: str, expected: str, got: object, next_step: str) -> CaptureError:
+    def wrong(self, key: str, expected: str, got: str, next_step: str) -> CaptureError:
         """The error to raise about a key."""
-        return CaptureError(f"{self.where}: {key}: expected {expected}, got {_short(got)}; {next_step}")
+        return CaptureError(f"{self.where}: {key}: expected {expected}, got {got}; {next_step}")
 
     def check_spelling(self, known: Sequence[str]) -> None:
         """Unknown keys are notes and pass, unless they look like a known key that is absent (a typo)."""
@@ -40,7 +41,7 @@ class Fields:
         if value is not None:
             return value
         if default is _REQUIRED:
-            raise self.wrong(key, expected, "nothing" if key not in self.data else None, "add the key")
+            raise self.wrong(key, expected, "nothing" if key not in self.data else "null", "add the key")
         return default
 
     @overload
@@ -52,7 +53,7 @@ class Fields:
         value = self._get(key, default, "a text")
         if value is None or (isinstance(value, str) and value):
             return value
-        raise self.wrong(key, "a text that is not empty", value, "put it in quotes")
+        raise self.wrong(key, "a text that is not empty", shown(value), "put it in quotes")
 
     @overload
     def number(self, key: str, default: float) -> float: ...
@@ -64,21 +65,21 @@ class Fields:
         if value is None:
             return None
         if not _is_number(value) or not math.isfinite(value):  # pyright: ignore[reportArgumentType]
-            raise self.wrong(key, "a finite number", value, "correct the value")
+            raise self.wrong(key, "a finite number", shown(value), "correct the value")
         return float(value)  # pyright: ignore[reportArgumentType]
 
     def positive_integer(self, key: str) -> int:
         """A whole number above zero."""
         value = self._get(key, _REQUIRED, "a whole number")
         if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
-            raise self.wrong(key, "a whole number above 0", value, "correct the value")
+            raise self.wrong(key, "a whole number above 0", shown(value), "correct the value")
         return value
 
     def list(self, key: str) -> "list[object]":
         """A list that is not empty."""
         value = self._get(key, _REQUIRED, "a list")
         if not isinstance(value, list) or not value:
-            raise self.wrong(key, "a list that is not empty", value, "fill it")
+            raise self.wrong(key, "a list that is not empty", shown(value), "fill it")
         return value
 
     @overload
@@ -98,10 +99,10 @@ class Fields:
         if isinstance(value, np.ndarray):
             return value.copy()
         if not _has_shape(value, shape):
-            raise self.wrong(key, expected, value, "correct the value")
+            raise self.wrong(key, expected, shown(value), "correct the value")
         array = np.array(value, np.float64)
         if not np.isfinite(array).all():
-            raise self.wrong(key, expected, value, "calibrate again, or leave the camera out")
+            raise self.wrong(key, expected, shown(value), "calibrate again, or leave the camera out")
         return array
 
 
@@ -115,6 +116,7 @@ def _has_shape(value: object, shape: tuple[int, ...]) -> bool:
     return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(v, shape[1:]) for v in value)
 
 
-def _short(value: object) -> str:
-    text = value if isinstance(value, str) else repr(value)
+def shown(value: object) -> str:
+    """A value from the file as messages show it: like the file does, cut where it is long."""
+    text = json.dumps(value)
     return text if len(text) <= 200 else text[:197] + "..."

@@ -189,13 +189,14 @@ def _never(folder: Path, camera: PlainCamera, frames: Sequence[str], listing: Fo
     """What to say of a camera that is at no time there."""
     for stream in camera.streams:
         if not any(listing.has(camera.file(stream, frame)) for frame in frames):
-            missing, what = camera.file(stream, frames[0]), f"the camera's {stream}"
+            file, what = camera.file(stream, frames[0]), f"the camera's {stream} at one frame or more"
             break
     else:
-        missing, what = camera.file(camera.streams[0], frames[0]), "all of the camera's files at one frame"
+        file = camera.file(camera.streams[0], frames[0])
+        what = f"{' and '.join(camera.streams)} of the camera at the same frame"
     return (
-        f"{folder / missing}: camera '{camera.name}', frame '{frames[0]}': expected {what}, got no such file at any of "
-        f"{len(frames)} frames; correct the path in {folder / CALIBRATION}, or leave the camera out"
+        f"{folder / file}: camera '{camera.name}', frame '{frames[0]}': expected {what}, found at none of "
+        f"{len(frames)}; correct the paths in {folder / CALIBRATION}, or leave the camera out"
     )
 
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.json_fields import Fields
+from viewmend.capture.json_fields import Fields, shown
 from viewmend.geometry.rigid import is_rotation
 
 FORMAT = "plain-capture/1"
@@ -79,21 +79,23 @@ def read_calibration(folder: Path) -> PlainCalibration:
     root = Fields(_load(path), str(path))
     version = root.text("format")
     if version != FORMAT:
-        raise root.wrong("format", f'"{FORMAT}"', version, "convert the capture, or use the viewmend that reads it")
+        raise root.wrong(
+            "format", f'"{FORMAT}"', shown(version), "convert the capture, or use the viewmend that reads it"
+        )
     root.check_spelling(CAPTURE_KEYS)
     scale = root.number("metres_per_unit", default=1.0)
     if scale <= 0:
-        raise root.wrong("metres_per_unit", "a number above 0", scale, "write 0.001 for millimetres")
+        raise root.wrong("metres_per_unit", "a number above 0", shown(scale), "write 0.001 for millimetres")
     first = root.array("first_pixel_center", (2,), default=np.zeros(2))
     bounds = root.array("bounds", (2, 3), default=None)
     if bounds is not None and not (bounds[0] < bounds[1]).all():
-        raise root.wrong("bounds", "[low corner, high corner]", bounds.tolist(), "put the smaller numbers first")
+        raise root.wrong("bounds", "[low corner, high corner]", shown(bounds.tolist()), "put the smaller numbers first")
     up = root.array("up", (3,), default=None)
     if up is not None and not np.linalg.norm(up) > 0:
-        raise root.wrong("up", "a direction or null", up.tolist(), "write null where it is unknown")
+        raise root.wrong("up", "a direction or null", shown(up.tolist()), "write null where it is unknown")
     fps = root.number("fps", default=None)
     if fps is not None and fps <= 0:
-        raise root.wrong("fps", "a number above 0 or null", fps, "write null for a static capture")
+        raise root.wrong("fps", "a number above 0 or null", shown(fps), "write null for a static capture")
     return PlainCalibration(
         frames=_frames(root),
         cameras=_cameras(root, 0.5 - first, scale),
@@ -118,7 +120,7 @@ def _frames(root: Fields) -> tuple[str, ...]:
     frames = root.list("frames")
     for index, frame in enumerate(frames):
         if not isinstance(frame, str) or not frame:
-            raise root.wrong(f"frames[{index}]", "a frame id, a string", frame, "put it in quotes")
+            raise root.wrong(f"frames[{index}]", "a frame id, a string", shown(frame), "put it in quotes")
     _check_unique(root, "frames", [str(f) for f in frames])
     return tuple(str(f) for f in frames)
 
@@ -126,7 +128,7 @@ def _frames(root: Fields) -> tuple[str, ...]:
 def _cameras(root: Fields, shift_px: Float64[np.ndarray, "2"], scale: float) -> tuple[PlainCamera, ...]:
     entries = root.list("cameras")
     if len(entries) < 2:
-        raise root.wrong("cameras", "two cameras or more", len(entries), "add the rig's other cameras")
+        raise root.wrong("cameras", "two cameras or more", str(len(entries)), "add the rig's other cameras")
     cameras = tuple(_camera(Fields(e, f"{root.where}: cameras[{i}]"), shift_px, scale) for i, e in enumerate(entries))
     _check_unique(root, "cameras", [c.name for c in cameras])
     return cameras
@@ -163,18 +165,21 @@ def _camera(entry: Fields, shift_px: Float64[np.ndarray, "2"], scale: float) -> 
 def _intrinsics(entry: Fields) -> Float64[np.ndarray, "3 3"]:
     K = entry.array("K", (3, 3))
     if K[0, 0] * K[1, 1] == 0:
-        raise entry.wrong("K", "an invertible matrix", f"a singular one, {K.tolist()}", "give focal lengths in pixels")
+        raise entry.wrong(
+            "K", "an invertible matrix", f"a singular one, {shown(K.tolist())}", "give focal lengths in pixels"
+        )
     upper = K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]
     if not upper or K[0, 0] < 0 or K[1, 1] < 0:
         expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
-        raise entry.wrong("K", expected, K.tolist(), "bring the calibration to OpenCV's axes and form")
+        raise entry.wrong("K", expected, shown(K.tolist()), "bring the calibration to OpenCV's axes and form")
     return K
 
 
 def _rotation(entry: Fields) -> Float64[np.ndarray, "3 3"]:
     R = entry.array("R", (3, 3))
     if not bool(is_rotation(torch.from_numpy(R), ROTATION_TOLERANCE)):
-        got = f"determinant {np.linalg.det(R):.4g}, R R^T off by {abs(R @ R.T - np.eye(3)).max():.2g}, {R.tolist()}"
+        off = abs(R @ R.T - np.eye(3)).max()
+        got = f"determinant {np.linalg.det(R):.4g}, R R^T off by {off:.2g}, {shown(R.tolist())}"
         raise entry.wrong("R", "a rotation, world to camera", got, "check axes, signs and the number of digits")
     u, _, vt = np.linalg.svd(R)  # the nearest rotation: calibrations carry few digits
     return u @ vt
@@ -183,7 +188,9 @@ def _rotation(entry: Fields) -> Float64[np.ndarray, "3 3"]:
 def _stream(entry: Fields, key: str) -> str | None:
     pattern = entry.text(key, default=None)
     if pattern is not None and not stays_inside(pattern):
-        raise entry.wrong(key, "a path inside the capture folder", pattern, "move the file in and write it relative")
+        raise entry.wrong(
+            key, "a path inside the capture folder", shown(pattern), "move the file in and write it relative"
+        )
     return pattern
 
 

@@ -1,6 +1,6 @@
 """The protocol that every source of frames obeys."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -10,6 +10,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.views import MultiViewFrame
 
 
+@runtime_checkable
 class CaptureSource(Protocol):
     """A calibrated multi-camera capture: a folder, the studio, a live rig."""
 

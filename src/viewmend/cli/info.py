@@ -50,9 +50,14 @@ def _is_model(target: str) -> bool:
     from viewmend.inpainting.checkpoint import CONFIG, WEIGHTS, shipped_models
 
     folder = Path(target)
+    if not folder.exists() and target not in shipped_models():
+        raise ValueError(
+            f"expected a capture folder (with cameras.json), a model's folder or one of the models "
+            f"{list(shipped_models())}, got '{target}', which is none; check the path"
+        )
     if (folder / "cameras.json").exists():
         return False
-    return any((folder / name).exists() for name in (CONFIG, WEIGHTS)) or target in shipped_models()
+    return not folder.exists() or any((folder / name).exists() for name in (CONFIG, WEIGHTS))
 
 
 def _look_at_capture(options: Options) -> "CaptureDescription":

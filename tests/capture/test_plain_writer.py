@@ -1,0 +1,123 @@
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from viewmend.capture.errors import CaptureError
+from viewmend.capture.plain import open_capture
+from viewmend.capture.plain_writer import write_capture
+
+
+class Renamed:
+    """A capture seen through a change of its frames."""
+
+    def __init__(self, source, change):
+        self.source, self.change = source, change
+
+    def __getattr__(self, name):
+        return getattr(self.source, name)
+
+    def read(self, time):
+        return self.change(self.source.read(time))
+
+
+def assert_same(written, source, tolerance=0):
+    assert written.frame_ids == source.frame_ids and written.fps == source.fps
+    torch.testing.assert_close(written.up, source.up)
+    torch.testing.assert_close(written.bounds.low, source.bounds.low)
+    assert written.gaps == source.gaps
+    for time in range(len(source.frame_ids)):
+        a, b = written.read(time), source.read(time)
+        assert a.cameras.names == b.cameras.names
+        torch.testing.assert_close(a.cameras.K, b.cameras.K)
+        torch.testing.assert_close(a.cameras.camera_from_world, b.cameras.camera_from_world, atol=1e-6, rtol=0)
+        assert torch.equal(a.cameras.size_px, b.cameras.size_px)
+        assert torch.equal(a.mask, b.mask)
+        assert (a.rgb.float() - b.rgb.float()).abs().mean() <= tolerance
+
+
+def test_what_is_written_is_read_again(plain, tmp_path):
+    plain.edit(lambda d: d["cameras"][2].update(dist=[-0.2, 0.1, 0, 0, 0]))  # undistorted once, not twice
+    plain.edit(lambda d: d["cameras"][1].update(width=30, height=20))
+    for kind in ("images", "masks"):
+        for frame in ("000", "001"):
+            plain.put(f"{kind}/b_{frame}.png", plain.get(f"{kind}/b_{frame}.png")[:20, :30])
+    (plain.path / "images/d_001.png").unlink()
+    source = open_capture(plain.path)
+    write_capture(source, tmp_path / "copy", images="png")
+    assert_same(open_capture(tmp_path / "copy"), source)
+
+
+def test_depth_to_half_a_millimetre(plain, tmp_path, rng):
+    def with_depth(frame):
+        return replace(frame, depth=3 * torch.rand(frame.mask.shape, generator=rng))
+
+    depths = []
+    source = Renamed(open_capture(plain.path), lambda frame: depths.append(with_depth(frame)) or depths[-1])
+    write_capture(source, tmp_path / "copy")
+    for time in (0, 1):
+        read = open_capture(tmp_path / "copy").read(time).depth
+        assert (read - depths[time].depth).abs().max() < 0.5001e-3
+
+
+def test_depth_that_does_not_fit_is_refused(plain, tmp_path):
+    far = Renamed(open_capture(plain.path), lambda frame: replace(frame, depth=torch.full(frame.mask.shape, 70.0)))
+    with pytest.raises(CaptureError, match=r"0 to 65\.535 m, got 70"):
+        write_capture(far, tmp_path / "copy")
+
+
+@pytest.mark.parametrize("options", [{"images": "jpeg"}, {"video": True}])
+def test_smaller_forms_lose_little(plain, tmp_path, options):
+    smooth = torch.linspace(0, 255, 40).expand(4, 3, 32, 40).byte()
+    source = Renamed(open_capture(plain.path), lambda frame: replace(frame, rgb=smooth.clone()))
+    write_capture(source, tmp_path / "copy", **options)
+    assert_same(open_capture(tmp_path / "copy"), source, tolerance=2)
+
+
+def test_a_video_cannot_have_gaps(plain, tmp_path):
+    (plain.path / "images/d_001.png").unlink()
+    with pytest.raises(CaptureError, match=r"frame '001'.*cannot have gaps.*\['d'\].*write images"):
+        write_capture(open_capture(plain.path), tmp_path / "copy", video=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball"]
+
+
+def test_a_folder_in_use_is_left_alone(plain, tmp_path):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "thesis.txt").write_text("precious")
+    with pytest.raises(CaptureError, match=r"mine: expected no such folder, or an empty one"):
+        write_capture(open_capture(plain.path), out)
+    assert [p.name for p in out.iterdir()] == ["thesis.txt"]
+    (out / "thesis.txt").unlink()
+    write_capture(open_capture(plain.path), out)
+    assert open_capture(out).frame_ids == ("000", "001")
+
+
+def test_nothing_is_left_of_what_fails_halfway(plain, tmp_path):
+    (plain.path / "images/c_001.png").write_bytes(b"")
+    seen = []
+    with pytest.raises(CaptureError, match=r"c_001\.png"):
+        write_capture(
+            open_capture(plain.path), tmp_path / "copy", progress=lambda ts: (seen.append(t) or t for t in ts)
+        )
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball"]
+    assert seen == [0, 1]
+
+
+def test_names_that_are_no_file_names(plain, tmp_path):
+    names = ["Camera (1)", "../up", "a/b", "ok"]
+    plain.edit(lambda d: [camera.update(name=name) for camera, name in zip(d["cameras"], names, strict=True)])
+    source = open_capture(plain.path)
+    write_capture(source, tmp_path / "copy", images="png")
+    assert_same(open_capture(tmp_path / "copy"), source)
+    assert sorted(p.name for p in (tmp_path / "copy" / "image").iterdir()) == ["camera00", "camera01", "camera02", "ok"]
+
+
+def test_the_calibration_is_written_as_the_format_says(plain, tmp_path):
+    write_capture(open_capture(plain.path), tmp_path / "copy")
+    description = json.loads((tmp_path / "copy" / "cameras.json").read_text())
+    assert description["format"] == "plain-capture/1"
+    assert description["first_pixel_center"] == [0.5, 0.5]
+    assert description["cameras"][0]["image"] == "image/a/{frame}.jpg"
+    assert (tmp_path / "copy" / "image" / "a" / "001.jpg").is_file()
