@@ -25,7 +25,8 @@ def _tube(
     return centers[:, None] + ring
 
 
-def _uv(shape: tuple[int, ...]) -> Float[np.ndarray, "row column 2"]:
+def unit_grid(shape: tuple[int, ...]) -> Float[np.ndarray, "row column 2"]:
+    """Chart coordinates of a regular grid: u along the columns, v along the rows."""
     v, u = np.meshgrid(np.linspace(0, 1, shape[0]), np.linspace(0, 1, shape[1]), indexing="ij")
     return np.stack([u, v], -1)
 
@@ -47,7 +48,7 @@ def hand_patches(body: Body, skeleton: Skeleton, height_m: float, side: str, ski
     weights = one_joint(grid.shape[:2], f"{side}_hand")
     wrist_turn = smoothstep(arm.along(grid), 0.96, 1.03)
     weights = mix(one_joint(grid.shape[:2], f"{side}_forearm"), weights, wrist_turn)
-    patches = [Patch(grid, _uv(grid.shape), weights, skin)]
+    patches = [Patch(grid, unit_grid(grid.shape), weights, skin)]
     for k in range(4):
         spread = (1.5 - k) * 0.0108 * H * girth
         length = (0.043, 0.048, 0.045, 0.036)[k] * H
@@ -87,7 +88,7 @@ def _finger(
     grid = _tube(centers, side, radii, 9)
     tip = centers[0] + 0.35 * radius_m * unit(centers[0] - centers[1])
     grid = np.concatenate([np.broadcast_to(tip, (1, 9, 3)), grid])
-    return Patch(grid, _uv(grid.shape), one_joint(grid.shape[:2], joint), skin)
+    return Patch(grid, unit_grid(grid.shape), one_joint(grid.shape[:2], joint), skin)
 
 
 # Place from heel (0) to tip (1), half width, height of the upper: shares of the person's height.
@@ -129,10 +130,8 @@ def shoe_patch(
     z = np.broadcast_to(((s - 0.25) * 0.152 * H)[:, None], x.shape)
     splay = SIGN[side] * 0.04 * H * np.maximum(s - 0.25, 0)[:, None] * 0.7
     points = np.stack([ankle[0] + x + splay, y, ankle[2] + z], -1)
-    # Seen from above, v (heel to tip) is up; u must run to the right.
-    points = points[:, ::-1]
     chart = np.empty((96, 128, 3))
-    u = np.linspace(1, 0, 128)[None, :, None] * 2 * np.pi
+    u = np.linspace(0, 1, 128)[None, :, None] * 2 * np.pi
     v = np.linspace(1, 0, 96)[:, None, None]
     chart[:] = np.where((np.sin(u) < 0.16), sole_rgb, upper_rgb)
     laces = (np.abs(np.sin(u) - 1) < 0.14) & (v > 0.42) & (v < 0.66) & ((v * 24) % 1 < 0.4)
@@ -140,4 +139,4 @@ def shoe_patch(
     weights = one_joint(points.shape[:2], f"{side}_foot")
     toe = float(skeleton.at(f"{side}_toe")[2])
     bend = smoothstep(points[..., 2], toe - 0.02 * H, toe + 0.02 * H)
-    return Patch(points, _uv(points.shape), mix(weights, one_joint(points.shape[:2], f"{side}_toe"), bend), chart)
+    return Patch(points, unit_grid(points.shape), mix(weights, one_joint(points.shape[:2], f"{side}_toe"), bend), chart)

@@ -7,7 +7,7 @@ import numpy as np
 from viewmend.capture.studio.procedural.gestures import Gesture, arm_poses, sample_gesture
 from viewmend.capture.studio.procedural.grounds import GROUNDS, Score, Tempo, ease
 from viewmend.capture.studio.procedural.physique import Physique
-from viewmend.capture.studio.procedural.skeleton import Skeleton
+from viewmend.capture.studio.procedural.skeleton import SIDES, Skeleton
 from viewmend.capture.studio.procedural.stance import ArmPose, FootPose, Stance
 
 MOTIONS: dict[Tempo, tuple[str, ...]] = {
@@ -66,6 +66,16 @@ class Motion:
             arms=_shifted_arms(stance.arms, self.center),
         )
 
+    def gripping(self, side: str) -> "Motion":
+        """The same motion with this hand closed round something."""
+        i = SIDES.index(side)
+        gestures = []
+        for gesture in self.gestures:
+            bases, amplitudes = gesture.bases.copy(), gesture.amplitudes.copy()
+            bases[i, 4], amplitudes[i, 4] = 1.3, 0.0
+            gestures.append(replace(gesture, bases=bases, amplitudes=amplitudes))
+        return replace(self, gestures=(gestures[0], gestures[1]))
+
     def _arms(self, base: Stance, time_s: float, beats: float) -> Stance:
         if self.score.kind == "reach":
             return base
@@ -89,7 +99,13 @@ def _shifted_arms(arms: tuple[ArmPose, ArmPose], center: tuple[float, float]) ->
 
 
 def sample_motion(
-    rng: np.random.Generator, person: Physique, skeleton: Skeleton, tempo: Tempo, kind: str | None, bulk: float
+    rng: np.random.Generator,
+    person: Physique,
+    skeleton: Skeleton,
+    tempo: Tempo,
+    kind: str | None,
+    bulk: float,
+    center: tuple[float, float] = (0.0, 0.0),
 ) -> Motion:
     """Draw a motion of this tempo; `kind` fixes which."""
     chosen = kind or MOTIONS[tempo][int(rng.integers(len(MOTIONS[tempo])))]
@@ -115,4 +131,4 @@ def sample_motion(
         path,
         rng.uniform(0, 1, 8),
     )
-    return Motion(score, (gestures[0], gestures[1]), float(rng.uniform(2.5, 5.0)))
+    return Motion(score, (gestures[0], gestures[1]), float(rng.uniform(2.5, 5.0)), center)

@@ -1,117 +1,112 @@
 """Performers and scenes drawn from a seed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
-from viewmend.capture.studio.performer import Performer, TexturedMesh
-from viewmend.capture.studio.procedural.body import build_body
-from viewmend.capture.studio.procedural.clothing import Cut, Tailor, sample_cut, sample_outfit
-from viewmend.capture.studio.procedural.extremities import hand_patches, shoe_patch
-from viewmend.capture.studio.procedural.fabric import Canvas, Image
-from viewmend.capture.studio.procedural.grounds import Tempo
-from viewmend.capture.studio.procedural.hair import hair_patches, sample_hair
-from viewmend.capture.studio.procedural.head import build_head, head_patches
-from viewmend.capture.studio.procedural.motion import Motion, sample_motion
-from viewmend.capture.studio.procedural.patches import BoundMesh, Patch, assemble
-from viewmend.capture.studio.procedural.physique import Physique, build_skeleton, sample_physique
-from viewmend.capture.studio.procedural.sheets import Wearer, azimuths, limb_sheet, torso_sheet
-from viewmend.capture.studio.procedural.skeleton import SIDES, Skeleton
-from viewmend.capture.studio.procedural.stance import solve
-from viewmend.capture.studio.skinning import skin_with_normals
-from viewmend.geometry.mesh import Mesh
+from viewmend.capture.studio.procedural.grounds import Tempo, seat_height
+from viewmend.capture.studio.procedural.motion import MOTIONS
+from viewmend.capture.studio.procedural.patches import Patch, assemble
+from viewmend.capture.studio.procedural.person import ProceduralPerson, draw_person
+from viewmend.capture.studio.procedural.props import STANDING, standing_prop, stool
+from viewmend.capture.studio.procedural.scene import ProceduralPerformer, still
+
+TEMPOS: tuple[Tempo, ...] = ("calm", "dance", "fast")
+ROAMING = ("walk", "run", "sidestep")
+"""Motions that need the floor for themselves."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PerformerStyle:
-    """What of a performer is fixed; None leaves it to the seed."""
+    """What of a performer or scene is fixed; None leaves it to the seed."""
 
     tempo: Tempo | None = None
     motion: str | None = None
-    """One of `motion.MOTIONS`."""
-
-
-@dataclass(frozen=True)
-class ProceduralPerformer:
-    """One person in motion. `pose` skins the bind mesh; it keeps nothing between calls."""
-
-    bound: BoundMesh
-    skeleton: Skeleton
-    motion: Motion
-    description: str
-
-    def pose(self, time_s: float) -> TexturedMesh:
-        """The person at this time, in seconds."""
-        elapsed = 0.12
-        stance = self.motion.stance(time_s)
-        world_from_bind = solve(self.skeleton, stance, self.motion.stance(time_s - elapsed), elapsed)
-        transforms = torch.from_numpy(world_from_bind).float()
-        bound = self.bound
-        vertices, normals = skin_with_normals(
-            bound.mesh.vertices, bound.normals, bound.joints, bound.weights, transforms
-        )
-        faces = bound.mesh.faces
-        texture = torch.zeros(len(faces), dtype=torch.int64)
-        return TexturedMesh(Mesh(vertices, faces), normals, bound.uv, texture, (bound.atlas,))
+    """One of those in `motion.MOTIONS`."""
+    people: int | None = None
+    """1 or 2, for scenes."""
+    holding: bool | None = None
+    """Whether something is held in a hand."""
+    furniture: bool | None = None
+    """Whether things stand around, for scenes (who sits has a stool anyway)."""
 
 
 def procedural_performer(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
-    """A clothed person in motion, the same for the same seed (and style), bit for bit."""
+    """A clothed person in motion around the stage's centre, the same for the same seed and style, bit for bit.
+
+    Args:
+        seed: any non-negative number; from 10000 on they are for tests, never for training.
+        style: what to fix.
+
+    Raises:
+        ValueError: the style names a motion that does not exist.
+    """
+    return procedural_scene(seed, style=replace(style or PerformerStyle(), people=1, furniture=False))
+
+
+def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
+    """One or two performers, perhaps with things in their hands and around them; deterministic as the above.
+
+    Raises:
+        ValueError: the style names a motion that does not exist, or another number of people than 1 or 2.
+    """
     style = style or PerformerStyle()
-    body_rng, cloth_rng, hair_rng, motion_rng = (
-        np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)
-    )
-    person = sample_physique(body_rng)
-    outfit = sample_outfit(cloth_rng, person.femininity)
-    hair = sample_hair(hair_rng, person.femininity, person.skin_rgb[0] < 0.6)
-    skeleton = build_skeleton(person)
-    body = build_body(person, skeleton)
-    head = build_head(person, skeleton)
-    wearer = Wearer(body, skeleton, person.height_m)
-    tailor = Tailor(wearer, outfit, sample_cut(outfit))
-    patches = tailor.top() + tailor.bottom() + tailor.outer()
-    patches += head_patches(person, head, hair_rng, hair.color)
-    patches += hair_patches(head, hair, body.torso, outfit.fabrics[1].colors[0])
-    patches += _skin_patches(person, wearer, tailor.cut, hair_rng)
-    shoes = tailor.shoes_rgb()
-    patches += [shoe_patch(skeleton, person.height_m, side, shoes[0], shoes[1]) for side in SIDES]
-    tempos: tuple[Tempo, ...] = ("calm", "dance", "fast")
-    tempo = style.tempo or tempos[int(motion_rng.integers(3))]
-    bulk = 0.06 + 0.08 * max(person.weight, 0) + (0.10 if outfit.outer != "none" else 0.0)
-    motion = sample_motion(motion_rng, person, skeleton, tempo, style.motion, bulk)
-    sex = "woman" if person.femininity > 0.5 else "man"
-    words = f"{sex}, {person.height_m:.2f} m, {hair.style} hair, {outfit.words}, {motion.score.kind} ({tempo})"
-    return ProceduralPerformer(assemble(patches), skeleton, motion, words)
+    _check(style)
+    rng = np.random.default_rng([seed, 77])
+    chance = rng.random(3)
+    count = style.people or (2 if chance[0] < 0.2 else 1)
+    tempo: Tempo = style.tempo or TEMPOS[int(rng.integers(3))]
+    angle = rng.uniform(0, 2 * np.pi)
+    aside = np.array([np.sin(angle), np.cos(angle)]) * (0.46 if count == 2 else 0.0)
+    people = []
+    for i, seeds in enumerate(np.random.SeedSequence(seed).spawn(count)):
+        kind = style.motion or _kind(rng, tempo, crowded=count == 2)
+        x, z = (aside * (1 - 2 * i)).tolist()
+        people.append(draw_person(seeds, tempo, kind, style.holding, (x, z)))
+    patches, names = _seats(people, rng), []
+    roams = any(person.motion.score.kind in ROAMING for person in people)
+    if (chance[1] < 0.5 if style.furniture is None else style.furniture) and not roams:
+        more, names = _furniture(rng, angle)
+        patches += more
+    words = " and ".join(person.description for person in people)
+    if names:
+        words += ", beside " + " and ".join(names)
+    return ProceduralPerformer(tuple(people), still(assemble(patches)) if patches else None, words)
 
 
-def _skin_patches(person: Physique, wearer: Wearer, cut: Cut, rng: np.random.Generator) -> list[Patch]:
-    """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
-    H = person.height_m
+def _check(style: PerformerStyle) -> None:
+    known = sorted({kind for kinds in MOTIONS.values() for kind in kinds})
+    if style.motion is not None and style.motion not in known:
+        raise ValueError(f"expected a motion among {known}, got {style.motion!r}; choose one of them")
+    if style.people not in (None, 1, 2):
+        raise ValueError(f"expected 1 or 2 people, got {style.people}; the stage holds no more")
 
-    def paint(canvas: Canvas) -> Image:
-        tone = 1 + 0.015 * canvas.noise(rng, 0.03, 0.03) + 0.012 * canvas.noise(rng, 0.004, 0.004)
-        return np.clip(np.array(person.skin_rgb) * tone[..., None], 0, 1)
 
-    around = azimuths(49)
-    low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
-    patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=24)]
-    # Cloth covers what lies further in than a hand's breadth from its hem.
-    arm, leg = max(cut.sleeve - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
-    for i in (0, 1):
-        patches.append(
-            limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, rows=8 + int(24 * (1 - arm)), columns=21)
-        )
-        patches.append(
-            limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, rows=8 + int(28 * (1 - leg)), columns=25)
-        )
-    skin = paint(Canvas(0.1, 0.1))
-    girth = 1.05 - 0.13 * person.femininity + 0.05 * person.weight
-    for side in SIDES:
-        patches += hand_patches(wearer.body, wearer.skeleton, H, side, skin, girth)
+def _kind(rng: np.random.Generator, tempo: Tempo, crowded: bool) -> str:
+    kinds = [kind for kind in MOTIONS[tempo] if not (crowded and kind in ROAMING)]
+    return kinds[int(rng.integers(len(kinds)))]
+
+
+def _seats(people: list[ProceduralPerson], rng: np.random.Generator) -> list[Patch]:
+    """A stool under everyone who sits."""
+    patches: list[Patch] = []
+    for person in people:
+        score, center = person.motion.score, person.motion.center
+        if score.kind == "sit":
+            under = np.array([center[0], 0.0, center[1]])
+            back = 0.03 * score.height_m * np.array([np.sin(score.heading), 0, np.cos(score.heading)])
+            patches += stool(rng, under - back, score.heading, seat_height(score.height_m))
     return patches
 
 
-def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Performer:
-    """One or two performers with props."""
-    return procedural_performer(seed, style=style)
+def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], list[str]]:
+    """One or two things on the floor, off the line through two people."""
+    patches: list[Patch] = []
+    names: list[str] = []
+    for i in range(int(rng.integers(1, 3))):
+        kind = STANDING[int(rng.integers(len(STANDING)))]
+        turn = angle + np.pi / 2 + i * np.pi + rng.uniform(-0.6, 0.6)
+        at = rng.uniform(0.78, 0.95) * np.array([np.sin(turn), 0, np.cos(turn)])
+        patches += standing_prop(kind, rng, at, float(rng.uniform(0, 6.3)))
+        names.append(f"a {kind}")
+    return patches, names
