@@ -2,15 +2,22 @@
 
 import math
 from dataclasses import dataclass
+from types import ModuleType
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from viewmend.geometry import _hull_torch
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, project
+from viewmend.geometry.threads import share
 
-NEAR_M = 1e-6
+TILE_PX = 16
+"""Side of the mask tiles by which the search for the subject's box judges blocks of space."""
+
+BLOCK = 4
+"""Side in voxels of the blocks, and in (pooled) pixels of the mask tiles, that the fast path judges whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,10 +26,12 @@ class HullConfig:
 
     resolution: int = 128
     """Voxels along the longest side of the box that is carved."""
-    coarse_resolution: int = 48
-    """Voxels along the longest side of the given bounds, in the first pass that finds the subject's box."""
-    blur_px: float = 2.0
-    """Standard deviation of the masks' Gaussian blur, pixels; 0 leaves them as they are."""
+    coarse_resolution: int = 24
+    """Blocks along the longest side of the bounds, in each pass of the search for the subject's box."""
+    coarse_passes: int = 3
+    """Passes of that search; 0 carves the bounds as they are."""
+    pixels_per_voxel: float = 2.0
+    """Mask pixels are pooled until a voxel spans about so many, and smoothed: else the surface shows their steps."""
     min_views: int = 2
     """Space that fewer cameras see is empty."""
     min_share: float = 0.5
@@ -42,35 +51,148 @@ class OccupancyGrid:
 def visual_hull(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> OccupancyGrid:
-    """Occupancy of `bounds`: the product of the (softened) mask values over the cameras that see a point.
+    """Occupancy of `bounds`: the smallest (softened) mask value over the cameras that see a point.
 
-    A camera says nothing about what is outside its image or behind it; space that too few cameras see is empty.
+    A camera says nothing about what is outside its image or behind it; space that too few cameras see is empty. The
+    minimum, unlike RIFTCast's product, does not thin the subject as cameras are added.
 
     Raises:
         ValueError: there is one camera only, or no mask has any foreground.
     """
     check_masks(mask, cameras)
-    longest = float(bounds.size_m.max())
-    voxel_m = longest / config.resolution
-    shape = [max(1, math.ceil(side / voxel_m - 1e-4)) for side in bounds.size_m.tolist()]
-    soft = soften(mask, config.blur_px)
-    axes = [
-        low + (torch.arange(n, device=mask.device) + 0.5) * voxel_m for low, n in zip(bounds.low, shape, strict=True)
-    ]
-    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    values = torch.ones(len(points), device=mask.device)
-    seen = torch.zeros(len(points), dtype=torch.int32, device=mask.device)
-    for view in range(len(cameras)):
-        value, sees = _look_up(soft[view], cameras[view], points)
-        values *= torch.where(sees, value, 1.0)
-        seen += sees
-    values[seen < needed_views(len(cameras), config)] = 0
-    return OccupancyGrid(values.view(*shape), bounds.low, voxel_m)
+    voxel_m, shape = _divide(bounds, config.resolution)
+    pool = max(1, int(_footprint_px(cameras, bounds, voxel_m) / config.pixels_per_voxel))
+    needed = needed_views(len(cameras), config)
+    if (kernels := _kernels(mask)) is None:
+        soft = _hull_torch.soften(mask, cameras.size_px, pool)
+        values = _hull_torch.carve(soft, pool, cameras, bounds.low, voxel_m, shape, needed)
+    else:
+        values = _carve_cpu(kernels, mask, pool, cameras, bounds.low, voxel_m, shape, needed)
+    return OccupancyGrid(values, bounds.low, voxel_m)
+
+
+def occupied_bounds(
+    mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
+) -> Bounds | None:
+    """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it."""
+    needed = needed_views(len(cameras), config)
+    kernels = _kernels(mask)
+    tiles = None if kernels is None else _count_tiles(kernels, mask)
+    for _ in range(config.coarse_passes):
+        block_m, shape = _divide(bounds, config.coarse_resolution)
+        if kernels is None or tiles is None:
+            occupied = _hull_torch.occupied_blocks(mask, TILE_PX, cameras, bounds.low, block_m, shape, needed)
+        else:
+            occupied = _occupied_cpu(kernels, tiles, cameras, bounds.low, block_m, shape, needed)
+        index = occupied.nonzero()
+        if not len(index):
+            return None
+        low = bounds.low + index.amin(0) * block_m
+        bounds = Bounds(low, torch.minimum(bounds.low + (index.amax(0) + 1) * block_m, bounds.high))
+    return bounds
 
 
 def needed_views(views: int, config: HullConfig) -> int:
     """How many of `views` cameras must see a point for it to count."""
     return max(min(config.min_views, views), math.ceil(config.min_share * views))
+
+
+def _divide(bounds: Bounds, resolution: int) -> tuple[float, tuple[int, int, int]]:
+    """The side of the cubes of which the longest side has `resolution`, and how many cover each axis."""
+    sides = bounds.size_m.tolist()
+    cube_m = max(sides) / resolution
+    x, y, z = (max(1, math.ceil(side / cube_m - 1e-3)) for side in sides)
+    return cube_m, (x, y, z)
+
+
+def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
+    """The image size of `length_m` at the middle of the bounds, in the median camera that has it in front."""
+    z = project(bounds.center[None], cameras)[1][:, 0]
+    size = (cameras.K[:, 0, 0] * length_m / z)[z > length_m]
+    return float(size.median()) if len(size) else 1.0
+
+
+def _kernels(mask: Tensor) -> ModuleType | None:
+    """The fast path for CPU tensors, where numba is installed."""
+    if mask.device.type != "cpu":
+        return None
+    try:
+        from viewmend.geometry import _hull_numba
+    except ImportError:
+        return None
+    return _hull_numba
+
+
+def _projections(cameras: Cameras) -> tuple[Float[Tensor, "view 3 4"], Float[Tensor, "view 4"]]:
+    """P = K [R t], and what `judge` wants of K."""
+    K = cameras.K.double()
+    lens = torch.stack([K[:, 0, 0] ** 2 + K[:, 0, 1] ** 2, K[:, 0, 2], K[:, 1, 1] ** 2, K[:, 1, 2]], -1)
+    return K @ cameras.camera_from_world[:, :3].double(), lens
+
+
+def _tile_sums(views: int, height: int, width: int, tile: int) -> Int[Tensor, "view row column 2"]:
+    return torch.empty(views, -(-height // tile) + 1, -(-width // tile) + 1, 2, dtype=torch.int32)
+
+
+def _carve_cpu(
+    kernels: ModuleType,
+    mask: UInt8[Tensor, "view height width"],
+    pool: int,
+    cameras: Cameras,
+    low: Float[Tensor, "3"],
+    voxel_m: float,
+    shape: tuple[int, int, int],
+    needed: int,
+) -> Float[Tensor, "x y z"]:
+    views, height, width = mask.shape
+    soft_rows, soft_columns = -(-height // pool), -(-width // pool)
+    soft = torch.empty(views, soft_rows + 1, soft_columns + 1, dtype=torch.uint8)
+    sums = _tile_sums(views, soft_rows, soft_columns, BLOCK).numpy()
+    values = torch.empty(shape)
+    masks, images, out, size = mask.numpy(), soft.numpy(), values.numpy(), cameras.size_px.numpy()
+    (P, lens), corner = (part.numpy() for part in _projections(cameras)), low.double().numpy()
+
+    def prepare(view: int) -> None:
+        columns, rows = size[view]
+        kernels.soften(masks[view], rows, columns, pool, images[view])
+        kernels.count_tiles(images[view], soft_rows, soft_columns, BLOCK, sums[view])
+
+    def carve(slab: int) -> None:
+        kernels.carve_blocks(
+            P, lens, size, images, pool, BLOCK, sums, corner, voxel_m, needed, BLOCK, slab * BLOCK, out
+        )
+
+    share(prepare, views)
+    share(carve, -(-shape[0] // BLOCK))
+    return values
+
+
+def _count_tiles(kernels: ModuleType, mask: UInt8[Tensor, "view height width"]) -> Int[Tensor, "view row column 2"]:
+    views, height, width = mask.shape
+    sums = _tile_sums(views, height, width, TILE_PX)
+    masks, out = mask.numpy(), sums.numpy()
+    share(lambda view: kernels.count_tiles(masks[view], height, width, TILE_PX, out[view]), views)
+    return sums
+
+
+def _occupied_cpu(
+    kernels: ModuleType,
+    tiles: Int[Tensor, "view row column 2"],
+    cameras: Cameras,
+    low: Float[Tensor, "3"],
+    block_m: float,
+    shape: tuple[int, int, int],
+    needed: int,
+) -> Bool[Tensor, "x y z"]:
+    occupied = torch.empty(shape, dtype=torch.bool)
+    sums, out, size = tiles.numpy(), occupied.numpy(), cameras.size_px.numpy()
+    (P, lens), corner = (part.numpy() for part in _projections(cameras)), low.double().numpy()
+
+    def judge(slab: int) -> None:
+        kernels.occupied_blocks(P, lens, size, TILE_PX, sums, corner, block_m, needed, slab, slab + 1, out)
+
+    share(judge, shape[0])
+    return occupied
 
 
 def check_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> None:
@@ -82,36 +204,6 @@ def check_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> N
             f"expected foreground in the masks, got none in any of {len(cameras)} cameras; check the masks' "
             "files and that 255 means foreground"
         )
-
-
-def soften(mask: UInt8[Tensor, "view height width"], blur_px: float) -> Float[Tensor, "view height width"]:
-    """Masks in [0, 1], blurred by a Gaussian of `blur_px` that continues the border's values beyond the image."""
-    soft = mask.float() / 255
-    if blur_px <= 0:
-        return soft
-    reach = math.ceil(2 * blur_px)
-    offsets = torch.arange(-reach, reach + 1, device=mask.device)
-    kernel = torch.exp(-0.5 * (offsets / blur_px) ** 2)
-    kernel /= kernel.sum()
-    padded = torch.nn.functional.pad(soft[:, None], (reach,) * 4, mode="replicate")
-    rows = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
-    return torch.nn.functional.conv2d(rows, kernel.view(1, 1, -1, 1))[:, 0]
-
-
-def _look_up(
-    soft: Float[Tensor, "height width"], camera: Cameras, points: Float[Tensor, "point 3"]
-) -> tuple[Float[Tensor, "point"], Tensor]:
-    """The mask's value at each point's image, bilinear, and whether the camera sees the point."""
-    P = camera.K[0] @ camera.camera_from_world[0, :3]
-    x, y, z = (points @ P[:, :3].T + P[:, 3]).unbind(-1)
-    width, height = camera.size_px[0].tolist()
-    u, v = x / z, y / z
-    sees = (z > NEAR_M) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    grid = torch.stack([2 * u / soft.shape[1] - 1, 2 * v / soft.shape[0] - 1], -1).nan_to_num(0, 0, 0)
-    value = torch.nn.functional.grid_sample(
-        soft[None, None], grid[None, None], padding_mode="border", align_corners=False
-    )
-    return value[0, 0, 0], sees
 
 
 def bounds_from_cameras(cameras: Cameras) -> Bounds:

@@ -1,6 +1,6 @@
 """The geometry proxy G[t] of section 1: a mesh of the subject that gives its depth in any camera."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, UInt8
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import HullConfig, bounds_from_masks, visual_hull
+from viewmend.geometry.hull import HullConfig, bounds_from_masks, occupied_bounds, visual_hull
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface
@@ -51,11 +51,6 @@ def reconstruct(
     """
     config = config or HullConfig()
     bounds = bounds or bounds_from_masks(mask, cameras)
-    coarse = visual_hull(mask, cameras, bounds, replace(config, resolution=config.coarse_resolution))
-    inside = (coarse.values > 0.05).nonzero()
-    if len(inside):
-        low = torch.maximum(coarse.low + (inside.amin(0) - 1) * coarse.voxel_m, bounds.low)
-        high = torch.minimum(coarse.low + (inside.amax(0) + 2) * coarse.voxel_m, bounds.high)
-        bounds = Bounds(low, high)
+    bounds = occupied_bounds(mask, cameras, bounds, config) or bounds
     mesh = extract_surface(visual_hull(mask, cameras, bounds, config))
     return GeometryProxy(mesh, vertex_normals(mesh), bounds)

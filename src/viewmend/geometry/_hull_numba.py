@@ -1,0 +1,217 @@
+"""The hull on the CPU, fast: blocks of space are judged whole, single voxels only where masks have edges."""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+
+UNSEEN, EMPTY, FULL, MIXED = 0, 1, 2, 3
+NEAR_M = 1e-6
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def soften(mask, rows, columns, pool, out):
+    """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
+
+    Beyond the image's own rows and columns its border continues, in the last row and column of `out` as well.
+    """
+    height, width = out.shape[0] - 1, out.shape[1] - 1
+    smooth = np.empty((height, width), np.int32)
+    column_sums = np.empty(width * pool, np.int32)
+    pooled = np.empty(width, np.int32)
+    for y in range(height):
+        column_sums[:] = 0
+        for j in range(pool):
+            line = mask[min(y * pool + j, rows - 1)]
+            for x in range(min(columns, width * pool)):
+                column_sums[x] += line[x]
+        for x in range(columns, width * pool):
+            column_sums[x] = column_sums[columns - 1]
+        for x in range(width):
+            total = 0
+            for i in range(pool):
+                total += column_sums[x * pool + i]
+            pooled[x] = total
+        for x in range(1, width - 1):
+            smooth[y, x] = pooled[x - 1] + 2 * pooled[x] + pooled[x + 1]
+        smooth[y, 0] = 3 * pooled[0] + pooled[min(1, width - 1)]
+        smooth[y, width - 1] = pooled[max(width - 2, 0)] + 3 * pooled[width - 1]
+    scale = np.float32(1) / np.float32(16 * pool * pool)
+    for y in range(height):
+        above, below = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(width):
+            total = smooth[above, x] + 2 * smooth[y, x] + smooth[below, x]
+            out[y, x] = np.uint8(np.float32(total) * scale + np.float32(0.5))
+        out[y, width] = out[y, width - 1]
+    out[height] = out[height - 1]
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def count_tiles(image, rows, columns, tile, sums):
+    """Summed-area tables: how many tiles have any foreground (sums[..., 0]), how many are all of it (sums[..., 1])."""
+    sums[:] = 0
+    largest, smallest = np.empty(columns, np.uint8), np.empty(columns, np.uint8)
+    for ty in range(sums.shape[0] - 1):
+        largest[:] = 0
+        smallest[:] = 255
+        for y in range(ty * tile, min(ty * tile + tile, rows)):
+            line = image[y]
+            for x in range(columns):
+                largest[x] = max(largest[x], line[x])
+                smallest[x] = min(smallest[x], line[x])
+        for tx in range(sums.shape[1] - 1):
+            some, full = 0, 1
+            for x in range(tx * tile, min(tx * tile + tile, columns)):
+                some |= largest[x] > 0
+                full &= smallest[x] == 255
+            sums[ty + 1, tx + 1, 0] = sums[ty, tx + 1, 0] + sums[ty + 1, tx, 0] - sums[ty, tx, 0] + some
+            sums[ty + 1, tx + 1, 1] = sums[ty, tx + 1, 1] + sums[ty + 1, tx, 1] - sums[ty, tx, 1] + full
+
+
+@njit(nogil=True, cache=True, inline="always")
+@no_type_check
+def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
+    """What one camera says about a ball: not in view, all background, all foreground, or mixed.
+
+    The ball's image lies within radius |p1 - u p3| / (depth - radius) of its centre's u, likewise v, where p1 and p3
+    are rows of P; with `lens` = (fx^2 + skew^2, cx, fy^2, cy), |p1 - u p3|^2 = fx^2 + skew^2 + (cx - u)^2.
+    """
+    depth = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+    if depth + radius <= NEAR_M:
+        return UNSEEN
+    if depth - radius <= NEAR_M:
+        return MIXED
+    inverse, reach = 1 / depth, radius / (depth - radius)
+    u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) * inverse
+    v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) * inverse
+    du = np.sqrt(lens[0] + (lens[1] - u) ** 2) * reach
+    dv = np.sqrt(lens[2] + (lens[3] - v) ** 2) * reach
+    width, height = size[0], size[1]
+    if u + du < 0 or u - du >= width or v + dv < 0 or v - dv >= height:
+        return UNSEEN
+    if u - du < 0 or u + du >= width or v - dv < 0 or v + dv >= height:
+        return MIXED
+    # Bilinear sampling reads the pixel before and the one after.
+    shrink, last_x, last_y = 1 / (pool * tile), sums.shape[1] - 2, sums.shape[0] - 2
+    margin = 1.5 * pool
+    left = np.int64(max(u - du - margin, 0.0) * shrink)
+    right = min(np.int64((u + du + margin) * shrink), last_x) + 1
+    top = np.int64(max(v - dv - margin, 0.0) * shrink)
+    bottom = min(np.int64((v + dv + margin) * shrink), last_y) + 1
+    some = sums[bottom, right, 0] - sums[top, right, 0] - sums[bottom, left, 0] + sums[top, left, 0]
+    if some == 0:
+        return EMPTY
+    full = sums[bottom, right, 1] - sums[top, right, 1] - sums[bottom, left, 1] + sums[top, left, 1]
+    return FULL if full == (bottom - top) * (right - left) else MIXED
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, first, end, occupied):
+    """Mark the blocks of slabs [first, end) along x that no camera calls empty and enough cameras may see."""
+    radius = block_m * np.sqrt(3.0) / 2
+    for i in range(first, end):
+        x = low[0] + (i + 0.5) * block_m
+        for j in range(occupied.shape[1]):
+            y = low[1] + (j + 0.5) * block_m
+            for k in range(occupied.shape[2]):
+                z = low[2] + (k + 0.5) * block_m
+                seen = 0
+                for view in range(P.shape[0]):
+                    verdict = judge(P[view], lens[view], x, y, z, radius, size[view], 1, tile, sums[view])
+                    if verdict == EMPTY:
+                        seen = -1
+                        break
+                    if verdict != UNSEEN:
+                        seen += 1
+                occupied[i, j, k] = seen >= needed
+
+
+@njit(nogil=True, cache=True)
+@no_type_check
+def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, block, first, values):
+    """Fill values[first : first + block]: the smallest mask value over the cameras that see each voxel's middle."""
+    end_x, end_y, end_z = min(first + block, values.shape[0]), values.shape[1], values.shape[2]
+    radius = voxel_m * np.sqrt(3.0) / 2 * (block - 1) + 1e-9
+    mixed = np.empty(P.shape[0], np.int64)
+    for first_y in range(0, end_y, block):
+        for first_z in range(0, end_z, block):
+            x = low[0] + (first + block / 2) * voxel_m
+            y = low[1] + (first_y + block / 2) * voxel_m
+            z = low[2] + (first_z + block / 2) * voxel_m
+            seen, undecided = 0, 0
+            for view in range(P.shape[0]):
+                verdict = judge(P[view], lens[view], x, y, z, radius, size[view], pool, tile, sums[view])
+                if verdict == EMPTY:
+                    seen = -1
+                    break
+                if verdict == FULL:
+                    seen += 1
+                elif verdict == MIXED:
+                    mixed[undecided] = view
+                    undecided += 1
+            box = values[first:end_x, first_y : min(first_y + block, end_y), first_z : min(first_z + block, end_z)]
+            if seen < 0 or seen + undecided < needed:
+                box[:] = 0
+            elif undecided == 0:
+                box[:] = 1
+            else:
+                corner = (low[0] + first * voxel_m, low[1] + first_y * voxel_m, low[2] + first_z * voxel_m)
+                carve_voxels(P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box)
+
+
+@njit(nogil=True, cache=True, fastmath=True)
+@no_type_check
+def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, values):
+    """Voxel by voxel: the smallest bilinear mask value over those of `views` that see it; 0 where too few do.
+
+    A run along z asks one camera after another, so that the arithmetic of its voxels shares vector instructions.
+    """
+    count = values.shape[2]
+    smallest, seen = np.empty(count, np.float32), np.empty(count, np.int32)
+    one, half, near = np.float32(1), np.float32(0.5), np.float32(NEAR_M)
+    last_y, last_x = np.float32(soft.shape[1] - 2), np.float32(soft.shape[2] - 2)
+    stride = np.int32(soft.shape[2])
+    for i in range(values.shape[0]):
+        x = low[0] + (i + 0.5) * voxel_m
+        for j in range(values.shape[1]):
+            y, z = low[1] + (j + 0.5) * voxel_m, low[2] + 0.5 * voxel_m
+            smallest[:] = 255
+            seen[:] = seen_before
+            for n in range(len(views)):
+                view = views[n]
+                p, image = P[view], soft[view].reshape(-1)
+                u0 = np.float32((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / pool)
+                v0 = np.float32((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / pool)
+                w0 = np.float32(p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3])
+                du, dv = np.float32(p[0, 2] * voxel_m / pool), np.float32(p[1, 2] * voxel_m / pool)
+                dw = np.float32(p[2, 2] * voxel_m)
+                width, height = np.float32(size[view, 0] / pool), np.float32(size[view, 1] / pool)
+                most = np.float32(0)
+                for k in range(count):
+                    step = np.float32(k)
+                    depth = w0 + step * dw
+                    inverse = one / max(depth, near)
+                    u, v = (u0 + step * du) * inverse, (v0 + step * dv) * inverse
+                    sees = (depth > near) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+                    across, down = min(max(u - half, np.float32(0)), last_x), min(max(v - half, np.float32(0)), last_y)
+                    left, top = np.int32(across), np.int32(down)
+                    a, b = across - np.float32(left), down - np.float32(top)
+                    at = top * stride + left
+                    one_one, one_two = np.float32(image[at]), np.float32(image[at + 1])
+                    two_one, two_two = np.float32(image[at + stride]), np.float32(image[at + stride + 1])
+                    over, under = one_one + a * (one_two - one_one), two_one + a * (two_two - two_one)
+                    value = over + b * (under - over)
+                    smallest[k] = min(smallest[k], value if sees else np.float32(255))
+                    seen[k] += sees
+                    most = max(most, smallest[k])
+                if most == 0:
+                    # The camera that empties one run will empty the next: ask it first.
+                    views[n], views[0] = views[0], view
+                    break
+            for k in range(count):
+                values[i, j, k] = smallest[k] / np.float32(255) if seen[k] >= needed else np.float32(0)
