@@ -1,0 +1,131 @@
+"""The files of `viewmend mend`: mended views, holes, and a contact sheet. All of them, or none."""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from viewmend.capture.images import write_image
+from viewmend.cli.contact_sheet import Tile, contact_sheet, picture
+from viewmend.cli.mending import MendStep
+from viewmend.views import IncompleteView
+
+SHEET_ROWS = 4
+HOLE_COLOUR = (1.0, 0.0, 1.0)
+DIFFERENCE_GAIN = 3.0
+
+
+class MendOutput:
+    """Takes one step after another; a context manager that puts the files into `out` when all went well.
+
+    Until then they lie in a hidden folder beside it, which an error removes.
+    """
+
+    def __init__(self, out: Path, fps: float):
+        self._out, self._fps = out, fps
+        out.parent.mkdir(parents=True, exist_ok=True)
+        self._draft = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
+        self._count = 0
+        self._rows: list[list[Tile]] = []
+        self._stride = 1
+
+    def __enter__(self) -> "MendOutput":
+        return self
+
+    def add(self, step: MendStep) -> None:
+        """Write one view and, of a few spread over the run, remember a row of the sheet."""
+        number = f"{self._count:06d}.png"
+        write_image(self._draft / "mended" / number, picture(step.completed.rgb))
+        write_image(self._draft / "holes" / number, picture(step.completed.view.error[None]))
+        if self._count % self._stride == 0:
+            if len(self._rows) == SHEET_ROWS:
+                self._rows, self._stride = self._rows[::2], 2 * self._stride
+            if self._count % self._stride == 0:
+                self._rows.append(sheet_row(step))
+        self._count += 1
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        try:
+            if kind is None and self._count:
+                write_image(self._draft / "contact_sheet.png", contact_sheet(self._rows, tile_width=260))
+                if self._count > 1:
+                    self._to_video()
+                self._publish()
+        finally:
+            shutil.rmtree(self._draft, ignore_errors=True)
+
+    def _to_video(self) -> None:
+        """Replace the mended pictures by a video, where PyAV is installed."""
+        import cv2
+
+        from viewmend.capture.video_writer import VideoWriter
+
+        pictures = sorted((self._draft / "mended").glob("*.png"))
+        try:
+            with VideoWriter(self._draft / "mended.mp4", self._fps) as video:
+                for file in pictures:
+                    image = cv2.imread(str(file))
+                    assert image is not None, f"{file} was just written"
+                    video.add(np.ascontiguousarray(image[..., ::-1]))
+        except ImportError:
+            return
+        shutil.rmtree(self._draft / "mended")
+
+    def _publish(self) -> None:
+        self._out.mkdir(parents=True, exist_ok=True)
+        for name in ("mended", "mended.mp4", "holes", "contact_sheet.png"):
+            old, new = self._out / name, self._draft / name
+            if old.is_dir():
+                shutil.rmtree(old)
+            old.unlink(missing_ok=True)
+            if new.exists():
+                new.rename(old)
+
+
+def sheet_row(step: MendStep) -> list[Tile]:
+    """Input cameras, rendered, holes marked, mended, truth and difference; cut to the subject."""
+    view, rgb = step.completed.view, step.completed.rgb
+    box = _box(view.mask > 0)
+    tiles = []
+    for name in view.chosen:
+        own = step.frame.select([name])
+        assert own.mask is not None, "frames without masks are refused"
+        tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > 127)]))
+    tiles += [
+        Tile(f"rendered, frame {view.time}", picture(view.rgb)[box]),
+        Tile("holes", picture(holes_marked(view))[box]),
+        Tile("mended", picture(rgb)[box]),
+    ]
+    if step.truth is None:
+        return tiles
+    difference = (DIFFERENCE_GAIN * (rgb - step.truth).abs()).clamp(0, 1)
+    return [
+        *tiles,
+        Tile("truth", picture(step.truth)[box]),
+        Tile(f"difference x{DIFFERENCE_GAIN:.0f}", picture(difference)[box]),
+    ]
+
+
+def holes_marked(view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    """F with the pixels of E in magenta."""
+    colour = torch.tensor(HOLE_COLOUR, device=view.rgb.device)[:, None, None]
+    return torch.lerp(view.rgb, colour.expand_as(view.rgb), view.error)
+
+
+def side_by_side(*images: Float[Tensor, "3 height width"]) -> UInt8[np.ndarray, "height total_width 3"]:
+    """Pictures in a row."""
+    return picture(torch.cat(images, -1))
+
+
+def _box(mask: Tensor) -> tuple[slice, slice]:
+    """Rows and columns of what is not empty, and a margin; all where it is empty."""
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    if not len(rows):
+        return slice(None), slice(None)
+    margin = 4 + len(rows) // 20
+    top, bottom, left, right = int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
+    return slice(max(0, top - margin), bottom + 1 + margin), slice(max(0, left - margin), right + 1 + margin)
