@@ -1,6 +1,9 @@
-"""The shading's fast path on the CPU: scalar loops compiled by numba."""
+"""The shading's fast path on the CPU: scalar loops compiled by numba.
 
-from typing import no_type_check
+Rows of arrays are never sliced in the loops: each slice counts references, which threads then fight over.
+"""
+
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from numba import njit
@@ -8,135 +11,161 @@ from numba import njit
 # Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
 
 
+class Scene(NamedTuple):
+    """What all views share, as arrays."""
+
+    vertex: np.ndarray
+    """(vertex, 11) float32: x y z, u v, normal, irradiance."""
+    faces: np.ndarray
+    textures: np.ndarray
+    """(face): which texture."""
+    texels: np.ndarray
+    first: np.ndarray
+    size: np.ndarray
+    lamps: np.ndarray
+    gloss: np.ndarray
+    doublings: int
+    steps: np.ndarray
+    guesses: np.ndarray
+    """`encoding()`."""
+
+
+class View(NamedTuple):
+    """One view, as arrays."""
+
+    ids: np.ndarray
+    """(fine row, fine column): face or -1."""
+    projected: np.ndarray
+    """(vertex, 3) float64: P X in fine pixels."""
+    center: np.ndarray
+    behind: np.ndarray
+    """(3, row, column): background, linear light."""
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def shade_band(
-    ids, P, center, vertex, faces, textures, texels, first, size, lamps, gloss, doublings, behind, rows, rgb, mask
-):
-    """Fill rows [rows[0], rows[1]) of one view's rgb (3, h, w) and mask (h, w); see `render.shade_torch`.
-
-    `vertex` has the columns x y z, u v, normal, irradiance.
-    """
-    n = ids.shape[0] // mask.shape[0]
-    sums, sample, at = np.zeros(3, np.float32), np.zeros(3, np.float32), np.zeros(vertex.shape[1], np.float32)
-    corners = np.zeros((3, 3))
-    for row in range(rows[0], rows[1]):
+def shade_band(scene, view, first_row, end_row, rgb, mask):
+    """Fill rows [first_row, end_row) of one view's rgb (3, h, w) and mask (h, w); see `render.shade_torch`."""
+    n = view.ids.shape[0] // mask.shape[0]
+    sums, color, at = np.zeros(3, np.float32), np.zeros(3, np.float32), np.zeros(11, np.float32)
+    whole = np.float32(n * n)
+    for row in range(first_row, end_row):
         for column in range(mask.shape[1]):
             count = 0
             sums[:] = 0
             for y in range(row * n, row * n + n):
                 for x in range(column * n, column * n + n):
-                    face = ids[y, x]
+                    face = view.ids[y, x]
                     if face < 0:
                         continue
                     count += 1
-                    sizes = size[textures[face]]
-                    interpolate(corners, vertex, faces[face], P, x + 0.5, y + 0.5, at)
-                    level = texture_level(corners, vertex, faces[face], sizes)
-                    texture_color(texels, first[textures[face]], sizes, at[3], at[4], level, sample)
-                    add_highlights(at, center, lamps, gloss, doublings, sample)
+                    level = interpolate(scene, view.projected, face, x + 0.5, y + 0.5, at)
+                    texture_color(scene, scene.textures[face], at[3], at[4], level, color)
+                    add_highlights(scene, view.center, at, color)
                     for c in range(3):
-                        sums[c] += at[8 + c] * sample[c]
-            mask[row, column] = np.uint8(np.rint(np.float32(255) * count / (n * n)))
-            free = np.float32(1) - np.float32(count) / np.float32(n * n)
+                        sums[c] += at[8 + c] * color[c]
+            mask[row, column] = np.uint8(np.rint(np.float32(255) * count / whole))
+            free = np.float32(1) - np.float32(count) / whole
             for c in range(3):
-                rgb[c, row, column] = encode(sums[c] / np.float32(n * n) + free * behind[c, row, column])
+                linear = sums[c] / whole + free * view.behind[c, row, column]
+                rgb[c, row, column] = encode(linear, scene.steps, scene.guesses)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def interpolate(corners, vertex, face, P, u, v, at):
-    """Fill `at` with the vertex columns of a face at pixel (u, v), perspective-correct (see the rasteriser)."""
-    for k in range(3):
-        for r in range(3):
-            corners[k, r] = P[r, 3]
-            for c in range(3):
-                corners[k, r] += P[r, c] * np.float64(vertex[face[k], c])
-    total = 0.0
-    a = edge(corners[1], corners[2], u, v)
-    b = edge(corners[2], corners[0], u, v)
-    c = edge(corners[0], corners[1], u, v)
+def interpolate(scene, projected, face, u, v, at):
+    """Fill `at` with the vertex columns of a face at pixel (u, v), perspective-correct (see the rasteriser).
+
+    Returns the texture level at which a texel is as large as a pixel.
+    """
+    i, j, k = scene.faces[face, 0], scene.faces[face, 1], scene.faces[face, 2]
+    ax, ay, az = projected[i, 0], projected[i, 1], projected[i, 2]
+    bx, by, bz = projected[j, 0], projected[j, 1], projected[j, 2]
+    cx, cy, cz = projected[k, 0], projected[k, 1], projected[k, 2]
+    a = (by * cz - bz * cy) * u + (bz * cx - bx * cz) * v + (bx * cy - by * cx)
+    b = (cy * az - cz * ay) * u + (cz * ax - cx * az) * v + (cx * ay - cy * ax)
+    c = (ay * bz - az * by) * u + (az * bx - ax * bz) * v + (ax * by - ay * bx)
     total = a + b + c
     wa, wb, wc = np.float32(a / total), np.float32(b / total), np.float32(c / total)
-    for k in range(at.shape[0]):
-        at[k] = wa * vertex[face[0], k] + wb * vertex[face[1], k] + wc * vertex[face[2], k]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
-def texture_level(corners, vertex, face, sizes):
-    """The level of a face, whose `corners` are P X, at which a texel is as large as a pixel."""
-    if corners[0, 2] <= 0 or corners[1, 2] <= 0 or corners[2, 2] <= 0:
+    vertex = scene.vertex
+    for n in range(11):
+        at[n] = wa * vertex[i, n] + wb * vertex[j, n] + wc * vertex[k, n]
+    if az <= 0 or bz <= 0 or cz <= 0:
         return 0.0
-    a, b, c = vertex[face[0]], vertex[face[1]], vertex[face[2]]
-    texels = np.abs((b[3] - a[3]) * (c[4] - a[4]) - (b[4] - a[4]) * (c[3] - a[3])) * sizes[0, 0] * sizes[0, 1] / 2
-    x0, y0 = corners[0, 0] / corners[0, 2], corners[0, 1] / corners[0, 2]
-    x1, y1 = corners[1, 0] / corners[1, 2] - x0, corners[1, 1] / corners[1, 2] - y0
-    x2, y2 = corners[2, 0] / corners[2, 2] - x0, corners[2, 1] / corners[2, 2] - y0
-    pixels = np.abs(x1 * y2 - y1 * x2) / 2
-    ratio = max(texels / max(pixels, 1e-6), 1e-6)
-    return min(max(0.5 * np.log2(ratio), 0.0), sizes.shape[0] - 1.0)
-
-
-@njit(nogil=True, cache=True, inline="always")
-@no_type_check
-def edge(p, q, u, v):
-    """(p x q) . (u, v, 1)."""
-    return (p[1] * q[2] - p[2] * q[1]) * u + (p[2] * q[0] - p[0] * q[2]) * v + (p[0] * q[1] - p[1] * q[0])
+    texture = scene.textures[face]
+    u1, v1 = vertex[j, 3] - vertex[i, 3], vertex[j, 4] - vertex[i, 4]
+    u2, v2 = vertex[k, 3] - vertex[i, 3], vertex[k, 4] - vertex[i, 4]
+    texels = np.abs(u1 * v2 - v1 * u2) * scene.size[texture, 0, 0] * scene.size[texture, 0, 1]
+    x0, y0 = ax / az, ay / az
+    pixels = np.abs((bx / bz - x0) * (cy / cz - y0) - (by / bz - y0) * (cx / cz - x0))
+    level = 0.5 * np.log2(max(texels / max(pixels, 2e-6), 1e-6))
+    return min(max(level, 0.0), scene.first.shape[1] - 1.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def texture_color(texels, first, size, u, v, level, out):
+def texture_color(scene, texture, u, v, level, out):
     """Fill `out` with the trilinear look-up in one texture's levels, clamped at its edges."""
-    low = int(np.floor(level))
+    texels, low = scene.texels, int(level)
     out[:] = 0
     for step in range(2):
-        at = min(low + step, first.shape[0] - 1)
         share = np.float32(level - low) if step == 1 else np.float32(1 - (level - low))
         if share <= 0:
             continue
-        width, height = size[at, 0], size[at, 1]
-        x = min(max(np.float32(u * width) - np.float32(0.5), np.float32(0)), np.float32(width - 1))
-        y = min(max(np.float32(v * height) - np.float32(0.5), np.float32(0)), np.float32(height - 1))
+        at = min(low + step, scene.first.shape[1] - 1)
+        width, height, base = scene.size[texture, at, 0], scene.size[texture, at, 1], scene.first[texture, at]
+        x = min(max(u * np.float32(width) - np.float32(0.5), np.float32(0)), np.float32(width - 1))
+        y = min(max(v * np.float32(height) - np.float32(0.5), np.float32(0)), np.float32(height - 1))
         x0, y0 = int(x), int(y)
-        x1, y1 = min(x0 + 1, width - 1), min(y0 + 1, height - 1)
-        fx, fy = np.float32(x - x0), np.float32(y - y0)
-        base = first[at]
+        fx, fy = x - np.float32(x0), y - np.float32(y0)
+        right = 1 if x0 + 1 < width else 0
+        top = base + y0 * width + x0
+        bottom = top + (width if y0 + 1 < height else 0)
         for c in range(3):
-            top = texels[base + y0 * width + x0, c] * (1 - fx) + texels[base + y0 * width + x1, c] * fx
-            bottom = texels[base + y1 * width + x0, c] * (1 - fx) + texels[base + y1 * width + x1, c] * fx
-            out[c] += share * (top * (1 - fy) + bottom * fy)
+            above = texels[top, c] + fx * (texels[top + right, c] - texels[top, c])
+            below = texels[bottom, c] + fx * (texels[bottom + right, c] - texels[bottom, c])
+            out[c] += share * (above + fy * (below - above))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def add_highlights(at, center, lamps, gloss, doublings, out):
+def add_highlights(scene, center, at, out):
     """Add the Blinn-Phong highlights of all lamps to a colour."""
     ex, ey, ez = center[0] - at[0], center[1] - at[1], center[2] - at[2]
-    scale = 1 / np.sqrt(ex * ex + ey * ey + ez * ez)
+    scale = np.float32(1) / np.sqrt(ex * ex + ey * ey + ez * ez)
     ex, ey, ez = ex * scale, ey * scale, ez * scale
-    length = np.sqrt(at[5] * at[5] + at[6] * at[6] + at[7] * at[7])
-    for k in range(lamps.shape[0]):
-        hx, hy, hz = ex + lamps[k, 0], ey + lamps[k, 1], ez + lamps[k, 2]
-        half = np.sqrt(hx * hx + hy * hy + hz * hz)
-        power = (at[5] * hx + at[6] * hy + at[7] * hz) / max(half * length, np.float32(1e-12))
-        if power <= 0:
+    length = at[5] * at[5] + at[6] * at[6] + at[7] * at[7]
+    for k in range(scene.lamps.shape[0]):
+        hx, hy, hz = ex + scene.lamps[k, 0], ey + scene.lamps[k, 1], ez + scene.lamps[k, 2]
+        facing = at[5] * hx + at[6] * hy + at[7] * hz
+        if facing <= 0:
             continue
-        for _ in range(doublings):
+        # The cosine's square: one doubling of its power is saved, and two roots.
+        power = facing * facing / max((hx * hx + hy * hy + hz * hz) * length, np.float32(1e-12))
+        for _ in range(scene.doublings - 1):
             power = power * power
         for c in range(3):
-            out[c] += power * gloss[k, c]
+            out[c] += power * scene.gloss[k, c]
+
+
+def encoding(entries=4096):
+    """Tables for `encode`: the linear light half way between 8-bit sRGB levels, and a level not above each entry's."""
+    halves = (np.arange(255) + 0.5) / 255
+    steps = np.where(halves <= 0.04045, halves / 12.92, ((halves + 0.055) / 1.055) ** 2.4)
+    return steps, np.searchsorted(steps, np.arange(entries + 1) / entries)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def encode(linear):
-    """8-bit sRGB of linear light."""
-    value = min(max(linear, np.float32(0)), np.float32(1))
-    if value <= 0.0031308:
-        return np.uint8(np.rint(value * 12.92 * 255))
-    return np.uint8(np.rint((1.055 * value ** (1 / 2.4) - 0.055) * 255))
+def encode(linear, steps, guesses):
+    """8-bit sRGB of linear light, by tables: a power for each pixel would cost more than its shading."""
+    if not linear > 0:
+        return np.uint8(0)
+    value = min(np.float64(linear), 1.0)
+    level = guesses[int(value * (len(guesses) - 1))]
+    while level < 255 and value > steps[level]:
+        level += 1
+    return np.uint8(level)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

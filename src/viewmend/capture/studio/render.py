@@ -160,23 +160,21 @@ def _shade_cpu(
     """`shade_torch` by numba: bands of rows, shared among threads."""
     scene, lights, pyramid = surface.scene, surface.lights, surface.pyramid
     views, _, height, width = background.shape
-    P = (fine.K.double() @ fine.camera_from_world[:, :3].double()).numpy()
-    vertex = torch.cat([scene.mesh.vertices, scene.uv, scene.normals, surface.irradiance], 1).float().numpy()
+    P = fine.K.double() @ fine.camera_from_world[:, :3].double()
+    projected = scene.mesh.vertices.double() @ P[:, :, :3].mT + P[:, None, :, 3]
+    vertex = torch.cat([scene.mesh.vertices, scene.uv, scene.normals, surface.irradiance], 1).float()
+    parts = (vertex, scene.mesh.faces, scene.texture_of_face, pyramid.texels, pyramid.first, pyramid.size)
+    arrays = [t.contiguous().numpy() for t in (*parts, lights.lamps, lights.gloss)]
+    shared = kernels.Scene(*arrays, GLOSS_DOUBLINGS, *kernels.encoding())
+    seen = [t.contiguous().numpy() for t in (triangle, projected, fine.centers, background)]
     rgb = torch.zeros(views, 3, height, width, dtype=torch.uint8)
     mask = torch.zeros(views, height, width, dtype=torch.uint8)
-    arrays = [
-        scene.mesh.faces.numpy(), scene.texture_of_face.numpy(), pyramid.texels.numpy(), pyramid.first.numpy(),
-        pyramid.size.numpy(), lights.lamps.numpy(), lights.gloss.numpy(),
-    ]  # fmt: skip
-    centers, ids = fine.centers.numpy(), triangle.numpy()
-    behind, colors, covers = background.contiguous().numpy(), rgb.numpy(), mask.numpy()
+    colors, covers = rgb.numpy(), mask.numpy()
 
     def draw(item: int) -> None:
         v, band = divmod(item, BANDS)
         rows = (height * band // BANDS, height * (band + 1) // BANDS)
-        kernels.shade_band(
-            *(ids[v], P[v], centers[v], vertex, *arrays, GLOSS_DOUBLINGS, behind[v], rows, colors[v], covers[v])
-        )
+        kernels.shade_band(shared, kernels.View(*(a[v] for a in seen)), *rows, colors[v], covers[v])
 
     share(draw, views * BANDS)
     return rgb, mask
