@@ -66,11 +66,13 @@ def run(options: Options) -> int:
     capture = _open(options)
     times = _times(options.frames, len(capture.frame_ids))
     inpainter = load_named(options.model, options.top_k, options.device)
-    mender = Mender(inpainter, options.context, capture.bounds, options.leave_out)
+    held = () if options.leave_out is None else (options.leave_out,)
+    mender = Mender(inpainter, options.context, capture.bounds, held)
     summary = MendSummary()
     with MendOutput(options.out, fps=capture.fps or 15.0) as output:
         for frame, target in track(_views(options, capture, times), "mending", _count(options, capture, times)):
-            step = mender.mend(frame, target)
+            truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
+            step = mender.mend(frame.without(held), target, truth)
             summary.add(step)
             output.add(step)
     say(f"wrote {options.out}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.capture.images import write_image
@@ -51,7 +51,7 @@ class MendOutput:
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
             if kind is None and self._count:
-                write_image(self._draft / "contact_sheet.png", contact_sheet(self._rows, tile_width=260))
+                write_image(self._draft / "contact_sheet.png", contact_sheet(self._rows, 260, 400))
                 if self._count > 1:
                     self._to_video()
                 self._publish()
@@ -114,11 +114,6 @@ def holes_marked(view: IncompleteView) -> Float[Tensor, "3 height width"]:
     """F with the pixels of E in magenta."""
     colour = torch.tensor(HOLE_COLOUR, device=view.rgb.device)[:, None, None]
     return torch.lerp(view.rgb, colour.expand_as(view.rgb), view.error)
-
-
-def side_by_side(*images: Float[Tensor, "3 height width"]) -> UInt8[np.ndarray, "height total_width 3"]:
-    """Pictures in a row."""
-    return picture(torch.cat(images, -1))
 
 
 def _box(mask: Tensor) -> tuple[slice, slice]:

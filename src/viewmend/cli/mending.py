@@ -1,5 +1,6 @@
 """One stream of mended views, with what a command shows and scores of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,6 +19,15 @@ from viewmend.views import CompletedView, MultiViewFrame
 
 
 @dataclass(frozen=True)
+class Scores:
+    """The same view filled in three ways, against the truth."""
+
+    unfilled: ViewScores
+    telea: ViewScores
+    ours: ViewScores
+
+
+@dataclass(frozen=True)
 class MendStep:
     """One mended view and what is known of it."""
 
@@ -25,59 +35,63 @@ class MendStep:
     """The input cameras."""
     completed: CompletedView
     truth: Float[Tensor, "3 height width"] | None
-    """What the camera that was left out saw, background black; None without one, or in a gap of it."""
-    ours: ViewScores | None
-    telea: ViewScores | None
+    """What the view should look like, background black; None where nobody knows."""
+    scores: Scores | None
+    """None without truth."""
     hull_iou: dict[str, float]
-    """The hull's silhouette against the mask, for each camera, the one left out included."""
+    """The hull's silhouette against the mask, for each input camera and the truth."""
     stage_ms: StageMs
 
 
 class Mender:
-    """Runs the pipeline over a stream; `held` is used for nothing but scores."""
+    """Runs the pipeline over a stream of frames, and judges what comes out."""
 
-    def __init__(self, inpainter: ViewInpainter, context: int, bounds: Bounds | None, held: str | None):
+    def __init__(self, inpainter: ViewInpainter, context: int, bounds: Bounds | None, exclude: Sequence[str] = ()):
         self.inpainter = inpainter
         self.config = PipelineConfig(render=RenderConfig(cameras=context))
         self.bounds = bounds
-        self.held = held
+        self.exclude = exclude
         self._state: StreamState | None = None
         self._observation: Observation | None = None
 
-    def mend(self, frame: MultiViewFrame, target: Cameras) -> MendStep:
-        """The next view of the stream; the same frame may be looked at many times."""
-        inputs = frame if self.held is None else frame.without([self.held])
+    def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
+        """The next view of the stream; the same frame may be looked at many times.
+
+        Args:
+            frame: the input cameras.
+            target: the novel view's camera.
+            truth: what a camera there saw (one view), used for scores alone.
+        """
         bounds = None if self.bounds is None else self.bounds.to(frame.rgb.device)
         state = self._state or StreamState(self.inpainter.initial_state())
         if self._state is None:
             # Once unseen, so that what is compiled at first use is in no time that is shown.
-            warm = observe(inputs, bounds, self.config)
-            mend_view(warm, target, state, self.inpainter, self.config)
+            warm = observe(frame, bounds, self.config)
+            mend_view(warm, target, state, self.inpainter, self.config, self.exclude)
         if self._observation is None or self._observation.frame.time != frame.time:
-            self._observation = observe(inputs, bounds, self.config)
-        held = () if self.held is None else (self.held,)
-        mended = mend_view(self._observation, target, state, self.inpainter, self.config, held)
+            self._observation = observe(frame, bounds, self.config)
+        mended = mend_view(self._observation, target, state, self.inpainter, self.config, self.exclude)
         self._state = mended.state
-        return self._judge(frame, self._observation, mended.completed, mended.stage_ms)
+        iou = _hull_iou(self._observation)
+        if truth is None:
+            return MendStep(frame, mended.completed, None, None, iou, mended.stage_ms)
+        image, scores = _judge(mended.completed, truth)
+        if scores.ours.hull_iou is not None:
+            iou[truth.cameras.names[0]] = scores.ours.hull_iou
+        return MendStep(frame, mended.completed, image, scores, iou, mended.stage_ms)
 
-    def _judge(
-        self, frame: MultiViewFrame, observation: Observation, completed: CompletedView, stage_ms: StageMs
-    ) -> MendStep:
-        view, iou = completed.view, _hull_iou(observation)
-        if self.held is None or self.held not in frame.cameras.names:
-            return MendStep(observation.frame, completed, None, None, None, iou, stage_ms)
-        height, width = view.mask.shape
-        own = frame.select([self.held])
-        assert own.mask is not None, "frames without masks are refused"
-        mask = own.mask[0, :height, :width]
-        truth = own.rgb[0, :, :height, :width] / 255 * (mask / 255)
-        ours = score_view(view, completed.rgb, truth, mask > 127)
-        baseline = Telea()
-        filled, _ = baseline.step(view, lambda time, names: None, baseline.initial_state())
-        telea = score_view(view, filled.rgb, truth, mask > 127)
-        if ours.hull_iou is not None:
-            iou[self.held] = ours.hull_iou
-        return MendStep(observation.frame, completed, truth, ours, telea, iou, stage_ms)
+
+def _judge(completed: CompletedView, truth: MultiViewFrame) -> tuple[Float[Tensor, "3 height width"], Scores]:
+    """The true image on black, and the scores against it."""
+    view = completed.view
+    height, width = view.mask.shape
+    assert truth.mask is not None, "frames without masks are refused"
+    mask = truth.mask[0, :height, :width]
+    image = truth.rgb[0, :, :height, :width] / 255 * (mask / 255)
+    baseline = Telea()
+    filled, _ = baseline.step(view, lambda time, names: None, baseline.initial_state())
+    unfilled, telea, ours = (score_view(view, rgb, image, mask > 127) for rgb in (view.rgb, filled.rgb, completed.rgb))
+    return image, Scores(unfilled, telea, ours)
 
 
 def _hull_iou(observation: Observation) -> dict[str, float]:

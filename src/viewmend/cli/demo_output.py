@@ -1,0 +1,68 @@
+"""The files of `viewmend demo`: a video of all stages side by side, and a contact sheet."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from viewmend.capture.images import write_image
+from viewmend.capture.video_writer import VideoWriter
+from viewmend.cli.console import say
+from viewmend.cli.contact_sheet import Tile, contact_sheet, picture
+from viewmend.cli.mend_output import SHEET_ROWS, holes_marked, sheet_row
+from viewmend.cli.mending import MendStep
+
+APART = 4
+"""Frames of the sheet are at least so many apart."""
+
+
+def write_demo(out: Path, steps: Sequence[MendStep], fps: float) -> list[Path]:
+    """Write demo.mp4 (frames/*.png without PyAV) and contact_sheet.png into `out`; the files written.
+
+    The sheet shows the frames with the most holes, in order of time.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    panels = [_panel(step) for step in steps]
+    files = [_write_video(out / "demo.mp4", panels, fps)]
+    rows = [sheet_row(steps[n]) for n in _worth_seeing(steps)]
+    write_image(out / "contact_sheet.png", contact_sheet(rows, 260, 340))
+    return [*files, out / "contact_sheet.png"]
+
+
+def _worth_seeing(steps: Sequence[MendStep]) -> list[int]:
+    """A few frames with many holes, some frames apart, in order of time."""
+    chosen: list[int] = []
+    for n in sorted(range(len(steps)), key=lambda n: -float(steps[n].completed.view.error.sum())):
+        if len(chosen) < SHEET_ROWS and all(abs(n - other) >= APART for other in chosen):
+            chosen.append(n)
+    return sorted(chosen)
+
+
+def _panel(step: MendStep) -> UInt8[np.ndarray, "height width 3"]:
+    view = step.completed.view
+    assert step.truth is not None, "the studio knows the truth"
+    tiles = [
+        Tile("rendered", picture(view.rgb)),
+        Tile("holes", picture(holes_marked(view))),
+        Tile("mended", picture(step.completed.rgb)),
+        Tile("truth", picture(step.truth)),
+    ]
+    return contact_sheet([tiles], view.rgb.shape[2])
+
+
+def _write_video(file: Path, panels: Sequence[UInt8[np.ndarray, "height width 3"]], fps: float) -> Path:
+    beside = file.with_name(f".{file.name}.part.mp4")
+    try:
+        with VideoWriter(beside, fps) as video:
+            for panel in panels:
+                video.add(panel)
+        beside.replace(file)
+    except ImportError as missing:
+        say(f"{missing}; writing pictures instead")
+        for n, panel in enumerate(panels):
+            write_image(file.parent / "frames" / f"{n:06d}.png", panel)
+        return file.parent / "frames"
+    finally:
+        beside.unlink(missing_ok=True)
+    return file
