@@ -1,4 +1,4 @@
-"""How fast the studio draws: python benchmarks/studio.py [--performers DIR --motions DIR] [--device cuda] [--json F]."""
+"""How fast the studio draws: python benchmarks/studio.py [--performers DIR --motions DIR] [--json FILE]."""
 
 import argparse
 import json

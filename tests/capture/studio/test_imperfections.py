@@ -90,6 +90,18 @@ def test_holes_lie_in_the_subject_and_blobs_add(frame):
     assert bool((blobs >= frame.mask).all()) and not torch.equal(blobs, frame.mask)
 
 
+def test_mask_outlines_wander_by_about_what_they_say(frame):
+    y, x = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
+    radius = ((x - 25) ** 2 + (y - 20) ** 2).float().sqrt()
+    areas = []
+    for seed in range(30):
+        mask = imperfect_frame(frame, Imperfections(mask_edge_px=1.0), seed).mask[0]
+        assert int(mask[radius > 20].max()) == 0 and int(mask[radius < 10].min()) == 255
+        areas.append(float(mask.sum()) / 255)
+    radii = (torch.tensor(areas) / torch.pi).sqrt()
+    assert 0.4 < float(radii.std()) < 1.2 and abs(float(radii.mean()) - 15) < 0.5
+
+
 def test_spill_stains_the_outline_alone(frame):
     out = imperfect_frame(frame, Imperfections(spill=0.8), 2, background(frame)).rgb
     changed = (out != frame.rgb).any(1)

@@ -85,6 +85,8 @@ def imperfect_frame(
         seed: of the capture; the same seed, camera position and time give the same errors.
         background: what the images have behind the subject, linear light; only `spill` uses it.
     """
+    if imperfections == Imperfections():
+        return frame
     assert frame.mask is not None, "the studio always knows its masks"
     rgb, mask = [], []
     for n, (width, height) in enumerate(frame.cameras.size_px.tolist()):
@@ -144,7 +146,9 @@ def _mask(
         lean = torch.randn((), generator=_generator(seed, 5, view, 0)).to(value)
         # A blurred straight edge has the slope 0.4 / sigma: this moves its half level by about mask_edge_px.
         shift = 0.4 * it.mask_edge_px / sigma * (0.7 * wander + 0.7 * lean)
-        value = (1.5 * (_blurred(value, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
+        # Bounded so that, with this gain, what is flat stays flat: 2.5 (0.5 - 0.3) = 0.5.
+        shift = 0.3 * torch.tanh(shift / 0.3)
+        value = (2.5 * (_blurred(value, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
     return (value * 255).round().to(torch.uint8)
 
 
