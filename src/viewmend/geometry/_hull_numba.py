@@ -11,7 +11,7 @@ UNSEEN, EMPTY, FULL, MIXED = 0, 1, 2, 3
 NEAR_M = 1e-6
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def soften(mask, rows, columns, pool, out):
     """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
@@ -49,7 +49,7 @@ def soften(mask, rows, columns, pool, out):
     out[height] = out[height - 1]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def count_tiles(image, rows, columns, tile, sums):
     """Summed-area tables: how many tiles have any foreground (sums[..., 0]), how many are all of it (sums[..., 1])."""
@@ -72,7 +72,7 @@ def count_tiles(image, rows, columns, tile, sums):
             sums[ty + 1, tx + 1, 1] = sums[ty, tx + 1, 1] + sums[ty + 1, tx, 1] - sums[ty, tx, 1] + full
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
 def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
     """What one camera says about a ball: not in view, all background, all foreground, or mixed.
@@ -109,7 +109,7 @@ def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
     return FULL if full == (bottom - top) * (right - left) else MIXED
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, first, end, occupied):
     """Mark the blocks of slabs [first, end) along x that no camera calls empty and enough cameras may see."""
@@ -131,13 +131,14 @@ def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, first, end,
                 occupied[i, j, k] = seen >= needed
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, block, first, values):
     """Fill values[first : first + block]: the smallest mask value over the cameras that see each voxel's middle."""
     end_x, end_y, end_z = min(first + block, values.shape[0]), values.shape[1], values.shape[2]
     radius = voxel_m * np.sqrt(3.0) / 2 * (block - 1) + 1e-9
     mixed = np.empty(P.shape[0], np.int64)
+    scratch = np.empty((8, block**3), np.float32)
     for first_y in range(0, end_y, block):
         for first_z in range(0, end_z, block):
             x = low[0] + (first + block / 2) * voxel_m
@@ -161,57 +162,93 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
                 box[:] = 1
             else:
                 corner = (low[0] + first * voxel_m, low[1] + first_y * voxel_m, low[2] + first_z * voxel_m)
-                carve_voxels(P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box)
+                carve_voxels(P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box, scratch)
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, values):
+def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, values, scratch):
     """Voxel by voxel: the smallest bilinear mask value over those of `views` that see it; 0 where too few do.
 
-    A run along z asks one camera after another, so that the arithmetic of its voxels shares vector instructions.
+    One camera after another is asked about the voxels that are left, gathered at the front of `scratch`.
     """
-    count = values.shape[2]
-    smallest, seen = np.empty(count, np.float32), np.empty(count, np.int32)
-    one, half, near = np.float32(1), np.float32(0.5), np.float32(NEAR_M)
-    last_y, last_x = np.float32(soft.shape[1] - 2), np.float32(soft.shape[2] - 2)
-    stride = np.int32(soft.shape[2])
+    x, y, z, smallest, seen, place = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]
+    left = 0
     for i in range(values.shape[0]):
-        x = low[0] + (i + 0.5) * voxel_m
         for j in range(values.shape[1]):
-            y, z = low[1] + (j + 0.5) * voxel_m, low[2] + 0.5 * voxel_m
-            smallest[:] = 255
-            seen[:] = seen_before
-            for n in range(len(views)):
-                view = views[n]
-                p, image = P[view], soft[view].reshape(-1)
-                u0 = np.float32((p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]) / pool)
-                v0 = np.float32((p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]) / pool)
-                w0 = np.float32(p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3])
-                du, dv = np.float32(p[0, 2] * voxel_m / pool), np.float32(p[1, 2] * voxel_m / pool)
-                dw = np.float32(p[2, 2] * voxel_m)
-                width, height = np.float32(size[view, 0] / pool), np.float32(size[view, 1] / pool)
-                most = np.float32(0)
-                for k in range(count):
-                    step = np.float32(k)
-                    depth = w0 + step * dw
-                    inverse = one / max(depth, near)
-                    u, v = (u0 + step * du) * inverse, (v0 + step * dv) * inverse
-                    sees = (depth > near) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-                    across, down = min(max(u - half, np.float32(0)), last_x), min(max(v - half, np.float32(0)), last_y)
-                    left, top = np.int32(across), np.int32(down)
-                    a, b = across - np.float32(left), down - np.float32(top)
-                    at = top * stride + left
-                    one_one, one_two = np.float32(image[at]), np.float32(image[at + 1])
-                    two_one, two_two = np.float32(image[at + stride]), np.float32(image[at + stride + 1])
-                    over, under = one_one + a * (one_two - one_one), two_one + a * (two_two - two_one)
-                    value = over + b * (under - over)
-                    smallest[k] = min(smallest[k], value if sees else np.float32(255))
-                    seen[k] += sees
-                    most = max(most, smallest[k])
-                if most == 0:
-                    # The camera that empties one run will empty the next: ask it first.
-                    views[n], views[0] = views[0], view
-                    break
-            for k in range(count):
-                values[i, j, k] = smallest[k] / np.float32(255) if seen[k] >= needed else np.float32(0)
+            for k in range(values.shape[2]):
+                x[left], y[left], z[left] = i, j, k
+                smallest[left], seen[left], place[left] = 255, seen_before, left
+                left += 1
+    origin = (low[0] + 0.5 * voxel_m, low[1] + 0.5 * voxel_m, low[2] + 0.5 * voxel_m)
+    for n in range(len(views)):
+        view = views[n]
+        locate(P[view], origin, voxel_m, size[view], pool, left, scratch)
+        kept = sample(soft[view], left, scratch)
+        if kept < left // 2:
+            # A camera that empties much of this block will empty much of the next: ask it first.
+            views[n], views[0] = views[0], view
+        left = kept
+        if left == 0:
+            break
+    values[:] = 0
+    plane, line = np.uint32(values.shape[1] * values.shape[2]), np.uint32(values.shape[2])
+    for n in range(left):
+        if seen[n] >= needed:
+            at = np.uint32(place[n])
+            values[at // plane, at % plane // line, at % line] = smallest[n] / np.float32(255)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
+@no_type_check
+def locate(P, origin, voxel_m, size, pool, count, scratch):
+    """Where the first `count` voxels are in one camera's pooled mask: scratch[6:8]; -1 in scratch[6] if out of view."""
+    base, step = np.empty(3, np.float32), np.empty((3, 3), np.float32)
+    for row in range(3):
+        scale = 1.0 if row == 2 else 1.0 / pool
+        base[row] = scale * (P[row, 0] * origin[0] + P[row, 1] * origin[1] + P[row, 2] * origin[2] + P[row, 3])
+        for axis in range(3):
+            step[row, axis] = scale * voxel_m * P[row, axis]
+    u0, v0, w0 = base[0], base[1], base[2]
+    ux, uy, uz = step[0, 0], step[0, 1], step[0, 2]
+    vx, vy, vz = step[1, 0], step[1, 1], step[1, 2]
+    wx, wy, wz = step[2, 0], step[2, 1], step[2, 2]
+    width, height = np.float32(size[0] / pool), np.float32(size[1] / pool)
+    one, nothing, near = np.float32(1), np.float32(0), np.float32(NEAR_M)
+    x, y, z, us, vs = scratch[0], scratch[1], scratch[2], scratch[6], scratch[7]
+    for n in range(count):
+        depth = w0 + x[n] * wx + y[n] * wy + z[n] * wz
+        inverse = one / max(depth, near)
+        u = (u0 + x[n] * ux + y[n] * uy + z[n] * uz) * inverse
+        v = (v0 + x[n] * vx + y[n] * vy + z[n] * vz) * inverse
+        sees = (depth > near) & (u >= nothing) & (u < width) & (v >= nothing) & (v < height)
+        us[n] = u if sees else -one
+        vs[n] = v
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
+@no_type_check
+def sample(image, count, scratch):
+    """Lower the first `count` voxels' values to the mask's at scratch[6:8]; move those still above 0 to the front."""
+    x, y, z, smallest, seen, place = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]
+    us, vs = scratch[6], scratch[7]
+    half, nothing, one = np.float32(0.5), np.float32(0), np.float32(1)
+    last_y, last_x = np.float32(image.shape[0] - 2), np.float32(image.shape[1] - 2)
+    kept = 0
+    for n in range(count):
+        value = smallest[n]
+        if us[n] >= 0:
+            seen[n] += one
+            u, v = min(max(us[n] - half, nothing), last_x), min(max(vs[n] - half, nothing), last_y)
+            # Unsigned, so that numba does not look for negative indices.
+            left, top = np.uint32(np.int32(u)), np.uint32(np.int32(v))
+            right, bottom = np.uint32(left + 1), np.uint32(top + 1)
+            a, b = u - np.float32(left), v - np.float32(top)
+            over = np.float32(image[top, left]) * (one - a) + np.float32(image[top, right]) * a
+            under = np.float32(image[bottom, left]) * (one - a) + np.float32(image[bottom, right]) * a
+            value = min(value, over * (one - b) + under * b)
+        if value > 0:
+            x[kept], y[kept], z[kept] = x[n], y[n], z[n]
+            smallest[kept], seen[kept], place[kept] = value, seen[n], place[n]
+            kept += 1
+    return kept

@@ -8,7 +8,7 @@ from numba import njit
 # Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def project_vertices(vertices, P, out):
     """Fill out[:, 0:3] with P [X; 1], in pixels times z, and out[:, 3:5] with the pixel coordinates, in float64."""
@@ -21,7 +21,7 @@ def project_vertices(vertices, P, out):
         out[i, 4] = out[i, 1] / w
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, triangle):
     """Draw all faces into rows [first_row, end_row) of one view's `depth` (as z) and `triangle`.

@@ -8,10 +8,20 @@ from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import HullConfig, bounds_from_masks, occupied_bounds, visual_hull
+from viewmend.geometry.hull import (
+    HullConfig,
+    OccupancyGrid,
+    bounds_from_masks,
+    check_masks,
+    occupied_bounds,
+    visual_hull,
+)
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface
+
+WORTH_RECARVING = 0.85
+"""A subject smaller than this share of the carved box is carved again in its own box."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +36,11 @@ class GeometryProxy:
     """The box that was carved at full resolution."""
 
     def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
-        """z-depth of the surface in each camera, metres; 0 where there is none."""
-        return rasterize(self.mesh, cameras).depth
+        """z-depth of the surface in each camera, metres; 0 where there is none.
+
+        Only the surface's outside is drawn: from inside it a camera sees nothing of the wall before it.
+        """
+        return rasterize(self.mesh, cameras, cull="back").depth
 
     def to(self, device: torch.device | str) -> "GeometryProxy":
         """The same proxy on `device`."""
@@ -42,15 +55,34 @@ def reconstruct(
 ) -> GeometryProxy:
     """The visual hull's surface from the masks of all cameras.
 
-    A coarse pass over `bounds` (estimated from the masks where None) finds the box that the subject fills; the fine
-    pass spends its voxels there. So bounds much larger than the subject cost no detail. Where the masks agree on no
+    A search over `bounds` (estimated from the masks where None) finds the box that the subject fills; all voxels are
+    spent there. So bounds much larger than the subject cost no detail. Where the masks agree on no
     point of space, the proxy is empty.
 
     Raises:
         ValueError: there is one camera only, or no mask has any foreground.
     """
     config = config or HullConfig()
+    check_masks(mask, cameras)
     bounds = bounds or bounds_from_masks(mask, cameras)
-    bounds = occupied_bounds(mask, cameras, bounds, config) or bounds
-    mesh = extract_surface(visual_hull(mask, cameras, bounds, config))
-    return GeometryProxy(mesh, vertex_normals(mesh), bounds)
+    box = occupied_bounds(mask, cameras, bounds, config)
+    if box is None:
+        nothing = torch.zeros(0, 3, device=mask.device)
+        return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds)
+    grid = visual_hull(mask, cameras, box, config)
+    # Where images end, the search cannot tell empty from unknown until the blocks are as small as voxels.
+    tight = _filled_bounds(grid, box)
+    if tight is not None and float(tight.size_m.max()) < WORTH_RECARVING * float(box.size_m.max()):
+        box, grid = tight, visual_hull(mask, cameras, tight, config)
+    mesh = extract_surface(grid)
+    return GeometryProxy(mesh, vertex_normals(mesh), box)
+
+
+def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
+    """The box of all that is not surely empty, with two voxels around it, within `bounds`; None for an empty grid."""
+    index = (grid.values > 0.1).nonzero()
+    if not len(index):
+        return None
+    low = grid.low + (index.amin(0) - 2) * grid.voxel_m
+    high = grid.low + (index.amax(0) + 3) * grid.voxel_m
+    return Bounds(torch.maximum(low, bounds.low), torch.minimum(high, bounds.high))
