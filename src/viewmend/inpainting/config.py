@@ -32,6 +32,9 @@ class InpainterConfig:
     """Blacken the background of camera images, as it is in a rendered view. Ours."""
     rope: bool = True
     """Rotary embedding of (u, v, s) in the attention's scores."""
+    rope_unit: Literal["image", "patch"] = "image"
+    """What (u, v) are measured in for the scores: the novel view's width and height (the paper's), or patches, 20 of
+    which count as one (the patches of a 320 pixel image), so that a model trained on small images fits large ones."""
     rope_values: bool = False
     """Rotate values by the offset between context patch and query as well, so that what is copied knows how far
     it must shift. Ours."""
@@ -119,5 +122,10 @@ def paper() -> InpainterConfig:
 def small() -> InpainterConfig:
     """About a quarter of the paper's widths: for two CPU cores."""
     return InpainterConfig(
-        widths=(16, 16, 32, 64, 96, 128, 96, 64, 32), dim=128, heads=4, rope_values=True, colour_path=True
+        widths=(16, 16, 32, 64, 96, 128, 96, 64, 32),
+        dim=128,
+        heads=4,
+        rope_unit="patch",
+        rope_values=True,
+        colour_path=True,
     )

@@ -59,4 +59,3 @@ def start_as_copier(tokenise: nn.Linear, decode: nn.Linear, config: InpainterCon
         decode.weight[rows] = 0
         decode.weight[rows, colour * head_dim : (colour + 1) * head_dim] = spread * synthesis(head_dim)
         decode.bias[rows] = 0
-        # The anchor must not show: the constant wave's sine is zero in `synthesis`, so it does not.

@@ -18,13 +18,14 @@ class Decoder(nn.Module):
         self.norm = nn.LayerNorm(config.dim)
         self.features = C
         self.linear = nn.Linear(config.dim, (C + 3 * config.colour_path) * PATCH_CELLS**2)
+        last = nn.Conv2d(C // 2, 3, 3, 1, 1)
         self.layers = nn.Sequential(
             nn.LeakyReLU(SLOPE),
             nn.ConvTranspose2d(C, C, 4, 2, 1),
             nn.LeakyReLU(SLOPE),
             nn.ConvTranspose2d(C, C // 2, 4, 2, 1),
             nn.LeakyReLU(SLOPE),
-            nn.Conv2d(C // 2, 3, 3, 1, 1),
+            last,
         )
         for layer in self.layers:
             if isinstance(layer, nn.ConvTranspose2d):
@@ -34,7 +35,7 @@ class Decoder(nn.Module):
                 nn.init.zeros_(layer.bias)
         if config.colour_path:
             # Detail starts small upon the colours that are copied.
-            self.layers[-1].weight.data.mul_(0.1)
+            last.weight.data.mul_(0.1)
 
     def forward(self, tokens: Float[Tensor, "patch dim"]) -> Float[Tensor, "patch 3 28 28"]:
         """RGB patches, about [0, 1] but not clamped."""

@@ -83,24 +83,31 @@ class Tokeniser(nn.Module):
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, stacks: Sequence[Images]) -> Float[Tensor, "patch dim"]:
-        """Tokens of all kept patches of all stacks, in order: one batch for the encoder.
+        """Tokens of all kept patches of all stacks, in order.
 
         Only a crop around each image's kept patches is encoded, with the encoder's receptive radius in zeros
         beyond the image: so nothing depends on the size of the crop, nor on what else is in the batch.
         """
-        windows, places, first = [], [], 0
-        crops = [crop_windows(stack.kept) for stack in stacks]
-        size = (max(s[0] for _, s in crops), max(s[1] for _, s in crops))
-        for stack, (origins, _) in zip(stacks, crops, strict=True):
-            pixels = (origins * STEP_PX).tolist()
-            windows += [crop(image, top, left, size) for image, (top, left) in zip(stack.channels, pixels, strict=True)]
-            kept = stack.places
-            local = kept[:, 1:] - origins[kept[:, 0]]
-            places.append(torch.cat([kept[:, :1] + first, local], 1))
-            first += len(stack.channels)
-        images = torch.stack(windows)
-        features = self.encoder(images)
-        if self.colour_path:
-            features = torch.cat([features, nn.functional.avg_pool2d(images, CELL_PX).to(features)], 1)
-        patches = split(features, torch.cat(places), PATCH_CELLS, STEP_CELLS)
+        images = [pair for stack in stacks for pair in zip(stack.channels, stack.kept, strict=True)]
+        # A batch pads all crops to the largest: worth it on a device that wants large batches, not on a CPU.
+        batches = [[pair] for pair in images] if images[0][0].device.type == "cpu" else [images]
+        patches = torch.cat([self._patches(batch) for batch in batches])
         return self.norm(self.linear(patches.flatten(1)))
+
+    def _patches(
+        self, images: Sequence[tuple[Float[Tensor, "channel _h _w"], Bool[Tensor, "_rows _cols"]]]
+    ) -> Float[Tensor, "patch feature 7 7"]:
+        """The kept patches of these images' features, encoded in one batch."""
+        crops = [crop_windows(kept[None]) for _, kept in images]
+        size = (max(s[0] for _, s in crops), max(s[1] for _, s in crops))
+        windows, places = [], []
+        for number, ((image, kept), (origins, _)) in enumerate(zip(images, crops, strict=True)):
+            top, left = (origins[0] * STEP_PX).tolist()
+            windows.append(crop(image, top, left, size))
+            local = torch.nonzero(kept) - origins
+            places.append(torch.cat([torch.full_like(local[:, :1], number), local], 1))
+        batch = torch.stack(windows)
+        features = self.encoder(batch)
+        if self.colour_path:
+            features = torch.cat([features, nn.functional.avg_pool2d(batch, CELL_PX).to(features)], 1)
+        return split(features, torch.cat(places), PATCH_CELLS, STEP_CELLS)

@@ -174,8 +174,9 @@ def _context_frames(
                 points_world=points[own],
                 valid=valid[own],
                 depths=depths[i],
-                tokens=tokens[own],
-                keys_values=keys_values[:, :, own],
+                # Copies, so that no frame keeps alive the memory of those it was encoded with.
+                tokens=tokens[own].clone(),
+                keys_values=keys_values[:, :, own].clone(memory_format=torch.contiguous_format),
             )
         )
         first += count

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from viewmend.inpainting.context import ContextCache
 from viewmend.views import CompletedView, ContextViews, IncompleteView
@@ -19,6 +19,7 @@ class State:
     cache: ContextCache = field(default_factory=ContextCache)
 
 
+@runtime_checkable
 class ViewInpainter(Protocol):
     """Completes one view after another."""
 

@@ -14,6 +14,8 @@ LONGEST = 2.0
 """Image widths (or windows of time) in one turn of the slowest pair."""
 SHORTEST = 0.1
 """The same of the fastest: two patch steps of a 320 pixel image."""
+UNIT_STEPS = 20
+"""Patch steps that count as one image width where coordinates are measured in patches."""
 WAVE_STEPS = 2.5
 """Patch steps in one turn of the slowest wave of values: a patch and its surroundings, 40 pixels."""
 

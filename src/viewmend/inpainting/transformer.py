@@ -12,8 +12,8 @@ from viewmend.inpainting.attention import attend, attend_and_sum, attend_weighte
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.pruning import most_attended, straight_through
 
-PRIOR_SPACE = (2.0, 0.5)
-"""How much a pair of u or v adds to the first and the last head's score of a patch at no distance, at the start."""
+PRIOR_SPACE = (1.0, 2.0)
+"""How much a pair of u or v adds to the score of a patch at no distance, at the start: first and last block."""
 PRIOR_TIME = 0.25
 """The same of a pair of s, as a share."""
 CONTENT_GAIN = 0.5
@@ -79,14 +79,14 @@ class Transformer(nn.Module):
         biases.zero_()
         counts = rope.pairs_per_axis(dim // heads)
         share = torch.tensor([1.0] * (counts[0] + counts[1]) + [PRIOR_TIME] * counts[2])
-        strength = torch.logspace(0, 1, heads, PRIOR_SPACE[1] / PRIOR_SPACE[0])[:, None] * PRIOR_SPACE[0]
-        prior = (strength * share / self.scale).sqrt()
-        prior = torch.cat([prior, torch.zeros_like(prior)], 1).flatten() * self.config.rope
+        strength = PRIOR_SPACE[0] * torch.logspace(0, 1, len(biases), PRIOR_SPACE[1] / PRIOR_SPACE[0])
+        prior = (strength[:, None] * share / self.scale).sqrt() * self.config.rope
+        prior = torch.cat([prior, torch.zeros_like(prior)], 1).repeat(1, heads)
         biases[:, 0] = prior
-        for block in self.blocks:
+        for block, bias in zip(self.blocks, prior, strict=True):
             assert isinstance(block, Block)
             nn.init.normal_(block.query.weight, 0, CONTENT_GAIN * dim**-0.5)
-            block.query.bias.data.copy_(prior)
+            block.query.bias.data.copy_(bias)
             last = block.ffn[-1]
             assert isinstance(last, nn.Linear)
             last.weight.data.mul_(0.2)
@@ -94,7 +94,7 @@ class Transformer(nn.Module):
 
     def project_context(self, tokens: Float[Tensor, "token dim"]) -> Float[Tensor, "block 2 token dim"]:
         """K = W_K R and V = W_V R of every block, before any rotation: what a cache keeps."""
-        return rearrange(self.keys_values(tokens), "n (b two d) -> b two n d", two=2, d=self.config.dim).contiguous()
+        return rearrange(self.keys_values(tokens), "n (b two d) -> b two n d", two=2, d=self.config.dim)
 
     def forward(
         self,
@@ -145,7 +145,9 @@ class _Turns:
         self.score = self.value = None
         if config.rope:
             f = transformer.score_frequencies
-            self.score = tuple(rope.angles(x.uvs, f)[:, None] for x in (at, context_at))
+            unit = f.new_tensor([rope.UNIT_STEPS, rope.UNIT_STEPS, 1.0])
+            where = [x.uvs if config.rope_unit == "image" else x.steps / unit for x in (at, context_at)]
+            self.score = tuple(rope.angles(x, f)[:, None] for x in where)
         if config.rope_values:
             f = transformer.value_frequencies
             self.value = tuple(rope.angles(x.steps, f)[:, None] for x in (at, context_at))

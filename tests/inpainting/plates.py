@@ -1,0 +1,93 @@
+"""A tiny analytic world for the inpainter: a flat, patterned plate that cameras look at from beside one another."""
+
+from dataclasses import replace
+
+import torch
+
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
+
+FOCAL_PX, DISTANCE_M = 60.0, 2.0
+WIDTH, HEIGHT = 90, 74  # not divisible by 4, 16 or 28
+NAMES = ("left", "right")
+OFFSETS_M = {"left": -0.2, "right": 0.25, "novel": 0.03, "third": 0.1}
+
+TINY = InpainterConfig(
+    widths=(8, 8, 8, 16, 16, 16, 16, 16, 8),
+    dim=64,
+    heads=4,
+    groups=2,
+    blocks=2,
+    n_c=2,
+    n_w=2,
+    k_w=4,
+    rope_values=True,
+    colour_path=True,
+)
+
+
+def tiny(seed: int = 0, **changes) -> Inpainter:
+    """An untrained inpainter whose every weight matters (a fresh one ignores many)."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    net = Inpainter(replace(TINY, **changes)).eval()
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=generator)
+    return net
+
+
+def camera(name: str, width: int = WIDTH, height: int = HEIGHT) -> Cameras:
+    camera_from_world = torch.eye(4)
+    camera_from_world[0, 3] = -OFFSETS_M[name]
+    K = torch.tensor([[FOCAL_PX, 0, width / 2], [0, FOCAL_PX, height / 2], [0, 0, 1.0]])
+    return Cameras((name,), K[None], camera_from_world[None], torch.tensor([[width, height]]))
+
+
+def look(at: Cameras, time: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """RGB and mask of the plate, a disc of 0.9 m by 0.7 m that drifts and changes its pattern."""
+    width, height = at.max_size_px
+    uv = pixel_centers(width, height)
+    x = (uv[..., 0] - width / 2) / FOCAL_PX * DISTANCE_M - float(at.camera_from_world[0, 0, 3])
+    y = (uv[..., 1] - height / 2) / FOCAL_PX * DISTANCE_M
+    x = x - 0.02 * time
+    mask = ((x / 0.9) ** 2 + (y / 0.7) ** 2 < 1).float()
+    rgb = torch.stack([0.5 + 0.5 * torch.sin(9 * x + c + 0.1 * time) * torch.cos(7 * y - c) for c in range(3)])
+    return rgb * mask, mask
+
+
+def context(time: int, names: tuple[str, ...] = NAMES, **size) -> ContextViews:
+    cameras = concatenate_cameras([camera(name, **size) for name in names])
+    seen = [look(cameras[i], time) for i in range(len(names))]
+    rgb, mask = (torch.stack(parts) for parts in zip(*seen, strict=True))
+    frame = MultiViewFrame(cameras, (rgb * 255).byte(), (mask * 255).byte(), time)
+    return ContextViews(frame, mask * DISTANCE_M)
+
+
+def view(time: int, hole: tuple[int, int, int, int] | None = (20, 40, 30, 55), **size) -> IncompleteView:
+    """The plate from between the cameras, without the rows and columns of `hole`; soft at the hole's left edge."""
+    at = camera("novel", **size)
+    rgb, mask = look(at, time)
+    error = torch.zeros_like(mask)
+    if hole is not None:
+        top, bottom, left, right = hole
+        error[top:bottom, left:right] = 1
+        error[top:bottom, left] = 0.5
+    error = error * mask
+    weights = torch.stack([mask * (1 - error) / 2] * 2)
+    return IncompleteView(at, rgb * (1 - error), mask, error, mask * DISTANCE_M, NAMES, weights, time)
+
+
+class Rig:
+    """A source that counts what it is asked; frames from `start` on, some cameras silent at some times."""
+
+    def __init__(self, start: int = 0, silent: frozenset[tuple[str, int]] = frozenset(), **size) -> None:
+        self.start, self.silent, self.size = start, silent, size
+        self.asked: list[tuple[int, tuple[str, ...]]] = []
+
+    def __call__(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
+        self.asked.append((time, names))
+        there = tuple(name for name in names if (name, time) not in self.silent)
+        return context(time, there, **self.size) if there and time >= self.start else None
