@@ -1,0 +1,120 @@
+"""Models on disk: whole, strict, and clear about what is wrong."""
+
+import json
+import shutil
+from dataclasses import replace
+from inspect import signature
+
+import pytest
+import torch
+from inpainting.plates import Rig, tiny, view
+
+from viewmend.inpainting import checkpoint
+from viewmend.inpainting.checkpoint import (
+    DamagedCheckpointError,
+    MismatchedCheckpointError,
+    MissingCheckpointError,
+    load_inpainter,
+    save_inpainter,
+)
+from viewmend.inpainting.config import InpainterConfig, paper, small
+from viewmend.inpainting.inpainter import Inpainter
+
+
+@pytest.fixture
+def saved(tmp_path):
+    save_inpainter(tiny(), tmp_path / "model", "# A card")
+    return tmp_path / "model"
+
+
+def test_what_is_saved_comes_back(saved):
+    net, again = tiny(), load_inpainter(str(saved))
+    assert again.config == net.config and not again.training
+    pairs = zip(net.state_dict().values(), again.state_dict().values(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+    one, other = (n.step(view(3), Rig(), n.initial_state())[0].rgb for n in (net, again))
+    assert torch.equal(one, other)
+    assert (saved / "README.md").read_text() == "# A card"
+    assert sorted(p.name for p in saved.iterdir()) == ["README.md", "config.json", "model.safetensors"]
+
+
+def test_the_config_is_what_huggingface_hubs_mixin_hands_to_init(saved):
+    """The mixin stores a dataclass argument named `config` as its fields, and ignores other keys."""
+    values = json.loads((saved / "config.json").read_text())
+    values.pop("viewmend_format")
+    assert list(signature(Inpainter.__init__).parameters) == ["self", "config"]
+    values["widths"] = tuple(values["widths"])
+    assert InpainterConfig(**values) == tiny().config
+
+
+@pytest.mark.parametrize("config", [paper(), small()])
+def test_configs_survive_json(config):
+    assert InpainterConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+
+
+def test_missing(saved, tmp_path):
+    with pytest.raises(MissingCheckpointError, match="nowhere"):
+        load_inpainter(tmp_path / "nowhere")
+    (saved / "config.json").unlink()
+    with pytest.raises(MissingCheckpointError, match=r"config\.json missing"):
+        load_inpainter(saved)
+
+
+@pytest.mark.parametrize("length", [0, 4, 500, -1])
+def test_weights_cut_short(saved, length):
+    path = saved / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(DamagedCheckpointError, match=r"model\.safetensors.*whole"):
+        load_inpainter(saved)
+
+
+def test_a_config_that_is_no_json(saved):
+    (saved / "config.json").write_text('{"dim": 12')
+    with pytest.raises(DamagedCheckpointError, match=r"config\.json"):
+        load_inpainter(saved)
+
+
+@pytest.mark.parametrize("changes", [{"dim": 128}, {"blocks": 3}, {"use_depth": False}, {"heads": 3}, {"dim": "64"}])
+def test_weights_of_another_config(saved, changes):
+    values = json.loads((saved / "config.json").read_text()) | changes
+    (saved / "config.json").write_text(json.dumps(values))
+    with pytest.raises(MismatchedCheckpointError, match=str(saved)):
+        load_inpainter(saved)
+
+
+def test_a_config_of_another_version(saved):
+    values = json.loads((saved / "config.json").read_text())
+    for changed in (values | {"viewmend_format": 99}, values | {"novelty": 1}, {"viewmend_format": 1}, []):
+        (saved / "config.json").write_text(json.dumps(changed))
+        with pytest.raises(MismatchedCheckpointError):
+            load_inpainter(saved)
+
+
+def test_nothing_half_written(saved, monkeypatch):
+    before = (saved / "model.safetensors").read_bytes()
+
+    def break_off(weights, path, metadata):
+        path.write_bytes(b"half")
+        raise OSError("no space left")
+
+    monkeypatch.setattr(checkpoint, "save_file", break_off)
+    with pytest.raises(OSError, match="no space"):
+        save_inpainter(tiny(1), saved, "")
+    assert (saved / "model.safetensors").read_bytes() == before
+    assert len(list(saved.iterdir())) == 3
+
+
+def test_shipped_models_are_found_by_name(saved, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "SHIPPED", tmp_path)
+    shutil.copytree(saved, tmp_path / "other")
+    assert checkpoint.shipped_models() == ("model", "other")
+    assert load_inpainter("other").config == tiny().config
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"dim": 100}, {"widths": (8,) * 8}, {"widths": (8,) * 8 + (9,)}, {"top_k": 0}, {"n_c": -1}, {"blocks": 0}],
+)
+def test_impossible_configs(changes):
+    with pytest.raises(ValueError, match="expected"):
+        replace(paper(), **changes)
