@@ -1,7 +1,9 @@
 """What commands say to people: progress and messages on standard error, results on standard output."""
 
+import contextlib
 import json
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
@@ -42,6 +44,25 @@ def _bar():
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=Console(stderr=True), transient=True)
+
+
+@contextlib.contextmanager
+def busy(description: str) -> Iterator[None]:
+    """For work that cannot be counted: says what is going on once two seconds went by, if there is a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    status = Console(stderr=True).status(description)
+    timer = threading.Timer(QUIET_S, status.start)
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
+        status.stop()
 
 
 def say(message: str) -> None:

@@ -65,14 +65,16 @@ def _look_at_capture(options: Options) -> "CaptureDescription":
     from viewmend.capture.plain import open_capture
     from viewmend.cli.calibration_check import check_calibration, check_picture
     from viewmend.cli.capture_description import describe_capture
-    from viewmend.cli.console import say
+    from viewmend.cli.console import busy, say
 
     capture = open_capture(options.target)
     if not 0 <= options.time < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
         raise ValueError(f"{options.target}: expected --time of 0 to {last}, got {options.time}; choose again")
-    check = check_calibration(capture.read(options.time), capture.bounds)
+    with busy("carving the subject"):
+        check = check_calibration(capture.read(options.time), capture.bounds)
     if options.out is not None:
-        write_image(options.out, check_picture(check, capture.up))
+        with busy("drawing the check picture"):
+            write_image(options.out, check_picture(check, capture.up))
         say(f"wrote {options.out}")
     return describe_capture(capture, check)
