@@ -92,6 +92,14 @@ def test_families_are_recognised(family, prefix):
     assert find_parts(names, list(parents)) == {part: prefix + name for part, name in table.items()}
 
 
+def test_right_sides_mirror_left_ones():
+    feet = {f: family_table(f)["RightFoot"] for f in FAMILIES}
+    assert feet == {
+        "acclaim": "rfoot", "cgspeed": "RightAnkle", "humanik": "RightFoot", "mixamo": "RightFoot",
+        "rigify": "DEF-foot.R", "mannequin": "foot_r",
+    }  # fmt: skip
+
+
 def test_other_names_are_read():
     sided = ("UpperLeg", "LowerLeg", "Foot", "Toes", "Shoulder", "UpperArm", "LowerArm", "Hand", "Thumb1")
     names = ["J_Bip_C_Hips", "J_Bip_C_Spine", "J_Bip_C_Chest", "J_Bip_C_UpperChest", "J_Bip_C_Neck", "J_Bip_C_Head"]
