@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from ball import camera_at, photograph, proxy, ring
+from reference.ball import camera_at, photograph, proxy, ring
 from reference.blend_twin import blend_twin
 
 from viewmend.geometry.rasterize import interpolate, rasterize

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from ball import camera_at, ring
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.ball import camera_at, ring
 
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.rendering.selection import angles_to, select_closest, select_covering

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from ball import camera_at, photograph, proxy, ring
+from reference.ball import camera_at, photograph, proxy, ring
 
 from viewmend.geometry.mesh import Mesh
 from viewmend.rendering.error_rules import error_rule

@@ -1,6 +1,7 @@
 """An analytic world: a ball whose colour is a smooth function of its surface, seen by a ring of cameras."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -55,3 +56,20 @@ def proxy(rows: int = 48) -> GeometryProxy:
     faces = torch.cat([torch.stack([a, b, b + 2 * rows], -1), torch.stack([a, b + 2 * rows, a + 2 * rows], -1)])
     half = torch.full((3,), RADIUS_M)
     return GeometryProxy(Mesh(RADIUS_M * normals, faces.reshape(-1, 3)), normals, Bounds(-half, half))
+
+
+class BallCapture:
+    """The ball as a `CaptureSource`; from frame to frame its colour changes a little."""
+
+    name, fps, up = "ball", 10.0, None
+
+    def __init__(self, cameras: Cameras, frames: int = 2):
+        self.cameras = cameras
+        self.frame_ids = tuple(f"{time:03d}" for time in range(frames))
+        side = torch.full((3,), 1.2 * RADIUS_M)
+        self.bounds = Bounds(-side, side)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """The ball at this time, exact."""
+        frame = photograph(self.cameras, time)
+        return replace(frame, rgb=(frame.rgb.float() * (1 - 0.1 * time)).byte(), depth=None)

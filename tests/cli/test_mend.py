@@ -1,0 +1,169 @@
+"""`viewmend mend` from end to end on a small capture of a ball."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from reference.ball import BallCapture, camera_at
+
+from viewmend.capture.plain_writer import write_capture
+from viewmend.cli import main
+from viewmend.geometry.cameras import concatenate_cameras
+
+KEYS = [
+    "frames", "hole_fraction", "psnr_whole", "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg",
+    "psnr_holes_fg_telea", "hull_iou", "stage_ms",
+]  # fmt: skip
+
+
+def rig():
+    """Six cameras about the ball at different heights, and `held` between two of them."""
+    heights = (0.0, 1.2, -0.8, 0.6, 1.4, -1.0)
+    around = [camera_at(60 * n, f"c{n}", height_m=height) for n, height in enumerate(heights)]
+    return concatenate_cameras([*around, camera_at(75, "held", height_m=0.3)])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mend") / "ball"
+    write_capture(BallCapture(rig()), path, images="png")
+    return path
+
+
+def mend(capsys, folder, out, *arguments):
+    """Exit code, JSON and messages."""
+    code = main(["mend", str(folder), "--out", str(out), "--model", "telea", "--json", *map(str, arguments)])
+    said = capsys.readouterr()
+    return code, json.loads(said.out) if code == 0 else said.out, said.err
+
+
+def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, capsys):
+    code, report, _ = mend(capsys, folder, tmp_path / "out", "--leave-out", "held")
+    assert code == 0 and list(report) == KEYS
+    assert report["frames"] == 2
+    assert report["psnr_valid"] > 19 and report["psnr_whole"] > 21  # the hull of six views is fat
+    assert report["psnr_holes"] == report["psnr_holes_telea"]
+    assert list(report["hull_iou"]) == ["c0", "c1", "c2", "c3", "c4", "c5", "held"]
+    assert min(report["hull_iou"].values()) > 0.9
+    assert set(report["stage_ms"]) == {"geometry", "rendering", "inpainting"} and min(report["stage_ms"].values()) > 0
+    holes = np.stack([cv2.imread(str(f), 0) for f in sorted((tmp_path / "out" / "holes").iterdir())])
+    assert holes.shape == (2, 48, 48) and set(np.unique(holes)) <= {0, 255}
+    assert report["hole_fraction"] == pytest.approx((holes > 0).sum() / 2 / 900, rel=0.3)
+    assert {f.name for f in (tmp_path / "out").iterdir()} == {"mended.mp4", "holes", "contact_sheet.png"}
+    sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
+    assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
+    assert [f.name for f in tmp_path.iterdir()] == ["out"]
+
+
+def test_what_the_camera_left_out_saw_changes_scores_alone(folder, tmp_path, capsys):
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    for kind, value in (("image", 200), ("mask", 255)):
+        for file in (other / kind / "held").iterdir():
+            picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(file), np.full_like(picture, value))
+    runs = [
+        mend(capsys, given, tmp_path / out, "--leave-out", "held", "--frames", "1:2")
+        for given, out in ((folder, "a"), (other, "b"))
+    ]
+    pictures = [cv2.imread(str(tmp_path / out / "mended" / "000000.png")) for out in "ab"]
+    assert np.array_equal(*pictures) and pictures[0].std() > 20
+    assert runs[0][1]["hole_fraction"] == runs[1][1]["hole_fraction"]
+    assert runs[0][1]["psnr_whole"] > runs[1][1]["psnr_whole"] + 10
+
+
+def test_cameras_that_are_not_used_leave_no_trace(folder, tmp_path, capsys):
+    chosen = "c0,c1,c3,c5,held"
+    _, report, _ = mend(capsys, folder, tmp_path / "out", "--leave-out", "held", "--use-cameras", chosen)
+    assert list(report["hull_iou"]) == ["c0", "c1", "c3", "c5", "held"]
+
+
+def test_without_holes_there_is_null(folder, tmp_path, capsys):
+    code, report, _ = mend(capsys, folder, tmp_path / "out", "--leave-out", "c2", "--frames", "0:1", "--context", "6")
+    assert code == 0
+    holes = cv2.imread(str(tmp_path / "out" / "holes" / "000000.png"), 0)
+    assert (report["psnr_holes"] is None) == (holes.max() == 0)
+    assert (report["psnr_holes_fg"] is None) or report["psnr_holes"] is not None
+
+
+def test_an_orbit_follows_the_frames(folder, tmp_path, capsys):
+    code, report, _ = mend(capsys, folder, tmp_path / "out", "--path", "orbit")
+    assert code == 0 and report["frames"] == 2
+    assert report["psnr_whole"] is None and report["psnr_holes_telea"] is None
+    assert report["hole_fraction"] < 0.9 and min(report["hull_iou"].values()) > 0.9
+
+
+def test_poses_come_from_a_file(folder, tmp_path, capsys):
+    poses = [camera_at(angle, "t").world_from_camera[0].tolist() for angle in (30, 60, 80)]
+    file = tmp_path / "path.json"
+    K = [[60, 0, 20], [0, 60, 10], [0, 0, 1]]
+    file.write_text(json.dumps({"world_from_camera": poses, "K": K, "width": 40, "height": 20}))
+    code, report, _ = mend(capsys, folder, tmp_path / "out", "--path", file, "--frames", "0:1")
+    assert code == 0 and report["frames"] == 3
+    assert cv2.imread(str(tmp_path / "out" / "holes" / "000002.png"), 0).shape == (20, 40)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--leave-out", "nobody"], "expected --leave-out among"),
+        (["--leave-out", "held", "--use-cameras", "c0,nobody"], "nobody"),
+        (["--leave-out", "held", "--use-cameras", "c0"], "at least 2 input cameras, got 1"),
+        ([], "either --leave-out CAMERA or --path"),
+        (["--leave-out", "held", "--path", "orbit"], "either --leave-out CAMERA or --path"),
+        (["--leave-out", "held", "--frames", "5:9"], "--frames first:end within 0:2"),
+        (["--leave-out", "held", "--frames", "x"], "--frames first:end within 0:2"),
+        (["--leave-out", "held", "--context", "0"], "--context of at least 1"),
+        (["--leave-out", "held", "--device", "abacus"], "expected a device that is there"),
+        (["--leave-out", "held", "--model", "nothing"], "nothing"),
+        (["--path", "missing.json"], "missing.json"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, capsys, arguments, message):
+    code, out, err = mend(capsys, folder, tmp_path / "out", *arguments)
+    assert code == 2 and out == ""
+    assert message in err and err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "expected JSON"),
+        ("[]", "of finite 4x4 matrices"),
+        ("[[[1, 0], [0, 1]]]", "of finite 4x4 matrices"),
+        (json.dumps([(2 * torch.eye(4)).tolist()]), "pose 0: expected a rotation"),
+        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 30}), "'height'"),
+        (json.dumps([torch.eye(4).tolist()] * 3), "one for each of 2 frames, got 3"),
+    ],
+)
+def test_a_bad_path_is_named(folder, tmp_path, capsys, content, message):
+    file = tmp_path / "path.json"
+    file.write_text(content)
+    code, _, err = mend(capsys, folder, tmp_path / "out", "--path", file)
+    assert code == 2 and message in err
+    assert [f.name for f in tmp_path.iterdir()] == ["path.json"]
+
+
+def test_a_capture_without_masks_is_refused(folder, tmp_path, capsys):
+    bare = tmp_path / "bare"
+    shutil.copytree(folder, bare)
+    description = json.loads((bare / "cameras.json").read_text())
+    for camera in description["cameras"]:
+        del camera["mask"]
+    (bare / "cameras.json").write_text(json.dumps(description))
+    code, _, err = mend(capsys, bare, tmp_path / "out", "--leave-out", "held")
+    assert code == 2 and "expected a 'mask'" in err and not (tmp_path / "out").exists()
+
+
+def test_an_unreadable_frame_leaves_nothing_half_written(folder, tmp_path, capsys):
+    broken = tmp_path / "broken"
+    shutil.copytree(folder, broken)
+    last = broken / "image" / "c5" / "001.png"
+    last.write_bytes(b"no picture")
+    code, _, err = mend(capsys, broken, tmp_path / "out", "--leave-out", "held")
+    assert code == 2 and last.name in err
+    assert [f.name for f in tmp_path.iterdir()] == ["broken"]
