@@ -1,0 +1,133 @@
+"""Drawing meshes: the slow twin, both fast paths, and the cases where rasterisers go wrong."""
+
+import pytest
+import torch
+from geometry.solids import ball_mesh, camera_at, dome
+from reference.raster_twin import raster_twin
+
+from viewmend.geometry._rasterize_torch import rasterize_torch
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers, unproject
+from viewmend.geometry.mesh import Mesh
+from viewmend.geometry.rasterize import NEAR_M, Raster, barycentric, interpolate, rasterize
+
+SIDE = {"none": 0, "back": 1, "front": -1}
+
+
+def in_torch(mesh: Mesh, cameras: Cameras, cull: str = "none") -> Raster:
+    return Raster(*rasterize_torch(mesh, cameras, NEAR_M, SIDE[cull]))
+
+
+def skewed(cameras: Cameras) -> Cameras:
+    K = cameras.K.clone()
+    K[:, 0, 1] = 3.0
+    K[:, 0, 2] -= 4.3
+    return Cameras(cameras.names, K, cameras.camera_from_world, cameras.size_px)
+
+
+@pytest.fixture(scope="module")
+def ball_scene() -> tuple[Mesh, Cameras]:
+    """Views of different sizes, with skew, one of them so close that triangles reach behind it."""
+    views = [
+        camera_at((1.5, 0.4, 0.3), width=24, height=20),
+        camera_at((0.2, -0.3, -1.5), width=18, height=25),
+        camera_at((0.0, 0.45, 0.3), target=(0.0, 0.1, 0.0), width=20, height=20, fov=1.5),
+    ]
+    return ball_mesh(7, 10), skewed(concatenate_cameras(views))
+
+
+@pytest.mark.parametrize("cull", ["none", "back", "front"])
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_equals_the_twin(ball_scene, draw, cull):
+    mesh, cameras = ball_scene
+    depth, triangle, margin = raster_twin(mesh, cameras, cull)
+    raster = draw(mesh, cameras, cull)
+    # Single precision decides otherwise only where a pixel's centre is all but on an edge.
+    clear = torch.from_numpy(margin > 1e-4)
+    assert clear.float().mean() > 0.97
+    assert (raster.triangle == torch.from_numpy(triangle))[clear].all()
+    torch.testing.assert_close(raster.depth.double()[clear], torch.from_numpy(depth)[clear], rtol=1e-5, atol=0)
+    assert (raster.triangle >= 0).any(-1).any(-1).all()
+
+
+@pytest.mark.parametrize("cull", ["none", "back", "front"])
+def test_numba_equals_torch(cull):
+    mesh, cameras = ball_mesh(40, 60), dome(5, width=120, height=90)
+    fast, slow = rasterize(mesh, cameras, cull), in_torch(mesh, cameras, cull)
+    assert (fast.triangle != slow.triangle).float().mean() < 1e-4
+    torch.testing.assert_close(fast.depth, slow.depth, rtol=2e-6, atol=0)
+
+
+def test_many_chunks_draw_what_one_does(ball_scene, monkeypatch):
+    mesh, cameras = ball_scene
+    whole = in_torch(mesh, cameras)
+    monkeypatch.setattr("viewmend.geometry._rasterize_torch.CANDIDATES", 100)
+    assert torch.equal(in_torch(mesh, cameras).depth, whole.depth)
+
+
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_a_closed_surface_has_no_cracks(draw):
+    """Seen from inside, a closed mesh covers every pixel, shared edges and corners included."""
+    inside = camera_at((0.01, 0.02, 0.03), target=(1.0, 0.0, 0.0), width=64, height=64, fov=2.0)
+    assert (draw(ball_mesh(40, 60), inside).triangle >= 0).all()
+
+
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_what_is_behind_a_camera_draws_nothing(draw):
+    away = camera_at((2.0, 0.0, 0.0), target=(4.0, 0.0, 0.0))
+    raster = draw(ball_mesh(), away)
+    assert (raster.triangle == -1).all()
+    assert (raster.depth == 0).all()
+
+
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_back_faces_are_those_turned_away(draw):
+    mesh, camera = ball_mesh(), camera_at((2.0, 0.3, 0.0))
+    front, back = draw(mesh, camera, "back"), draw(mesh, camera, "front")
+    covered = front.triangle >= 0
+    assert torch.equal(front.depth, draw(mesh, camera).depth)
+    assert (front.depth < back.depth)[covered & (back.triangle >= 0)].all()
+    assert float(front.depth[covered].min()) == pytest.approx((4 + 0.09) ** 0.5 - 0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_nothing_is_drawn_beyond_a_views_own_size(draw):
+    near = concatenate_cameras(
+        [camera_at((0.9, 0, 0), width=40, height=30), camera_at((0, 0, 0.9), width=20, height=50)]
+    )
+    raster = draw(ball_mesh(), near)
+    assert raster.depth.shape == (2, 50, 40)
+    assert (raster.triangle[0, 30:] == -1).all()
+    assert (raster.triangle[1, :, 20:] == -1).all()
+    assert (raster.triangle[1, :, 19] >= 0).any()
+
+
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_an_empty_mesh_draws_nothing(draw):
+    empty = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
+    raster = draw(empty, dome(2))
+    assert (raster.triangle == -1).all()
+    assert interpolate(torch.zeros(0, 2), empty, dome(2), raster).shape == (2, 80, 96, 2)
+
+
+def test_interpolation_is_perspective_correct(ball_scene):
+    """Interpolated world positions are where the pixel's ray meets its depth."""
+    mesh, cameras = ball_scene
+    raster = rasterize(mesh, cameras)
+    width, height = cameras.max_size_px
+    pixels = pixel_centers(width, height).reshape(1, -1, 2).expand(len(cameras), -1, -1)
+    world = unproject(pixels, raster.depth.flatten(1), cameras).view(*raster.depth.shape, 3)
+    covered = raster.triangle >= 0
+    positions = interpolate(mesh.vertices, mesh, cameras, raster)
+    torch.testing.assert_close(positions[covered], world[covered], atol=2e-6, rtol=1e-5)
+    assert (positions[~covered] == 0).all()
+    weights = barycentric(mesh, cameras, raster)
+    torch.testing.assert_close(weights.sum(-1), covered.float())
+    assert weights.min() >= -1e-6
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu():
+    mesh, cameras = ball_mesh(40, 60), dome(5, width=120, height=90)
+    there = rasterize(mesh.to("cuda"), cameras.to("cuda"))
+    here = rasterize(mesh, cameras)
+    assert (there.triangle.cpu() != here.triangle).float().mean() < 1e-4
