@@ -235,6 +235,7 @@ class Body:
         """
         bias = np.full(len(self.parts), seam_m)
         bias[part] = 0.0
+        bias[opposite(part)] = np.inf
         moved = np.zeros(points.shape[:-1])
         for _ in range(4):
             fields = self.fields(points + moved[..., None] * outward) + bias.reshape(-1, *[1] * moved.ndim)
@@ -242,6 +243,11 @@ class Body:
             union = -k * np.log(np.exp(np.clip(-fields / k, -30, 30)).sum(0))
             moved = np.clip(moved - 0.8 * union, 0.0, 2.0 * k)
         return points + moved[..., None] * outward
+
+
+def opposite(part: int) -> list[int]:
+    """The limb of the other side (a pair's cloth must not grow together); none for the torso."""
+    return [] if part == 0 else [part + 1 if part % 2 else part - 1]
 
 
 def build_body(person: Physique, skeleton: Skeleton) -> Body:

@@ -1,6 +1,6 @@
 """What is worn: outfits drawn from a seed, cut from the body's own shape and painted with cloth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -66,6 +66,8 @@ def sample_outfit(rng: np.random.Generator, femininity: float) -> Outfit:
     bottom = BOTTOMS[int(rng.choice(len(BOTTOMS), p=np.array(odds) / sum(odds)))]
     top = TOPS[int(rng.choice(len(TOPS), p=[0.32, 0.2, 0.2, 0.2, 0.08]))]
     outer = OUTERS[int(rng.choice(3, p=[0.72, 0.16, 0.12]))]
+    if outer == "coat" and bottom in ("skirt", "dress"):
+        outer = "jacket"  # a wide skirt has no room under a coat
     lower = sample_fabric(rng, ("denim",) if bottom == "jeans" else LOWER)
     fabrics = (sample_fabric(rng), lower, sample_fabric(rng, LOOSE))
     written = bottom != "dress" and outer == "none" and fabrics[0].kind in QUIET and rng.random() < 0.6
@@ -95,6 +97,8 @@ class Cut:
     vee: bool
     ease_m: float
     leg: float
+    cuff: float
+    """Where the skin of the arm shows from: the end of the longest sleeve."""
     leg_hang: float
     leg_flare_m: float
 
@@ -121,6 +125,7 @@ def sample_cut(outfit: Outfit) -> Cut:
         vee=bool(rng.random() < 0.35),
         ease_m=eases[kind] if kind in eases else float(rng.uniform(0.006, 0.011)),
         leg=float(end),
+        cuff=float(sleeve if outfit.outer == "none" else max(sleeve, 0.97)),
         leg_hang=hangs[kind] if kind in hangs else float(rng.choice([0.5, 0.35, 0.72])),
         leg_flare_m=flares[kind] if kind in flares else float(rng.uniform(-0.012, 0.004)),
     )
@@ -157,7 +162,7 @@ class Tailor:
     def top(self) -> list[Patch]:
         """Shirt, sweater or the like: trunk and sleeves."""
         H, outfit, body, cut = self.wearer.height_m, self.outfit, self.wearer.body, self.cut
-        lower, short = self.lower_shape(), cut.sleeve < 0.7
+        lower = self.lower_shape()
         legs = [leg.eased(0.004) for leg in lower.legs]
         shape = Body(self._trunk(lower.torso), self._sleeves(), (legs[0], legs[1]), body.blend_m)
         around = azimuths(65)
@@ -165,15 +170,22 @@ class Tailor:
         high = neckline(around, H, cut.neck, cut.vee, wide)
         low = np.full_like(around, cut.top_hem * H)
         folds = self.folds(0.0022, 0.10, 0.16, 0)
-        patches = [torso_sheet(self.wearer, shape, low, high, around, self._paint_top, folds, 40)]
-        if cut.sleeve > 0.05:
-            folds = self.folds(0.0022, 0.06, 0.12, 1)
-            rows = 20 if short else 40
-            patches += [
-                limb_sheet(self.wearer, shape, 1 + i, -0.03, cut.sleeve, self._paint_sleeve, folds, rows, 25)
-                for i in (0, 1)
-            ]
-        return patches
+        trunk = torso_sheet(self.wearer, shape, low, high, around, self._paint_top, folds, 40)
+        start = -0.03
+        if outfit.outer != "none":
+            # Only what an open front and the hems show: the rest could but poke through.
+            start = 0.8
+            shown = np.broadcast_to(np.abs(around) < 0.9, trunk.points.shape[:2]).copy()
+            shown[:6] = shown[-5:] = True
+            trunk = replace(trunk, keep=shown)
+        if cut.sleeve <= max(start, 0.05):
+            return [trunk]
+        folds = self.folds(0.0022, 0.06, 0.12, 1)
+        rows = 20 if cut.sleeve < 0.7 or start > 0 else 40
+        return [trunk] + [
+            limb_sheet(self.wearer, shape, 1 + i, start, cut.sleeve, self._paint_sleeve, folds, rows, 25)
+            for i in (0, 1)
+        ]
 
     def _paint_top(self, canvas: Canvas) -> Image:
         outfit = self.outfit
@@ -262,7 +274,7 @@ class Tailor:
         gap = float(rng.uniform(0.12, 0.4))
         around = azimuths(65, gap)
         coat = outfit.outer == "coat"
-        hem = 0.555 if coat else float(rng.uniform(0.50, 0.55))
+        hem = 0.535 if coat else float(rng.uniform(0.50, 0.55))
         high = neckline(around, H, 0.05, vee=True)
         folds = self.folds(0.0025, 0.09, 0.14, 5)
         patches = [
@@ -273,7 +285,7 @@ class Tailor:
         if coat:
             low = float(rng.uniform(0.2, 0.38))
             patches += skirt_sheets(
-                self.wearer, shape, 0.56 * H, low * H, around, outfit.fabrics[2].paint, 0.16, (6, 0.003)
+                self.wearer, shape, 0.575 * H, low * H, around, outfit.fabrics[2].paint, 0.16, (6, 0.003)
             )
         return patches
 

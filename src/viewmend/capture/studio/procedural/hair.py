@@ -1,6 +1,6 @@
 """Hair: a layer over the head up to a hairline, with curls, and what hangs or is tied: curtain, tail, bun, cap."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -69,7 +69,7 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Float[np.ndarray,
     canvas = Canvas(0.6, 0.26, 600.0)
     chart = strands(hair, canvas)
     azimuth, y = face_grid(48, 65)
-    base = {"bald": 0.012, "cropped": 0.018, "short": 0.045, "parted": 0.06, "afro": 0.17, "bob": 0.075, "cap": 0.05}
+    base = {"bald": 0.012, "cropped": 0.018, "short": 0.045, "parted": 0.06, "afro": 0.17, "bob": 0.075, "cap": 0.065}
     thick = base.get(hair.style, 0.05) * (0.75 + 0.5 * hair.volume)
     recede = float(rng.uniform(-0.4, 1.0))
     line = hairline(azimuth, recede)
@@ -94,6 +94,7 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Float[np.ndarray,
         patches.append(_tied(head, hair, chart))
     if hair.style == "cap":
         patches.append(_brim(head, chart))
+        patches += hair_patches(head, replace(hair, style="cropped"), torso, accent)
     return patches
 
 

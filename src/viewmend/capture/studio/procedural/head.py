@@ -129,20 +129,14 @@ def head_patches(
     uv = np.stack([azimuth / (2 * np.pi) + 0.5, y], -1)
     patches = [Patch(points, uv, one_joint(points.shape[:2], "head"), chart)]
     skin = np.broadcast_to(np.array(person.skin_rgb) * [0.97, 0.9, 0.88], (8, 8, 3))
+    # They stand on the cheeks behind the middle, and lean out backwards.
+    cheek = float(head.radius(np.array([1.62]), np.array([0.46]))[0]) + 0.012
     for side in (1.0, -1.0):
         phi, v = np.meshgrid(np.linspace(-np.pi, np.pi, 17), np.linspace(-1, 1, 11))
         tall = np.cos(v * np.pi / 2) ** 0.6
         x = 0.022 * np.sin(phi) * tall * (1 + 0.5 * np.maximum(0, v))
-        z = 0.055 * np.cos(phi) * tall
-        at = np.stack(
-            [
-                side * (head.radius(np.array(1.62), np.array(0.46)) + 0.012 + x - 0.25 * side * 0),
-                0.455 + 0.1 * v,
-                z - 0.02,
-            ],
-            -1,
-        )
-        at[..., 0] += side * -0.35 * (z - 0.02)
+        z = 0.055 * np.cos(phi) * tall - 0.02
+        at = np.stack([side * (cheek + x - 0.35 * z), 0.455 + 0.1 * v, z], -1)
         grid = head.origin + head.size_m * at
         grid = grid if side > 0 else grid[:, ::-1]
         uv = np.stack([(phi / np.pi + 1) / 2, (v + 1) / 2], -1)

@@ -113,6 +113,8 @@ def sample_motion(
     beat = float(rng.uniform(low, high))
     if chosen == "walk":
         beat = float(rng.uniform(0.75, 0.98))
+    if chosen == "jacks":
+        beat = float(rng.uniform(0.85, 1.15))
     if chosen == "run":
         beat = float(rng.uniform(1.25, 1.5))
     gestures = [sample_gesture(rng, GESTURES[chosen], bulk, ENERGY[tempo]) for _ in range(2)]

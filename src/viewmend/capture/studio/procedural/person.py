@@ -93,7 +93,7 @@ def _skin_patches(person: Physique, wearer: Wearer, cut: Cut, rng: np.random.Gen
     low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
     patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=24)]
     # Cloth covers what lies further in than a hand's breadth from its hem.
-    arm, leg = max(cut.sleeve - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
+    arm, leg = max(cut.cuff - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
     for i in (0, 1):
         rows = 8 + int(24 * (1 - arm)), 8 + int(28 * (1 - leg))
         patches.append(limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, rows=rows[0], columns=21))

@@ -116,7 +116,10 @@ def standing_prop(kind: str, rng: np.random.Generator, origin: Float[np.ndarray,
     if kind == "suitcase":
         body = box(frame, (0.42, 0.62, 0.24), _print(rng, 0.42, 0.62))
         grip = Frame(origin + np.array([0, 0.62, 0]), frame.axes)
-        return [*body, *(cylinder(_beside(grip, x), 0.009, 0, 0.3, plain_chart(np.full(3, 0.3))) for x in (-0.1, 0.1))]
+        return [
+            *body,
+            *(cylinder(_beside(grip, x), 0.009, 0.0, 0.3, plain_chart(np.full(3, 0.3))) for x in (-0.1, 0.1)),
+        ]
     if kind == "table":
         wood = _wood(rng, Canvas(0.5, 0.5, 300.0))
         tall = float(rng.uniform(0.5, 0.75))
@@ -175,7 +178,7 @@ def held_prop(
 
     color = hsv(rng.random(), rng.uniform(0.2, 0.9), rng.uniform(0.3, 0.95))
     if kind == "staff":
-        return [cylinder(moved(0, -0.6, 0), 0.013, 0, float(rng.uniform(1.0, 1.3)), _print(rng, 0.1, 0.9))]
+        return [cylinder(moved(0.0, -0.6, 0.0), 0.013, 0.0, float(rng.uniform(1.0, 1.3)), _print(rng, 0.1, 0.9))]
     if kind in ("cup", "bottle"):
         r = 0.036 if kind == "cup" else 0.03
         knots = [(0, -0.05), (0.85 * r, -0.05), (0.85 * r, -0.05), (r, 0.05), (r, 0.05), (0.8 * r, 0.045), (0, 0.045)]
@@ -188,7 +191,7 @@ def held_prop(
     if kind == "bag":
         hang = np.stack([forward, -along, np.cross(forward, -along)], 1)
         low = Frame(grip + 0.44 * along, hang, frame.joint)
-        loop = cylinder(Frame(grip + 0.12 * along, hang, frame.joint), 0.008, 0, 0.13, plain_chart(0.5 * color))
+        loop = cylinder(Frame(grip + 0.12 * along, hang, frame.joint), 0.008, 0.0, 0.13, plain_chart(0.5 * color))
         return [*box(low, (0.30, 0.32, 0.11), _print(rng, 0.30, 0.32)), loop]
     size = (0.15, 0.21, 0.025) if kind == "book" else (0.17, 0.24, 0.009)
     flat = np.stack([forward, -along, np.cross(forward, -along)], 1)

@@ -25,9 +25,9 @@ class Wearer:
     skeleton: Skeleton
     height_m: float
 
-    def weights(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n joint"]:
-        """Skinning weights at these points."""
-        return body_weights(self.body, self.skeleton, self.height_m, points)
+    def weights(self, points: Float[np.ndarray, "*n 3"], part: int = 0) -> Float[np.ndarray, "*n joint"]:
+        """Skinning weights at these points of a part's sheet."""
+        return body_weights(self.body, self.skeleton, self.height_m, points, part)
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def limb_sheet(
     center = naked.center(t[0])
     lip = center + 0.8 * (naked.point(theta, t[0]) - center) + 0.004 * limb.frame[1]
     points = _with_lips(points, lip, None)
-    return Patch(points, _with_lips(uv, uv[0], None), wearer.weights(points), _paint(canvas, painter, folds))
+    return Patch(points, _with_lips(uv, uv[0], None), wearer.weights(points, part), _paint(canvas, painter, folds))
 
 
 def skirt_weights(

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from viewmend.capture.studio.procedural.skeleton import (
     ARM_ANGLE_RAD,
     INDEX,
+    PARENTS,
     SIDES,
     SIGN,
     SKIRT_COLUMNS,
@@ -176,18 +177,37 @@ def _hang(
             joint_origin(skeleton, f"{s}_{last}", world) - joint_origin(skeleton, f"{s}_{first}", world) for s in SIDES
         ]
         bones[segment] = np.array([pelvis.T @ unit(end) for end in ends] + [weight])
-    for column in range(SKIRT_COLUMNS):
-        azimuth = 2 * np.pi * column / SKIRT_COLUMNS
-        outward = np.array([np.sin(azimuth), 0.0, np.cos(azimuth)])
-        for segment, give in (("high", 0.6), ("low", 1.0)):
-            tilts = np.arctan2(bones[segment] @ outward, -bones[segment][:, 1])
-            tilt = np.log(np.exp(9 * tilts).sum() / len(tilts)) / 9 + 0.07
-            tilt += give * (0.10 * abs(np.tanh(turning / 3)) - 0.22 * np.tanh(speed @ outward / 2))
-            spin = rotation(1, -give * 0.25 * float(np.tanh(turning / 4)))
-            # From hanging (-y) towards `outward`: a turn about the axis across both.
-            toward = rotation(1, azimuth) @ rotation(0, -float(tilt)) @ rotation(1, -azimuth)
-            skeleton.place(INDEX[f"skirt{column}_{segment}"], pelvis @ spin @ toward, world)
+    azimuth = 2 * np.pi * np.arange(SKIRT_COLUMNS) / SKIRT_COLUMNS
+    outward = np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], 1)
+    for segment, give in (("high", 0.6), ("low", 1.0)):
+        tilts = np.arctan2(outward @ bones[segment].T, -bones[segment][:, 1])
+        tilt = np.log(np.exp(9 * tilts).mean(1)) / 9
+        tilt = tilt + 0.07 + 0.09 * np.maximum(tilt, 0.0)
+        tilt += give * (0.10 * abs(np.tanh(turning / 3)) - 0.22 * np.tanh(outward @ speed / 2))
+        spin = rotation(1, -give * 0.25 * float(np.tanh(turning / 4)))
+        joints = np.array([INDEX[f"skirt{column}_{segment}"] for column in range(SKIRT_COLUMNS)])
+        parents = np.array([PARENTS[joint] for joint in joints])
+        R = pelvis @ spin @ _tilted(outward, tilt)
+        bind = skeleton.positions[joints]
+        origins = np.einsum("cij,cj->ci", world[parents, :3, :3], bind) + world[parents, :3, 3]
+        world[joints, :3, :3] = R
+        world[joints, :3, 3] = origins - np.einsum("cij,cj->ci", R, bind)
     head = world[INDEX["head"], :3, :3]
     drop = unit(0.6 * np.array([0, -1.0, 0]) + 0.4 * head @ np.array([0, -1.0, 0]) - 0.15 * pelvis @ speed)
     lag = rotation(1, -0.5 * float(np.tanh(turning / 4)))
     skeleton.place(INDEX["tail"], lag @ hinge_frame(drop, head @ np.array([1.0, 0, 0])), world)
+
+
+def _tilted(
+    outward: Float[np.ndarray, "column 3"], angle_rad: Float[np.ndarray, "column"]
+) -> Float[np.ndarray, "column 3 3"]:
+    """Rotations that lift what hangs down (-y) towards `outward` by these angles: (column, 3, 3)."""
+    x, z = outward[:, 0], outward[:, 2]
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    # In the plane of `outward` and y; what is across both stays.
+    rows = [
+        [1 + (c - 1) * x * x, -s * x, (c - 1) * x * z],
+        [s * x, c, s * z],
+        [(c - 1) * x * z, -s * z, 1 + (c - 1) * z * z],
+    ]
+    return np.array(rows).transpose(2, 0, 1)

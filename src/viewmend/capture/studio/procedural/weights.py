@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from viewmend.capture.studio.procedural.body import Body, Limb
+from viewmend.capture.studio.procedural.body import Body, Limb, opposite
 from viewmend.capture.studio.procedural.skeleton import INDEX, JOINTS, SIDES, SPINE, Skeleton
 
 
@@ -28,10 +28,14 @@ def mix(
 
 
 def body_weights(
-    body: Body, skeleton: Skeleton, height_m: float, points: Float[np.ndarray, "*n 3"]
+    body: Body, skeleton: Skeleton, height_m: float, points: Float[np.ndarray, "*n 3"], part: int = 0
 ) -> Float[np.ndarray, "*n joint"]:
-    """Weights of points on or near the body: soft membership in a part, then soft steps along the part's chain."""
+    """Weights of points on or near the body: soft membership in a part, then soft steps along the part's chain.
+
+    Points of a limb's sheet (`part`, as in `Body.parts`) never follow the limb of the other side.
+    """
     fields = body.fields(points)
+    fields[opposite(part)] = 1.0
     soft = 0.010 * height_m
     member = np.exp(np.clip(-(fields - fields.min(0)) / soft, -40, 0))
     member /= member.sum(0)
@@ -51,7 +55,7 @@ def limb_weights(
 ) -> Float[np.ndarray, "*n joint"]:
     """Weights along a limb's three joints; `width` is half the bend's extent as a share of the limb."""
     t = limb.along(points)
-    middle = float(limb.along(skeleton.at(names[1])))
+    middle = float(limb.along(skeleton.at(names[1])[None])[0])
     weights = one_joint(points.shape[:-1], names[0])
     weights = mix(weights, one_joint(points.shape[:-1], names[1]), smoothstep(t, middle - width, middle + width))
     return mix(weights, one_joint(points.shape[:-1], names[2]), smoothstep(t, 0.94, 1.05))
