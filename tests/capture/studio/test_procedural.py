@@ -7,12 +7,12 @@ import torch
 
 from viewmend.capture.studio.performer import Performer, TexturedMesh
 from viewmend.capture.studio.procedural import PerformerStyle, procedural_performer, procedural_scene
-from viewmend.capture.studio.procedural.clothing import BOTTOMS, OUTERS, TOPS, sample_outfit
 from viewmend.capture.studio.procedural.fabric import KINDS, Canvas, sample_fabric
 from viewmend.capture.studio.procedural.gestures import FAMILIES
 from viewmend.capture.studio.procedural.grounds import Tempo
 from viewmend.capture.studio.procedural.hair import STYLES, sample_hair
 from viewmend.capture.studio.procedural.motion import GESTURES, MOTIONS, sample_motion
+from viewmend.capture.studio.procedural.outfit import BOTTOMS, OUTERS, TOPS, sample_outfit
 from viewmend.capture.studio.procedural.physique import sample_physique
 
 SEED = 10_000

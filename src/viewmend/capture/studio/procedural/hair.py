@@ -24,6 +24,11 @@ class Hair:
     """0 to 1."""
     seed: int
 
+    @property
+    def words(self) -> str:
+        """For a description."""
+        return {"bald": "bald", "cap": "in a cap"}.get(self.style, f"{self.style} hair")
+
 
 def sample_hair(rng: np.random.Generator, femininity: float, dark_skin: bool) -> Hair:
     """Draw a hairstyle; colours over the human range, dark ones on dark skin."""

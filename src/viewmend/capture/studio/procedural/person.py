@@ -7,13 +7,14 @@ import torch
 
 from viewmend.capture.studio.performer import TexturedMesh
 from viewmend.capture.studio.procedural.body import build_body
-from viewmend.capture.studio.procedural.clothing import Cut, Tailor, sample_cut, sample_outfit
+from viewmend.capture.studio.procedural.clothing import Tailor
 from viewmend.capture.studio.procedural.extremities import hand_patches, shoe_patch
 from viewmend.capture.studio.procedural.fabric import Canvas, Image
 from viewmend.capture.studio.procedural.grounds import Tempo
 from viewmend.capture.studio.procedural.hair import hair_patches, sample_hair
 from viewmend.capture.studio.procedural.head import build_head, head_patches
 from viewmend.capture.studio.procedural.motion import Motion, sample_motion
+from viewmend.capture.studio.procedural.outfit import Cut, sample_cut, sample_outfit
 from viewmend.capture.studio.procedural.patches import BoundMesh, Patch, assemble
 from viewmend.capture.studio.procedural.physique import Physique, build_skeleton, sample_physique
 from viewmend.capture.studio.procedural.props import HELD, held_prop
@@ -77,7 +78,7 @@ def draw_person(
         motion = motion.gripping(side)
         held = f" with a {thing}"
     sex = "woman" if person.femininity > 0.5 else "man"
-    words = f"{sex}, {person.height_m:.2f} m, {hair.style} hair, {outfit.words}, {motion.score.kind} ({tempo}){held}"
+    words = f"{sex}, {person.height_m:.2f} m, {hair.words}, {outfit.words}, {motion.score.kind} ({tempo}){held}"
     return ProceduralPerson(assemble(patches), skeleton, motion, person, words)
 
 
@@ -95,9 +96,9 @@ def _skin_patches(person: Physique, wearer: Wearer, cut: Cut, rng: np.random.Gen
     # Cloth covers what lies further in than a hand's breadth from its hem.
     arm, leg = max(cut.cuff - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
     for i in (0, 1):
-        rows = 8 + int(24 * (1 - arm)), 8 + int(28 * (1 - leg))
-        patches.append(limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, rows=rows[0], columns=21))
-        patches.append(limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, rows=rows[1], columns=25))
+        grids = (8 + int(24 * (1 - arm)), 21), (8 + int(28 * (1 - leg)), 25)
+        patches.append(limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, grid=grids[0]))
+        patches.append(limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, grid=grids[1]))
     skin = paint(Canvas(0.1, 0.1))
     girth = 1.05 - 0.13 * person.femininity + 0.05 * person.weight
     for side in SIDES:

@@ -135,10 +135,13 @@ def limb_sheet(
     high: float,
     painter: Painter,
     folds: Folds = BARE,
-    rows: int = 36,
-    columns: int = 29,
+    grid: tuple[int, int] = (36, 29),
 ) -> Patch:
-    """A limb of `shape` (part 1..4 of `Body.parts`) from t = `low` (towards the body) to `high`, with a lip there."""
+    """A limb of `shape` (part 1..4 of `Body.parts`) from t = `low` (towards the body) to `high`, with a lip there.
+
+    `grid` counts its rows and columns.
+    """
+    rows, columns = grid
     limb, naked = (s.limbs[part - 1] for s in (shape, wearer.body))
     theta = np.linspace(-np.pi, np.pi, columns)
     t = np.broadcast_to(np.linspace(high, low, rows)[:, None], (rows, columns))
