@@ -13,8 +13,8 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.threads import share
 
-TILE_PX = 16
-"""Side of the mask tiles by which the search for the subject's box judges blocks of space."""
+TILES = 32
+"""Tiles across a mask's shorter side, by which the search for the subject's box judges blocks of space."""
 
 BLOCK = 4
 """Side in voxels of the blocks, and in (pooled) pixels of the mask tiles, that the fast path judges whole."""
@@ -76,14 +76,15 @@ def occupied_bounds(
 ) -> Bounds | None:
     """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it."""
     needed = needed_views(len(cameras), config)
+    tile = max(1, min(mask.shape[1:]) // TILES)
     kernels = _kernels(mask)
-    tiles = None if kernels is None else _count_tiles(kernels, mask)
+    tiles = None if kernels is None else _count_tiles(kernels, mask, tile)
     for _ in range(config.coarse_passes):
         block_m, shape = _divide(bounds, config.coarse_resolution)
         if kernels is None or tiles is None:
-            occupied = _hull_torch.occupied_blocks(mask, TILE_PX, cameras, bounds.low, block_m, shape, needed)
+            occupied = _hull_torch.occupied_blocks(mask, tile, cameras, bounds.low, block_m, shape, needed)
         else:
-            occupied = _occupied_cpu(kernels, tiles, cameras, bounds.low, block_m, shape, needed)
+            occupied = _occupied_cpu(kernels, tiles, tile, cameras, bounds.low, block_m, shape, needed)
         index = occupied.nonzero()
         if not len(index):
             return None
@@ -167,17 +168,20 @@ def _carve_cpu(
     return values
 
 
-def _count_tiles(kernels: ModuleType, mask: UInt8[Tensor, "view height width"]) -> Int[Tensor, "view row column 2"]:
+def _count_tiles(
+    kernels: ModuleType, mask: UInt8[Tensor, "view height width"], tile: int
+) -> Int[Tensor, "view row column 2"]:
     views, height, width = mask.shape
-    sums = _tile_sums(views, height, width, TILE_PX)
+    sums = _tile_sums(views, height, width, tile)
     masks, out = mask.numpy(), sums.numpy()
-    share(lambda view: kernels.count_tiles(masks[view], height, width, TILE_PX, out[view]), views)
+    share(lambda view: kernels.count_tiles(masks[view], height, width, tile, out[view]), views)
     return sums
 
 
 def _occupied_cpu(
     kernels: ModuleType,
     tiles: Int[Tensor, "view row column 2"],
+    tile: int,
     cameras: Cameras,
     low: Float[Tensor, "3"],
     block_m: float,
@@ -189,7 +193,7 @@ def _occupied_cpu(
     (P, lens), corner = (part.numpy() for part in _projections(cameras)), low.double().numpy()
 
     def judge(slab: int) -> None:
-        kernels.occupied_blocks(P, lens, size, TILE_PX, sums, corner, block_m, needed, slab, slab + 1, out)
+        kernels.occupied_blocks(P, lens, size, tile, sums, corner, block_m, needed, slab, slab + 1, out)
 
     share(judge, shape[0])
     return occupied

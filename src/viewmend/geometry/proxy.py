@@ -21,7 +21,10 @@ from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface
 
 WORTH_RECARVING = 0.85
-"""A subject smaller than this share of the carved box is carved again in its own box."""
+"""A subject smaller than this share of the carved box is carved again in its own box,"""
+
+RECARVINGS = 3
+"""so often at most."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,11 @@ def reconstruct(
         nothing = torch.zeros(0, 3, device=mask.device)
         return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds)
     grid = visual_hull(mask, cameras, box, config)
-    # Where images end, the search cannot tell empty from unknown until the blocks are as small as voxels.
-    tight = _filled_bounds(grid, box)
-    if tight is not None and float(tight.size_m.max()) < WORTH_RECARVING * float(box.size_m.max()):
+    # Where images end, the search cannot tell empty from unknown until its blocks are as small as voxels.
+    for _ in range(RECARVINGS):
+        tight = _filled_bounds(grid, box)
+        if tight is None or float(tight.size_m.max()) > WORTH_RECARVING * float(box.size_m.max()):
+            break
         box, grid = tight, visual_hull(mask, cameras, tight, config)
     mesh = extract_surface(grid)
     return GeometryProxy(mesh, vertex_normals(mesh), box)

@@ -1,0 +1,200 @@
+"""The visual hull: the slow twin, both fast paths, the search for the subject's box, and bounds from nothing."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from geometry.solids import around, ball_masks, camera_at, dome
+from reference.hull_twin import hull_twin
+
+from viewmend.geometry import _hull_torch
+from viewmend.geometry import hull as hull_module
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.geometry.hull import (
+    HullConfig,
+    bounds_from_cameras,
+    bounds_from_masks,
+    needed_views,
+    occupied_bounds,
+    visual_hull,
+)
+
+SMALL = HullConfig(resolution=16)
+
+
+@pytest.fixture(params=["numba", "torch"])
+def path(request, monkeypatch) -> str:
+    """Run a test on the numba path and on the torch path."""
+    if request.param == "torch":
+        monkeypatch.setattr(hull_module, "_kernels", lambda mask: None)
+    return request.param
+
+
+def mixed_rig():
+    """Views of two sizes that crop the subject, one camera amid the volume, one turned away from it; soft masks."""
+    views = [
+        camera_at((2.0, 0.3, 0.1), width=40, height=30),
+        camera_at((0.2, -0.3, 2.0), width=30, height=44),
+        camera_at((-1.4, 0.8, -1.0), width=40, height=44, fov=0.4),
+        camera_at((0.4, 0.3, -0.2), target=(-1.0, 0.0, 0.3), width=36, height=30, fov=1.2),
+        camera_at((0.0, 0.2, -2.0), target=(0.0, 0.2, -3.0), width=30, height=30),
+    ]
+    cameras = concatenate_cameras(views)
+    masks = ball_masks(cameras)
+    masks[2, 10:20] = 128
+    masks[3, :, :18] = 255
+    return cameras, masks
+
+
+@pytest.mark.parametrize("pixels_per_voxel", [1.0, 30.0])
+def test_equals_the_twin(path, pixels_per_voxel):
+    cameras, masks = mixed_rig()
+    config = replace(SMALL, pixels_per_voxel=pixels_per_voxel)
+    bounds = Bounds(torch.tensor([-0.7, -0.6, -0.5]), torch.tensor([0.6, 0.7, 0.6]))
+    grid = visual_hull(masks, cameras, bounds, config)
+    pool = max(1, int(hull_module._footprint_px(cameras, bounds, grid.voxel_m) / pixels_per_voxel))
+    assert (pool > 1) == (pixels_per_voxel == 1.0)
+    twin = hull_twin(masks, cameras, grid.low, grid.voxel_m, grid.values.shape, pool, 3)
+    difference = (grid.values - torch.from_numpy(twin)).abs()
+    # A voxel whose image is on an image's very border may be seen by one and not by the other.
+    assert (difference > 0.01).float().mean() < 1e-3
+    assert 0.05 < (grid.values > 0.5).float().mean() < 0.95
+
+
+def test_numba_equals_torch(monkeypatch):
+    cameras = dome(9, width=200, height=160)
+    masks = ball_masks(cameras)
+    fast = visual_hull(masks, cameras, around(0.9), HullConfig(resolution=70))
+    monkeypatch.setattr(hull_module, "_kernels", lambda mask: None)
+    slow = visual_hull(masks, cameras, around(0.9), HullConfig(resolution=70))
+    assert (fast.values - slow.values).abs().max() < 1e-3
+
+
+def test_numba_softens_like_torch():
+    from viewmend.geometry import _hull_numba
+
+    masks = torch.randint(0, 256, (1, 23, 37), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    size = torch.tensor([[35, 20]])
+    for pool in (1, 2, 3, 7):
+        slow = _hull_torch.soften(masks, size, pool)
+        fast = torch.empty(slow.shape[1] + 1, slow.shape[2] + 1, dtype=torch.uint8)
+        _hull_numba.soften(masks[0].numpy(), 20, 35, pool, fast.numpy())
+        # Rounding may go either way on a tie.
+        assert (fast[:-1, :-1].int() - slow[0].int()).abs().max() <= 1
+        assert torch.equal(fast[-1, :-1], fast[-2, :-1])
+        assert torch.equal(fast[:, -1], fast[:, -2])
+
+
+def test_points_behind_a_camera_never_count(path):
+    """The mirror image of the subject behind a camera is neither kept nor carved."""
+    cameras = concatenate_cameras([dome(4), camera_at((0.0, 0.0, 1.0), target=(0.0, 0.0, 3.0), name="away")])
+    masks = ball_masks(cameras)
+    assert not masks[4].any()
+    config = replace(SMALL, min_share=0.0)
+    with_it = visual_hull(masks, cameras, around(0.6), config)
+    without = visual_hull(masks[:4], cameras[0:4], around(0.6), config)
+    assert torch.equal(with_it.values, without.values)
+
+
+def test_space_that_too_few_cameras_see_is_empty(path):
+    """Bounds much larger than what the rig sees do not fill up at their corners."""
+    cameras = dome(8)
+    grid = visual_hull(ball_masks(cameras), cameras, around(4.0), HullConfig(resolution=64))
+    filled = (grid.values > 0.1).nonzero() * grid.voxel_m + grid.low
+    assert len(filled)
+    assert filled.norm(dim=1).max() < 0.9
+
+
+@pytest.mark.parametrize(("views", "expected"), [(2, 2), (3, 2), (4, 2), (8, 4), (19, 10)])
+def test_half_of_the_cameras_must_see_a_point(views, expected):
+    assert needed_views(views, HullConfig()) == expected
+
+
+def test_cropped_subjects_keep_what_some_cameras_do_not_see(path):
+    """A camera that sees the lower half only says nothing about the upper one."""
+    cameras = dome(6)
+    low_view = camera_at((0.0, -0.5, 2.5), target=(0.0, -0.9, 0.0), name="low")
+    everyone = concatenate_cameras([cameras, low_view])
+    masks = ball_masks(everyone)
+    assert masks[6, 0].any(), "the subject leaves this image at the top"
+    with_it = visual_hull(masks, everyone, around(0.6), SMALL)
+    without = visual_hull(masks[:6], cameras, around(0.6), SMALL)
+    top = with_it.values.shape[1] * 3 // 4
+    assert torch.equal(with_it.values[:, top:], without.values[:, top:])
+    assert (without.values[:, top:] > 0.5).any()
+
+
+def test_the_search_keeps_all_of_the_hull(path):
+    cameras = dome(7)
+    masks = ball_masks(cameras, center=(0.3, -0.1, 0.2), radius=0.3)
+    box = occupied_bounds(masks, cameras, around(1.6), HullConfig())
+    assert box is not None
+    assert float(box.size_m.max()) < 1.2
+    grid = visual_hull(masks, cameras, around(1.0), HullConfig(resolution=50))
+    filled = (grid.values > 0).nonzero() * grid.voxel_m + grid.low
+    assert (filled.amin(0) + grid.voxel_m >= box.low).all()
+    assert (filled.amax(0) <= box.high).all()
+
+
+def test_both_searches_find_the_same_box(monkeypatch):
+    cameras, masks = mixed_rig()
+    fast = occupied_bounds(masks, cameras, around(1.5), HullConfig())
+    monkeypatch.setattr(hull_module, "_kernels", lambda mask: None)
+    slow = occupied_bounds(masks, cameras, around(1.5), HullConfig())
+    assert fast is not None and slow is not None
+    torch.testing.assert_close(fast.low, slow.low)
+    torch.testing.assert_close(fast.high, slow.high)
+
+
+def test_the_search_finds_nothing_where_masks_contradict(path):
+    cameras = dome(4)
+    masks = ball_masks(cameras, radius=0.3)
+    masks[2] = 0
+    assert occupied_bounds(masks, cameras, around(0.8), HullConfig()) is None
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.0, 1000.0])
+def test_bounds_from_masks_hold_the_subject(scale):
+    arc = [camera_at((2.5, 0.5, 0.0)), camera_at((1.5, 0.2, 2.0)), camera_at((-1.0, 0.0, 2.4))]
+    cameras = concatenate_cameras(arc)
+    masks = ball_masks(cameras, center=(0.2, 0.1, 0.3), radius=0.4)
+    pose = cameras.camera_from_world.clone()
+    pose[:, :3, 3] *= scale
+    bounds = bounds_from_masks(masks, replace(cameras, camera_from_world=pose))
+    center = torch.tensor([0.2, 0.1, 0.3]) * scale
+    assert (bounds.low <= center - 0.4 * scale).all()
+    assert (bounds.high >= center + 0.4 * scale).all()
+    assert float(bounds.size_m.max()) < 3 * scale
+
+
+def test_bounds_from_cameras_hold_what_they_look_at():
+    bounds = bounds_from_cameras(dome(6))
+    assert (bounds.low <= -0.6).all()
+    assert (bounds.high >= 0.6).all()
+    assert float(bounds.size_m.max()) < 3
+
+
+def test_cameras_that_look_apart_have_no_bounds():
+    apart = [camera_at((1.0, 0, 0), target=(3.0, 0, 0)), camera_at((-1.0, 0, 0.1), target=(-3.0, 0, 0.1))]
+    with pytest.raises(ValueError, match="OpenCV axes"):
+        bounds_from_cameras(concatenate_cameras(apart))
+
+
+def test_one_camera_or_no_foreground_is_an_error():
+    cameras = dome(3)
+    masks = ball_masks(cameras)
+    with pytest.raises(ValueError, match="at least two cameras"):
+        visual_hull(masks[:1], cameras[0], around(1.0), SMALL)
+    with pytest.raises(ValueError, match="foreground"):
+        visual_hull(torch.zeros_like(masks), cameras, around(1.0), SMALL)
+    with pytest.raises(ValueError, match="foreground"):
+        bounds_from_masks(torch.zeros_like(masks), cameras)
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu():
+    cameras, masks = mixed_rig()
+    here = visual_hull(masks, cameras, around(0.7), SMALL)
+    there = visual_hull(masks.cuda(), cameras.to("cuda"), around(0.7).to("cuda"), SMALL)
+    assert ((here.values - there.values.cpu()).abs() > 0.01).float().mean() < 1e-3
