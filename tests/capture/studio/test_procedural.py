@@ -11,6 +11,7 @@ from viewmend.capture.studio.procedural.fabric import KINDS, Canvas, sample_fabr
 from viewmend.capture.studio.procedural.gestures import FAMILIES
 from viewmend.capture.studio.procedural.grounds import Tempo
 from viewmend.capture.studio.procedural.hair import STYLES, sample_hair
+from viewmend.capture.studio.procedural.head import build_head
 from viewmend.capture.studio.procedural.motion import GESTURES, MOTIONS, sample_motion
 from viewmend.capture.studio.procedural.outfit import BOTTOMS, OUTERS, TOPS, sample_outfit
 from viewmend.capture.studio.procedural.physique import sample_physique
@@ -71,8 +72,10 @@ def test_the_size_is_human(walker):
     # An A-pose: the finger tips are less far out than in a T-pose (half the height).
     assert 0.34 < float(bind[:, 0].max()) / tall < 0.46
     # Seven and a half heads: the chin is where anatomy has it.
-    chin = person.skeleton.at("head")[1] / person.physique.height_m
-    assert chin == pytest.approx(1 - 1 / 7.6, abs=0.02)
+    head = build_head(person.physique, person.skeleton)
+    chin, crown = head.point(np.zeros(2), np.array([0.0, 1.0]))[:, 1] / person.physique.height_m
+    assert crown == pytest.approx(1.0, abs=1e-6)
+    assert 7.0 < 1 / (crown - chin) < 8.0
     for seed in range(200):
         assert 1.5 <= sample_physique(np.random.default_rng(seed)).height_m <= 1.95
 
@@ -146,7 +149,9 @@ def test_two_people_and_things():
         SEED, style=PerformerStyle(people=2, furniture=True, holding=True, tempo="calm", motion="talk")
     )
     assert len(cast.people) == 2 and cast.things is not None
-    assert len(cast.pose(0.0).textures) == 3
+    scene = cast.pose(0.0)
+    assert len(scene.textures) == 3
+    assert len(torch.unique(scene.mesh.faces)) == len(scene.mesh.vertices)
     assert "with a" in cast.description and "beside" in cast.description
 
 
