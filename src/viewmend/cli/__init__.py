@@ -29,6 +29,7 @@ COMMANDS = (
     Command("demo", "viewmend.cli.demo", "Render and mend a moving procedural scene; needs nothing."),
     Command("mend", "viewmend.cli.mend", "Mend novel views of a capture."),
     Command("studio", "viewmend.cli.studio", "Write synthetic captures with exact truth."),
+    Command("train", "viewmend.cli.train", "Train a model on the studio."),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 

@@ -23,6 +23,8 @@ class Target:
     view: IncompleteView
     places: Int[Tensor, "patch 3"]
     tokens: Float[Tensor, "patch dim"]
+    shown: Float[Tensor, "channel height width"]
+    """The view as the encoder was shown it."""
     incomplete: Bool[Tensor, "patch"]
 
 

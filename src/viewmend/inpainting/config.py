@@ -40,6 +40,9 @@ class InpainterConfig:
     it must shift. Ours."""
     colour_path: bool = False
     """Let patches carry their colours at 1/4 besides their features, as waves that start out as a copy. Ours."""
+    prefill: bool = False
+    """Fill the holes smoothly from their surroundings first: the encoder is shown the fill instead of black, the
+    decoder the view's own pixels, and it decides pixel by pixel how much of the fill to replace. Ours."""
     top_k: int | None = None
     """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
     attention_scale: Literal["model", "head"] = "model"
@@ -128,4 +131,5 @@ def small() -> InpainterConfig:
         rope_unit="patch",
         rope_values=True,
         colour_path=True,
+        prefill=True,
     )

@@ -8,6 +8,9 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.encoder import SLOPE
 from viewmend.inpainting.patches import PATCH_CELLS, PATCH_PX
 
+KEEP = -2.0
+"""Where a decoder that may keep the fill starts: it replaces an eighth."""
+
 
 class Decoder(nn.Module):
     """Each token becomes 7 x 7 x C by a linear layer, then 28 x 28 RGB by deconvolutions that see no other patch."""
@@ -18,16 +21,17 @@ class Decoder(nn.Module):
         self.norm = nn.LayerNorm(config.dim)
         self.features = C
         self.linear = nn.Linear(config.dim, (C + 3 * config.colour_path) * PATCH_CELLS**2)
-        last = nn.Conv2d(C // 2, 3, 3, 1, 1)
         self.layers = nn.Sequential(
             nn.LeakyReLU(SLOPE),
             nn.ConvTranspose2d(C, C, 4, 2, 1),
             nn.LeakyReLU(SLOPE),
             nn.ConvTranspose2d(C, C // 2, 4, 2, 1),
             nn.LeakyReLU(SLOPE),
-            last,
         )
-        for layer in self.layers:
+        self.prefill = config.prefill
+        self.mix = nn.Conv2d(C // 2 + config.in_channels, C // 2, 3, 1, 1) if config.prefill else None
+        self.last = last = nn.Conv2d(C // 2, 3 + config.prefill, 3, 1, 1)
+        for layer in (*self.layers, self.last):
             if isinstance(layer, nn.ConvTranspose2d):
                 # Each output pixel sees a quarter of the 4 x 4 kernel's taps.
                 nn.init.normal_(layer.weight, 0, (2 / (layer.in_channels * 4)) ** 0.5)
@@ -37,13 +41,22 @@ class Decoder(nn.Module):
             # Detail starts small upon the colours that are copied.
             last.weight.data.mul_(0.1)
 
-    def forward(self, tokens: Float[Tensor, "patch dim"]) -> Float[Tensor, "patch 3 28 28"]:
-        """RGB patches, about [0, 1] but not clamped."""
+    def forward(
+        self, tokens: Float[Tensor, "patch dim"], pixels: Float[Tensor, "patch channel 28 28"]
+    ) -> Float[Tensor, "patch output 28 28"]:
+        """RGB patches, about [0, 1] but not clamped; with `prefill` a fourth channel, 0 to 1: how much they replace.
+
+        `pixels` is what the encoder was shown of the patches; the paper's decoder does not look at it.
+        """
         cells = self.linear(self.norm(tokens)).unflatten(1, (-1, PATCH_CELLS, PATCH_CELLS))
-        rgb = self.layers(cells[:, : self.features])
+        detail = self.layers(cells[:, : self.features])
+        if self.mix is not None:
+            detail = nn.functional.leaky_relu(self.mix(torch.cat([detail, pixels.to(detail)], 1)), SLOPE)
+        out = self.last(detail)
+        rgb = out[:, :3]
         if cells.shape[1] > self.features:
             rgb = rgb + nn.functional.interpolate(cells[:, self.features :], size=PATCH_PX, mode="bilinear")
-        return rgb
+        return torch.cat([rgb, (out[:, 3:] + KEEP).sigmoid()], 1) if self.prefill else rgb
 
 
 def blend(

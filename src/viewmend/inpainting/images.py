@@ -19,6 +19,7 @@ from viewmend.inpainting.patches import (
     crop_windows,
     split,
 )
+from viewmend.inpainting.prefill import pull_push
 from viewmend.views import ContextViews, IncompleteView
 
 MIN_FOREGROUND = 0.1
@@ -54,9 +55,10 @@ def context_images(views: ContextViews, config: InpainterConfig) -> Images:
 
 
 def target_images(view: IncompleteView, config: InpainterConfig) -> Images:
-    """The novel view, a stack of one."""
+    """The novel view, a stack of one; with `prefill`, its holes filled from their surroundings."""
     mask = view.mask[None]
-    return _images(view.rgb[None], mask, view.depth[None], 1 - view.error[None], mask > 0, config)
+    rgb = pull_push(view.rgb, (view.mask > 0) & (view.error == 0)) if config.prefill else view.rgb
+    return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], mask > 0, config)
 
 
 def _images(

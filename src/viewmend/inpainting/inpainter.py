@@ -14,7 +14,17 @@ from viewmend.inpainting.coordinates import lift, patch_depths
 from viewmend.inpainting.copying import start_as_copier
 from viewmend.inpainting.decoder import Decoder, blend
 from viewmend.inpainting.images import Images, Tokeniser, context_images, target_images
-from viewmend.inpainting.patches import STEP_PX, any_in_patch, centers_px, merge
+from viewmend.inpainting.patches import (
+    PATCH_PX,
+    STEP_PX,
+    any_in_patch,
+    centers_px,
+    crop,
+    grid_shape,
+    merge,
+    padded_size,
+    split,
+)
 from viewmend.inpainting.protocol import Source, State
 from viewmend.inpainting.transformer import Transformer
 from viewmend.views import CompletedView, ContextViews, IncompleteView
@@ -109,13 +119,13 @@ class Inpainter(nn.Module):
         parts = zip(views, stacks, tokens.split([len(stack.places) for stack in stacks]), strict=True)
         for view, stack, own in parts:
             incomplete = any_in_patch(view.error[None] > 0)[tuple(stack.places.unbind(1))]
-            targets.append(Target(view, stack.places, own, incomplete))
+            targets.append(Target(view, stack.places, own, stack.channels[0], incomplete))
         return targets
 
     def _decode(
         self, targets: Sequence[Target], contexts: Sequence[Sequence[ContextFrame]], top_k: int | None
-    ) -> list[Float[Tensor, "patch 3 28 28"]]:
-        """RGB patches of each target's incomplete patches."""
+    ) -> list[Float[Tensor, "patch output 28 28"]]:
+        """The decoder's patches for each target's incomplete patches."""
         with self._autocast(targets[0].tokens.device):
             own = [self.transformer.project_context(t.tokens[~t.incomplete]) for t in targets]
         batch = assemble(targets, contexts, own, self.config)
@@ -127,7 +137,7 @@ class Inpainter(nn.Module):
                 batch.context_at,
                 self.config.top_k if top_k is None else top_k,
             )
-            decoded = self.decoder(tokens[batch.at.present])
+            decoded = self.decoder(tokens[batch.at.present], torch.cat([_pixels(t) for t in targets]))
         return list(decoded.float().split([int(t.incomplete.sum()) for t in targets]))
 
     def initial_state(self) -> State:
@@ -183,11 +193,21 @@ def _context_frames(
     return tuple(frames)
 
 
-def _prediction(target: Target, patches: Float[Tensor, "patch 3 28 28"] | None) -> Prediction:
+def _prediction(target: Target, patches: Float[Tensor, "patch output 28 28"] | None) -> Prediction:
     """Patches back in their places, blended, and the view completed; without patches it stays as it is."""
     view = target.view
     if patches is None:
         return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb)
     height, width = view.mask.shape
     merged, coverage = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
-    return Prediction(merged[0], coverage[0], blend(view.rgb, view.error, merged[0], coverage[0]))
+    inpainted = merged[0, :3]
+    if len(merged[0]) > 3:
+        inpainted = torch.lerp(target.shown[:3] * coverage, inpainted, merged[0, 3])
+    return Prediction(inpainted, coverage[0], blend(view.rgb, view.error, inpainted, coverage[0]))
+
+
+def _pixels(target: Target) -> Float[Tensor, "patch channel 28 28"]:
+    """What the encoder was shown of the incomplete patches."""
+    height, width = padded_size(*grid_shape(*target.view.mask.shape))
+    full = crop(target.shown, 0, 0, (height, width))[None]
+    return split(full, target.places[target.incomplete], PATCH_PX, STEP_PX)

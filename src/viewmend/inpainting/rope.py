@@ -63,6 +63,13 @@ def rotate(
     x: Float[Tensor, "*batch channel"], angle: Float[Tensor, "*#batch channel/2"]
 ) -> Float[Tensor, "*batch channel"]:
     """Pairs (i, i + channel / 2) of x turned by these angles, in x's own precision."""
-    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
+    return turn(x, torch.stack([angle.cos(), angle.sin()]))
+
+
+def turn(
+    x: Float[Tensor, "*batch channel"], cos_sin: Float[Tensor, "2 *#batch channel/2"]
+) -> Float[Tensor, "*batch channel"]:
+    """`rotate` by angles whose cosine and sine are at hand."""
+    cos, sin = cos_sin.to(x.dtype)
     first, second = x.chunk(2, -1)
     return torch.cat([first * cos - second * sin, second * cos + first * sin], -1)

@@ -147,16 +147,17 @@ class _Turns:
             f = transformer.score_frequencies
             unit = f.new_tensor([rope.UNIT_STEPS, rope.UNIT_STEPS, 1.0])
             where = [x.uvs if config.rope_unit == "image" else x.steps / unit for x in (at, context_at)]
-            self.score = tuple(rope.angles(x, f)[:, None] for x in where)
+            self.score = tuple(_cos_sin(rope.angles(x, f)) for x in where)
         if config.rope_values:
             f = transformer.value_frequencies
-            self.value = tuple(rope.angles(x.steps, f)[:, None] for x in (at, context_at))
+            at_query, at_key = (rope.angles(x.steps, f) for x in (at, context_at))
+            self.value = (_cos_sin(-at_query), _cos_sin(at_key))
 
     def query(self, Q: Tensor) -> Tensor:
-        return Q if self.score is None else rope.rotate(Q, self.score[0])
+        return Q if self.score is None else rope.turn(Q, self.score[0])
 
     def back(self, looked: Tensor) -> Tensor:
-        return looked if self.value is None else rope.rotate(looked, -self.value[0])
+        return looked if self.value is None else rope.turn(looked, self.value[0])
 
     def context(self, KV: Tensor, kept: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Rotated K and V of the kept keys and which of these count."""
@@ -165,6 +166,11 @@ class _Turns:
             present = present.gather(1, kept)
             index = kept[:, None, :, None]
             KV = KV.gather(3, index.expand(2, -1, KV.shape[2], -1, KV.shape[4]))
-            turns = [None if t is None else t.gather(2, index.expand(-1, -1, -1, t.shape[3])) for t in turns]
-        K, V = (x if t is None else rope.rotate(x, t) for x, t in zip(KV, turns, strict=True))
+            turns = [None if t is None else t.gather(3, index.expand(2, -1, -1, -1, t.shape[4])) for t in turns]
+        K, V = (x if t is None else rope.turn(x, t) for x, t in zip(KV, turns, strict=True))
         return K, V, present
+
+
+def _cos_sin(angle: Float[Tensor, "sample token pair"]) -> Float[Tensor, "2 sample 1 token pair"]:
+    """What turns every head and block by the same angles."""
+    return torch.stack([angle.cos(), angle.sin()])[:, :, None]

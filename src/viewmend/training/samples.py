@@ -1,0 +1,77 @@
+"""Training pairs through the production pipeline: leave a camera out, hull, render, holes (section 8)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import GeometryProxy, reconstruct
+from viewmend.rendering.view import RenderConfig, render_view
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A rendered view, what the cameras saw, and what a camera that was left out saw in its place (F*)."""
+
+    view: IncompleteView
+    context: tuple[ContextViews, ...]
+    """The chosen cameras, one element a time, the view's own time first."""
+    truth: UInt8[Tensor, "3 height width"]
+    """F*, background black."""
+
+    def to(self, device: torch.device | str) -> "Sample":
+        """The same sample on `device`."""
+        view = replace(
+            self.view,
+            camera=self.view.camera.to(device),
+            rgb=self.view.rgb.to(device),
+            mask=self.view.mask.to(device),
+            error=self.view.error.to(device),
+            depth=self.view.depth.to(device),
+            weights=self.view.weights.to(device),
+        )
+        context = tuple(ContextViews(c.frame.to(device), c.depth.to(device)) for c in self.context)
+        return Sample(view, context, self.truth.to(device))
+
+
+class LeaveOneOut:
+    """The frames of one rig without one of its cameras, image and mask; proxies are computed once a time."""
+
+    def __init__(self, frames: Mapping[int, MultiViewFrame], held: str, bounds: Bounds | None, hull: HullConfig):
+        self.frames = {time: frame.without([held]) for time, frame in frames.items()}
+        self.held = held
+        self.bounds = bounds
+        self.hull = hull
+        self._proxies: dict[int, GeometryProxy] = {}
+
+    def proxy(self, time: int) -> GeometryProxy:
+        """G[time], from the masks of the cameras that are left."""
+        if time not in self._proxies:
+            frame = self.frames[time]
+            assert frame.mask is not None, "the studio always knows its masks"
+            self._proxies[time] = reconstruct(frame.mask, frame.cameras, self.bounds, self.hull)
+        return self._proxies[time]
+
+    def sample(
+        self, time: int, past: Sequence[int], truth: MultiViewFrame, render: RenderConfig, min_hole_px: int
+    ) -> Sample | None:
+        """The pair at `time` with context from `time` and the `past` times; None if fewer pixels are missing.
+
+        truth: the held camera at `time`, one view.
+        """
+        view = render_view(self.frames[time], self.proxy(time), truth.cameras, render)
+        if float(view.error.sum()) < min_hole_px:
+            return None
+        context = []
+        for tau in (time, *past):
+            names = [n for n in view.chosen if n in self.frames[tau].cameras.names]
+            frame = self.frames[tau].select(names)
+            context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
+        assert truth.mask is not None, "the studio always knows its masks"
+        black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
+        return Sample(view, tuple(context), black.round().to(torch.uint8))
