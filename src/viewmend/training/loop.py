@@ -122,6 +122,7 @@ def _card(recipe: Recipe, entry: Progress) -> str:
 
 Trained by `viewmend train {recipe.name}`: {entry.step + 1} steps of {recipe.batch} samples in
 {entry.elapsed_s / 60:.0f} minutes ({entry.progress:.0%} of the schedule), seed {recipe.seed},
-torch {torch.__version__}, {torch.get_num_threads()} threads. Loss: L1 in and outside of the holes (section 8), averaged weights.
+torch {torch.__version__}, {torch.get_num_threads()} threads, CUDA {torch.cuda.is_available()}.
+Loss: L1 inside and outside of the holes (section 8); averaged weights.
 Data: studio scenes made on the fly{characters}; no real captures, no test seeds, performers or motions.
 """
