@@ -126,7 +126,7 @@ def test_cropped_subjects_keep_what_some_cameras_do_not_see(path):
 
 
 def test_the_search_keeps_all_of_the_hull(path):
-    cameras = dome(7)
+    cameras = dome(7, fov=1.4)
     masks = ball_masks(cameras, center=(0.3, -0.1, 0.2), radius=0.3)
     box = occupied_bounds(masks, cameras, around(1.6), HullConfig())
     assert box is not None

@@ -1,0 +1,92 @@
+"""Pinhole cameras: projection and changes of the image grid."""
+
+import pytest
+import torch
+from geometry.solids import camera_at, dome
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import concatenate_cameras, pinhole, pixel_centers, project, unproject
+
+
+def test_the_center_of_view_is_in_the_middle():
+    camera = camera_at((2.0, 0.5, 0.0), width=40, height=30)
+    uv, z = project(torch.zeros(1, 3), camera)
+    torch.testing.assert_close(uv[0, 0], torch.tensor([20.0, 15.0]), atol=1e-4, rtol=0)
+    assert float(z[0, 0]) == pytest.approx(4.25**0.5, rel=1e-5)
+
+
+def test_axes_are_opencvs():
+    """Seen by a camera that looks along z with y up in the world: world up is image up, v grows downwards."""
+    camera = camera_at((0.0, 0.0, -2.0))
+    uv, _ = project(torch.tensor([[0.0, 0.1, 0.0], [-0.1, 0.0, 0.0]]), camera)
+    assert uv[0, 0, 1] < 40, "what is above the axis is above the middle"
+    assert uv[0, 1, 0] > 48, "from the front, world -x is to the right"
+
+
+def test_skew_moves_points_sideways_by_their_height():
+    camera = pinhole(0.8, 40, 30, torch.eye(4))
+    skewed = camera.K.clone()
+    skewed[0, 0, 1] = 7.0
+    points = torch.tensor([[0.1, 0.2, 2.0]])
+    straight, _ = project(points, camera)
+    slanted, _ = project(points, type(camera)(camera.names, skewed, camera.camera_from_world, camera.size_px))
+    torch.testing.assert_close(slanted - straight, torch.tensor([[[7 * 0.1, 0.0]]]))
+
+
+def test_a_point_behind_has_negative_depth_and_finite_pixels():
+    uv, z = project(torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), pinhole(0.8, 40, 30, torch.eye(4)))
+    assert (z <= 0).all()
+    assert torch.isfinite(uv).all()
+
+
+def test_resizing_keeps_the_field_of_view():
+    cameras = concatenate_cameras(
+        [camera_at((2, 0, 0), width=40, height=30), camera_at((0, 0, 2), width=60, height=50)]
+    )
+    points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    before, _ = project(points, cameras)
+    after, _ = project(points, cameras.resized(80, 100))
+    scale = torch.tensor([[[2.0, 100 / 30]], [[80 / 60, 2.0]]])
+    torch.testing.assert_close(after, before * scale)
+    assert cameras.resized(80, 100).max_size_px == (80, 100)
+
+
+def test_cropping_moves_the_origin():
+    camera = camera_at((2.0, 0.0, 0.0))
+    points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    window = camera.cropped(10, -5, 20, 16)
+    torch.testing.assert_close(project(points, window)[0], project(points, camera)[0] - torch.tensor([10.0, -5.0]))
+    assert window.max_size_px == (20, 16)
+
+
+def test_selection_by_name_and_by_position():
+    cameras = dome(4)
+    assert cameras.select(["c2", "c0"]).names == ("c2", "c0")
+    assert torch.equal(cameras.select(["c2"]).K, cameras[2].K)
+    assert cameras[1:3].names == ("c1", "c2")
+    assert cameras[-1].names == ("c3",)
+    assert len(cameras[[3, 3]]) == 2
+    with pytest.raises(ValueError, match="spelling"):
+        cameras.select(["c9"])
+
+
+def test_pixel_centers_start_at_a_half():
+    centers = pixel_centers(3, 2)
+    assert centers.shape == (2, 3, 2)
+    assert centers[0, 0].tolist() == [0.5, 0.5]
+    assert centers[1, 2].tolist() == [2.5, 1.5]
+
+
+def test_centers_are_where_the_cameras_stand():
+    cameras = concatenate_cameras([camera_at((2.0, 0.3, 0.1)), camera_at((0.0, -1.0, 2.0))])
+    torch.testing.assert_close(cameras.centers, torch.tensor([[2.0, 0.3, 0.1], [0.0, -1.0, 2.0]]))
+    uv = torch.full((2, 1, 2), 7.0)
+    at_zero = unproject(uv, torch.zeros(2, 1), cameras)
+    torch.testing.assert_close(at_zero[:, 0], cameras.centers)
+
+
+def test_bounds_grow_about_their_center():
+    bounds = Bounds(torch.tensor([0.0, 1.0, 2.0]), torch.tensor([2.0, 5.0, 4.0]))
+    grown = bounds.grown(0.5)
+    torch.testing.assert_close(grown.center, bounds.center)
+    torch.testing.assert_close(grown.size_m, bounds.size_m * 1.5)

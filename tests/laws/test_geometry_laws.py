@@ -1,0 +1,145 @@
+"""Laws of the geometry, on analytic scenes and random rigs."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from geometry.solids import around, ball_masks, camera_at, dome, sides, volume
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, project, unproject
+from viewmend.geometry.hull import HullConfig, visual_hull
+from viewmend.geometry.proxy import reconstruct
+from viewmend.geometry.rigid import invert_rigid, rigid, rotation_from_axis_angle
+
+CONFIG = HullConfig(resolution=32)
+seeds = st.integers(0, 10_000)
+
+
+def random_rig(seed: int, views: int = 3) -> Cameras:
+    """Cameras anywhere, looking anywhere, with skewed, uneven K."""
+    rng = torch.Generator().manual_seed(seed)
+    pose = rigid(rotation_from_axis_angle(torch.randn(views, 3, generator=rng)), torch.randn(views, 3, generator=rng))
+    K = torch.tensor([[80.0, 0.0, 50.0], [0.0, 80.0, 40.0], [0.0, 0.0, 1.0]]).repeat(views, 1, 1)
+    K[:, 0, 0] *= 0.5 + torch.rand(views, generator=rng)
+    K[:, 0, 1] = 4 * torch.randn(views, generator=rng)
+    return Cameras(tuple(f"c{v}" for v in range(views)), K, pose, torch.tensor([[100, 80]] * views))
+
+
+@given(seeds)
+@settings(max_examples=25, deadline=None)
+def test_projecting_what_was_unprojected_is_the_identity(seed):
+    rng = torch.Generator().manual_seed(seed)
+    cameras = random_rig(seed)
+    uv = torch.rand(3, 5, 2, generator=rng) * 100
+    z = torch.rand(3, 5, generator=rng) * 5 + 0.1
+    world = unproject(uv, z, cameras)
+    for view in range(3):
+        back, depth = project(world[view], cameras[view])
+        torch.testing.assert_close(back[0], uv[view], atol=2e-2, rtol=1e-4)
+        torch.testing.assert_close(depth[0], z[view], atol=1e-4, rtol=1e-4)
+
+
+@given(seeds)
+@settings(max_examples=25, deadline=None)
+def test_inverting_a_motion_twice_and_against_itself(seed):
+    pose = random_rig(seed).camera_from_world
+    torch.testing.assert_close(invert_rigid(invert_rigid(pose)), pose, atol=1e-5, rtol=0)
+    identity = torch.eye(4).expand_as(pose)
+    torch.testing.assert_close(invert_rigid(pose) @ pose, identity, atol=1e-5, rtol=0)
+
+
+@given(st.lists(st.integers(0, 7), min_size=2, max_size=8, unique=True), st.integers(0, 7))
+@settings(max_examples=6, deadline=None)
+def test_more_views_never_grow_the_hull(some, another):
+    """Where enough cameras see a point in both cases, one more mask only takes away."""
+    cameras = dome(8)
+    masks = ball_masks(cameras, center=(0.1, 0.0, -0.1))
+    config = replace(CONFIG, min_share=0.0)
+    fewer = visual_hull(masks[some], cameras[some], around(0.7), config).values
+    more_views = sorted({*some, another})
+    more = visual_hull(masks[more_views], cameras[more_views], around(0.7), config).values
+    # Single precision rounds a voxel's image one way or the other as voxels are grouped.
+    assert (more <= fewer + 1e-4).all()
+
+
+@pytest.mark.parametrize("views", [3, 8, 20])
+def test_the_hull_contains_the_object(views):
+    """And with many cameras not much else."""
+    cameras = dome(views, width=160, height=140)
+    center = torch.tensor([0.15, -0.1, 0.05])
+    grid = visual_hull(ball_masks(cameras, center.tolist(), 0.45), cameras, around(0.7), HullConfig(resolution=48))
+    steps = [torch.arange(n) for n in grid.values.shape]
+    at = (torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + 0.5) * grid.voxel_m + grid.low
+    inside = (at - center).norm(dim=-1) < 0.45 - grid.voxel_m
+    assert (grid.values[inside] > 0.5).all()
+    if views == 20:
+        filled = float((grid.values > 0.5).float().sum()) * grid.voxel_m**3
+        assert filled < 1.12 * 4 / 3 * torch.pi * 0.45**3
+
+
+def test_the_surface_is_closed_and_outward_whatever_the_cut():
+    cameras = dome(6)
+    masks = ball_masks(cameras)
+    for bounds in (around(0.8), around(0.4), around(0.4, (0.4, 0.2, 0.0))):
+        mesh = reconstruct(masks, cameras, bounds, CONFIG).mesh
+        undirected, directed = sides(mesh)
+        assert (undirected == 2).all()
+        assert (directed == 1).all()
+        assert volume(mesh) > 0
+        margin = float(bounds.size_m.max()) / 32
+        assert (mesh.vertices >= bounds.low - margin).all()
+        assert (mesh.vertices <= bounds.high + margin).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 10.0, 1000.0])
+def test_units_do_not_matter(scale):
+    """The same capture in millimetres or kilometres gives the same proxy, scaled."""
+    cameras = dome(7)
+    masks = ball_masks(cameras)
+    pose = cameras.camera_from_world.clone()
+    pose[:, :3, 3] *= scale
+    scaled = replace(cameras, camera_from_world=pose)
+    mesh = reconstruct(masks, cameras, None, CONFIG).mesh
+    other = reconstruct(masks, scaled, None, CONFIG)
+    assert volume(other.mesh) / scale**3 == pytest.approx(volume(mesh), rel=0.01)
+    torch.testing.assert_close(
+        other.depth(scaled) / scale, reconstruct(masks, cameras, None, CONFIG).depth(cameras), atol=0.05, rtol=0
+    )
+
+
+@given(seeds)
+@settings(max_examples=2, deadline=None)
+def test_the_worlds_orientation_does_not_matter(seed):
+    """Turn and move the world: the proxy covers the same pixels at the same depth."""
+    rng = torch.Generator().manual_seed(seed)
+    motion = rigid(rotation_from_axis_angle(torch.randn(3, generator=rng)), torch.randn(3, generator=rng))
+    cameras = dome(7)
+    masks = ball_masks(cameras)
+    moved = replace(cameras, camera_from_world=cameras.camera_from_world @ invert_rigid(motion))
+    here = reconstruct(masks, cameras, None, CONFIG).depth(cameras)
+    there = reconstruct(masks, moved, None, CONFIG).depth(moved)
+    both = (here > 0) & (there > 0)
+    assert both.sum() > 0.95 * (here > 0).sum()
+    assert (here - there).abs()[both].median() < 0.01
+
+
+def test_the_order_of_cameras_does_not_matter():
+    cameras = dome(6)
+    masks = ball_masks(cameras)
+    order = [3, 0, 5, 1, 4, 2]
+    bounds = Bounds(torch.full((3,), -0.6), torch.full((3,), 0.6))
+    here = visual_hull(masks, cameras, bounds, CONFIG).values
+    there = visual_hull(masks[order], cameras[order], bounds, CONFIG).values
+    torch.testing.assert_close(here, there, atol=1e-5, rtol=0)
+
+
+def test_a_camera_that_looks_away_changes_nothing():
+    cameras = concatenate_cameras([dome(6), camera_at((0.0, 0.0, 1.5), target=(0.0, 0.0, 4.0), name="away")])
+    masks = ball_masks(cameras)
+    bounds = around(0.6)
+    with_it = visual_hull(masks, cameras, bounds, CONFIG).values
+    without = visual_hull(masks[:6], cameras[0:6], bounds, CONFIG).values
+    torch.testing.assert_close(with_it, without, atol=1e-5, rtol=0)
