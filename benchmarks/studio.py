@@ -19,19 +19,24 @@ from viewmend.capture.studio.textures import texture_pyramid
 
 
 def timed(work, runs: int, device: str) -> dict[str, float]:
-    """Median and p95 of `work(run)` in milliseconds, after one warm-up."""
+    """Median and p95 of `work(run)` in milliseconds after one warm-up, and the median of its CPU time."""
     work(0)
-    spent = []
+    spent, cpu = [], []
     for run in range(1, runs + 1):
         if device.startswith("cuda"):
             torch.cuda.synchronize()
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         work(run)
         if device.startswith("cuda"):
             torch.cuda.synchronize()
         spent.append(1e3 * (time.perf_counter() - start))
+        cpu.append(1e3 * (time.process_time() - cpu_start))
     spent.sort()
-    return {"median_ms": round(statistics.median(spent), 2), "p95_ms": round(spent[int(0.95 * (len(spent) - 1))], 2)}
+    return {
+        "median_ms": round(statistics.median(spent), 2),
+        "p95_ms": round(spent[int(0.95 * (len(spent) - 1))], 2),
+        "cpu_ms": round(statistics.median(cpu), 2),
+    }
 
 
 def measure(config: StudioConfig, runs: int) -> dict[str, object]:
@@ -50,6 +55,7 @@ def measure(config: StudioConfig, runs: int) -> dict[str, object]:
         "render_all_views": timed(lambda _: render(surface, cameras), runs, device),
         "read_frame": frame,
         "images_per_second": round(1e3 * len(cameras) / frame["median_ms"], 1),
+        "images_per_cpu_second": round(1e3 * len(cameras) / max(frame["cpu_ms"], 1e-3), 1),
     }
 
 
@@ -60,9 +66,12 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=8)
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--runs", type=int, default=8)
+    parser.add_argument("--threads", type=int, help="of torch; 1 where others use the machine too")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
+    if options.threads is not None:
+        torch.set_num_threads(options.threads)
     base = {"seed": 0, "cameras": options.cameras, "size_px": options.size, "frames": options.runs + 1}
     files = {"performers": options.performers, "motions": options.motions}
     cases = {

@@ -12,6 +12,9 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.rigid import rotation_from_axis_angle
 from viewmend.views import MultiViewFrame
 
+SPILL_PX = 3.0
+"""Standard deviation of the blur that says how near the outline is."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
@@ -106,23 +109,57 @@ def _image(
     it: Imperfections,
     seeds: tuple[int, int, int],
 ) -> UInt8[Tensor, "3 height width"]:
-    """Spill, then exposure and white balance in linear light, noise, compression."""
+    """Spill, then exposure and white balance in linear light, noise, compression.
+
+    Gains and strengths of noise are looked up by 8-bit level: powers for every pixel would cost as much as drawing.
+    """
     seed, view, time = seeds
-    value = rgb.float() / 255
-    if it.exposure_stops or it.white_balance or (it.spill and background is not None):
-        linear = linear_from_srgb(value)
-        if it.spill and background is not None:
-            inside = _blurred(mask.float() / 255, 3.0)
-            share = it.spill * 2 * (1 - inside).clamp(0, 0.5) * (mask > 0)
-            linear = linear + share * (background - linear)
-        draw = torch.randn(4, generator=_generator(seed, 2, view, 0)).to(linear)
+    if it.spill and background is not None:
+        rgb = _stained(rgb, mask, background, it.spill)
+    level = (torch.arange(256, device=rgb.device) / 255).expand(3, -1)
+    if it.exposure_stops or it.white_balance:
+        draw = torch.randn(4, generator=_generator(seed, 2, view, 0)).to(level)
         gain = torch.exp2(it.exposure_stops * draw[3]) * (1 + it.white_balance * draw[:3])
-        value = srgb_from_linear(linear * gain[:, None, None])
+        level = srgb_from_linear(linear_from_srgb(level) * gain[:, None])
+    entry = rgb.long() + 256 * torch.arange(3, device=rgb.device)[:, None, None]
     if it.shot_noise or it.read_noise:
-        noise = torch.randn(value.shape, generator=_generator(seed, 3, view, time)).to(value)
-        value = value + noise * (it.read_noise**2 + it.shot_noise**2 * value).sqrt()
-    out = (value.clamp(0, 1) * 255).round().to(torch.uint8)
+        strength = (it.read_noise**2 + it.shot_noise**2 * level).sqrt()
+        noise = torch.randn(rgb.shape, generator=_generator(seed, 3, view, time)).to(level)
+        value = torch.addcmul(level.take(entry), noise, strength.take(entry))
+        out = (value.clamp_(0, 1) * 255).round().to(torch.uint8)
+    else:
+        out = (level * 255).round().to(torch.uint8).take(entry)
     return out if it.jpeg_quality is None else _compressed(out, it.jpeg_quality)
+
+
+def _stained(
+    rgb: UInt8[Tensor, "3 height width"],
+    mask: UInt8[Tensor, "height width"],
+    background: Float[Tensor, "3 height width"],
+    strength: float,
+) -> UInt8[Tensor, "3 height width"]:
+    """The subject with the background's colour on it, the more the nearer to its outline."""
+    window = _window(mask, _reach(SPILL_PX))
+    inside = _blurred(mask[window].float() / 255, SPILL_PX)
+    share = strength * 2 * (1 - inside).clamp(0, 0.5) * (mask[window] > 0)
+    # Further than the blur reaches nothing is stained; its tails are below a level.
+    near = share > strength / 500
+    out = rgb.clone()
+    part = out[:, *window]
+    linear = linear_from_srgb(part[:, near].float() / 255)
+    mixed = torch.lerp(linear, background[:, *window][:, near], share[near])
+    part[:, near] = (srgb_from_linear(mixed) * 255).round().to(torch.uint8)
+    return out
+
+
+def _window(mask: Tensor, margin: int) -> tuple[slice, slice]:
+    """Rows and columns that hold all of a mask, and a margin."""
+    bounds = []
+    for along in (1, 0):
+        places = (mask > 0).any(along).nonzero()
+        first, last = (int(places[0]), int(places[-1])) if len(places) else (0, 0)
+        bounds.append(slice(max(0, first - margin), last + 1 + margin))
+    return bounds[0], bounds[1]
 
 
 def _mask(
@@ -141,14 +178,17 @@ def _mask(
                 value = torch.where(_spot(where, generator), torch.full_like(value, to), value)
     if it.mask_edge_px:
         sigma = 1.5 * it.mask_edge_px
+        window = _window(value, _reach(sigma))
+        part = value[window]
         coarse = torch.randn(1, 1, 8, 8, generator=generator).to(value)
-        wander = torch.nn.functional.interpolate(coarse, size=tuple(value.shape), mode="bicubic")[0, 0]
+        wander = torch.nn.functional.interpolate(coarse, size=tuple(part.shape), mode="bicubic")[0, 0]
         lean = torch.randn((), generator=_generator(seed, 5, view, 0)).to(value)
         # A blurred straight edge has the slope 0.4 / sigma: this moves its half level by about mask_edge_px.
         shift = 0.4 * it.mask_edge_px / sigma * (0.7 * wander + 0.7 * lean)
         # Bounded so that, with this gain, what is flat stays flat: 2.5 (0.5 - 0.3) = 0.5.
         shift = 0.3 * torch.tanh(shift / 0.3)
-        value = (2.5 * (_blurred(value, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
+        value = value.clone()
+        value[window] = (2.5 * (_blurred(part, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
     return (value * 255).round().to(torch.uint8)
 
 
@@ -166,9 +206,14 @@ def _spot(where: Tensor, generator: torch.Generator) -> Tensor:
     return (y / radii[0]) ** 2 + (x / radii[1] + (draw[3] - 0.5) * y / radii[0]) ** 2 < 1
 
 
+def _reach(sigma_px: float) -> int:
+    """How far a blur looks, pixels."""
+    return max(1, round(3 * sigma_px))
+
+
 def _blurred(value: Float[Tensor, "height width"], sigma_px: float) -> Float[Tensor, "height width"]:
     """Gaussian blur; the outermost pixels continue beyond the image."""
-    reach = max(1, round(3 * sigma_px))
+    reach = _reach(sigma_px)
     offsets = torch.arange(-reach, reach + 1, device=value.device)
     kernel = torch.exp(-0.5 * (offsets / sigma_px) ** 2)
     kernel = kernel / kernel.sum()
