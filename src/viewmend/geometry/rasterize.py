@@ -1,5 +1,6 @@
 """Drawing a triangle mesh into cameras: depth, triangle ids, and interpolated attributes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -64,8 +65,29 @@ def interpolate(
 ) -> Float[Tensor, "view height width channel"]:
     """Vertex attributes at every pixel of `raster`, perspective-correct; zeros where there is no surface."""
     image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
+    if attributes.device.type == "cpu" and not (attributes.requires_grad or mesh.vertices.requires_grad):
+        try:
+            from viewmend.geometry._interpolate_numba import interpolate_band
+        except ImportError:
+            pass
+        else:
+            return _interpolate_cpu(interpolate_band, attributes, mesh, cameras, raster, image)
     where, corners, weights = _visible_corners(mesh, cameras, raster)
     image[where] = (attributes[corners] * weights[..., None].to(attributes)).sum(1)
+    return image
+
+
+def _interpolate_cpu(band: Callable[..., None], attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
+    P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
+    given = attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy()
+    triangles, images, rows = raster.triangle.numpy(), image.numpy(), image.shape[1]
+
+    def work(item: int) -> None:
+        view, part = divmod(item, BANDS)
+        first, end = rows * part // BANDS, rows * (part + 1) // BANDS
+        band(*given, P[view], triangles[view], first, end, images[view])
+
+    share(work, len(cameras) * BANDS)
     return image
 
 

@@ -58,7 +58,7 @@ def blend_numba(
     return rgb, weights, disagreement
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _blend_rows(
     first, end, depth, normals, world_from_pixel, viewer, images, masks, depths, P, centers, focal, sizes,
@@ -86,7 +86,7 @@ def _blend_rows(
                 _average(colour, weights, total, row, column, rgb, disagreement)
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _average(colour, weights, total, row, column, rgb, disagreement):
     variance = 0.0
@@ -101,20 +101,22 @@ def _average(colour, weights, total, row, column, rgb, disagreement):
     disagreement[row, column] = sqrt(variance / (3 * total))
 
 
-@njit(nogil=True, cache=True)
+# Inlined: handing over so many arrays costs as much as the work.
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
 def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour):
     """Weight of one camera at a surface point; its sample goes into `colour[view]`."""
-    center = centers[view]
-    to_camera = _unit(center[0] - point[0], center[1] - point[1], center[2] - point[2])
+    x, y, w = point
+    to_camera = _unit(centers[view, 0] - x, centers[view, 1] - y, centers[view, 2] - w)
     facing = min(_dot(normal, to_camera), 1.0)
     agreeing = min(_dot(to_viewer, to_camera), 1.0)
-    z = _dot(P[view, 2], point) + P[view, 2, 3]
+    # Entries one by one here and below: a slice of an array costs an atomic count of its owners.
+    z = P[view, 2, 0] * x + P[view, 2, 1] * y + P[view, 2, 2] * w + P[view, 2, 3]
     if facing <= 0 or agreeing <= 0 or z <= 0:
         return 0.0
-    u = (_dot(P[view, 0], point) + P[view, 0, 3]) / z
-    v = (_dot(P[view, 1], point) + P[view, 1, 3]) / z
-    width, height = sizes[view]
+    u = (P[view, 0, 0] * x + P[view, 0, 1] * y + P[view, 0, 2] * w + P[view, 0, 3]) / z
+    v = (P[view, 1, 0] * x + P[view, 1, 1] * y + P[view, 1, 2] * w + P[view, 1, 3]) / z
+    width, height = sizes[view, 0], sizes[view, 1]
     if not (0 <= u <= width and 0 <= v <= height):
         return 0.0
 
@@ -131,7 +133,7 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
             continue
         part = (bottom_share if tap // 2 else 1 - bottom_share) * (right_share if tap % 2 else 1 - right_share)
         if masks.shape[0]:
-            part *= masks[view, row, column] / 255
+            part *= masks[view, row, column] * (1 / 255)
         usable += part
         red += part * images[view, 0, row, column]
         green += part * images[view, 1, row, column]
@@ -143,13 +145,13 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     return usable * facing ** powers[0] * agreeing ** powers[1]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _unit(x, y, z):
     length = sqrt(x * x + y * y + z * z)
@@ -157,7 +159,7 @@ def _unit(x, y, z):
     return x * scale, y * scale, z * scale
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def _backproject(u, v, z, world_from_pixel, center):
     m = world_from_pixel

@@ -1,0 +1,68 @@
+"""How long each stage of a mended view takes: python benchmarks/pipeline.py [--device cuda] [--write]."""
+
+import argparse
+import json
+from dataclasses import asdict
+
+import torch
+from measure import machine, summarise, write
+
+from viewmend.capture.studio.rigs import orbit
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.inpainting.config import small
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
+
+SEED, WARM_UP = 10008, 3
+SIZES = ((320, 320), (512, 612))
+
+
+def stream(size: tuple[int, int], cameras: int, frames: int, device: str) -> dict[str, object]:
+    """Stage times over a stream of a procedural scene, `small` with random weights, a camera that stands still."""
+    config = PipelineConfig()
+    studio = Studio(StudioConfig(seed=SEED, cameras=cameras, frames=frames, size_px=size))
+    target = orbit([0.4], size, elevation_rad=0.25).to(device)
+    torch.manual_seed(0)
+    inpainter = Inpainter(small()).to(device).eval()
+    bounds = studio.bounds
+    assert bounds is not None
+    bounds = bounds.to(device)
+    state, taken, second, holes = StreamState(inpainter.initial_state()), [], [], []
+    other = StreamState(inpainter.initial_state())
+    for time in range(frames):
+        observation = observe(studio.read(time).to(device), bounds, config)
+        mended = mend_view(observation, target, state, inpainter, config)
+        again = mend_view(observation, target, other, inpainter, config)
+        state, other = mended.state, again.state
+        if time >= WARM_UP:
+            taken.append(asdict(mended.stage_ms))
+            second.append(again.stage_ms.rendering)
+            holes.append(int((mended.completed.view.error > 0).sum()))
+    stages = {stage: summarise([t[stage] for t in taken]) for stage in taken[0]}
+    return {
+        "size_px": list(size),
+        "cameras": cameras,
+        "frames": len(taken),
+        "hole_px_mean": sum(holes) / len(holes),
+        **stages,
+        "all": summarise([sum(t.values()) for t in taken]),
+        "rendering_second_viewer": summarise(second),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--cameras", type=int, default=8)
+    parser.add_argument("--frames", type=int, default=25)
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    options = parser.parse_args()
+    results = {f"{w}x{h}": stream((w, h), options.cameras, options.frames, options.device) for w, h in SIZES}
+    config = {"seed": SEED, "model": "small, random weights", "pipeline": asdict(PipelineConfig())}
+    print(json.dumps({"machine": machine(options.device), "results": results}, indent=2))
+    if options.write:
+        print(write("pipeline", options.device, config, results))
+
+
+if __name__ == "__main__":
+    main()
