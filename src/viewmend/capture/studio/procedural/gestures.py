@@ -25,6 +25,8 @@ FAMILIES: dict[str, tuple[tuple[tuple[float, float], ...], float, float]] = {
     "wave": (((0.10, 0.10), (1.25, 0.08), (-1.40, 0.10), (1.35, 0.40)), 2.0, 0.0),
     "laps": (((0.48, 0.06), (0.16, 0.03), (0.20, 0.08), (0.90, 0.12)), 0.5, 0.4),
 }
+FASTEST_RAD_S = 7.0
+"""Of an arm's joint; hands then stay below about ten metres a second."""
 CURLS = {"box": 1.5, "drive": 1.0, "pump": 1.3, "clap": 0.05, "wave": 0.0, "jacks": 0.1, "hips": 0.6}
 
 
@@ -46,8 +48,13 @@ class Gesture:
         return moving
 
 
-def sample_gesture(rng: np.random.Generator, families: tuple[str, ...], bulk: float, energy: float) -> Gesture:
-    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes."""
+def sample_gesture(
+    rng: np.random.Generator, families: tuple[str, ...], bulk: float, energy: float, beat_hz: float
+) -> Gesture:
+    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes.
+
+    At `beat_hz` no joint turns faster than an arm can.
+    """
     first = families[int(rng.integers(len(families)))]
     names = (first, "hang" if first == "wave" else first)
     if first == "wave" and rng.random() < 0.5:
@@ -60,7 +67,8 @@ def sample_gesture(rng: np.random.Generator, families: tuple[str, ...], bulk: fl
         table = np.array(angles)
         base = table[:, 0] + 0.08 * rng.standard_normal(4)
         base[1] = max(base[1], table[1, 0]) + bulk * np.clip(1.2 - base[1], 0, 1)
-        amplitude = table[:, 1] * energy * rng.uniform(0.8, 1.2)
+        most = FASTEST_RAD_S / (2 * np.pi * harmonic * beat_hz)
+        amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
         # The main angle beats with the music; the others follow it loosely.
         offsets = phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
         bases.append([*base, CURLS.get(name, 0.3)])

@@ -117,7 +117,7 @@ def sample_motion(
         beat = float(rng.uniform(0.85, 1.15))
     if chosen == "run":
         beat = float(rng.uniform(1.25, 1.5))
-    gestures = [sample_gesture(rng, GESTURES[chosen], bulk, ENERGY[tempo]) for _ in range(2)]
+    gestures = [sample_gesture(rng, GESTURES[chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
     path = 0.0
     if chosen in ("walk", "run"):
         path = float(rng.uniform(0.42, 0.65)) if rng.random() < 0.7 else 0.0

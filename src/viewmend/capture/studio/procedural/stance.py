@@ -110,7 +110,9 @@ def _reachable(skeleton: Skeleton, stance: Stance, R: Float[np.ndarray, "3 3"]) 
         leg = skeleton.length(f"{side}_thigh", f"{side}_shin") + skeleton.length(f"{side}_shin", f"{side}_foot")
         flat = float(np.hypot(*(hip - ankle)[[0, 2]]))
         highest = ankle[1] + np.sqrt(max((0.992 * leg) ** 2 - flat**2, 0.01))
-        pelvis[1] -= max(0.0, float(hip[1] - highest))
+        # max(0, missing), rounded within two centimetres: a kink would jerk the whole body.
+        missing = float(hip[1] - highest)
+        pelvis[1] -= 0.5 * (missing + float(np.hypot(missing, 0.02)))
     return pelvis
 
 
