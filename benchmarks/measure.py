@@ -1,11 +1,12 @@
 """The one way to time: warm up, synchronise, take median and 95th percentile; and to write down what was measured."""
 
 import json
+import os
 import platform
 import statistics
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
 
@@ -15,59 +16,65 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def timed(work: Callable[[], object], runs: int = 30, warm_up: int = 3, device: str = "cpu") -> dict[str, float]:
-    """Milliseconds of `work()`: median and 95th percentile over `runs`, after `warm_up` runs that do not count."""
-    spent = []
+    """Milliseconds of `work()`, summarised over `runs`, after `warm_up` runs that do not count."""
+    taken = []
     for run in range(-warm_up, runs):
-        _synchronise(device)
+        synchronise(device)
         start = time.perf_counter()
         work()
-        _synchronise(device)
+        synchronise(device)
         if run >= 0:
-            spent.append(1e3 * (time.perf_counter() - start))
-    spent.sort()
+            taken.append(1e3 * (time.perf_counter() - start))
+    return summarise(taken)
+
+
+def summarise(taken_ms: Sequence[float]) -> dict[str, float]:
+    """Median, 95th percentile and smallest of some times."""
+    ordered = sorted(taken_ms)
     return {
-        "median_ms": round(statistics.median(spent), 2),
-        "p95_ms": round(spent[min(len(spent) - 1, int(0.95 * len(spent)))], 2),
-        "min_ms": round(spent[0], 2),
+        "median_ms": round(statistics.median(ordered), 2),
+        "p95_ms": round(ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))], 2),
+        "min_ms": round(ordered[0], 2),
     }
 
 
-def record(what: str, device: str, config: object, figures: object) -> Path:
-    """Write results/<what>--<device>--<date>.json with everything that a figure's value depends on."""
-    name = torch.cuda.get_device_name() if device.startswith("cuda") else processor()
-    entry = {
-        "what": what,
-        "device": name,
+def machine(device: str) -> dict[str, object]:
+    """Where and with what versions something was measured, and how busy the machine was."""
+    return {
+        "device": torch.cuda.get_device_name() if device.startswith("cuda") else processor(),
         "threads": torch.get_num_threads(),
-        "date": date.today().isoformat(),
-        "commit": _commit(),
+        "load_average": round(os.getloadavg()[0], 1),
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "config": config,
-        "figures": figures,
+        "commit": _commit(),
     }
+
+
+def write(what: str, device: str, config: object, results: object) -> Path:
+    """Write results/<what>--<device>--<date>.json with everything that a figure's value depends on."""
+    today = date.today().isoformat()
+    entry = {"what": what, "date": today, **machine(device), "config": config, "results": results}
     RESULTS.mkdir(exist_ok=True)
-    path = RESULTS / f"{what}--{device.split(':')[0]}--{date.today().isoformat()}.json"
+    path = RESULTS / f"{what}--{device.split(':')[0]}--{today}.json"
     path.write_text(json.dumps(entry, indent=2) + "\n")
     return path
 
 
-def processor() -> str:
-    """The CPU's name."""
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
-        if line.startswith("model name"):
-            return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
-def _synchronise(device: str) -> None:
+def synchronise(device: str) -> None:
+    """Wait for what was started on a GPU."""
     if device.startswith("cuda"):
         torch.cuda.synchronize()
 
 
+def processor() -> str:
+    """The CPU's name."""
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text().splitlines() if file.is_file() else []
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
 def _commit() -> str:
-    here = Path(__file__).parent
-    done = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True, check=False
-    )
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
     return done.stdout.strip() or "unknown"
