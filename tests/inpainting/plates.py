@@ -23,9 +23,13 @@ TINY = InpainterConfig(
     n_c=2,
     n_w=2,
     k_w=4,
+    rope_unit="patch",
     rope_values=True,
     colour_path=True,
+    prefill=True,
 )
+PLAIN = {"rope_unit": "image", "rope_values": False, "colour_path": False, "prefill": False}
+"""Changes that leave the paper's model."""
 
 
 def tiny(seed: int = 0, **changes) -> Inpainter:

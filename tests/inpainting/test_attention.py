@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from inpainting.plates import TINY, tiny
+from inpainting.plates import TINY
 from reference.attention_twin import attend_twin, rotate_twin, transformer_twin
 
 from viewmend.inpainting import attention, rope
@@ -114,29 +114,38 @@ def test_values_turn_by_distinct_waves():
     assert len(both_ways) == 2 * 16 - 1
 
 
-@pytest.mark.parametrize("rope_on", [True, False])
-@pytest.mark.parametrize("scale", ["model", "head"])
-@pytest.mark.parametrize("top_k", [None, 3, 7, 100])
-def test_the_transformer_equals_its_twin(rope_on, scale, top_k, rng):
-    net = Transformer(replace(TINY, rope=rope_on, rope_values=rope_on, attention_scale=scale))
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"attention_scale": "head"},
+        {"rope_unit": "image"},
+        {"rope_values": False},
+        {"rope": False, "rope_values": False},
+    ],
+    ids=["ours", "head", "image", "scores-only", "none"],
+)
+@pytest.mark.parametrize(("top_k", "grad"), [(None, True), (2, False), (2, True), (100, False)])
+def test_the_transformer_equals_its_twin(changes, top_k, grad, rng):
+    config = replace(TINY, **changes)
+    net = Transformer(config)
     with torch.no_grad():
         for parameter in net.parameters():
             parameter += 0.1 * torch.randn(parameter.shape, generator=rng)
-    counts, asks = (9, 6), (4, 3)
-    P, R = torch.randn(2, 4, 64, generator=rng), torch.randn(2, 9, 64, generator=rng)
-    places = [torch.rand(2, n, 3, generator=rng) for n in (4, 9)]
-    steps = [torch.rand(2, n, 3, generator=rng) * 6 for n in (4, 9)]
-    present = [torch.arange(n) < torch.tensor(c)[:, None] for n, c in ((4, asks), (9, counts))]
+    counts, asks = (5, 3), (3, 2)
+    P, R = torch.randn(2, 3, 64, generator=rng), torch.randn(2, 5, 64, generator=rng)
+    places = [torch.rand(2, n, 3, generator=rng) for n in (3, 5)]
+    steps = [torch.rand(2, n, 3, generator=rng) * 6 for n in (3, 5)]
+    present = [torch.arange(n) < torch.tensor(c)[:, None] for n, c in ((3, asks), (5, counts))]
     at, context_at = (Placed(*x) for x in zip(places, steps, present, strict=True))
-    KV = net.project_context(R.flatten(0, 1)).unflatten(2, (2, 9))
-    for grad in (False, True):
-        with torch.set_grad_enabled(grad):
-            fast = net(P, at, KV, context_at, top_k)
-            for b, (n, m) in enumerate(zip(asks, counts, strict=True)):
-                slow = transformer_twin(
-                    net, P[b, :n], places[0][b, :n], steps[0][b, :n], R[b, :m], places[1][b, :m], steps[1][b, :m], top_k
-                )
-                assert torch.allclose(fast[b, :n], slow, atol=2e-4), (grad, b)
+    with torch.set_grad_enabled(grad):
+        KV = net.project_context(R.flatten(0, 1)).unflatten(2, (2, 5))
+        fast = net(P, at, KV, context_at, top_k)
+    for b, (n, m) in enumerate(zip(asks, counts, strict=True)):
+        own = (places[0][b, :n], steps[0][b, :n])
+        with torch.no_grad():
+            slow = transformer_twin(net, P[b, :n], *own, R[b, :m], places[1][b, :m], steps[1][b, :m], top_k)
+        assert torch.allclose(fast[b, :n], slow, atol=2e-4), b
 
 
 def test_most_attended_keeps_order_and_may_ask_for_more():
@@ -165,7 +174,7 @@ def test_a_pruned_key_still_learns(qkv):
 @pytest.mark.parametrize("block", [0, 7])
 def test_an_untrained_model_looks_at_what_lands_near(block):
     """More than half of the weight falls within one and a half patch steps, in every head."""
-    config = replace(tiny().config, dim=128, blocks=4)
+    config = replace(TINY, dim=128, blocks=4, rope_unit="image")
     torch.manual_seed(0)
     net = Transformer(config)
     grid = torch.cartesian_prod(torch.arange(20), torch.arange(20)).float() * 16 / 320

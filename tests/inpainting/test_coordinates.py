@@ -52,7 +52,13 @@ def carried(past_geometry, past_depth):
     then = replace(then, depth=then.depth / DISTANCE_M * past_depth)
     past, now = net.encode_context(then)[0], net.encode_context(context(5))[0]
     none = torch.zeros(0, 64)
-    target = Target(view(5), torch.zeros(0, 3, dtype=torch.long), none, torch.zeros(0, dtype=torch.bool))
+    target = Target(
+        view=view(5),
+        places=torch.zeros(0, 3, dtype=torch.long),
+        tokens=none,
+        shown=torch.zeros(6, HEIGHT, WIDTH),
+        incomplete=torch.zeros(0, dtype=torch.bool),
+    )
     batch = assemble([target], [[past, now]], [past.keys_values[:, :, :0]], net.config)
     n = len(past.tokens)
     return past, batch.context_at.uvs[0, :n], batch.context_at.present[0, :n]

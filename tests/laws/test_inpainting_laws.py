@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from inpainting.plates import NAMES, Rig, context, tiny, view
+from inpainting.plates import NAMES, PLAIN, Rig, context, tiny, view
 
 from viewmend.inpainting.config import paper
 from viewmend.inpainting.context import window_times
@@ -41,10 +41,13 @@ def test_known_pixels_stay_bit_for_bit():
     assert not torch.equal(completed.rgb, incomplete.rgb)
 
 
-@pytest.mark.parametrize("grid", ["relative", "absolute"])
-@pytest.mark.parametrize("past_geometry", ["own", "current"])
-def test_cached_equals_uncached(grid, past_geometry):
-    net, rig = tiny(grid=grid, past_geometry=past_geometry), Rig()
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"grid": "absolute"}, {"past_geometry": "current"}, {"grid": "absolute", "past_geometry": "current"}, PLAIN],
+    ids=["ours", "absolute", "current", "absolute-current", "paper"],
+)
+def test_cached_equals_uncached(changes):
+    net, rig = tiny(**changes), Rig()
     state = net.initial_state()
     for time in range(11):
         completed, state = net.step(view(time), rig, state)
@@ -156,9 +159,10 @@ def test_any_size(width, height):
     assert ((completed.rgb - incomplete.rgb).abs().amax(0)[holes] > 0).float().mean() > 0.9
 
 
+@pytest.mark.parametrize("changes", [{}, PLAIN], ids=["ours", "paper"])
 @pytest.mark.parametrize("top_k", [None, 5])
-def test_gradients_reach_every_parameter(top_k):
-    net = tiny().train()
+def test_gradients_reach_every_parameter(top_k, changes):
+    net = tiny(**changes).train()
     prediction = net([view(5), view(6)], [[context(5), context(4)], [context(6)]], top_k)
     sum((p.inpainted**2).sum() for p in prediction).backward()
     starved = [n for n, p in net.named_parameters() if p.grad is None or not bool((p.grad != 0).any())]
@@ -177,9 +181,10 @@ def test_gradients_reach_the_encoder_through_the_context_alone():
     assert all(bool((g != 0).any()) for g in gradients)
 
 
+@pytest.mark.parametrize("changes", [{}, PLAIN], ids=["ours", "paper"])
 @pytest.mark.parametrize("top_k", [None, 6])
-def test_a_batch_equals_one_by_one(top_k):
-    net = tiny()
+def test_a_batch_equals_one_by_one(top_k, changes):
+    net = tiny(**changes)
     views = [view(5), view(6, (30, 34, 40, 44)), view(7, hole=None), view(4, width=64, height=48)]
     contexts = [[context(5), context(4), context(3)], [context(6)], [], [context(4, width=120, height=100)]]
     with torch.no_grad():

@@ -36,6 +36,9 @@ def transformer_twin(net, tokens, uvs, steps, context_tokens, context_uvs, conte
     heads, head_dim = config.heads, config.dim // config.heads
     scale = 1 / math.sqrt(config.dim if config.attention_scale == "model" else head_dim)
     turn = lambda where: (where[:, None] * net.score_frequencies).sum(0)  # noqa: E731
+    if config.rope_unit == "patch":
+        twenty = torch.tensor([20.0, 20.0, 1.0])
+        uvs, context_uvs = steps / twenty, context_steps / twenty
     P = tokens
     kept = list(range(len(context_tokens)))
     for number in range(config.groups * config.blocks):
