@@ -1,5 +1,7 @@
 """The surface of an occupancy grid."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -55,6 +57,19 @@ def test_noise_gives_a_closed_surface_too(seed):
     assert (undirected == 2).all()
     assert (directed == 1).all()
     assert torch.isfinite(mesh.vertices).all()
+
+
+def test_numba_equals_torch(monkeypatch):
+    values = torch.rand(9, 12, 10, generator=torch.Generator().manual_seed(9))
+    grid = OccupancyGrid(values, LOW, 0.1)
+    fast, fast_normals = extract_surface(grid), vertex_normals(extract_surface(grid))
+    monkeypatch.setitem(sys.modules, "viewmend.geometry._surface_numba", None)
+    slow = extract_surface(grid)
+    assert torch.equal(fast.faces, slow.faces)
+    torch.testing.assert_close(fast.vertices, slow.vertices)
+    # Where the faces around a vertex all but cancel, rounding decides the direction.
+    agree = torch.nn.functional.cosine_similarity(fast_normals, vertex_normals(slow)) > 0.999
+    assert agree.float().mean() > 0.99
 
 
 def test_agrees_with_another_marching_cubes():

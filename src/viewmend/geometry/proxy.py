@@ -18,7 +18,7 @@ from viewmend.geometry.hull import (
 )
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
-from viewmend.geometry.surface import extract_surface
+from viewmend.geometry.surface import extract_surface, occupied_box
 
 WORTH_RECARVING = 0.85
 """A subject smaller than this share of the carved box is carved again in its own box,"""
@@ -85,9 +85,10 @@ def reconstruct(
 
 def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
     """The box of all that is not surely empty, with two voxels around it, within `bounds`; None for an empty grid."""
-    index = (grid.values > 0.1).nonzero()
-    if not len(index):
+    filled = occupied_box(grid.values > 0.1)
+    if filled is None:
         return None
-    low = grid.low + (index.amin(0) - 2) * grid.voxel_m
-    high = grid.low + (index.amax(0) + 3) * grid.voxel_m
+    first = torch.tensor([side.start for side in filled], device=grid.low.device)
+    end = torch.tensor([side.stop for side in filled], device=grid.low.device)
+    low, high = grid.low + (first - 1) * grid.voxel_m, grid.low + (end + 1) * grid.voxel_m
     return Bounds(torch.maximum(low, bounds.low), torch.minimum(high, bounds.high))

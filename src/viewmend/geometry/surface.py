@@ -18,19 +18,40 @@ def extract_surface(grid: OccupancyGrid) -> Mesh:
     exactly two triangles. An empty grid gives a mesh of no vertices.
     """
     device = grid.values.device
-    box = _occupied_box(grid.values > ISO)
+    box = occupied_box(grid.values > ISO)
     if box is None:
         empty = torch.zeros(0, 3, device=device)
         return Mesh(empty, torch.zeros(0, 3, dtype=torch.int32, device=device))
     values = torch.nn.functional.pad(grid.values[box], (1, 1, 1, 1, 1, 1))
     first = torch.tensor([side.start for side in box], device=device)
-    vertices, vertex_of_edge = _crossings(values)
-    faces = _triangles(values > ISO, vertex_of_edge)
+    vertices, faces = _march(values)
     # Padding moved the origin by one voxel, values sit in the middle of theirs.
     return Mesh((vertices + first - 0.5) * grid.voxel_m + grid.low, faces)
 
 
-def _occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
+def _march(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Vertices, in voxels, and triangles; by numba on the CPU where it is installed."""
+    if values.device.type == "cpu":
+        try:
+            from viewmend.geometry import _surface_numba as kernels
+        except ImportError:
+            pass
+        else:
+            grid = values.contiguous().numpy()
+            vertices = torch.empty(kernels.count_crossings(grid, ISO), 3)
+            vertex_of_edge = torch.empty(3, *values.shape, dtype=torch.int32).numpy()
+            kernels.place_crossings(grid, ISO, vertices.numpy(), vertex_of_edge)
+            # A vertex is in one loop of each of its edge's four cells, and n vertices of a loop make n - 2 triangles.
+            faces = torch.empty(4 * len(vertices), 3, dtype=torch.int32)
+            starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
+            table = triangle_table().numpy()
+            count = kernels.connect(grid, ISO, table, starts.numpy(), vertex_of_edge, faces.numpy())
+            return vertices, faces[:count]
+    vertices, vertex_of_edge = _crossings(values)
+    return vertices, _triangles(values > ISO, vertex_of_edge)
+
+
+def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
     """The box of inside voxels and one voxel around them, where the grid has it."""
     over_x = inside.any(0)
     sides = []
