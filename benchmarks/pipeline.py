@@ -2,10 +2,11 @@
 
 import argparse
 import json
+import statistics
 from dataclasses import asdict
 
 import torch
-from measure import machine, summarise, write
+from measure import record
 
 from viewmend.capture.studio.rigs import orbit
 from viewmend.capture.studio.stage import Studio, StudioConfig
@@ -50,6 +51,13 @@ def stream(size: tuple[int, int], cameras: int, frames: int, device: str) -> dic
     }
 
 
+def summarise(taken_ms: list[float]) -> dict[str, float]:
+    """Median and 95th percentile."""
+    ordered = sorted(taken_ms)
+    p95 = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
+    return {"median_ms": round(statistics.median(ordered), 2), "p95_ms": round(p95, 2)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
@@ -57,11 +65,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=25)
     parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
     options = parser.parse_args()
-    results = {f"{w}x{h}": stream((w, h), options.cameras, options.frames, options.device) for w, h in SIZES}
-    config = {"seed": SEED, "model": "small, random weights", "pipeline": asdict(PipelineConfig())}
-    print(json.dumps({"machine": machine(options.device), "results": results}, indent=2))
+    figures = {f"{w}x{h}": stream((w, h), options.cameras, options.frames, options.device) for w, h in SIZES}
+    print(json.dumps(figures, indent=2))
     if options.write:
-        print(write("pipeline", options.device, config, results))
+        config = {"seed": SEED, "model": "small, random weights", "pipeline": asdict(PipelineConfig())}
+        print(record("pipeline", options.device, config, figures))
 
 
 if __name__ == "__main__":
