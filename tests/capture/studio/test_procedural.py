@@ -116,6 +116,15 @@ def test_motion_is_smooth_and_stays_on_the_floor(walker, tempo, kind):
     check_smooth(moving(walker, tempo, kind), kind, 0.2 + np.arange(4) / 40)
 
 
+@pytest.mark.parametrize("kind", ["groove", "walk", "sit"])
+def test_gestures_take_turns_without_a_jump(walker, kind):
+    motion = moving(walker, "dance", kind).motion
+    times = np.arange(0, 2 * motion.bar_s, 1 / 50)
+    arms = [arm for time in times for arm in motion.stance(float(time)).arms]
+    angles = np.array([(a.flexion, a.abduction, a.twist, a.elbow, a.curl) for a in arms]).reshape(len(times), 10)
+    assert np.abs(np.diff(angles, axis=0)).max() < 0.35
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("tempo", "kind"), KIND_OF_TEMPO)
 def test_long_motion_is_smooth_and_stays_on_the_floor(walker, tempo, kind):

@@ -48,7 +48,7 @@ class Score:
 def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
     """Where the body's middle is on the floor (x, z), and where it is heading."""
     if score.kind in ("walk", "run") and score.path_m > 0.15:
-        speed = (0.42 if score.kind == "walk" else 0.75) * score.beat_hz * score.height_m
+        speed = (0.42 if score.kind == "walk" else 0.55) * score.beat_hz * score.height_m
         angle = speed * time_s / score.path_m + score.heading
         # Walking to the left about the circle: the tangent.
         return score.path_m * np.array([np.sin(angle), np.cos(angle)]), angle + np.pi / 2

@@ -80,8 +80,8 @@ class Motion:
         if self.score.kind == "reach":
             return base
         bar = time_s / self.bar_s + float(self.score.amounts[6])
-        share = ease(((bar % 2.0) - 0.8) / 0.4) - ease(((bar % 2.0) - 1.8) / 0.4)
-        # A stride takes two beats of the feet's clock, and arms swing once a stride.
+        # The distance from the middle of the second gesture's bar, in bars, goes up and down between 0 and 1.
+        share = ease((0.7 - abs(bar % 2.0 - 1.0)) / 0.4)
         first, second = (gesture.angles(beats) for gesture in self.gestures)
         return replace(base, arms=arm_poses(first + share * (second - first)))
 
