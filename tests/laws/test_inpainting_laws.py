@@ -225,6 +225,14 @@ def test_memory_is_bounded_on_a_long_stream(grid):
     assert held(state) < 1.2 * len(state.cache.frames) * largest(state)
 
 
+def test_a_frame_keeps_alive_its_own_memory_only():
+    """Also when it was encoded together with many others."""
+    for frames in tiny().encode_contexts([context(t) for t in range(4)]):
+        for frame in frames:
+            for tensor in (frame.tokens, frame.keys_values):
+                assert tensor.untyped_storage().nbytes() == tensor.nbytes
+
+
 def held(state):
     """Bytes that a state keeps alive, storages counted whole and once."""
     tensors = [x for f in state.cache.frames.values() for x in vars(f).values() if isinstance(x, torch.Tensor)]
