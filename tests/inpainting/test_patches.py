@@ -122,4 +122,5 @@ def test_crop_windows_hold_every_kept_patch_with_its_margin():
     kept[0, 1, 2] = kept[0, 3, 4] = kept[1, 0, 0] = True
     first, size = crop_windows(kept)
     assert first[:2].tolist() == [[-1, 0], [-2, -2]]
-    assert size == (2 * 16 + 28 + 64, 2 * 16 + 28 + 64)
+    # 3 patches and a margin of 2 on both sides, rounded up to 8.
+    assert size == (7 * 16 + 28, 7 * 16 + 28)

@@ -18,6 +18,8 @@ PATCH_PX = PATCH_CELLS * CELL_PX
 STEP_PX = STEP_CELLS * CELL_PX
 MARGIN_STEPS = -(-RECEPTIVE_RADIUS_PX // STEP_PX)
 """Patch steps that hold the encoder's receptive radius."""
+CROP_STEPS = 4
+"""Crops are a multiple of so many patch steps: convolutions are compiled for each size they meet (20 ms on a CPU)."""
 
 
 def grid_shape(height: int, width: int) -> tuple[int, int]:
@@ -107,7 +109,8 @@ def crop_windows(kept: Bool[Tensor, "view rows cols"]) -> tuple[Int[Tensor, "vie
         first = torch.where(last >= 0, first, 0)
         firsts.append(first - MARGIN_STEPS)
         extents.append(int((last - first + 1).clamp_min(1).amax()))
-    height, width = padded_size(extents[0] + 2 * MARGIN_STEPS, extents[1] + 2 * MARGIN_STEPS)
+    rows, cols = (-(-(extent + 2 * MARGIN_STEPS) // CROP_STEPS) * CROP_STEPS for extent in extents)
+    height, width = padded_size(rows, cols)
     return torch.stack(firsts, 1), (height, width)
 
 
