@@ -1,0 +1,46 @@
+"""Where novel views are looked at from."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reference.ball import camera_at, ring
+
+from viewmend.cli.novel_paths import orbit_around
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
+
+CENTER = torch.tensor([0.1, 0.0, -0.1])
+
+
+def degrees_around(cameras: Cameras) -> torch.Tensor:
+    offsets = cameras.centers - CENTER
+    return torch.rad2deg(torch.atan2(offsets[:, 0], offsets[:, 2]))
+
+
+def test_a_ring_is_circled_at_its_own_height_and_distance():
+    rig = concatenate_cameras([camera_at(30 * n, f"c{n}", height_m=0.7) for n in range(12)])
+    path = orbit_around(CENTER, rig, None, 8, 8)
+    steps = (degrees_around(path).diff() + 360) % 360
+    torch.testing.assert_close(steps, torch.full((7,), 45.0), atol=1e-2, rtol=0)
+    distance = (rig.centers - CENTER).norm(dim=-1).mean()
+    torch.testing.assert_close((path.centers - CENTER).norm(dim=-1), distance.expand(8), atol=1e-3, rtol=0)
+    assert path.centers[:, 1].std() < 1e-4 and path.centers[0, 1] == pytest.approx(0.7, abs=0.05)
+    middle, _ = project(CENTER[None], path)
+    torch.testing.assert_close(middle[:, 0], torch.full((8, 2), 24.0), atol=1e-2, rtol=0)
+    torch.testing.assert_close(path.K[0, 1, 1], rig.K[0, 1, 1], atol=0.5, rtol=0)
+
+
+def test_a_rig_on_one_side_is_swung_over():
+    rig = concatenate_cameras([camera_at(angle, f"c{angle}") for angle in (-60, -20, 10, 50)])
+    around = degrees_around(orbit_around(CENTER, rig, None, 30, 30))
+    assert around.min() >= -65 and around.max() <= 56
+    assert around.max() - around.min() > 100
+    assert around[0] == pytest.approx(float(around[-1]), abs=3)
+
+
+def test_images_upside_down_do_not_tilt_the_orbit():
+    rig = ring(8)
+    turned = torch.diag(torch.tensor([-1.0, -1, 1, 1]))
+    poses = torch.stack([turned @ pose if n % 2 else pose for n, pose in enumerate(rig.camera_from_world)])
+    path = orbit_around(CENTER, replace(rig, camera_from_world=poses), None, 6, 6)
+    assert path.centers[:, 1].abs().max() < 1e-3
