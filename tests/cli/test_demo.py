@@ -3,9 +3,11 @@
 import json
 
 import cv2
+import torch
 
 from viewmend.cli import main
 from viewmend.cli.contact_sheet import GAP_PX, LABEL_PX
+from viewmend.cli.mending import Mender
 
 SMALL = ["--frames", "3", "--size", "72", "--cameras", "4", "--model", "telea", "--seed", "10001"]
 
@@ -25,6 +27,19 @@ def test_the_demo_renders_mends_and_scores(tmp_path, capsys):
     assert panel.shape == (LABEL_PX + 72 + 2 * GAP_PX, 4 * (72 + GAP_PX) + GAP_PX, 3)
     captions = panel[GAP_PX : GAP_PX + LABEL_PX]
     assert captions.max() > 150
+
+
+def test_every_frame_is_judged_by_the_truth_of_its_time_and_place(tmp_path, monkeypatch):
+    seen = []
+    mend = Mender.mend
+
+    def watched(self, frame, target, truth):
+        seen.append((frame.time, truth.time, torch.equal(target.camera_from_world, truth.cameras.camera_from_world)))
+        return mend(self, frame, target, truth)
+
+    monkeypatch.setattr(Mender, "mend", watched)
+    assert main(["demo", "--out", str(tmp_path / "a"), *SMALL]) == 0
+    assert seen == [(0, 0, True), (1, 1, True), (2, 2, True)]
 
 
 def test_the_same_seed_gives_the_same_picture(tmp_path, capsys):

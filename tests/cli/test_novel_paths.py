@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.ball import camera_at, ring
+from reference.ball import camera_at
 
 from viewmend.cli.novel_paths import orbit_around
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
@@ -39,8 +39,9 @@ def test_a_rig_on_one_side_is_swung_over():
 
 
 def test_images_upside_down_do_not_tilt_the_orbit():
-    rig = ring(8)
+    """The cameras of one side are upside down and look downwards: the mean of their ups points sideways."""
+    rig = concatenate_cameras([camera_at(45 * n, f"c{n}", height_m=0.8) for n in range(8)])
     turned = torch.diag(torch.tensor([-1.0, -1, 1, 1]))
-    poses = torch.stack([turned @ pose if n % 2 else pose for n, pose in enumerate(rig.camera_from_world)])
+    poses = torch.stack([turned @ pose if n < 4 else pose for n, pose in enumerate(rig.camera_from_world)])
     path = orbit_around(CENTER, replace(rig, camera_from_world=poses), None, 6, 6)
-    assert path.centers[:, 1].abs().max() < 1e-3
+    assert path.centers[:, 1].std() < 1e-3
