@@ -5,6 +5,9 @@ from pathlib import Path
 import pytest
 import torch
 
+# Tests are many small computations: a second thread costs more than it brings.
+torch.set_num_threads(1)
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

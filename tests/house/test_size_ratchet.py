@@ -11,7 +11,16 @@ MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ARGUMENTS = 300, 50, 8
 
 LONG_FILES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
-MANY_ARGUMENTS: set[str] = set()
+# Compiled kernels take plain arrays and numbers, no dataclasses: docs/decisions/0002-compiled-kernels.md.
+MANY_ARGUMENTS: set[str] = {
+    "viewmend/geometry/_hull_numba.py:carve_blocks",
+    "viewmend/geometry/_hull_numba.py:carve_voxels",
+    "viewmend/geometry/_hull_numba.py:judge",
+    "viewmend/geometry/_hull_numba.py:occupied_blocks",
+    "viewmend/geometry/_rasterize_numba.py:draw_band",
+    "viewmend/rendering/_blend_numba.py:_blend_rows",
+    "viewmend/rendering/_blend_numba.py:_weigh",
+}
 
 
 def measure(source: str, name: str) -> tuple[set[str], set[str], set[str]]:

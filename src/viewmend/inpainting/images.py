@@ -19,7 +19,7 @@ from viewmend.inpainting.patches import (
     crop_windows,
     split,
 )
-from viewmend.inpainting.prefill import pull_push
+from viewmend.inpainting.prefill import fill
 from viewmend.views import ContextViews, IncompleteView
 
 MIN_FOREGROUND = 0.1
@@ -57,7 +57,9 @@ def context_images(views: ContextViews, config: InpainterConfig) -> Images:
 def target_images(view: IncompleteView, config: InpainterConfig) -> Images:
     """The novel view, a stack of one; with `prefill`, its holes filled from their surroundings."""
     mask = view.mask[None]
-    rgb = pull_push(view.rgb, (view.mask > 0) & (view.error == 0)) if config.prefill else view.rgb
+    rgb = view.rgb
+    if config.prefill:
+        rgb = fill(rgb, view.error > 0, view.mask > 0)
     return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], mask > 0, config)
 
 

@@ -24,9 +24,10 @@ def weighted_l1(
     predicted: Float[Tensor, "3 height width"],
     truth: Float[Tensor, "3 height width"],
     weight: Float[Tensor, "height width"],
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Sum of |predicted - truth| over the weighted pixels (mean of the channels), and the sum of the weights."""
-    return (weight * (predicted - truth).abs().mean(0)).sum(), weight.sum()
+) -> Float[Tensor, ""]:
+    """|weight * (predicted - truth)|_1 / |weight|_1, the mean of the channels; 0 where the weight is."""
+    total = (weight * (predicted - truth).abs().mean(0)).sum()
+    return total / weight.sum().clamp_min(torch.finfo(torch.float32).tiny)
 
 
 def image_loss(
@@ -35,14 +36,12 @@ def image_loss(
     error: list[Float[Tensor, "_h _w"]],
     truth: list[Float[Tensor, "3 _h _w"]],
 ) -> ImageLoss:
-    """L_in and L_out over a batch of images of any sizes: sums over all pixels of the batch, then one division.
+    """L_in and L_out of each image, and their means over a batch of images of any sizes.
 
     L_out counts the pixels that decoded patches cover (section 8). An empty weight gives 0 with a zero gradient.
     """
-    sums = [torch.zeros((), device=truth[0].device) for _ in range(4)]
+    inside, outside = [], []
     for image, covered, E, target in zip(predicted, coverage, error, truth, strict=True):
-        image = image.float()
-        parts = (*weighted_l1(image, target, E), *weighted_l1(image, target, (1 - E) * (covered > 0)))
-        sums = [total + part for total, part in zip(sums, parts, strict=True)]
-    tiny = torch.finfo(torch.float32).tiny
-    return ImageLoss(sums[0] / sums[1].clamp_min(tiny), sums[2] / sums[3].clamp_min(tiny))
+        inside.append(weighted_l1(image.float(), target, E))
+        outside.append(weighted_l1(image.float(), target, (1 - E) * (covered > 0)))
+    return ImageLoss(torch.stack(inside).mean(), torch.stack(outside).mean())

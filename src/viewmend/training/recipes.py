@@ -11,9 +11,9 @@ from viewmend.inpainting.config import small as small_model
 class DataPlan:
     """Which scenes a run sees, and how much of each."""
 
-    sizes_px: tuple[int, ...] = (192, 224, 256, 320)
+    sizes_px: tuple[int, ...] = (224, 256, 320)
     """Edge lengths of the square images; each scene takes one."""
-    cameras: tuple[int, int] = (5, 12)
+    cameras: tuple[int, int] = (6, 14)
     """Fewest and most cameras of a rig."""
     times: tuple[int, ...] = (0, 10, 11, 12, 13)
     """Frames of a scene that are drawn; every one is a target whose past is the window's share of the earlier ones."""
@@ -27,7 +27,7 @@ class DataPlan:
     """and how often each."""
     imperfect_share: float = 0.4
     """Share of the scenes whose cameras have noise and differ in colour."""
-    min_hole_px: int = 80
+    min_hole_px: int = 50
     """Views that miss less are passed over."""
     hull_resolution: int = 96
     """Voxels along the hull's longest side (coarser than in production: it is done once for each left-out camera)."""

@@ -1,0 +1,42 @@
+"""L_in and L_out of section 8."""
+
+import torch
+
+from viewmend.training.losses import image_loss
+
+
+def loop_twin(predicted, coverage, error, truth):
+    """Section 8, pixel by pixel."""
+    parts = ([], [])
+    for image, covered, E, target in zip(predicted, coverage, error, truth, strict=True):
+        sums = [[0.0, 0.0], [0.0, 0.0]]
+        for v in range(E.shape[0]):
+            for u in range(E.shape[1]):
+                away = sum(abs(float(image[c, v, u] - target[c, v, u])) for c in range(3)) / 3
+                weights = (float(E[v, u]), (1 - float(E[v, u])) * (float(covered[v, u]) > 0))
+                for total, weight in zip(sums, weights, strict=True):
+                    total[0] += weight * away
+                    total[1] += weight
+        for part, (away, weight) in zip(parts, sums, strict=True):
+            part.append(away / weight if weight else 0.0)
+    return [sum(part) / len(part) for part in parts]
+
+
+def test_losses_equal_the_loop(rng):
+    sizes = [(5, 7), (6, 4)]
+    predicted, truth = ([torch.rand(3, *s, generator=rng) for s in sizes] for _ in range(2))
+    coverage = [(torch.rand(s, generator=rng) > 0.4).float() for s in sizes]
+    error = [torch.rand(s, generator=rng) * (torch.rand(s, generator=rng) > 0.5) for s in sizes]
+    loss = image_loss(predicted, coverage, error, truth)
+    expected = loop_twin(predicted, coverage, error, truth)
+    assert torch.allclose(torch.stack([loss.inside, loss.outside]), torch.tensor(expected), atol=1e-6)
+    assert torch.allclose(loss.total, torch.tensor(sum(expected)), atol=1e-6)
+
+
+def test_an_empty_hole_gives_zero_and_a_zero_gradient(rng):
+    predicted = torch.rand(3, 4, 4, generator=rng).requires_grad_()
+    none = torch.zeros(4, 4)
+    loss = image_loss([predicted], [none], [none], [torch.zeros(3, 4, 4)])
+    loss.total.backward()
+    assert float(loss.total.detach()) == 0
+    assert predicted.grad is not None and not predicted.grad.any()
