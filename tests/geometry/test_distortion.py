@@ -28,6 +28,14 @@ def test_undistortion_inverts_distortion(lens):
 
 
 @pytest.mark.parametrize("lens", LENSES)
+def test_four_steps_come_close(lens):
+    """Newton's method squares the error at each step; with a wrong slope it would not."""
+    dist = torch.tensor(LENSES[lens])
+    near = undistort_points(distort(points(), dist), dist, steps=4)
+    torch.testing.assert_close(near, points(), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("lens", LENSES)
 def test_equals_opencv(lens):
     dist = torch.tensor(LENSES[lens])
     at = torch.cat([points(), torch.ones(9, 9, 1)], -1).reshape(-1, 3).double().numpy()
