@@ -63,12 +63,7 @@ def render_view(
     Raises:
         ValueError: no camera is left to colour the view.
     """
-    usable = frame.cameras.select([name for name in frame.cameras.names if name not in exclude])
-    if not len(usable):
-        raise ValueError(
-            f"expected a camera to colour the view, got {len(frame.cameras)} cameras with all of them excluded; "
-            "exclude fewer"
-        )
+    usable = _without(frame.cameras, exclude)
     source_depth = source_depth or (lambda names: proxy.depth(frame.cameras.select(names)))
     raster = rasterize(proxy.mesh, target)
     depth = raster.depth[0]
@@ -93,6 +88,15 @@ def render_view(
         weights=blended.weights / total * coloured,
         time=frame.time,
     )
+
+
+def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:
+    left = [name for name in cameras.names if name not in exclude]
+    if not left:
+        raise ValueError(
+            f"expected a camera to colour the view, got {len(cameras)} cameras with all of them excluded; exclude fewer"
+        )
+    return cameras.select(left)
 
 
 def _select(
