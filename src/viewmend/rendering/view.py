@@ -57,8 +57,7 @@ def render_view(
         config: which cameras, how blended.
         previous_chosen: the cameras of the stream's last view, for covering selection's hysteresis.
         exclude: names of cameras that must not be used, whatever else holds.
-        source_depth: gives the proxy's depth in cameras; by default it is rendered here. Callers with several
-            viewers of one frame pass one that remembers.
+        source_depth: the proxy's depth in cameras, for callers that remember it; by default it is rendered here.
 
     Raises:
         ValueError: no camera is left to colour the view.
