@@ -30,13 +30,22 @@ def test_losses_equal_the_loop(rng):
     loss = image_loss(predicted, coverage, error, truth)
     expected = loop_twin(predicted, coverage, error, truth)
     assert torch.allclose(torch.stack([loss.inside, loss.outside]), torch.tensor(expected), atol=1e-6)
-    assert torch.allclose(loss.total, torch.tensor(sum(expected)), atol=1e-6)
+    assert torch.allclose(loss.total(0.0), torch.tensor(sum(expected)), atol=1e-6)
 
 
 def test_an_empty_hole_gives_zero_and_a_zero_gradient(rng):
     predicted = torch.rand(3, 4, 4, generator=rng).requires_grad_()
     none = torch.zeros(4, 4)
     loss = image_loss([predicted], [none], [none], [torch.zeros(3, 4, 4)])
-    loss.total.backward()
-    assert float(loss.total.detach()) == 0
+    total = loss.total(0.5) - 0.5 * loss.log_error.detach()
+    total.backward()
+    assert float(total.detach()) == 0
     assert predicted.grad is not None and not predicted.grad.any()
+
+
+def test_the_logarithmic_error_is_a_tenth_of_psnr_in_the_holes(rng):
+    predicted, truth = torch.rand(3, 6, 6, generator=rng), torch.rand(3, 6, 6, generator=rng)
+    E = (torch.rand(6, 6, generator=rng) > 0.5).float()
+    loss = image_loss([predicted], [E], [E], [truth])
+    psnr = -10 * (predicted - truth)[:, E > 0].square().mean().log10()
+    assert torch.allclose(-10 * loss.log_error, psnr, atol=0.02)

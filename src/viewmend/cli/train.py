@@ -25,6 +25,8 @@ class Options:
     """Instead of the recipe's."""
     minutes: float | None = None
     """Instead of the recipe's."""
+    log_error_weight: float | None = None
+    """Weight of the logarithm of the squared error in the holes, instead of the recipe's."""
     seed: int = 0
     """Of weights and scenes."""
 
@@ -44,6 +46,7 @@ def run(options: Options) -> int:
         seed=options.seed,
         steps=options.steps or recipe.steps,
         minutes=options.minutes or recipe.minutes,
+        log_error_weight=recipe.log_error_weight if options.log_error_weight is None else options.log_error_weight,
     )
 
     def report(entry: Progress) -> None:

@@ -97,10 +97,11 @@ def train(
             factor = learning_rate_factor(step, progress, recipe.warmup)
             optimizer.param_groups[0]["lr"] = recipe.learning_rate * factor
             loss = batch_loss(model, batch)
-            if not torch.isfinite(loss.total):
+            total = loss.total(recipe.log_error_weight)
+            if not torch.isfinite(total):
                 raise FloatingPointError(f"expected a finite loss, got {loss} at step {step}; lower the learning rate")
             optimizer.zero_grad(set_to_none=True)
-            loss.total.backward()
+            total.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), recipe.clip)
             optimizer.step()
             average.update_parameters(model)
@@ -123,6 +124,7 @@ def _card(recipe: Recipe, entry: Progress) -> str:
 Trained by `viewmend train {recipe.name}`: {entry.step + 1} steps of {recipe.batch} samples in
 {entry.elapsed_s / 60:.0f} minutes ({entry.progress:.0%} of the schedule), seed {recipe.seed},
 torch {torch.__version__}, {torch.get_num_threads()} threads, CUDA {torch.cuda.is_available()}.
-Loss: L1 inside and outside of the holes (section 8); averaged weights.
+Loss: L1 inside and outside of the holes (section 8), and {recipe.log_error_weight:g} x log10 of the squared error in
+them; averaged weights.
 Data: studio scenes made on the fly{characters}; no real captures, no test seeds, performers or motions.
 """

@@ -57,6 +57,8 @@ class Recipe:
     learning_rate: float = 8e-4
     warmup: int = 60
     weight_decay: float = 0.01
+    log_error_weight: float = 0.0
+    """Of the logarithm of the squared error in the holes, beside the paper's L1."""
     clip: float = 1.0
     """Largest norm of the gradient."""
     ema: float = 0.995
