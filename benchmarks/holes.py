@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from measure import record
+from measure import write
 
 from viewmend.capture.plain import open_capture
 from viewmend.capture.studio.stage import Studio, StudioConfig
@@ -86,7 +86,7 @@ def main() -> None:
         for studio in studios(options.set, options.folder):
             rows += studio_scores(studio, inpainters)
             print(rows[-3].scene, [r.holes and round(r.holes, 2) for r in rows[-3:]], flush=True)
-    record(f"holes-{options.set}", "cpu", {"model": options.model}, {"scores": [asdict(row) for row in rows]})
+    write(f"holes-{options.set}", "cpu", {"model": options.model}, {"scores": [asdict(row) for row in rows]})
     print(table(rows, list(inpainters)))
 
 

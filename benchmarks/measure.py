@@ -60,9 +60,6 @@ def write(what: str, device: str, config: object, results: object) -> Path:
     return path
 
 
-record = write  # pipeline.py's name for it
-
-
 def synchronise(device: str) -> None:
     """Wait for what was started on a GPU."""
     if device.startswith("cuda"):

@@ -2,11 +2,10 @@
 
 import argparse
 import json
-import statistics
 from dataclasses import asdict
 
 import torch
-from measure import record
+from measure import summarise, write
 
 from viewmend.capture.studio.rigs import orbit
 from viewmend.capture.studio.stage import Studio, StudioConfig
@@ -51,13 +50,6 @@ def stream(size: tuple[int, int], cameras: int, frames: int, device: str) -> dic
     }
 
 
-def summarise(taken_ms: list[float]) -> dict[str, float]:
-    """Median and 95th percentile."""
-    ordered = sorted(taken_ms)
-    p95 = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
-    return {"median_ms": round(statistics.median(ordered), 2), "p95_ms": round(p95, 2)}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
@@ -71,7 +63,7 @@ def main() -> None:
         print(json.dumps(figures), flush=True)
     if options.write:
         config = {"seed": SEED, "model": "small, random weights", "pipeline": asdict(PipelineConfig())}
-        print(record("pipeline", options.device, config, figures))
+        print(write("pipeline", options.device, config, figures))
 
 
 if __name__ == "__main__":
