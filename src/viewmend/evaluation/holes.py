@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.inpainting.protocol import ViewInpainter
-from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
+from viewmend.metrics.view_scores import ENOUGH_HOLE_PX, ViewScores, mean_over_frames, score_view
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
 from viewmend.views import MultiViewFrame
 
@@ -62,8 +62,8 @@ def _scene(scene: str, method: str, scores: Sequence[ViewScores]) -> SceneScores
     return SceneScores(
         scene,
         method,
-        mean_over_frames([s.psnr_holes for s in scores], [s.holes_px for s in scores]),
-        mean_over_frames([s.psnr_holes_fg for s in scores], [s.holes_fg_px for s in scores]),
+        mean_over_frames([s.psnr_holes for s in scores if s.holes_px >= ENOUGH_HOLE_PX]),
+        mean_over_frames([s.psnr_holes_fg for s in scores if s.holes_fg_px >= ENOUGH_HOLE_PX]),
         mean_over_frames([s.psnr_whole for s in scores]),
         sum(s.holes_px for s in scores),
     )
