@@ -64,6 +64,17 @@ class ContextViews:
     depth: Float[Tensor, "view height width"]
     """z-depth of G[t] in each camera, metres; 0 where the proxy is not seen."""
 
+    def to(self, device: torch.device | str) -> "ContextViews":
+        """The same on `device`."""
+        return ContextViews(self.frame.to(device), self.depth.to(device))
+
+    def select(self, names: Sequence[str]) -> "ContextViews":
+        """What those of these cameras that are there saw, in the order of `names`."""
+        own = self.frame.cameras.names
+        frame = self.frame.select([n for n in names if n in own])
+        index = torch.tensor([own.index(n) for n in frame.cameras.names], device=self.depth.device, dtype=torch.long)
+        return ContextViews(frame, self.depth[index, : frame.rgb.shape[2], : frame.rgb.shape[3]])
+
 
 @dataclass(frozen=True)
 class IncompleteView:
@@ -84,6 +95,8 @@ class IncompleteView:
     weights: Float[Tensor, "chosen height width"]
     """Share of each chosen camera in each pixel; the sum is 1 where a pixel is coloured, else 0."""
     time: int
+    nearest: tuple[str, ...] = ()
+    """Names of all cameras that an inpainter may look at, the closest first; () where the renderer does not say."""
 
 
 @dataclass(frozen=True)

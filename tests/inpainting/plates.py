@@ -27,8 +27,9 @@ TINY = InpainterConfig(
     rope_values=True,
     colour_path=True,
     prefill=True,
+    rays=3,
 )
-PLAIN = {"rope_unit": "image", "rope_values": False, "colour_path": False, "prefill": False}
+PLAIN = {"rope_unit": "image", "rope_values": False, "colour_path": False, "prefill": False, "rays": 0}
 """Changes that leave the paper's model."""
 
 

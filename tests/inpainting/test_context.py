@@ -71,7 +71,9 @@ def test_only_what_is_missing_is_asked_for():
     rig.asked.clear()
     other = replace(view(8), chosen=("left", "third"))
     _, state = net.step(other, rig, state)
-    assert rig.asked == [(t, ("third",)) for t in window_times(8, net.config)]
+    now, *past = rig.asked
+    assert now == (8, ("third", "left")), "what is cached is asked for where rays are read"
+    assert past == [(t, ("third",)) for t in window_times(8, net.config)[1:]]
     rig.asked.clear()
     net.step(view(9), rig, state)
     assert rig.asked == [(9, NAMES), (5, NAMES), (1, NAMES)]

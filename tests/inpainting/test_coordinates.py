@@ -82,7 +82,7 @@ def test_a_patch_without_depth_is_dropped():
 def test_the_views_own_complete_patches_join_the_context_where_they_are():
     net, incomplete = tiny(), view(5)
     with torch.no_grad():
-        (target,) = net._encode_targets([incomplete])
+        (target,) = net._encode_targets([incomplete], [None])
     batch = assemble([target], [[]], [torch.zeros(4, 2, int((~target.incomplete).sum()), 64)], net.config)
     centres = (target.places[:, [2, 1]] * 16 + 14) / torch.tensor([WIDTH, HEIGHT])
     assert torch.allclose(batch.at.uvs[0, :, :2], centres[target.incomplete])

@@ -15,7 +15,7 @@ def mend(net, time, **options):
     """From scratch: all frames of the window, no cache."""
     contexts = [context(t) for t in window_times(time, net.config)]
     with torch.no_grad():
-        return net([view(time)], [contexts], **options)[0].completed
+        return net([view(time)], [contexts], nearby=[context(time)], **options)[0].completed
 
 
 def close(a, b, tolerance=2e-5):
@@ -96,7 +96,9 @@ def test_order_of_cameras_changes_nothing():
     net = tiny()
     frames = [f for t in (3, 2) for f in net.encode_context(context(t))]
     with torch.no_grad():
-        one, other = (net([view(3)], [order])[0].completed for order in (frames, frames[::-1]))
+        one, other = (
+            net([view(3)], [frames[::step]], nearby=[context(3, NAMES[::step])])[0].completed for step in (1, -1)
+        )
     assert close(one, other)
     swapped = replace(view(5), chosen=NAMES[::-1])
     assert close(net.step(swapped, Rig(), net.initial_state())[0].rgb, mend(net, 5))
@@ -146,7 +148,8 @@ def test_a_gap_in_one_camera_is_skipped():
     completed, _ = net.step(view(5), rig, net.initial_state())
     frames = [context(5, ("right",)), context(4, ("left",)), context(3), context(1)]
     with torch.no_grad():
-        assert close(completed.rgb, net([view(5)], [frames])[0].completed)
+        expected = net([view(5)], [frames], nearby=[context(5, ("right",))])[0].completed
+    assert close(completed.rgb, expected)
 
 
 @pytest.mark.parametrize(("width", "height"), [(28, 28), (29, 31), (97, 61), (20, 23), (64, 48), (101, 130)])
@@ -163,7 +166,8 @@ def test_any_size(width, height):
 @pytest.mark.parametrize("top_k", [None, 5])
 def test_gradients_reach_every_parameter(top_k, changes):
     net = tiny(**changes).train()
-    prediction = net([view(5), view(6)], [[context(5), context(4)], [context(6)]], top_k)
+    contexts = [[context(5), context(4)], [context(6)]]
+    prediction = net([view(5), view(6)], contexts, top_k, [context(5), context(6, ("left", "third", "right"))])
     sum((p.inpainted**2).sum() for p in prediction).backward()
     starved = [n for n, p in net.named_parameters() if p.grad is None or not bool((p.grad != 0).any())]
     assert not starved
@@ -187,10 +191,11 @@ def test_a_batch_equals_one_by_one(top_k, changes):
     net = tiny(**changes)
     views = [view(5), view(6, (30, 34, 40, 44)), view(7, hole=None), view(4, width=64, height=48)]
     contexts = [[context(5), context(4), context(3)], [context(6)], [], [context(4, width=120, height=100)]]
+    nearby = [context(5), None, None, context(4, ("left", "third", "right"), width=120, height=100)]
     with torch.no_grad():
-        together = net(views, contexts, top_k)
-        for one, v, c in zip(together, views, contexts, strict=True):
-            alone = net([v], [c], top_k)[0]
+        together = net(views, contexts, top_k, nearby)
+        for one, v, c, n in zip(together, views, contexts, nearby, strict=True):
+            alone = net([v], [c], top_k, [n])[0]
             assert close(one.completed, alone.completed) and close(one.inpainted, alone.inpainted)
             assert torch.equal(one.coverage, alone.coverage)
 

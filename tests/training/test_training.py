@@ -11,6 +11,7 @@ from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.config import small as small_model
+from viewmend.inpainting.inpainter import Inpainter
 from viewmend.rendering.view import RenderConfig
 from viewmend.training.loop import learning_rate_factor, train
 from viewmend.training.recipes import DataPlan, Recipe
@@ -24,6 +25,7 @@ PLAN = DataPlan(
     held_cameras=2,
     targets_per_camera=1,
     min_hole_px=5,
+    rays=3,
     hull_resolution=48,
 )
 
@@ -73,13 +75,20 @@ def test_the_learning_rate_warms_up_and_ends_at_zero():
     assert learning_rate_factor(100, 1.0, 10) == pytest.approx(0.0)
 
 
-def test_a_short_run_writes_a_model_that_loads_and_a_log(tmp_path):
+@pytest.mark.parametrize("part", ["all", "rays", "patches"])
+def test_a_short_run_trains_its_part_and_writes_a_model_that_loads_and_a_log(part, tmp_path):
     model = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2)
-    recipe = Recipe(name="tiny", model=model, data=PLAN, steps=3, batch=2, fresh=1, warmup=1, workers=0)
+    recipe = Recipe(
+        name="tiny", model=model, data=PLAN, steps=3, batch=2, fresh=1, warmup=1, workers=0, part=part, ema=0.0
+    )
     reported = []
     train(recipe, tmp_path / "run", report=reported.append)
     log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert [entry["step"] for entry in log] == [0, 1, 2] == [entry.step for entry in reported]
     inpainter = load_inpainter(tmp_path / "run")
     assert inpainter.config == model
+    torch.manual_seed(recipe.seed)
+    untrained = Inpainter(model).state_dict()
+    moved = {n.startswith("ray_reader.") for n, w in inpainter.state_dict().items() if not torch.equal(w, untrained[n])}
+    assert moved == {"all": {True, False}, "rays": {True}, "patches": {False}}[part]
     assert "tiny" in (tmp_path / "run" / "README.md").read_text()

@@ -1,7 +1,7 @@
 """`viewmend mend`: novel views of a capture, rendered and mended, and scored against a camera that was left out."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -44,6 +44,9 @@ class Options:
     """Context tokens that survive pruning: fewer is faster. All by default."""
     frames: str | None = None
     """Which frames, first:end, counted from 0; all by default."""
+    align: bool = True
+    """Look for a shift of all images against the calibration (a wrong convention for pixel centres, say), in the masks
+    of the input cameras' first frame, and undo it where they then agree better."""
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
     json: bool = False
@@ -69,8 +72,10 @@ def run(options: Options) -> int:
     held = () if options.leave_out is None else (options.leave_out,)
     mender = Mender(inpainter, options.context, capture.bounds, held)
     summary = MendSummary()
+    offset_px = _offset(options, capture, times[0]) if options.align else (0.0, 0.0)
+    views = _views(options, capture, times, offset_px)
     with MendOutput(options.out, fps=capture.fps or 15.0) as output:
-        for frame, target in track(_views(options, capture, times), "mending", _count(options, capture, times)):
+        for frame, target in track(views, "mending", _count(options, capture, times)):
             truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
             step = mender.mend(frame.without(held), target, truth)
             summary.add(step)
@@ -106,6 +111,24 @@ def _open(options: Options) -> "PlainCapture":
     return capture
 
 
+def _offset(options: Options, capture: "PlainCapture", time: int) -> tuple[float, float]:
+    """The shift of the calibration that the input cameras' masks ask for; it is said if there is one."""
+    from viewmend.cli.console import say
+    from viewmend.geometry.alignment import shared_offset
+
+    frame = capture.read(time).without([options.leave_out] if options.leave_out else [])
+    if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > 0).any()):
+        return (0.0, 0.0)
+    found = shared_offset(frame.mask, frame.cameras, capture.bounds)
+    if found.offset_px != (0.0, 0.0):
+        x, y = found.offset_px
+        say(
+            f"all principal points moved by ({x:+.2f}, {y:+.2f}) pixels: hull and masks then agree better, IoU "
+            f"{found.iou_before:.3f} -> {found.iou_after:.3f}; check first_pixel_center, or use --no-align"
+        )
+    return found.offset_px
+
+
 def _times(frames: str | None, count: int) -> range:
     if frames is None:
         return range(count)
@@ -125,13 +148,15 @@ def _count(options: Options, capture: "PlainCapture", times: range) -> int:
     return STATIC_VIEWS if options.path == "orbit" and len(capture.frame_ids) == 1 else len(times)
 
 
-def _views(options: Options, capture: "PlainCapture", times: range) -> "Iterator[tuple[MultiViewFrame, Cameras]]":
-    """Each frame with the novel view's camera, in order of time."""
+def _views(
+    options: Options, capture: "PlainCapture", times: range, offset_px: tuple[float, float]
+) -> "Iterator[tuple[MultiViewFrame, Cameras]]":
+    """Each frame with the novel view's camera, in order of time; the rig's principal points are moved."""
     from viewmend.capture.prefetch import prefetch
     from viewmend.cli.novel_paths import paired, read_path
 
     if options.leave_out is not None:
-        plan = [(time, capture.cameras.select([options.leave_out])) for time in times]
+        plan = [(time, capture.cameras.select([options.leave_out]).moved(*offset_px)) for time in times]
     elif options.path == "orbit":
         plan = _orbit(capture, times)
     else:
@@ -140,7 +165,8 @@ def _views(options: Options, capture: "PlainCapture", times: range) -> "Iterator
     frame = None
     for time, target in plan:
         if frame is None or frame.time != time:
-            frame = next(frames).to(options.device)
+            frame = next(frames)
+            frame = replace(frame, cameras=frame.cameras.moved(*offset_px)).to(options.device)
         yield frame, target.to(options.device)
 
 

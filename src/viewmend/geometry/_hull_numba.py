@@ -137,7 +137,7 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
     """Fill values[first : first + block]: the smallest mask value over the cameras that see each voxel's middle."""
     end_x, end_y, end_z = min(first + block, values.shape[0]), values.shape[1], values.shape[2]
     radius = voxel_m * np.sqrt(3.0) / 2 * (block - 1) + 1e-9
-    mixed = np.empty(P.shape[0], np.int64)
+    order, mixed = np.arange(P.shape[0]), np.empty(P.shape[0], np.int64)
     scratch = np.empty((8, block**3), np.float32)
     for first_y in range(0, end_y, block):
         for first_z in range(0, end_z, block):
@@ -145,9 +145,12 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
             y = low[1] + (first_y + block / 2) * voxel_m
             z = low[2] + (first_z + block / 2) * voxel_m
             seen, undecided = 0, 0
-            for view in range(P.shape[0]):
+            for n in range(len(order)):
+                view = order[n]
                 verdict = judge(P[view], lens[view], x, y, z, radius, size[view], pool, tile, sums[view])
                 if verdict == EMPTY:
+                    # It will call the next block empty as well: ask it first.
+                    order[n], order[0] = order[0], view
                     seen = -1
                     break
                 if verdict == FULL:

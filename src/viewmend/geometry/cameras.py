@@ -88,6 +88,12 @@ class Cameras:
         size = torch.tensor([width, height], device=K.device).expand(len(self), 2).contiguous()
         return replace(self, K=K, size_px=size)
 
+    def moved(self, x_px: float, y_px: float) -> "Cameras":
+        """Cameras whose principal points are moved by (x, y) pixels."""
+        K = self.K.clone()
+        K[:, :2, 2] += torch.tensor([x_px, y_px]).to(K)
+        return replace(self, K=K)
+
     def cropped(self, left: int, top: int, width: int, height: int) -> "Cameras":
         """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image."""
         K = self.K.clone()

@@ -43,6 +43,9 @@ class InpainterConfig:
     prefill: bool = False
     """Fill the holes smoothly from their surroundings first: the encoder is shown the fill instead of black, the
     decoder the view's own pixels, and it decides pixel by pixel how much of the fill to replace. Ours."""
+    rays: int = 0
+    """Read that first fill from this many cameras at the view's own time, pixel by pixel along its ray: the chosen
+    ones, then the closest others. 0: fill from the surroundings alone. Ours."""
     top_k: int | None = None
     """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
     attention_scale: Literal["model", "head"] = "model"
@@ -62,7 +65,7 @@ class InpainterConfig:
         object.__setattr__(self, "widths", tuple(self.widths))
         positive = {n: getattr(self, n) for n in ("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w")}
         wrong = [f"{n} = {v}" for n, v in positive.items() if v < 1]
-        wrong += [f"{n} = {getattr(self, n)}" for n in ("n_c", "n_w") if getattr(self, n) < 0]
+        wrong += [f"{n} = {getattr(self, n)}" for n in ("n_c", "n_w", "rays") if getattr(self, n) < 0]
         if wrong:
             raise ValueError(f"expected positive sizes, got {', '.join(wrong)}")
         if self.dim % (16 * self.heads):
@@ -72,6 +75,8 @@ class InpainterConfig:
             )
         if len(self.widths) != len(ENCODER_GROUPS) or any(w % 8 for w in self.widths):
             raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
+        if self.rays and not self.prefill:
+            raise ValueError(f"expected prefill with rays (they make the fill), got rays {self.rays} without")
         if self.top_k is not None and self.top_k < 1:
             raise ValueError(f"expected top_k of at least 1 or none, got {self.top_k}")
 
@@ -132,4 +137,5 @@ def small() -> InpainterConfig:
         rope_values=True,
         colour_path=True,
         prefill=True,
+        rays=8,
     )

@@ -29,7 +29,7 @@ class Decoder(nn.Module):
             nn.LeakyReLU(SLOPE),
         )
         self.prefill = config.prefill
-        self.mix = nn.Conv2d(C // 2 + config.in_channels, C // 2, 3, 1, 1) if config.prefill else None
+        self.mix = _mix(C // 2 + config.in_channels, C // 2) if config.prefill else None
         self.last = last = nn.Conv2d(C // 2, 3 + config.prefill, 3, 1, 1)
         for layer in (*self.layers, self.last):
             if isinstance(layer, nn.ConvTranspose2d):
@@ -51,12 +51,24 @@ class Decoder(nn.Module):
         cells = self.linear(self.norm(tokens)).unflatten(1, (-1, PATCH_CELLS, PATCH_CELLS))
         detail = self.layers(cells[:, : self.features])
         if self.mix is not None:
-            detail = nn.functional.leaky_relu(self.mix(torch.cat([detail, pixels.to(detail)], 1)), SLOPE)
+            detail = self.mix(torch.cat([detail, pixels.to(detail)], 1))
         out = self.last(detail)
         rgb = out[:, :3]
         if cells.shape[1] > self.features:
             rgb = rgb + nn.functional.interpolate(cells[:, self.features :], size=PATCH_PX, mode="bilinear")
         return torch.cat([rgb, (out[:, 3:] + KEEP).sigmoid()], 1) if self.prefill else rgb
+
+
+def _mix(features: int, width: int) -> nn.Sequential:
+    """Three convolutions by which a pixel sees seven others to each side."""
+    return nn.Sequential(
+        nn.Conv2d(features, width, 3, 1, 1),
+        nn.LeakyReLU(SLOPE),
+        nn.Conv2d(width, width, 3, 1, 2, dilation=2),
+        nn.LeakyReLU(SLOPE),
+        nn.Conv2d(width, width, 3, 1, 4, dilation=4),
+        nn.LeakyReLU(SLOPE),
+    )
 
 
 def blend(

@@ -19,7 +19,6 @@ from viewmend.inpainting.patches import (
     crop_windows,
     split,
 )
-from viewmend.inpainting.prefill import fill
 from viewmend.views import ContextViews, IncompleteView
 
 MIN_FOREGROUND = 0.1
@@ -54,12 +53,9 @@ def context_images(views: ContextViews, config: InpainterConfig) -> Images:
     return _images(rgb, mask, views.depth, inside, mask > MIN_FOREGROUND, config)
 
 
-def target_images(view: IncompleteView, config: InpainterConfig) -> Images:
-    """The novel view, a stack of one; with `prefill`, its holes filled from their surroundings."""
+def target_images(view: IncompleteView, rgb: Float[Tensor, "3 height width"], config: InpainterConfig) -> Images:
+    """The novel view with these colours, a stack of one."""
     mask = view.mask[None]
-    rgb = view.rgb
-    if config.prefill:
-        rgb = fill(rgb, view.error > 0, view.mask > 0)
     return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], mask > 0, config)
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from viewmend.inpainting.assembly import Target, assemble
 from viewmend.inpainting.config import InpainterConfig
-from viewmend.inpainting.context import ContextFrame, window_times
+from viewmend.inpainting.context import ContextCache, ContextFrame, window_times
 from viewmend.inpainting.coordinates import lift, patch_depths
 from viewmend.inpainting.copying import start_as_copier
 from viewmend.inpainting.decoder import Decoder, blend
@@ -25,7 +25,9 @@ from viewmend.inpainting.patches import (
     padded_size,
     split,
 )
+from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.ray_reader import RayReader
 from viewmend.inpainting.transformer import Transformer
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
@@ -38,6 +40,8 @@ class Prediction:
     """Ftilde: the decoded patches, blended; about [0, 1] but not clamped; 0 where not covered."""
     coverage: Float[Tensor, "height width"]
     """1 where a decoded patch covers the pixel, else 0."""
+    filled: Float[Tensor, "3 height width"]
+    """What the encoder was shown: with `prefill` the view with its holes filled before any patch was decoded."""
     completed: Float[Tensor, "3 height width"]
     """Fhat = E Ftilde + (1 - E) F, Ftilde clamped; F bit for bit where E is 0."""
 
@@ -51,12 +55,15 @@ class Inpainter(nn.Module):
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
         self.decoder = Decoder(config)
+        self.ray_reader = RayReader() if config.rays else None
         if config.colour_path:
             start_as_copier(self.tokeniser.linear, self.decoder.linear, config)
         self.compute_dtype = torch.float32
         """Set to torch.bfloat16 to run the networks under autocast; coordinates stay float32."""
 
-    def _autocast(self, device: torch.device) -> torch.autocast:
+    def autocast(self) -> torch.autocast:
+        """The context in which the networks compute in `compute_dtype`."""
+        device = self.decoder.linear.weight.device
         return torch.autocast(device.type, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     def encode_context(self, views: ContextViews) -> tuple[ContextFrame, ...]:
@@ -68,7 +75,7 @@ class Inpainter(nn.Module):
         if not many:
             return []
         stacks = [context_images(views, self.config) for views in many]
-        with self._autocast(stacks[0].channels.device):
+        with self.autocast():
             tokens = self.tokeniser(stacks)
             keys_values = self.transformer.project_context(tokens)
         counts = [len(stack.places) for stack in stacks]
@@ -80,6 +87,7 @@ class Inpainter(nn.Module):
         views: Sequence[IncompleteView],
         contexts: Sequence[Sequence[ContextFrame | ContextViews]],
         top_k: int | None = None,
+        nearby: Sequence[ContextViews | None] | None = None,
     ) -> list[Prediction]:
         """`predict`, whose contexts may also be camera images; these are encoded first, all in one batch."""
         fresh = [item for context in contexts for item in context if isinstance(item, ContextViews)]
@@ -88,21 +96,23 @@ class Inpainter(nn.Module):
             [f for item in context for f in (next(encoded) if isinstance(item, ContextViews) else (item,))]
             for context in contexts
         ]
-        return self.predict(views, frames, top_k)
+        return self.predict(views, frames, top_k, nearby)
 
     def predict(
         self,
         views: Sequence[IncompleteView],
         contexts: Sequence[Sequence[ContextFrame]],
         top_k: int | None = None,
+        nearby: Sequence[ContextViews | None] | None = None,
     ) -> list[Prediction]:
         """One prediction per view from its own context frames (any number, 0 included).
 
-        `top_k` context tokens survive pruning; None takes the config's. Gradients reach every parameter.
+        `top_k` context tokens survive pruning; None takes the config's. `nearby` is what the cameras near each view see
+        at its time, for `rays`; None where there are none. Gradients reach every parameter.
         """
         if len(views) != len(contexts):
             raise ValueError(f"expected one context per view, got {len(views)} views and {len(contexts)} contexts")
-        targets = self._encode_targets(views)
+        targets = self._encode_targets(views, nearby or [None] * len(views))
         asking = [i for i, target in enumerate(targets) if bool(target.incomplete.any())]
         patches: dict[int, Tensor] = {}
         if asking:
@@ -110,10 +120,22 @@ class Inpainter(nn.Module):
             patches = dict(zip(asking, decoded, strict=True))
         return [_prediction(target, patches.get(i)) for i, target in enumerate(targets)]
 
-    def _encode_targets(self, views: Sequence[IncompleteView]) -> list[Target]:
+    def prefill(
+        self, views: Sequence[IncompleteView], nearby: Sequence[ContextViews | None]
+    ) -> list[Float[Tensor, "3 _h _w"]]:
+        """What the encoder is shown as each view's colours: its holes filled as the config says."""
+        if self.ray_reader is not None:
+            with self.autocast():
+                return self.ray_reader(views, nearby)
+        if self.config.prefill:
+            return [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
+        return [view.rgb for view in views]
+
+    def _encode_targets(self, views: Sequence[IncompleteView], nearby: Sequence[ContextViews | None]) -> list[Target]:
         """Tokens of every kept patch of each view; those with any pixel of E > 0 are the input set P."""
-        stacks: list[Images] = [target_images(view, self.config) for view in views]
-        with self._autocast(stacks[0].channels.device):
+        filled = self.prefill(views, nearby)
+        stacks: list[Images] = [target_images(*own, self.config) for own in zip(views, filled, strict=True)]
+        with self.autocast():
             tokens = self.tokeniser(stacks)
         targets = []
         parts = zip(views, stacks, tokens.split([len(stack.places) for stack in stacks]), strict=True)
@@ -126,10 +148,10 @@ class Inpainter(nn.Module):
         self, targets: Sequence[Target], contexts: Sequence[Sequence[ContextFrame]], top_k: int | None
     ) -> list[Float[Tensor, "patch output 28 28"]]:
         """The decoder's patches for each target's incomplete patches."""
-        with self._autocast(targets[0].tokens.device):
+        with self.autocast():
             own = [self.transformer.project_context(t.tokens[~t.incomplete]) for t in targets]
         batch = assemble(targets, contexts, own, self.config)
-        with self._autocast(targets[0].tokens.device):
+        with self.autocast():
             tokens = self.transformer(
                 batch.queries,
                 batch.at,
@@ -150,18 +172,32 @@ class Inpainter(nn.Module):
     ) -> tuple[CompletedView, State]:
         """The completed view and the state for the next one (section 9).
 
-        `source` is asked only for frames of `view.chosen` that the window needs and the state has not; a view
-        without holes comes back at once, without asking it.
+        `source` is asked for frames of `view.chosen` that the window needs and the state has not, and for those of
+        `view.nearest` that `rays` reads now; a view without holes comes back at once, without asking it.
         """
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
-        times = window_times(view.time, self.config)
-        wanted = [(time, state.cache.missing(view.chosen, time)) for time in times]
-        found = [source(time, names) for time, names in wanted if names]
-        frames = [f for group in self.encode_contexts([v for v in found if v is not None]) for f in group]
+        fresh, nearby = self._look(view, source, state.cache)
+        frames = [frame for group in self.encode_contexts(fresh) for frame in group]
         cache = state.cache.add(frames, view.time, self.config)
-        prediction = self.predict([view], [cache.find(view.chosen, times)], top_k)[0]
+        context = cache.find(view.chosen, window_times(view.time, self.config))
+        prediction = self.predict([view], [context], top_k, [nearby])[0]
         return CompletedView(view, prediction.completed), State(cache)
+
+    def _look(
+        self, view: IncompleteView, source: Source, cache: ContextCache
+    ) -> tuple[list[ContextViews], ContextViews | None]:
+        """What the window needs and the cache has not, by time; and what the cameras near the view see now."""
+        around = tuple(dict.fromkeys((*view.chosen, *view.nearest)))[: self.config.rays]
+        fresh, nearby = [], None
+        for time in window_times(view.time, self.config):
+            new = cache.missing(view.chosen, time)
+            names = tuple(dict.fromkeys((*new, *around))) if time == view.time else new
+            seen = source(time, names) if names else None
+            if seen is not None:
+                fresh.append(seen.select(new))
+                nearby = seen.select(around) if time == view.time and around else nearby
+        return [views for views in fresh if len(views.frame.cameras)], nearby
 
 
 def _context_frames(
@@ -197,13 +233,13 @@ def _prediction(target: Target, patches: Float[Tensor, "patch output 28 28"] | N
     """Patches back in their places, blended, and the view completed; without patches it stays as it is."""
     view = target.view
     if patches is None:
-        return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb)
+        return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), target.shown[:3], view.rgb)
     height, width = view.mask.shape
     merged, coverage = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
     inpainted = merged[0, :3]
     if len(merged[0]) > 3:
         inpainted = torch.lerp(target.shown[:3] * coverage, inpainted, merged[0, 3])
-    return Prediction(inpainted, coverage[0], blend(view.rgb, view.error, inpainted, coverage[0]))
+    return Prediction(inpainted, coverage[0], target.shown[:3], blend(view.rgb, view.error, inpainted, coverage[0]))
 
 
 def _pixels(target: Target) -> Float[Tensor, "patch channel 28 28"]:

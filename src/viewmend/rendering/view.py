@@ -68,7 +68,9 @@ def render_view(
     depth = raster.depth[0]
     mask = (depth > 0).to(depth)
 
-    chosen = _select(usable, proxy, target, depth, config, previous_chosen, source_depth)
+    center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
+    nearest = select_closest(target, usable, center, len(usable))
+    chosen = _select(usable, nearest, proxy, target, depth, config, previous_chosen, source_depth)
     normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
     sources = ContextViews(frame.select(chosen), source_depth(chosen))
     bias_m = config.blend.depth_bias * float(proxy.bounds.size_m.norm())
@@ -76,17 +78,8 @@ def render_view(
 
     error = error_rule(config.error_rule)(Evidence(mask, depth, blended))
     coloured = mask * (error < 1)
-    total = blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny)
-    return IncompleteView(
-        camera=target,
-        rgb=blended.rgb * coloured,
-        mask=mask,
-        error=error,
-        depth=depth,
-        chosen=chosen,
-        weights=blended.weights / total * coloured,
-        time=frame.time,
-    )
+    weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
+    return IncompleteView(target, blended.rgb * coloured, mask, error, depth, chosen, weights, frame.time, nearest)
 
 
 def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:
@@ -100,6 +93,7 @@ def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:
 
 def _select(
     usable: Cameras,
+    nearest: tuple[str, ...],
     proxy: GeometryProxy,
     target: Cameras,
     depth: Float[Tensor, "height width"],
@@ -108,12 +102,10 @@ def _select(
     source_depth: SourceDepth,
 ) -> tuple[str, ...]:
     """Names of the cameras that colour the view, among those of `usable`."""
-    center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
     if config.selection == "closest":
-        return select_closest(target, usable, center, config.cameras)
-    closest = select_closest(target, usable, center, len(usable))
+        return nearest[: config.cameras]
     evidence = _evidence(usable, proxy, target, depth, config, source_depth)
-    return select_covering(evidence, usable.names, closest, config.cameras, previous, config.keep_share)
+    return select_covering(evidence, usable.names, nearest, config.cameras, previous, config.keep_share)
 
 
 def _evidence(

@@ -51,15 +51,28 @@ def batches(recipe: Recipe) -> Iterator[list[Sample]]:
 
 def batch_loss(model: Inpainter, batch: list[Sample]) -> ImageLoss:
     """The objective of section 8 over a batch, through encoder, context and transformer."""
-    device = next(model.parameters()).device
-    batch = [sample.to(device) for sample in batch]
-    predictions = model([s.view for s in batch], [list(s.context) for s in batch])
+    predictions = model([s.view for s in batch], [list(s.context) for s in batch], nearby=[s.nearby for s in batch])
     return image_loss(
         [p.inpainted for p in predictions],
         [p.coverage for p in predictions],
         [s.view.error for s in batch],
         [s.truth.float() / 255 for s in batch],
     )
+
+
+def rays_loss(model: Inpainter, batch: list[Sample], most_px: int) -> ImageLoss:
+    """The objective inside the holes, of what the ray reader makes of at most `most_px` random pixels of each view."""
+    assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
+    pixels = [torch.nonzero(s.view.error > 0) for s in batch]
+    pixels = [p[torch.randperm(len(p), device=p.device)[:most_px]] for p in pixels]
+    with model.autocast():
+        filled = model.ray_reader([s.view for s in batch], [s.nearby for s in batch], pixels)
+    one = torch.ones((), device=filled[0].device)
+    counted = [
+        torch.zeros_like(s.view.error).index_put(tuple(p.unbind(1)), one) for s, p in zip(batch, pixels, strict=True)
+    ]
+    nowhere = [torch.zeros_like(s.view.error) for s in batch]
+    return image_loss(filled, nowhere, counted, [s.truth.float() / 255 for s in batch])
 
 
 def learning_rate_factor(step: int, progress: float, warmup: int) -> float:
@@ -72,7 +85,7 @@ def train(
 ) -> Path:
     """Run a recipe; the averaged weights are in `out` every 100 steps and at the end, the log in out/log.jsonl.
 
-    start: a model to go on from, of the recipe's config.
+    start: a model to go on from: its weights, wherever the recipe's model has one of the same name and shape.
     report: told of each step.
 
     Raises:
@@ -81,12 +94,12 @@ def train(
     torch.manual_seed(recipe.seed)
     out.mkdir(parents=True, exist_ok=True)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model = (start if start is not None else Inpainter(recipe.model)).to(device).train()
-    model.compute_dtype = torch.bfloat16 if recipe.bfloat16 else torch.float32
+    model = _model(recipe, start).to(device)
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema))
     averaged = average.module
     assert isinstance(averaged, Inpainter)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+    learned = [p for p in model.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(learned, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     began, entry = time.monotonic(), Progress(-1, 0.0, 0.0, 0.0, 0.0)
     with (out / "log.jsonl").open("a") as log:
         for step, batch in enumerate(batches(recipe)):
@@ -96,13 +109,14 @@ def train(
                 break
             factor = learning_rate_factor(step, progress, recipe.warmup)
             optimizer.param_groups[0]["lr"] = recipe.learning_rate * factor
-            loss = batch_loss(model, batch)
+            batch = [sample.to(device) for sample in batch]
+            loss = rays_loss(model, batch, recipe.pixels) if recipe.part == "rays" else batch_loss(model, batch)
             total = loss.total(recipe.log_error_weight)
             if not torch.isfinite(total):
                 raise FloatingPointError(f"expected a finite loss, got {loss} at step {step}; lower the learning rate")
             optimizer.zero_grad(set_to_none=True)
             total.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), recipe.clip)
+            torch.nn.utils.clip_grad_norm_(learned, recipe.clip)
             optimizer.step()
             average.update_parameters(model)
             entry = Progress(step, progress, loss.inside.item(), loss.outside.item(), elapsed_s)
@@ -114,6 +128,18 @@ def train(
                 save_inpainter(averaged, out, _card(recipe, entry))
     save_inpainter(averaged, out, _card(recipe, entry))
     return out
+
+
+def _model(recipe: Recipe, start: Inpainter | None) -> Inpainter:
+    """The recipe's model with those weights of `start` whose name and shape it has; its part is ready to learn."""
+    model = Inpainter(recipe.model).train()
+    own = model.state_dict()
+    given = {} if start is None else start.state_dict()
+    model.load_state_dict(own | {n: w for n, w in given.items() if n in own and own[n].shape == w.shape})
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(recipe.part == "all" or name.startswith("ray_reader.") == (recipe.part == "rays"))
+    model.compute_dtype = torch.bfloat16 if recipe.bfloat16 else torch.float32
+    return model
 
 
 def _card(recipe: Recipe, entry: Progress) -> str:

@@ -1,7 +1,8 @@
 """What a training run is: model, data and schedule. A recipe is a function of a few lines."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.config import small as small_model
@@ -25,8 +26,10 @@ class DataPlan:
     """How many cameras colour a view and are its context,"""
     context_weights: tuple[int, ...] = (1, 4, 1)
     """and how often each."""
+    rays: int = 0
+    """How many cameras near a view an inpainter that reads rays is given."""
     imperfect_share: float = 0.4
-    """Share of the scenes whose cameras have noise and differ in colour."""
+    """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
     min_hole_px: int = 50
     """Views that miss less are passed over."""
     hull_resolution: int = 96
@@ -65,16 +68,41 @@ class Recipe:
     """Decay of the averaged weights, which are what is shipped."""
     workers: int = 1
     """Processes that make samples."""
+    part: Literal["rays", "patches", "all"] = "all"
+    """What is trained: the ray reader alone, on the fill that it makes, all but it, or both."""
+    pixels: int = 300
+    """For the rays alone: missing pixels that are read of each view, at most."""
     bfloat16: bool = True
     """Run the networks under autocast."""
     seed: int = 0
 
 
 def small(performers: Path | None = None, motions: Path | None = None) -> Recipe:
-    """The small model, for two CPU cores and less than an hour."""
+    """The small model's patches, for two CPU cores and less than an hour, upon what `small_rays` made."""
     return Recipe(
-        name="small", model=small_model(), data=DataPlan(performers=performers, motions=motions), steps=1500, minutes=55
+        name="small",
+        model=small_model(),
+        data=DataPlan(performers=performers, motions=motions, rays=small_model().rays),
+        steps=1500,
+        minutes=40,
+        part="patches",
+        log_error_weight=0.5,
     )
 
 
-RECIPES = {"small": small}
+def small_rays(performers: Path | None = None, motions: Path | None = None) -> Recipe:
+    """The small model's ray reader: it learns ten times as fast, alone."""
+    return replace(
+        small(performers, motions),
+        name="small_rays",
+        part="rays",
+        steps=6000,
+        batch=16,
+        fresh=3,
+        learning_rate=3e-3,
+        ema=0.998,
+        log_error_weight=2.0,
+    )
+
+
+RECIPES = {"small": small, "small_rays": small_rays}

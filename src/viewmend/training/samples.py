@@ -21,6 +21,8 @@ class Sample:
     view: IncompleteView
     context: tuple[ContextViews, ...]
     """The chosen cameras, one element a time, the view's own time first."""
+    nearby: ContextViews | None
+    """What the cameras near the view, the chosen ones first, saw at its time: for an inpainter that reads rays."""
     truth: UInt8[Tensor, "3 height width"]
     """F*, background black."""
 
@@ -35,8 +37,8 @@ class Sample:
             depth=self.view.depth.to(device),
             weights=self.view.weights.to(device),
         )
-        context = tuple(ContextViews(c.frame.to(device), c.depth.to(device)) for c in self.context)
-        return Sample(view, context, self.truth.to(device))
+        context = tuple(c.to(device) for c in self.context)
+        return Sample(view, context, None if self.nearby is None else self.nearby.to(device), self.truth.to(device))
 
 
 class LeaveOneOut:
@@ -58,11 +60,18 @@ class LeaveOneOut:
         return self._proxies[time]
 
     def sample(
-        self, time: int, past: Sequence[int], truth: MultiViewFrame, render: RenderConfig, min_hole_px: int
+        self,
+        time: int,
+        past: Sequence[int],
+        truth: MultiViewFrame,
+        render: RenderConfig,
+        min_hole_px: int,
+        rays: int = 0,
     ) -> Sample | None:
         """The pair at `time` with context from `time` and the `past` times; None if fewer pixels are missing.
 
         truth: the held camera at `time`, one view.
+        rays: how many cameras are `nearby`.
         """
         view = render_view(self.frames[time], self.proxy(time), truth.cameras, render)
         if float(view.error.sum()) < min_hole_px:
@@ -73,5 +82,8 @@ class LeaveOneOut:
             frame = self.frames[tau].select(names)
             context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
         assert truth.mask is not None, "the studio always knows its masks"
+        around = tuple(dict.fromkeys((*view.chosen, *view.nearest)))[:rays]
+        near = self.frames[time].select(around)
+        nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
-        return Sample(view, tuple(context), black.round().to(torch.uint8))
+        return Sample(view, tuple(context), nearby, black.round().to(torch.uint8))

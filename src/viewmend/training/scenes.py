@@ -61,6 +61,10 @@ def random_studio(plan: DataPlan, random: Random) -> Studio:
             shot_noise=0.02 * strength,
             read_noise=0.008 * strength,
             spill=0.5 * strength * random.random(),
+            mask_edge_px=strength * random.random(),
+            mask_holes=0.2 * strength,
+            mask_blobs=0.2 * strength,
+            calibration_px=0.5 * strength * random.random(),
         ),
     )
     if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:
@@ -82,6 +86,6 @@ def scene_samples(studio: Studio, plan: DataPlan, random: Random) -> Iterator[Sa
                 studio.truth(studio.true_cameras.select([held]), time), cameras=studio.cameras.select([held])
             )
             cameras = random.choices(plan.context_cameras, weights=plan.context_weights)[0]
-            sample = rig.sample(time, past, truth, RenderConfig(cameras=cameras), plan.min_hole_px)
+            sample = rig.sample(time, past, truth, RenderConfig(cameras=cameras), plan.min_hole_px, plan.rays)
             if sample is not None:
                 yield sample

@@ -1,0 +1,82 @@
+"""A shift that all images of a rig have against its calibration, found from the masks alone.
+
+Wrong conventions for pixel centres, crops and chroma subsampling shift every image of a rig by the same fraction of a
+pixel. Then no point of space agrees with all outlines, and the visual hull comes out thinner than the masks. The shift
+that makes hull and masks agree best undoes it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from jaxtyping import UInt8
+from torch import Tensor
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import reconstruct
+
+STEP_PX = 1.0
+"""Shifts of this size are tried along each image axis."""
+LARGEST_PX = 1.5
+"""No larger shift is believed."""
+WORTH_MOVING = 0.003
+"""A shift counts if hull and masks then agree better by this much (IoU): above the noise of exact calibrations."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How all principal points should move, and what that is worth."""
+
+    offset_px: tuple[float, float]
+    """To add to (cx, cy) of every camera; zeros where no shift is worth it."""
+    iou_before: float
+    """Mean IoU of the hull's silhouettes and the masks, as calibrated;"""
+    iou_after: float
+    """and after the move."""
+
+
+def shared_offset(
+    mask: UInt8[Tensor, "view height width"],
+    cameras: Cameras,
+    bounds: Bounds | None = None,
+    config: HullConfig | None = None,
+) -> Alignment:
+    """The common shift of the images against the calibration, from one time's masks.
+
+    A few hulls and their silhouettes are computed, so this is for the start of a capture, not for every frame. Shifts
+    that a rig cannot tell from a move of the subject (all cameras level: up and down) stay near zero.
+
+    Raises:
+        ValueError: there is one camera only, or no mask has any foreground.
+    """
+
+    def iou(x: float, y: float) -> float:
+        moved = cameras.moved(x, y)
+        proxy = reconstruct(mask, moved, bounds, config)
+        silhouette = proxy.depth(moved) > 0
+        inside = mask[:, : silhouette.shape[1], : silhouette.shape[2]] > 127
+        either = (silhouette | inside).sum((1, 2))
+        shares = (silhouette & inside).sum((1, 2)) / either.clamp_min(1)
+        return float(shares[either > 0].mean()) if bool(either.any()) else 0.0
+
+    before = iou(0.0, 0.0)
+    x, after_x = _peak(lambda x: iou(x, 0.0), before)
+    y, after = _peak(lambda y: iou(x, y), after_x)
+    if after - before < WORTH_MOVING:
+        return Alignment((0.0, 0.0), before, before)
+    return Alignment((x, y), before, after)
+
+
+def _peak(value: Callable[[float], float], middle: float) -> tuple[float, float]:
+    """Where a function of one shift is largest, and its value there, if that is higher than in the middle.
+
+    The agreement of outlines falls linearly to both sides of its peak: two lines of equal slope are fitted.
+    """
+    low, high = value(-STEP_PX), value(STEP_PX)
+    fall = middle - min(low, high)
+    if fall <= 0:
+        return 0.0, middle
+    peak = max(-LARGEST_PX, min(LARGEST_PX, 0.5 * STEP_PX * (high - low) / fall))
+    there = value(peak)
+    return (peak, there) if there >= middle + WORTH_MOVING else (0.0, middle)

@@ -1,0 +1,96 @@
+"""What the cameras show along the rays of missing pixels. Ours.
+
+A hole is where no chosen camera sees the proxy. The true surface is at or behind the proxy's, and what it looks like is
+in the images: where a ray passes it, cameras that see it agree. So the ray is followed from the proxy inwards, and each
+of its points looked up in each camera (as in IBRNet, Wang et al., CVPR 2021, which renders whole views so).
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.geometry.cameras import project, unproject
+from viewmend.inpainting.prefill import pull_push
+from viewmend.views import ContextViews, IncompleteView
+
+OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
+"""Where a ray is looked at: z-depth behind the proxy, in subject sizes."""
+RAY_CHANNELS = 9
+"""Features of one point in one camera."""
+NEAR, FAR = 0.03, 0.2
+"""Subject sizes over which the fine and the coarse distance behind the proxy saturate."""
+
+
+@dataclass(frozen=True)
+class RaySamples:
+    """Points along the rays of some pixels, as each camera shows them."""
+
+    features: Float[Tensor, "pixel point view 9"]
+    """RGB (background black), mask, how far behind the proxy as that camera sees it (fine and coarse, -1 to 1), cosine
+    between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view.
+    All 0 for a point out of view."""
+    occupancy: Float[Tensor, "pixel point"]
+    """Least mask of the cameras that have the point in view: 0 where one sees background there."""
+
+    def padded(self, views: int) -> "RaySamples":
+        """The same with cameras behind that see nothing, `views` in all."""
+        return RaySamples(F.pad(self.features, (0, 0, 0, views - self.features.shape[2])), self.occupancy)
+
+
+def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
+    """Root of the subject's area at its median depth, metres: the unit along rays, so that any rig fits."""
+    f = (view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]).sqrt()
+    return (view.mask > 0).sum().sqrt() * view.depth[view.depth > 0].median() / f
+
+
+def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews) -> RaySamples:
+    """Looks up the rays of these pixels (row, column) in every camera.
+
+    The view needs a depth somewhere; a pixel without takes it from around.
+    """
+    cameras, frame = nearby.frame.cameras, nearby.frame
+    size_m = subject_size_m(view)
+    depth = pull_push(view.depth[None], view.depth > 0)[0][tuple(pixels.unbind(1))]
+    z = depth[:, None] + size_m * depth.new_tensor(OFFSETS)
+    uv = (pixels.flip(1) + 0.5).to(z)[:, None].expand(-1, len(OFFSETS), -1)
+    points = unproject(uv.reshape(1, -1, 2), z.reshape(1, -1), view.camera)[0]
+
+    at, z = project(points, cameras)
+    inside = (z > 0) & (at >= 0).all(-1) & (at < cameras.size_px[:, None]).all(-1)
+    covered = (nearby.depth > 0).to(z)
+    mask = covered if frame.mask is None else frame.mask.to(z) / 255
+    images = torch.cat([frame.rgb.to(z) / 255 * mask[:, None], torch.stack([mask, covered, nearby.depth], 1)], 1)
+    seen = _bilinear(images, at) * inside[..., None]
+    coverage, surface_m = seen[..., 4], seen[..., 5] / seen[..., 4].clamp_min(0.05)
+    behind = torch.where(coverage > 0.3, (z - surface_m) / size_m, 0.0)
+    to_viewer = F.normalize(view.camera.centers[0] - points, dim=-1)
+    cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1)
+    chosen = z.new_tensor([name in view.chosen for name in cameras.names])[:, None].expand_as(z)
+    place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z)], -1)
+    features = torch.cat([seen[..., :4], place * inside[..., None]], -1).movedim(0, 1)
+    # A camera more that sees nothing, for the minimum over none.
+    occupancy = F.pad(torch.where(inside, seen[..., 3], 1.0), (0, 0, 0, 1), value=1.0).amin(0)
+    shape = (len(pixels), len(OFFSETS))
+    return RaySamples(features.unflatten(0, shape), occupancy.unflatten(0, shape))
+
+
+def windows(
+    image: Float[Tensor, "channel height width"], pixels: Int[Tensor, "pixel 2"], radius: int
+) -> Float[Tensor, "pixel channel window window"]:
+    """The square around each pixel, zeros beyond the image."""
+    padded = F.pad(image, (radius,) * 4)
+    reach = torch.arange(2 * radius + 1, device=image.device)
+    rows, cols = (pixels[:, i, None] + reach for i in (0, 1))
+    return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
+
+
+def _bilinear(
+    images: Float[Tensor, "view channel height width"], at: Float[Tensor, "view point 2"]
+) -> Float[Tensor, "view point channel"]:
+    """Images sampled between pixel centres, zeros beyond."""
+    size = torch.tensor([images.shape[3], images.shape[2]], device=at.device)
+    grid = (2 * at / size - 1).clamp(-4, 4)[:, :, None]
+    return F.grid_sample(images, grid, align_corners=False)[..., 0].movedim(1, 2)

@@ -1,0 +1,34 @@
+"""A shift that all images share is found from the masks, and nothing is found where there is none."""
+
+import pytest
+import torch
+
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.geometry.alignment import WORTH_MOVING, shared_offset
+from viewmend.geometry.hull import HullConfig
+
+HULL = HullConfig(resolution=96)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return Studio(StudioConfig(seed=4, cameras=8, frames=1, size_px=256)).read(0)
+
+
+def test_an_exact_calibration_stays_as_it_is(frame):
+    found = shared_offset(frame.mask, frame.cameras, None, HULL)
+    assert found.offset_px == (0.0, 0.0) and found.iou_after == found.iou_before > 0.95
+
+
+@pytest.mark.parametrize("shift", [0.7, -0.5])
+def test_a_wrong_convention_is_undone(frame, shift):
+    found = shared_offset(frame.mask, frame.cameras.moved(shift, 0.0), None, HULL)
+    assert found.offset_px[0] == pytest.approx(-shift, abs=0.15)
+    assert found.iou_after > found.iou_before + WORTH_MOVING
+
+
+def test_masks_that_agree_on_nothing_ask_for_no_shift(frame):
+    scattered = torch.zeros_like(frame.mask)
+    for view in range(len(scattered)):
+        scattered[view, 10 * view : 10 * view + 4, 5:9] = 255
+    assert shared_offset(scattered, frame.cameras, None, HULL).offset_px == (0.0, 0.0)

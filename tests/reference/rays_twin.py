@@ -1,0 +1,61 @@
+"""Slow, obvious twin of viewmend.inpainting.rays.follow: one pixel, one point, one camera at a time."""
+
+import numpy as np
+from reference.blend_twin import unit
+
+
+def follow_twin(view, pixels, nearby, offsets, near, far):
+    """Features [pixel point view 9] and occupancy [pixel point], in double precision."""
+    depth = view.depth.double().numpy()
+    focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
+    covered = np.sort(depth[depth > 0])
+    size_m = np.sqrt((view.mask > 0).sum().item()) * covered[(len(covered) - 1) // 2] / focal
+    pose = np.linalg.inv(view.camera.camera_from_world[0].double().numpy())
+    features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 9))
+    occupancy = np.ones(features.shape[:2])
+    for number, (row, column) in enumerate(pixels.tolist()):
+        ray = np.linalg.inv(view.camera.K[0].double().numpy()) @ [column + 0.5, row + 0.5, 1]
+        for point, offset in enumerate(offsets):
+            at = pose[:3, :3] @ (ray * (depth[row, column] + offset * size_m)) + pose[:3, 3]
+            for camera in range(features.shape[2]):
+                seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far)
+                features[number, point, camera] = seen
+                if seen[8]:
+                    occupancy[number, point] = min(occupancy[number, point], seen[3])
+    return features, occupancy
+
+
+def look(point, viewer, view, nearby, index, size_m, near, far):
+    """The nine features of one point in one camera; zeros where it is out of view."""
+    camera, frame = nearby.frame.cameras[index], nearby.frame
+    pose = camera.camera_from_world[0].double().numpy()
+    x, y, z = pose[:3, :3] @ point + pose[:3, 3]
+    width, height = camera.size_px[0].tolist()
+    if z <= 0:
+        return np.zeros(9)
+    u, v, _ = camera.K[0].double().numpy() @ [x / z, y / z, 1]
+    if not (0 <= u < width and 0 <= v < height):
+        return np.zeros(9)
+    rgb, mask, coverage, surface = np.zeros(3), 0.0, 0.0, 0.0
+    for row, column, share in four_beyond(u, v):
+        if 0 <= row < frame.rgb.shape[2] and 0 <= column < frame.rgb.shape[3]:
+            there = float(nearby.depth[index, row, column])
+            fore = float(frame.mask[index, row, column]) / 255
+            rgb += share * fore * frame.rgb[index, :, row, column].double().numpy() / 255
+            mask += share * fore
+            coverage += share * (there > 0)
+            surface += share * there
+    behind = (z - surface / coverage) / size_m if coverage > 0.3 else 0.0
+    centre = -pose[:3, :3].T @ pose[:3, 3]
+    cosine = unit(centre - point) @ unit(viewer - point)
+    chosen = camera.names[0] in view.chosen
+    return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1])
+
+
+def four_beyond(u, v):
+    """The four pixels around (u, v), with bilinear shares; also those beyond the border."""
+    left, top = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
+    right_share, lower_share = u - 0.5 - left, v - 0.5 - top
+    for row, vertical in ((top, 1 - lower_share), (top + 1, lower_share)):
+        for column, horizontal in ((left, 1 - right_share), (left + 1, right_share)):
+            yield row, column, vertical * horizontal
