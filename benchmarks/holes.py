@@ -18,8 +18,10 @@ from measure import write
 from viewmend.capture.plain import open_capture
 from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.evaluation.holes import SceneScores, leave_one_out
+from viewmend.geometry.alignment import shared_offset
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.classical import NearestColour, Telea
+from viewmend.inpainting.reprojection_fill import ReprojectionFill
 from viewmend.pipeline import PipelineConfig
 
 FRAMES, CAMERAS, SIZE_PX = 10, 12, 320
@@ -51,8 +53,10 @@ def capture_scores(folder: Path, inpainters: dict) -> Iterator[list[SceneScores]
     frame = capture.read(0)
     for held in frame.cameras.names:
         for label, names in (("all", frame.cameras.names), ("8", (*WD2_EIGHT, held))):
-            used = frame.select(list(dict.fromkeys(names)))
-            pairs = [(used, frame.select([held]))]
+            inputs = frame.select([name for name in dict.fromkeys(names) if name != held])
+            offset_px = shared_offset(inputs.mask, inputs.cameras, capture.bounds).offset_px  # as `viewmend mend` does
+            moved = replace(frame, cameras=frame.cameras.moved(*offset_px))
+            pairs = [(moved.select(inputs.cameras.names), moved.select([held]))]
             yield leave_one_out(f"{held} from {label}", pairs, capture.bounds, inpainters, PipelineConfig())
 
 
@@ -77,7 +81,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--model", default="small")
     options = parser.parse_args()
-    inpainters = {"ours": load_inpainter(options.model), "Telea": Telea(), "nearest colour": NearestColour()}
+    inpainters = {
+        "ours": load_inpainter(options.model),
+        "Telea": Telea(),
+        "nearest colour": NearestColour(),
+        "reprojection": ReprojectionFill(),
+    }
     rows: list[SceneScores] = []
     if options.set == "wd2":
         for scores in capture_scores(options.folder, inpainters):
@@ -85,7 +94,7 @@ def main() -> None:
     else:
         for studio in studios(options.set, options.folder):
             rows += studio_scores(studio, inpainters)
-            print(rows[-3].scene, [r.holes and round(r.holes, 2) for r in rows[-3:]], flush=True)
+            print(rows[-1].scene, [r.holes and round(r.holes, 2) for r in rows[-len(inpainters) :]], flush=True)
     write(f"holes-{options.set}", "cpu", {"model": options.model}, {"scores": [asdict(row) for row in rows]})
     print(table(rows, list(inpainters)))
 

@@ -4,38 +4,38 @@ import numpy as np
 from reference.blend_twin import unit
 
 
-def follow_twin(view, pixels, nearby, offsets, near, far):
-    """Features [pixel point view 9] and occupancy [pixel point], in double precision."""
+def follow_twin(view, pixels, nearby, offsets, near, far, outline):
+    """Features [pixel point view 10] and occupancy [pixel point], in double precision."""
     depth = view.depth.double().numpy()
     focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
     covered = np.sort(depth[depth > 0])
     size_m = np.sqrt((view.mask > 0).sum().item()) * covered[(len(covered) - 1) // 2] / focal
     pose = np.linalg.inv(view.camera.camera_from_world[0].double().numpy())
-    features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 9))
+    features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 10))
     occupancy = np.ones(features.shape[:2])
     for number, (row, column) in enumerate(pixels.tolist()):
         ray = np.linalg.inv(view.camera.K[0].double().numpy()) @ [column + 0.5, row + 0.5, 1]
         for point, offset in enumerate(offsets):
             at = pose[:3, :3] @ (ray * (depth[row, column] + offset * size_m)) + pose[:3, 3]
             for camera in range(features.shape[2]):
-                seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far)
+                seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far, outline)
                 features[number, point, camera] = seen
                 if seen[8]:
                     occupancy[number, point] = min(occupancy[number, point], seen[3])
     return features, occupancy
 
 
-def look(point, viewer, view, nearby, index, size_m, near, far):
-    """The nine features of one point in one camera; zeros where it is out of view."""
+def look(point, viewer, view, nearby, index, size_m, near, far, outline):
+    """The ten features of one point in one camera; zeros where it is out of view."""
     camera, frame = nearby.frame.cameras[index], nearby.frame
     pose = camera.camera_from_world[0].double().numpy()
     x, y, z = pose[:3, :3] @ point + pose[:3, 3]
     width, height = camera.size_px[0].tolist()
     if z <= 0:
-        return np.zeros(9)
+        return np.zeros(10)
     u, v, _ = camera.K[0].double().numpy() @ [x / z, y / z, 1]
     if not (0 <= u < width and 0 <= v < height):
-        return np.zeros(9)
+        return np.zeros(10)
     rgb, mask, coverage, surface = np.zeros(3), 0.0, 0.0, 0.0
     for row, column, share in four_beyond(u, v):
         if 0 <= row < frame.rgb.shape[2] and 0 <= column < frame.rgb.shape[3]:
@@ -49,7 +49,19 @@ def look(point, viewer, view, nearby, index, size_m, near, far):
     centre = -pose[:3, :3].T @ pose[:3, 3]
     cosine = unit(centre - point) @ unit(viewer - point)
     chosen = camera.names[0] in view.chosen
-    return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1])
+    around = mean_around(frame.mask.double().numpy() / 255, index, u, v, outline)
+    return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, around])
+
+
+def mean_around(masks, index, u, v, outline):
+    """The mask's mean over squares, between the four squares around (u, v)."""
+    side = max(1, round(outline * float(np.sqrt(masks.sum((1, 2)).mean()))))
+    total = 0.0
+    for row, column, share in four_beyond(u / side, v / side):
+        if row >= 0 and column >= 0:
+            square = masks[index, row * side : (row + 1) * side, column * side : (column + 1) * side]
+            total += share * square.sum() / side**2
+    return total
 
 
 def four_beyond(u, v):

@@ -20,6 +20,8 @@ STEP_PX = 1.0
 """Shifts of this size are tried along each image axis."""
 LARGEST_PX = 1.5
 """No larger shift is believed."""
+MARGIN = 0.05
+"""How much larger than the first hull the box is in which the others are carved, to each side."""
 WORTH_MOVING = 0.003
 """A shift counts if hull and masks then agree better by this much (IoU): above the noise of exact calibrations."""
 
@@ -51,9 +53,12 @@ def shared_offset(
         ValueError: there is one camera only, or no mask has any foreground.
     """
 
+    found = reconstruct(mask, cameras, bounds, config).bounds
+    box = Bounds(found.low - MARGIN * found.size_m, found.high + MARGIN * found.size_m)
+
     def iou(x: float, y: float) -> float:
         moved = cameras.moved(x, y)
-        proxy = reconstruct(mask, moved, bounds, config)
+        proxy = reconstruct(mask, moved, box, config)
         silhouette = proxy.depth(moved) > 0
         inside = mask[:, : silhouette.shape[1], : silhouette.shape[2]] > 127
         either = (silhouette | inside).sum((1, 2))

@@ -93,7 +93,7 @@ class RayReader(nn.Module):
         self, samples: RaySamples
     ) -> tuple[Float[Tensor, "pixel point 3"], Float[Tensor, "pixel point feature"]]:
         """Each point's colour, by the cameras that seem to see it, and what speaks for it being there."""
-        seen, inside = samples.features, samples.features[..., 8:]
+        seen, inside = samples.features, samples.features[..., 8:9]
         rgb, fine, cosine = seen[..., :3], seen[..., 4:5], seen[..., 6:7]
         # A first opinion on who sees the point: not far behind the proxy, and from about where the view is.
         prior = inside * (4 * cosine).exp() * (-4 * fine).sigmoid()

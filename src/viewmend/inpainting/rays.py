@@ -18,20 +18,25 @@ from viewmend.views import ContextViews, IncompleteView
 
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Where a ray is looked at: z-depth behind the proxy, in subject sizes."""
-RAY_CHANNELS = 9
+RAY_CHANNELS = 10
 """Features of one point in one camera."""
 NEAR, FAR = 0.03, 0.2
 """Subject sizes over which the fine and the coarse distance behind the proxy saturate."""
+
+
+OUTLINE = 0.06
+"""Side, in subject sizes, of the squares over which masks are averaged to tell how near their outline is."""
 
 
 @dataclass(frozen=True)
 class RaySamples:
     """Points along the rays of some pixels, as each camera shows them."""
 
-    features: Float[Tensor, "pixel point view 9"]
+    features: Float[Tensor, "pixel point view 10"]
     """RGB (background black), mask, how far behind the proxy as that camera sees it (fine and coarse, -1 to 1), cosine
-    between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view.
-    All 0 for a point out of view."""
+    between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view,
+    and the mask's mean around: where the outlines of two cameras meet, a hull is fattest. All 0 for a point out of
+    view."""
     occupancy: Float[Tensor, "pixel point"]
     """Least mask of the cameras that have the point in view: 0 where one sees background there."""
 
@@ -69,7 +74,8 @@ def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: Context
     to_viewer = F.normalize(view.camera.centers[0] - points, dim=-1)
     cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1)
     chosen = z.new_tensor([name in view.chosen for name in cameras.names])[:, None].expand_as(z)
-    place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z)], -1)
+    around = _mean_around(mask, at)
+    place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z), around], -1)
     features = torch.cat([seen[..., :4], place * inside[..., None]], -1).movedim(0, 1)
     # A camera more that sees nothing, for the minimum over none.
     occupancy = F.pad(torch.where(inside, seen[..., 3], 1.0), (0, 0, 0, 1), value=1.0).amin(0)
@@ -85,6 +91,18 @@ def windows(
     reach = torch.arange(2 * radius + 1, device=image.device)
     rows, cols = (pixels[:, i, None] + reach for i in (0, 1))
     return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
+
+
+def _mean_around(
+    mask: Float[Tensor, "view height width"], at: Float[Tensor, "view point 2"]
+) -> Float[Tensor, "view point"]:
+    """Masks averaged over squares of `OUTLINE` subjects, sampled between the squares."""
+    subject_px = float(mask.sum((1, 2)).mean().sqrt())
+    side = max(1, round(OUTLINE * subject_px))
+    rows, cols = (-(-size // side) for size in mask.shape[1:])
+    height, width = mask.shape[1:]
+    coarse = F.avg_pool2d(F.pad(mask[:, None], (0, cols * side - width, 0, rows * side - height)), side)
+    return _bilinear(coarse, at / side)[..., 0]
 
 
 def _bilinear(

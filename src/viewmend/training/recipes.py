@@ -14,7 +14,7 @@ class DataPlan:
 
     sizes_px: tuple[int, ...] = (224, 256, 320)
     """Edge lengths of the square images; each scene takes one."""
-    cameras: tuple[int, int] = (6, 14)
+    cameras: tuple[int, int] = (6, 18)
     """Fewest and most cameras of a rig."""
     times: tuple[int, ...] = (0, 10, 11, 12, 13)
     """Frames of a scene that are drawn; every one is a target whose past is the window's share of the earlier ones."""
@@ -28,7 +28,7 @@ class DataPlan:
     """and how often each."""
     rays: int = 0
     """How many cameras near a view an inpainter that reads rays is given."""
-    imperfect_share: float = 0.4
+    imperfect_share: float = 0.6
     """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
     min_hole_px: int = 50
     """Views that miss less are passed over."""

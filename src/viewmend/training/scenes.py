@@ -64,7 +64,8 @@ def random_studio(plan: DataPlan, random: Random) -> Studio:
             mask_edge_px=strength * random.random(),
             mask_holes=0.2 * strength,
             mask_blobs=0.2 * strength,
-            calibration_px=0.5 * strength * random.random(),
+            mask_hard=flawed and random.random() < 0.6,
+            calibration_px=strength * random.random(),
         ),
     )
     if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:

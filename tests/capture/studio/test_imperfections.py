@@ -58,7 +58,7 @@ def test_each_switch_is_seeded_and_does_its_own(frame, switch):
 
 
 def test_every_switch_is_covered():
-    assert set(SWITCHES) | {"calibration_px", "calibration_m"} == {f.name for f in fields(Imperfections)}
+    assert set(SWITCHES) | {"calibration_px", "calibration_m", "mask_hard"} == {f.name for f in fields(Imperfections)}
 
 
 def test_typical_is_noticeable_but_small(frame):
@@ -88,6 +88,12 @@ def test_holes_lie_in_the_subject_and_blobs_add(frame):
     assert bool((holes <= frame.mask).all()) and not torch.equal(holes, frame.mask)
     blobs = imperfect_frame(frame, Imperfections(mask_blobs=4.0), 2).mask
     assert bool((blobs >= frame.mask).all()) and not torch.equal(blobs, frame.mask)
+
+
+def test_hard_masks_are_cut_at_one_half(frame):
+    soft = replace(frame, mask=(frame.mask.float() * torch.linspace(0, 1, 64)).to(torch.uint8))
+    hard = imperfect_frame(soft, Imperfections(mask_hard=True), 2)
+    assert torch.equal(hard.mask, (soft.mask > 127).to(torch.uint8) * 255) and torch.equal(hard.rgb, soft.rgb)
 
 
 def test_mask_outlines_wander_by_about_what_they_say(frame):

@@ -38,6 +38,8 @@ class Imperfections:
     """Mean number of spots of missing foreground per mask."""
     mask_blobs: float = 0.0
     """Mean number of spots of false foreground per mask."""
+    mask_hard: bool = False
+    """Masks are cut at one half, as recorded ones often are, instead of soft at outlines."""
     calibration_px: float = 0.0
     """Standard deviation of the cameras' wrong orientation, as pixels in the image; constant in time."""
     calibration_m: float = 0.0
@@ -189,6 +191,8 @@ def _mask(
         shift = 0.3 * torch.tanh(shift / 0.3)
         value = value.clone()
         value[window] = (2.5 * (_blurred(part, sigma) - 0.5 + shift) + 0.5).clamp(0, 1)
+    if it.mask_hard:
+        value = (value > 0.5).to(value)
     return (value * 255).round().to(torch.uint8)
 
 

@@ -1,0 +1,57 @@
+"""The strongest simple rival of our own idea: missing pixels from whichever camera saw the surface there."""
+
+import math
+
+import torch
+
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.context import window_times
+from viewmend.inpainting.prefill import fill
+from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.rays import NEAR, OFFSETS, follow
+from viewmend.views import CompletedView, IncompleteView
+
+TOLERANCE = 0.02
+"""A camera sees a point at most this far behind the proxy, in subject sizes."""
+FRONTAL_POWER = 8.0
+"""How much a camera's colour counts by the cosine of the angle to the viewer's ray."""
+
+
+class ReprojectionFill:
+    """Each pixel of E takes the colour that cameras show at its point of the proxy, by geometry alone.
+
+    The cameras nearest to the view are asked first, at its own time, then the chosen ones at past times, latest
+    first; where none saw the point, the hole is filled smoothly from its surroundings.
+    """
+
+    def __init__(self, cameras: int = 8) -> None:
+        self.cameras = cameras
+        self.config = InpainterConfig()
+
+    def initial_state(self) -> State:
+        """Nothing to remember."""
+        return State()
+
+    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
+        """Fills from the cameras' images; a view without holes comes back at once."""
+        missing = view.error > 0
+        if not bool(missing.any()):
+            return CompletedView(view, view.rgb), state
+        filled = fill(view.rgb, missing, view.mask > 0).movedim(0, -1).clone()
+        left = torch.nonzero(missing & (view.depth > 0).any())
+        nearest = tuple(dict.fromkeys((*view.chosen, *view.nearest)))[: self.cameras]
+        for time in window_times(view.time, self.config):
+            seen = source(time, nearest if time == view.time else view.chosen) if len(left) else None
+            if seen is None:
+                continue
+            point = follow(view, left, seen).features[:, OFFSETS.index(0.0)]
+            rgb, mask, behind, cosine = point[..., :3], point[..., 3], point[..., 4], point[..., 6]
+            visible = (point[..., 8] > 0) & (mask > 0.5) & (behind.abs() < math.tanh(TOLERANCE / NEAR))
+            weight = visible * (FRONTAL_POWER * cosine).exp()
+            total = weight.sum(1, keepdim=True)
+            colour = (weight[..., None] * rgb).sum(1) / total.clamp_min(1e-9)
+            found = total[:, 0] > 0
+            filled[tuple(left[found].unbind(1))] = colour[found]
+            left = left[~found]
+        mended = torch.lerp(view.rgb, filled.movedim(-1, 0), view.error)
+        return CompletedView(view, torch.where(missing, mended, view.rgb)), state
