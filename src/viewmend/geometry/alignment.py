@@ -52,7 +52,6 @@ def shared_offset(
     Raises:
         ValueError: there is one camera only, or no mask has any foreground.
     """
-
     found = reconstruct(mask, cameras, bounds, config).bounds
     box = Bounds(found.low - MARGIN * found.size_m, found.high + MARGIN * found.size_m)
 
