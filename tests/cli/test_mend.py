@@ -167,3 +167,19 @@ def test_an_unreadable_frame_leaves_nothing_half_written(folder, tmp_path, capsy
     code, _, err = mend(capsys, broken, tmp_path / "out", "--leave-out", "held")
     assert code == 2 and last.name in err
     assert [f.name for f in tmp_path.iterdir()] == ["broken"]
+
+
+def test_a_shift_of_all_images_is_said_and_undone(folder, tmp_path, capsys):
+    shifted = tmp_path / "shifted"
+    shutil.copytree(folder, shifted)
+    capture = json.loads((shifted / "cameras.json").read_text())
+    for camera in capture["cameras"]:
+        camera["K"][0][2] += 1.0
+    (shifted / "cameras.json").write_text(json.dumps(capture))
+    _, exact, nothing = mend(capsys, folder, tmp_path / "exact", "--leave-out", "held")
+    _, undone, said = mend(capsys, shifted, tmp_path / "undone", "--leave-out", "held")
+    _, left, also_nothing = mend(capsys, shifted, tmp_path / "left", "--leave-out", "held", "--no-align")
+    assert "principal points moved by (-" in said and "first_pixel_center" in said
+    assert "principal points" not in nothing + also_nothing
+    assert undone["hull_iou"]["held"] == pytest.approx(exact["hull_iou"]["held"], abs=0.02)
+    assert left["hull_iou"]["held"] < undone["hull_iou"]["held"] - 0.02
