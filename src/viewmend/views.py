@@ -98,6 +98,10 @@ class IncompleteView:
     nearest: tuple[str, ...] = ()
     """Names of all cameras that an inpainter may look at, the closest first; () where the renderer does not say."""
 
+    def around(self, count: int) -> tuple[str, ...]:
+        """Names of this many cameras: the chosen ones, then the closest others."""
+        return tuple(dict.fromkeys((*self.chosen, *self.nearest)))[:count]
+
 
 @dataclass(frozen=True)
 class CompletedView:

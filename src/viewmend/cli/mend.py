@@ -45,8 +45,8 @@ class Options:
     frames: str | None = None
     """Which frames, first:end, counted from 0; all by default."""
     align: bool = True
-    """Look for a shift of all images against the calibration (a wrong convention for pixel centres, say), in the masks
-    of the input cameras' first frame, and undo it where they then agree better."""
+    """Take the calibration as it is. By default a shift of all images against it (a wrong convention for pixel
+    centres, say) is looked for in the masks of the input cameras' first frame, and undone where they then agree."""
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
     json: bool = False

@@ -188,7 +188,7 @@ class Inpainter(nn.Module):
         self, view: IncompleteView, source: Source, cache: ContextCache
     ) -> tuple[list[ContextViews], ContextViews | None]:
         """What the window needs and the cache has not, by time; and what the cameras near the view see now."""
-        around = tuple(dict.fromkeys((*view.chosen, *view.nearest)))[: self.config.rays]
+        around = view.around(self.config.rays)
         fresh, nearby = [], None
         for time in window_times(view.time, self.config):
             new = cache.missing(view.chosen, time)

@@ -22,8 +22,6 @@ RAY_CHANNELS = 10
 """Features of one point in one camera."""
 NEAR, FAR = 0.03, 0.2
 """Subject sizes over which the fine and the coarse distance behind the proxy saturate."""
-
-
 OUTLINE = 0.06
 """Side, in subject sizes, of the squares over which masks are averaged to tell how near their outline is."""
 
@@ -58,7 +56,10 @@ def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: Context
     """
     cameras, frame = nearby.frame.cameras, nearby.frame
     size_m = subject_size_m(view)
-    depth = pull_push(view.depth[None], view.depth > 0)[0][tuple(pixels.unbind(1))]
+    index = tuple(pixels.unbind(1))
+    depth = view.depth[index]
+    if not bool((depth > 0).all()):
+        depth = pull_push(view.depth[None], view.depth > 0)[0][index]
     z = depth[:, None] + size_m * depth.new_tensor(OFFSETS)
     uv = (pixels.flip(1) + 0.5).to(z)[:, None].expand(-1, len(OFFSETS), -1)
     points = unproject(uv.reshape(1, -1, 2), z.reshape(1, -1), view.camera)[0]

@@ -6,6 +6,7 @@ import torch
 
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import window_times
+from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
 from viewmend.inpainting.rays import NEAR, OFFSETS, follow
@@ -39,7 +40,7 @@ class ReprojectionFill:
             return CompletedView(view, view.rgb), state
         filled = fill(view.rgb, missing, view.mask > 0).movedim(0, -1).clone()
         left = torch.nonzero(missing & (view.depth > 0).any())
-        nearest = tuple(dict.fromkeys((*view.chosen, *view.nearest)))[: self.cameras]
+        nearest = view.around(self.cameras)
         for time in window_times(view.time, self.config):
             seen = source(time, nearest if time == view.time else view.chosen) if len(left) else None
             if seen is None:
@@ -53,5 +54,5 @@ class ReprojectionFill:
             found = total[:, 0] > 0
             filled[tuple(left[found].unbind(1))] = colour[found]
             left = left[~found]
-        mended = torch.lerp(view.rgb, filled.movedim(-1, 0), view.error)
-        return CompletedView(view, torch.where(missing, mended, view.rgb)), state
+        mended = blend(view.rgb, view.error, filled.movedim(-1, 0), torch.ones_like(view.error))
+        return CompletedView(view, mended), state

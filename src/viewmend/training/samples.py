@@ -82,7 +82,7 @@ class LeaveOneOut:
             frame = self.frames[tau].select(names)
             context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
         assert truth.mask is not None, "the studio always knows its masks"
-        around = tuple(dict.fromkeys((*view.chosen, *view.nearest)))[:rays]
+        around = view.around(rays)
         near = self.frames[time].select(around)
         nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
