@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.inpainting.protocol import State, ViewInpainter
 from viewmend.rendering.view import RenderConfig, render_view
-from viewmend.views import CompletedView, ContextViews, MultiViewFrame
+from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +40,10 @@ class Observation:
     geometry_ms: float
     """What the proxy took."""
     _depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False, compare=False)
+
+    def apart(self) -> "Observation":
+        """The same time, remembered on its own from here on: what one viewer asks for saves no other any time."""
+        return replace(self, _depths=dict(self._depths))
 
     def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
         """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered once only."""
@@ -135,6 +139,23 @@ def mend_view(
     )
     rendering_ms = _ms_since(start, device)
 
+    return complete_view(view, observation, state, inpainter, config, exclude, rendering_ms)
+
+
+def complete_view(
+    view: IncompleteView,
+    observation: Observation,
+    state: StreamState,
+    inpainter: ViewInpainter,
+    config: PipelineConfig,
+    exclude: Sequence[str] = (),
+    rendering_ms: float = 0.0,
+) -> MendedView:
+    """Fill what is missing in a view that `observation` was rendered to: the second half of `mend_view`.
+
+    Comparisons call it, so that all inpainters fill the very same view. `rendering_ms` is what that took.
+    """
+    frame, device = observation.frame, observation.frame.rgb.device
     oldest = frame.time - config.history
     past = tuple(o for o in state.history if oldest <= o.frame.time < frame.time)
     at = {o.frame.time: o for o in (*past, observation)}

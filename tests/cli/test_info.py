@@ -7,7 +7,7 @@ import torch
 
 from viewmend.cli import main
 from viewmend.cli.calibration_check import HULL_ONLY, MASK_ONLY, check_calibration, check_picture
-from viewmend.cli.contact_sheet import GAP_PX, LABEL_PX
+from viewmend.contact_sheet import GAP_PX, LABEL_PX
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.views import MultiViewFrame

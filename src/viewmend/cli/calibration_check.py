@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from viewmend.cli.contact_sheet import Tile, contact_sheet, in_rows, picture
+from viewmend.contact_sheet import Tile, contact_sheet, in_rows, picture
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import project
 from viewmend.geometry.hull import bounds_from_cameras

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.capture.images import write_image
-from viewmend.cli.contact_sheet import Tile, contact_sheet, picture
 from viewmend.cli.mending import MendStep
+from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.views import IncompleteView
 
 SHEET_ROWS = 4

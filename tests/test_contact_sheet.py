@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from viewmend.cli.contact_sheet import BACKGROUND, GAP_PX, LABEL_PX, Tile, contact_sheet, in_rows, picture
+from viewmend.contact_sheet import BACKGROUND, GAP_PX, LABEL_PX, Tile, contact_sheet, in_rows, picture
 
 
 def test_tiles_land_in_their_boxes_with_their_aspect_kept():
