@@ -1,0 +1,92 @@
+"""FuseFormer (Liu et al. 2021, "Fusing Fine-Grained Information in Transformers for Video Inpainting")."""
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from viewmend.baselines.frame_decoder import FrameDecoder
+from viewmend.baselines.hierarchical_encoder import STRIDE_PX, HierarchicalEncoder
+from viewmend.baselines.soft_split import DIM, FusionFeedForward, SoftComposition, SoftSplit, token_grid
+from viewmend.baselines.token_transformer import (
+    BLOCKS,
+    NATIVE_PX,
+    TokenBlock,
+    TokenClips,
+    TokenTransformer,
+    initialise,
+)
+
+CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
+"""Rows and columns of the feature map, fixed by the learned bias map and positional embedding."""
+TOKENS = token_grid(*CELLS)
+
+
+class JointBlock(TokenBlock):
+    """Attention over all tokens of all frames, then the fusion feed-forward; both with the usual residual."""
+
+    def __init__(self) -> None:
+        super().__init__(FusionFeedForward(nn.ReLU(inplace=True), nn.Identity()))
+
+    def forward(
+        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
+    ) -> tuple[TokenClips, TokenClips]:
+        """See `TokenBlock`."""
+        own = self.norm1(tokens)
+        sources = own if memory is None else torch.cat([own, memory], 1)
+        queries, keys = (rearrange(x, "b f r c d -> b (f r c) d") for x in (own, sources))
+        x = tokens + self.attention(queries, keys).reshape(tokens.shape)
+        fused = self.ffn(self.norm2(x).flatten(0, 1), CELLS)
+        return x + fused.reshape(x.shape), own
+
+
+class PositionalEmbedding(nn.Module):
+    """A learned vector for each place of a frame, the same in all frames; key `pos_emb`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        rows, cols = TOKENS
+        self.pos_emb = nn.Parameter(torch.empty(1, 1, rows * cols, DIM))
+        nn.init.normal_(self.pos_emb, 0, 0.02)
+
+    def forward(self, tokens: Float[Tensor, "frame rows cols 512"]) -> Float[Tensor, "frame rows cols 512"]:
+        """Tokens that know their place."""
+        return tokens + self.pos_emb.reshape(*TOKENS, DIM)
+
+
+class FuseFormer(TokenTransformer):
+    """36.6 M parameters; 160 tensors, named as in the official checkpoint. Takes 432x240 alone."""
+
+    name = "FuseFormer"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = HierarchicalEncoder()
+        self.ss = SoftSplit()
+        self.add_pos_emb = PositionalEmbedding()
+        self.transformer = nn.ModuleList(JointBlock() for _ in range(BLOCKS))
+        self.sc = SoftComposition(bias_size=CELLS)
+        self.decoder = FrameDecoder()
+        initialise(self)
+
+    def check_size(self, height: int, width: int) -> None:
+        """ValueError unless the frame is 432x240: positional embedding and bias map are learned for this size."""
+        if (height, width) != NATIVE_PX:
+            raise ValueError(
+                f"FuseFormer: expected frames of {NATIVE_PX[1]}x{NATIVE_PX[0]}, the size of its learned positions, got "
+                f"{width}x{height}; resize them or run windows of that size"
+            )
+
+    def encode(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
+        """Features at a quarter of the size."""
+        return self.encoder(frames)
+
+    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+        """Tokens of overlapping patches that know their place."""
+        return self.add_pos_emb(self.ss(features))
+
+    def decode(
+        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
+    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
+        """Frames in [-1, 1]."""
+        return self.decoder(features + self.sc(tokens, CELLS))

@@ -1,0 +1,189 @@
+"""Does a baseline compute what the published network computes? Weights and inputs that anyone can make again."""
+
+import math
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from viewmend.baselines.dstt import DSTT
+from viewmend.baselines.fuseformer import FuseFormer
+from viewmend.baselines.token_transformer import NATIVE_PX, MemorySlot, TokenTransformer
+
+TOLERANCE = 1e-3
+"""Largest absolute difference, in a range of [-1, 1], of two float32 networks that are the same."""
+STRIDE_PX = 6
+"""Files keep every sixth row and column of the output."""
+OWN_VALUES = ("valid_ind_rolled", "update_spynet.mean", "update_spynet.std")
+"""Entries of a state dict that keep their values: constants, not weights."""
+FIELDS = ("name", "frames", "seed", "n_local", "output", "mean", "std")
+
+
+class ParityFileError(ValueError):
+    """A file that is no parity file: what was expected, what came, the next step."""
+
+
+@dataclass(frozen=True)
+class ParityCase:
+    """One file: what was run, and what came out of the published network."""
+
+    name: str
+    frames: int
+    seed: int
+    n_local: int
+    """E2FGVI: the first n_local frames are consecutive, the others references; else 0."""
+    output: Float[Tensor, "frame 3 rows cols"]
+    """Every sixth row and column of each output frame."""
+    mean: Float[Tensor, " frame"]
+    std: Float[Tensor, " frame"]
+    """Mean and standard deviation of each whole output frame."""
+
+
+@dataclass(frozen=True)
+class ParityResult:
+    """How far ours is from one file."""
+
+    name: str
+    frames: int
+    seed: int
+    difference: float
+    """Largest absolute difference of an output value."""
+    mean_difference: float
+    std_difference: float
+    """The same of the frames' means and standard deviations."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether all agree to the tolerance; NaN does not."""
+        return max(_or_infinite(d) for d in (self.difference, self.mean_difference, self.std_difference)) <= TOLERANCE
+
+
+def check(path: str | Path, device: torch.device | str = "cpu") -> ParityResult:
+    """Makes the file's weights and inputs, runs our network, and compares.
+
+    Raises:
+        ParityFileError: the file is missing, damaged, of another format, or of a network that is not known.
+    """
+    case = read_case(path)
+    output = run(case.name, case.frames, case.seed, case.n_local, device).cpu()
+    mean, std = output.double().mean((1, 2, 3)), output.double().std((1, 2, 3), correction=0)
+    sampled = output[..., ::STRIDE_PX, ::STRIDE_PX]
+    return ParityResult(
+        case.name,
+        case.frames,
+        case.seed,
+        _largest(sampled - case.output),
+        _largest(mean - case.mean),
+        _largest(std - case.std),
+    )
+
+
+def read_case(path: str | Path) -> ParityCase:
+    """The file's contents; ParityFileError where it cannot be one."""
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            absent = [field for field in FIELDS if field not in file]
+            if absent:
+                raise ParityFileError(f"{path}: expected the fields {list(FIELDS)}, {absent} missing; see the format")
+            values = {field: file[field] for field in FIELDS}
+    except FileNotFoundError as error:
+        raise ParityFileError(f"{path}: expected a parity file (.npz), found none; check the path") from error
+    except ParityFileError:
+        raise
+    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
+        raise ParityFileError(f"{path}: expected a whole .npz file, got one that does not read ({error})") from error
+    name, frames = str(values["name"]), int(values["frames"])
+    if name not in NETWORKS:
+        raise ParityFileError(f"{path}: expected a network among {sorted(NETWORKS)}, got {name!r}")
+    output = torch.from_numpy(values["output"].astype(np.float32))
+    expected = (frames, 3, *(-(-side // STRIDE_PX) for side in NATIVE_PX))
+    if tuple(output.shape) != expected or values["mean"].shape != (frames,) or values["std"].shape != (frames,):
+        raise ParityFileError(f"{path}: expected an output of {expected} for {frames} frames, got {output.shape}")
+    mean, std = (torch.from_numpy(values[field].astype(np.float32)) for field in ("mean", "std"))
+    return ParityCase(name, frames, int(values["seed"]), int(values["n_local"]), output, mean, std)
+
+
+@torch.inference_mode()
+def run(
+    name: str, frames: int, seed: int, n_local: int = 0, device: torch.device | str = "cpu"
+) -> Float[Tensor, "frame 3 height width"]:
+    """What our network of this name makes of the recipe's input with the recipe's weights."""
+    make, compute = NETWORKS[name]
+    network = make()
+    network.load_state_dict(recipe_weights(network, seed))
+    return compute(network.to(device).eval(), recipe_input(frames, seed).to(device), n_local)
+
+
+def recipe_weights(network: nn.Module, seed: int) -> dict[str, Tensor]:
+    """Random weights that depend on nothing but each key, its shape and the seed."""
+    weights = {}
+    for key, value in network.state_dict().items():
+        if not value.is_floating_point() or key.endswith(OWN_VALUES):
+            weights[key] = value
+            continue
+        shape = tuple(value.shape)
+        generator = np.random.RandomState((zlib.crc32(key.encode()) + seed) % 2**32)
+        drawn = generator.standard_normal(shape).astype(np.float32)
+        if key.endswith(("pos_emb", "sc.bias")):
+            drawn = 0.1 * drawn
+        elif len(shape) >= 2:
+            drawn = drawn / np.float32(math.sqrt(math.prod(shape[1:])))
+        elif key.endswith("bias"):
+            drawn = 0.1 * drawn
+        else:
+            drawn = 1 + 0.1 * drawn
+        weights[key] = torch.from_numpy(drawn.astype(np.float32))
+    return weights
+
+
+def recipe_input(frames: int, seed: int) -> Float[Tensor, "frame 3 240 432"]:
+    """Coarse noise and fine noise in [-1, 1], with a hole of zeros that moves."""
+    height, width = NATIVE_PX
+    generator = np.random.RandomState(seed)
+    coarse = generator.uniform(-1, 1, (1, frames, 3, height // 8, width // 8)).astype(np.float32)
+    fine = generator.standard_normal((1, frames, 3, height, width))
+    images = np.clip(coarse.repeat(8, -2).repeat(8, -1) + 0.1 * fine, -1, 1)
+    for time in range(frames):
+        a = 7 * time % 40
+        images[0, time, :, 80 + a : 140 + a, 150 + 2 * a : 230 + 2 * a] = 0
+    return torch.from_numpy(images[0].astype(np.float32))
+
+
+def _at_once(network: nn.Module, frames: Tensor, n_local: int) -> Tensor:
+    return network(frames[None])[0]
+
+
+def _one_by_one(network: nn.Module, frames: Tensor, n_local: int) -> Tensor:
+    assert isinstance(network, TokenTransformer)
+    memory: list[MemorySlot] = []
+    outputs = []
+    for frame in frames:
+        output, slot = network.forward_remembering(frame[None], memory)
+        memory.append(slot)
+        outputs.append(output)
+    return torch.cat(outputs)
+
+
+Compute = Callable[[nn.Module, Tensor, int], Tensor]
+NETWORKS: dict[str, tuple[Callable[[], nn.Module], Compute]] = {
+    "DSTT": (DSTT, _at_once),
+    "DSTT_OM": (DSTT, _one_by_one),
+    "FuseFormer": (FuseFormer, _at_once),
+    "FuseFormer_OM": (FuseFormer, _one_by_one),
+}
+"""How each network that a file may name is made and run."""
+
+
+def _largest(difference: Tensor) -> float:
+    return float(difference.abs().max())
+
+
+def _or_infinite(value: float) -> float:
+    return value if math.isfinite(value) else math.inf
