@@ -1,0 +1,75 @@
+"""The temporal term, ours and a switch: what changes between completed views where geometry says that nothing did.
+
+Each pixel of the later view is carried through its own depth into the earlier one, where its colour is looked up. It
+counts where the two views' proxies agree that this is one surface, and where either view was inpainted.
+
+What it cannot tell: the proxy has no correspondence over time. A surface that slides along itself, a limb that moves
+across the picture at its own depth, or a turning ball keep their depth while their colour rightly changes, and colours
+that change with the view direction or the light do so too. The right answer therefore has a loss above zero, more the
+faster the subject moves; a large weight buys stillness with blur. What moved in depth by more than the tolerance is not
+counted at all.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from viewmend.geometry.reprojection import carry
+from viewmend.views import CompletedView
+
+TOLERANCE = 0.01
+"""Two depths within this share of each other are one surface: 3 cm at 3 m."""
+COVERED = 0.5
+"""Mask from which a pixel belongs to the subject."""
+LEAST = torch.finfo(torch.float32).tiny
+
+
+def temporal_loss(
+    before: Sequence[CompletedView], now: Sequence[CompletedView], tolerance: float = TOLERANCE
+) -> Float[Tensor, ""]:
+    """`temporal_change` of each pair of consecutive views, and its mean over the batch."""
+    return torch.stack([temporal_change(b, n, tolerance) for b, n in zip(before, now, strict=True)]).mean()
+
+
+def temporal_change(before: CompletedView, now: CompletedView, tolerance: float = TOLERANCE) -> Float[Tensor, ""]:
+    """|w * (Fhat[t] - warped Fhat[t-1])|_1 / |w|_1, the mean of the channels; 0 with a zero gradient where w is.
+
+    w is the larger of E[t] and the warped E[t-1] where the pixel and all four pixels around its place in the earlier
+    view lie on the subject, at a depth that agrees; else 0. Gradients flow into both views' colours, not into depth.
+
+    Args:
+        before: the view one step earlier; its camera may be another, and its image of another size.
+        now: the view whose pixels are counted.
+        tolerance: largest difference of depth, as a share of it.
+    """
+    view, past = now.view, before.view
+    row, column = ((view.mask > COVERED) & (view.depth > 0)).nonzero(as_tuple=True)
+    uv = torch.stack([column, row], -1).to(view.depth) + 0.5
+    carried, z = (part[0] for part in carry(uv[None], view.depth[row, column][None], view.camera, past.camera))
+
+    inside, rows, columns, share = _corners(carried, past.depth)
+    there = past.depth[rows, columns]
+    one_surface = (there > 0) & (past.mask[rows, columns] > COVERED) & ((there - z).abs() <= tolerance * z)
+    valid = (inside & one_surface).all(0) & (z > 0)
+
+    weight = torch.maximum(view.error[row, column], (share * past.error[rows, columns]).sum(0)) * valid
+    warped = (share * before.rgb.float()[:, rows, columns]).sum(1)
+    change = (now.rgb.float()[:, row, column] - warped).abs().mean(0)
+    return (weight * change).sum() / weight.sum().clamp_min(LEAST)
+
+
+def _corners(
+    uv_px: Float[Tensor, "point 2"], image: Float[Tensor, "height width"]
+) -> tuple[Tensor, Int[Tensor, "4 point"], Int[Tensor, "4 point"], Float[Tensor, "4 point"]]:
+    """The four pixels around each place: whether they are in the image, their rows and columns, bilinear shares."""
+    height, width = image.shape
+    first = (uv_px - 0.5).floor()
+    right, below = (uv_px - 0.5 - first).unbind(-1)
+    # What is far outside, or behind the camera, must not overflow as an integer.
+    left, top = (first[:, axis].clamp(-2, size).long() for axis, size in ((0, width), (1, height)))
+    columns, rows = torch.stack([left, left + 1, left, left + 1]), torch.stack([top, top, top + 1, top + 1])
+    share = torch.stack([(1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below])
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    return inside, rows.clamp(0, height - 1), columns.clamp(0, width - 1), share
