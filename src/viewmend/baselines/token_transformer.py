@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
+from viewmend.baselines.clips import Clip, Frames
 from viewmend.baselines.soft_split import DIM
 
 HEADS = 4
@@ -133,6 +134,17 @@ class TokenTransformer(nn.Module, ABC):
             tokens, own = block(tokens, past)
             remembered.append(own[0])
         return self.decode(features[:decoded], tokens[0, :decoded]), torch.stack(remembered)
+
+    def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
+        """See `OnlineNetwork`."""
+        return self(torch.cat([clip.now, *clip.neighbours, *clip.references])[None])[0, 0]
+
+    def complete_remembering(
+        self, now: Frames, memory: tuple[MemorySlot, ...]
+    ) -> tuple[Float[Tensor, "3 height width"], MemorySlot]:
+        """See `OnlineNetwork`."""
+        completed, slot = self.forward_remembering(now, memory)
+        return completed[0], slot
 
 
 def initialise(network: nn.Module) -> None:
