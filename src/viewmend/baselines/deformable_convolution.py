@@ -1,0 +1,50 @@
+"""Modulated deformable convolution: every kernel point looks elsewhere, and counts as much as it is told."""
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.baselines.spynet import to_grid
+
+
+def deform_conv2d(
+    x: Float[Tensor, "sample channel height width"],
+    offsets: Float[Tensor, "sample offset height width"],
+    masks: Float[Tensor, "sample point height width"],
+    weight: Float[Tensor, "out channel kernel kernel"],
+    bias: Float[Tensor, "out"] | None,
+) -> Float[Tensor, "sample out height width"]:
+    """A convolution of stride 1 that keeps the size, its kernel points displaced and weighted pixel by pixel.
+
+    Args:
+        x: its channels fall into as many groups, in order, as the offsets have.
+        offsets: pixels; per group and kernel point (row by row), first down, then right.
+        masks: per group and kernel point, the factor of what is read.
+        weight: odd kernel; zero offsets and unit masks make this `conv2d` with padding kernel // 2.
+        bias: per output channel.
+
+    Reads bilinearly; outside of the image is zero.
+    """
+    kernel, (height, width) = weight.shape[-1], x.shape[-2:]
+    points = kernel * kernel
+    groups = masks.shape[1] // points
+    # Positions of a hundred pixels need more digits than half precision has.
+    with torch.autocast(x.device.type, enabled=False):
+        shift = rearrange(offsets.float(), "b (g k yx) h w -> yx (b g) k h w", k=points, yx=2)
+        place = torch.arange(kernel, device=x.device) - kernel // 2
+        y = torch.arange(height, device=x.device)[:, None] + place.repeat_interleave(kernel).view(-1, 1, 1) + shift[0]
+        x_at = torch.arange(width, device=x.device) + place.repeat(kernel).view(-1, 1, 1) + shift[1]
+        grid = torch.stack([to_grid(x_at, width), to_grid(y, height)], -1)
+        read = F.grid_sample(
+            rearrange(x.float(), "b (g c) h w -> (b g) c h w", g=groups),
+            rearrange(grid, "n k h w xy -> n (k h) w xy"),
+            align_corners=False,
+        )
+        read = rearrange(read, "(b g) c (k h) w -> b g c k (h w)", g=groups, k=points)
+        read = read * rearrange(masks.float(), "b (g k) h w -> b g 1 k (h w)", k=points)
+    # Back to what the layers around it compute in, then the convolution is one product of matrices.
+    out = weight.flatten(1) @ rearrange(read, "b g c k n -> b (g c k) n").to(weight.dtype)
+    out = rearrange(out, "b o (h w) -> b o h w", h=height)
+    return out if bias is None else out + bias.view(-1, 1, 1)
