@@ -1,72 +1,38 @@
-"""Samples come from the production pipeline and know nothing of the camera that is left out; a run mends its model."""
+"""A run trains its part, writes what it should, and goes on as if it had never been stopped."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
-from random import Random
+from itertools import islice
+from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
-from viewmend.capture.studio.stage import Studio, StudioConfig
-from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.checkpoint import load_inpainter
-from viewmend.inpainting.config import small as small_model
 from viewmend.inpainting.inpainter import Inpainter
-from viewmend.rendering.view import RenderConfig
-from viewmend.training.loop import learning_rate_factor, train
-from viewmend.training.recipes import DataPlan, Recipe
-from viewmend.training.samples import LeaveOneOut
-from viewmend.training.scenes import FIRST_TEST_SEED, random_studio, scene_samples
-
-PLAN = DataPlan(
-    sizes_px=(96,),
-    cameras=(5, 5),
-    times=(0, 1),
-    held_cameras=2,
-    targets_per_camera=1,
-    min_hole_px=5,
-    rays=3,
-    hull_resolution=48,
-)
+from viewmend.training import loop
+from viewmend.training.loop import Run, train
+from viewmend.training.plan import DataPlan, LossWeights
+from viewmend.training.processes import processes
+from viewmend.training.recipes import RECIPES, small, small_rays
+from viewmend.training.run_files import FILE, RunError
+from viewmend.training.sample_files import sample_from_bytes
+from viewmend.training.schedule import learning_rate_factor
 
 
-@pytest.fixture(scope="module")
-def studio() -> Studio:
-    return Studio(StudioConfig(seed=3, cameras=5, frames=2, size_px=96))
+def log_of(out):
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
-def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
-    held = studio.cameras.names[2]
-    frame = studio.read(1)
-    vandalised = replace(frame, rgb=frame.rgb.clone(), mask=frame.mask.clone())
-    vandalised.rgb[2] = 255
-    vandalised.mask[2] = 255
-    truth = studio.truth(studio.true_cameras.select([held]), 1)
-    samples = [
-        LeaveOneOut({1: f}, held, None, HullConfig(resolution=48)).sample(1, (), truth, RenderConfig(), 0)
-        for f in (frame, vandalised)
-    ]
-    first, second = samples
-    assert first is not None and second is not None
-    assert torch.equal(first.view.rgb, second.view.rgb) and torch.equal(first.view.error, second.view.error)
-    assert held not in first.view.chosen
-    assert all(held not in views.frame.cameras.names for views in first.context)
-
-
-def test_truth_is_black_where_the_mask_is_and_context_is_past(studio):
-    samples = list(scene_samples(studio, PLAN, Random(0)))
-    assert samples
-    for sample in samples:
-        times = [views.frame.time for views in sample.context]
-        assert times[0] == sample.view.time and times == sorted(times, reverse=True)
-        assert float(sample.view.error.sum()) >= PLAN.min_hole_px
-        assert not sample.truth[:, 0].any(), "the top row is background"
-
-
-def test_no_stage_takes_a_seed_that_is_kept_for_tests():
-    random = Random(1)
-    seeds = [random_studio(replace(PLAN, times=(0,)), random).config.seed for _ in range(6)]
-    assert max(seeds) < FIRST_TEST_SEED and len(set(seeds)) > 1
+def same_weights(a, b):
+    a, b = (load_file(folder / "model.safetensors") for folder in (a, b))
+    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
 
 
 def test_the_learning_rate_warms_up_and_ends_at_zero():
@@ -76,19 +42,149 @@ def test_the_learning_rate_warms_up_and_ends_at_zero():
 
 
 @pytest.mark.parametrize("part", ["all", "rays", "patches"])
-def test_a_short_run_trains_its_part_and_writes_a_model_that_loads_and_a_log(part, tmp_path):
-    model = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2)
-    recipe = Recipe(
-        name="tiny", model=model, data=PLAN, steps=3, batch=2, fresh=1, warmup=1, workers=0, part=part, ema=0.0
-    )
+def test_a_short_run_trains_its_part_and_writes_a_model_that_loads_and_a_log(part, tiny, tmp_path):
+    recipe = replace(tiny, part=part, steps=3, ema=0.0)
     reported = []
-    train(recipe, tmp_path / "run", report=reported.append)
-    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert [entry["step"] for entry in log] == [0, 1, 2] == [entry.step for entry in reported]
-    inpainter = load_inpainter(tmp_path / "run")
-    assert inpainter.config == model
+    train(recipe, tmp_path, report=reported.append)
+    assert [entry["step"] for entry in log_of(tmp_path)] == [1, 2, 3] == [entry.step for entry in reported]
+    inpainter = load_inpainter(tmp_path)
+    assert inpainter.config == recipe.model
     torch.manual_seed(recipe.seed)
-    untrained = Inpainter(model).state_dict()
+    untrained = Inpainter(recipe.model).state_dict()
     moved = {n.startswith("ray_reader.") for n, w in inpainter.state_dict().items() if not torch.equal(w, untrained[n])}
     assert moved == {"all": {True, False}, "rays": {True}, "patches": {False}}[part]
-    assert "tiny" in (tmp_path / "run" / "README.md").read_text()
+    assert "tiny" in (tmp_path / "README.md").read_text()
+
+
+ADVERSARIAL = LossWeights(adversarial=0.01, adversarial_kind="hinge", discriminator="clip", temporal=0.1)
+
+
+@pytest.mark.parametrize("loss", [LossWeights(), ADVERSARIAL], ids=["image", "adversarial"])
+def test_going_on_is_as_if_the_run_had_not_been_stopped(loss, tiny, tmp_path):
+    recipe = replace(tiny, loss=loss)
+    train(recipe, tmp_path / "whole")
+    with processes() as own:
+        for _ in islice(Run(recipe, tmp_path / "parts", None, own).steps(), 3):
+            pass  # the checkpoint is of step 2: the third step is lost and made again
+    assert [entry["step"] for entry in log_of(tmp_path / "parts")] == [1, 2, 3]
+    reported = []
+    train(recipe, tmp_path / "parts", report=reported.append)
+    assert [entry.step for entry in reported] == [3, 4]
+    assert same_weights(tmp_path / "whole", tmp_path / "parts")
+    costs = [[entry["costs"] for entry in log_of(tmp_path / which)] for which in ("whole", "parts")]
+    assert costs[0] == costs[1]
+    assert bool(costs[0][-1]["discriminator"]) == bool(loss.adversarial)
+    train(recipe, tmp_path / "parts", report=reported.append)
+    assert len(reported) == 2, "a finished run has nothing left to do"
+
+
+def test_a_run_goes_on_only_with_its_own_recipe_and_a_whole_file(tiny, tmp_path):
+    train(replace(tiny, steps=1), tmp_path)
+    with pytest.raises(RunError, match="differs in batch, learning_rate"):
+        train(replace(tiny, batch=3, learning_rate=1.0), tmp_path)
+    whole = (tmp_path / FILE).read_bytes()
+    (tmp_path / FILE).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(RunError, match=r"run\.safetensors: expected a run to go on with"):
+        train(tiny, tmp_path)
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_its_batch(tiny, tmp_path, monkeypatch):
+    def broken(recipe, start):
+        model = made(recipe, start)
+        model.decoder.linear.weight.data.fill_(torch.nan)
+        return model
+
+    made = loop._model
+    monkeypatch.setattr(loop, "_model", broken)
+    with pytest.raises(FloatingPointError, match="at step 0"):
+        train(tiny, tmp_path)
+    saved = sorted((tmp_path / "not-finite-000000").iterdir())
+    assert len(saved) == 1, "the first batch has no buffer yet"
+    assert sample_from_bytes(saved[0].read_bytes()).view.error.any()
+    assert not (tmp_path / FILE).exists()
+
+
+def test_validation_scores_the_averaged_weights_and_leaves_a_picture(tiny, tmp_path):
+    train(replace(tiny, validate_every=3), tmp_path)
+    judged = [entry for entry in log_of(tmp_path) if "validation" in entry]
+    assert [entry["step"] for entry in judged] == [3, 4]
+    assert all(5 < entry["validation"][n] < 60 for entry in judged for n in ("holes", "telea", "first_fill"))
+    assert judged[0]["validation"]["telea"] == judged[1]["validation"]["telea"], "the views are fixed"
+    assert sorted(p.name for p in tmp_path.glob("*.png")) == ["validation-000003.png", "validation-000004.png"]
+
+
+SCRIPT = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from conftest import MODEL, PLAN
+from dataclasses import replace
+from viewmend.training.loop import train
+from viewmend.training.plan import Recipe
+
+plan = replace(PLAN, clip=2, shards=Path(sys.argv[5]))
+recipe = Recipe(name="tiny", model=MODEL, data=plan, steps=int(sys.argv[3]), batch=2, fresh=1, buffer=3, warmup=1,
+                workers=0, ema=0.5, bfloat16=False, checkpoint_every=1, validate_every=0, streams=int(sys.argv[4]))
+train(recipe, Path(sys.argv[2]))
+"""
+
+
+def started(out, steps, shards, streams=1, launcher=()):
+    script = out.with_suffix(".py")
+    script.write_text(SCRIPT)
+    here = str(Path(__file__).parent)
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
+    command = [sys.executable, *launcher, str(script), here, str(out), str(steps), str(streams), str(shards)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def test_a_killed_run_goes_on_from_a_whole_checkpoint(shards, tmp_path):
+    run = started(tmp_path / "killed", 1000, shards)
+    while not (tmp_path / "killed" / FILE).exists():
+        assert run.poll() is None
+        time.sleep(0.02)
+    time.sleep(0.3)
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    before = len(log_of(tmp_path / "killed"))
+    assert started(tmp_path / "killed", before + 1, shards).wait() == 0
+    assert started(tmp_path / "whole", before + 1, shards).wait() == 0
+    # The cosine of a run of other steps is another: only that it went on, with every step in the log once.
+    assert [entry["step"] for entry in log_of(tmp_path / "killed")] == list(range(1, before + 2))
+    assert [e["costs"] for e in log_of(tmp_path / "killed")][:1] == [e["costs"] for e in log_of(tmp_path / "whole")][:1]
+
+
+def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, tmp_path):
+    torchrun = ("-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=29517")
+    assert started(tmp_path / "one", 4, shards, streams=2).wait() == 0
+    assert started(tmp_path / "two", 4, shards, launcher=torchrun).wait() == 0
+    one, two = (load_file(tmp_path / n / "model.safetensors") for n in ("one", "two"))
+    for key in one:
+        assert torch.allclose(one[key], two[key], atol=2e-5), key
+    curves = [[e["costs"]["total"] for e in log_of(tmp_path / n)] for n in ("one", "two")]
+    assert curves[0] == pytest.approx(curves[1], rel=1e-4)
+    assert len(set(curves[0])) == 4
+
+
+def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
+    for name, make in RECIPES.items():
+        recipe = make(plan)
+        assert recipe.name == name and recipe.data.rays == recipe.model.rays
+    assert small(plan).part == "patches" and small_rays(plan).part == "rays"
+    parameters = sum(p.numel() for p in Inpainter(RECIPES["base"](plan).model).parameters())
+    assert parameters < 40e6
+    assert RECIPES["paper"](plan).loss == LossWeights(adversarial=0.01), "the paper's objective, exactly"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"loss": LossWeights(temporal=1.0), "data": DataPlan()}, "expected clips of 2 or more"),
+        ({"loss": LossWeights(adversarial=0.01), "part": "rays"}, "expected no adversarial loss for rays alone"),
+        ({"fresh": 9}, "expected 1 to 2 fresh samples"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_refused(change, message, tiny):
+    with pytest.raises(ValueError, match=message):
+        replace(tiny, **change)

@@ -39,14 +39,19 @@ class AlignedConvolution(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(channels, 2 * channels, 3, 3))
         self.bias = nn.Parameter(torch.zeros(channels))
-        nn.init.normal_(self.weight, 0, 0.02)
         layers: list[nn.Module] = []
         for inputs in (3 * channels + 4, channels, channels):
             layers += [nn.Conv2d(inputs, channels, 3, padding=1), nn.LeakyReLU(0.1)]
-        last = nn.Conv2d(channels, 3 * GROUPS * POINTS, 3, padding=1)
+        self.conv_offset = nn.Sequential(*layers, nn.Conv2d(channels, 3 * GROUPS * POINTS, 3, padding=1))
+
+    def initialise(self) -> None:
+        """Fresh weights as the authors draw them: at first, kernel points are where the flow leads."""
+        nn.init.normal_(self.weight, 0, 0.02)
+        nn.init.zeros_(self.bias)
+        last = self.conv_offset[-1]
+        assert isinstance(last, nn.Conv2d)
         nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)  # pyright: ignore
-        self.conv_offset = nn.Sequential(*layers, last)
+        nn.init.zeros_(last.bias if last.bias is not None else self.bias)
 
     def forward(
         self,
@@ -95,10 +100,21 @@ class Propagation(nn.Module):
         backward = self._sweep("backward_", [(x,) for x in reversed(frames)], to_next.unbind(1))
         known = list(zip(frames, reversed(backward), strict=True))
         forward = self._sweep("forward_", known, to_previous.unbind(1))
-        return torch.stack([self.fuse(x, back, ahead) for (x, back), ahead in zip(known, forward, strict=True)], 1)
+        return torch.stack([self._fuse(x, back, ahead) for (x, back), ahead in zip(known, forward, strict=True)], 1)
 
-    def fuse(self, current: Feature, backward: Feature, forward: Feature) -> Feature:
-        """What both directions found, added to the frame's own features."""
+    def follow(self, current: Feature, flow: Flow | None, state: Propagated) -> tuple[Feature, Propagated]:
+        """The latest frame of a stream by itself: the forward sweep goes on, the backward one starts here.
+
+        Args:
+            current: the frame's features.
+            flow: from this frame to the one before, None at the first.
+            state: what this method returned there.
+        """
+        backward, _ = self.step("backward_", (current,), None, Propagated())
+        forward, state = self.step("forward_", (current, backward), flow, state)
+        return self._fuse(current, backward, forward), state
+
+    def _fuse(self, current: Feature, backward: Feature, forward: Feature) -> Feature:
         return current + self.fusion(torch.cat([backward, forward], 1))
 
     def _sweep(self, way: str, known: Sequence[tuple[Feature, ...]], flows: Sequence[Flow]) -> list[Feature]:

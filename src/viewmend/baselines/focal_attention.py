@@ -1,5 +1,6 @@
 """E2FGVI's temporal focal attention: windows see their own tokens, those around and a pooled map, in all frames."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,23 +16,13 @@ REACH = (WINDOW[0] // 2, WINDOW[1] // 2)
 
 
 @dataclass(frozen=True)
-class FocalKeys:
-    """Keys and values of frames, in one block: all that later frames need of them."""
+class FocalTokens:
+    """What attention sees of frames in one block, and all that later frames need of them."""
 
-    fine: Float[Tensor, "sample frame row column key_value"]
-    """Of each token."""
-    pooled: Float[Tensor, "sample frame window_row window_column key_value"]
-    """Of each window."""
-
-    def after(self, past: "FocalKeys | None") -> "FocalKeys":
-        """These behind the frames of `past`."""
-        if past is None:
-            return self
-        return FocalKeys(torch.cat([past.fine, self.fine], 1), torch.cat([past.pooled, self.pooled], 1))
-
-    def last(self, count: int) -> "FocalKeys | None":
-        """The latest `count` frames, None for no frame."""
-        return FocalKeys(self.fine[:, -count:], self.pooled[:, -count:]) if count else None
+    fine: Float[Tensor, "sample frame row column dim"]
+    """After the block's first norm."""
+    pooled: Float[Tensor, "sample frame window_row window_column dim"]
+    """One of each window."""
 
 
 class FocalAttention(nn.Module):
@@ -47,35 +38,34 @@ class FocalAttention(nn.Module):
         self.register_buffer("valid_ind_rolled", _outside_of_window())
 
     def forward(
-        self,
-        tokens: Float[Tensor, "sample frame row column dim"],
-        pooled: Float[Tensor, "sample frame window_row window_column dim"],
-        past: FocalKeys | None,
-    ) -> tuple[Float[Tensor, "sample frame row column dim"], FocalKeys]:
-        """What the tokens see in these and the past frames, and these frames' own keys and values."""
-        dim, grid = tokens.shape[-1], (pooled.shape[2], pooled.shape[3])
-        query, fine = self.qkv(tokens).split([dim, 2 * dim], -1)
-        keys = FocalKeys(fine, F.linear(pooled, self.qkv.weight[dim:], self.qkv.bias[dim:]))
-        seen = keys.after(past)
+        self, own: FocalTokens, past: Sequence[FocalTokens] = ()
+    ) -> Float[Tensor, "sample frame row column dim"]:
+        """What the frames' tokens see in them and in the `past` frames."""
+        batch, dim, grid = own.fine.shape[0], own.fine.shape[-1], (own.pooled.shape[2], own.pooled.shape[3])
+        frames = (own, *past)
 
-        # Every window's keys: the same places in all frames.
-        places = self._places(grid).to(tokens.device)
-        cells, near = (x.to(tokens.device) for x in pooled_places(grid))
-        KV = torch.cat([seen.fine.flatten(2, 3)[:, :, places], seen.pooled.flatten(2, 3)[:, :, cells]], 3)
+        # Keys and values of every window: the same places in all frames.
+        weight, bias = self.qkv.weight.split([dim, 2 * dim]), self.qkv.bias.split([dim, 2 * dim])
+        fine = F.linear(torch.cat([x.fine for x in frames], 1), weight[1], bias[1]).flatten(2, 3)
+        pooled = F.linear(torch.cat([x.pooled for x in frames], 1), weight[1], bias[1]).flatten(2, 3)
+        places = self._places(grid).to(fine.device)
+        cells, near = (x.to(fine.device) for x in pooled_places(grid))
+        KV = torch.cat([fine[:, :, places], pooled[:, :, cells]], 3)
         K, V = rearrange(KV, "b t n k (two heads c) -> two (b n) heads (t k) c", two=2, heads=self.heads)
-        Q = rearrange(
-            query, "b t (i y) (j x) (heads c) -> (b i j) heads (t y x) c", y=WINDOW[0], x=WINDOW[1], heads=self.heads
-        )
-        present = torch.cat([near.new_ones(len(places), places.shape[1]), near], 1)
-        present = repeat(present, "n k -> (b n) 1 1 (t k)", b=len(tokens), t=seen.fine.shape[1])
+        present = torch.cat([near.new_ones(places.shape), near], 1)
+        present = repeat(present, "n k -> (b n) 1 1 (t k)", b=batch, t=fine.shape[1])
 
+        Q = F.linear(own.fine, weight[0], bias[0])
+        Q = rearrange(
+            Q, "b t (i y) (j x) (heads c) -> (b i j) heads (t y x) c", y=WINDOW[0], x=WINDOW[1], heads=self.heads
+        )
         looked = F.scaled_dot_product_attention(Q, K, V, present)
         looked = rearrange(
             looked,
             "(b i j) heads (t y x) c -> b t (i y) (j x) (heads c)",
             i=grid[0], j=grid[1], y=WINDOW[0], x=WINDOW[1],
         )  # fmt: skip
-        return self.proj(looked), keys
+        return self.proj(looked)
 
     def _places(self, grid: tuple[int, int]) -> Int[Tensor, "window key"]:
         """Where each window's own and surrounding tokens are, in a frame of `grid` windows read row by row."""

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.baselines.dstt import DSTT
+from viewmend.baselines.e2fgvi import E2FGVI, E2FGVIHQ
 from viewmend.baselines.fuseformer import FuseFormer
 from viewmend.baselines.token_transformer import NATIVE_PX, MemorySlot, TokenTransformer
 
@@ -160,6 +161,10 @@ def _at_once(network: nn.Module, frames: Tensor, n_local: int) -> Tensor:
     return network(frames[None])[0]
 
 
+def _with_references(network: nn.Module, frames: Tensor, n_local: int) -> Tensor:
+    return network(frames[None], n_local)[0]
+
+
 def _one_by_one(network: nn.Module, frames: Tensor, n_local: int) -> Tensor:
     assert isinstance(network, TokenTransformer)
     memory: list[MemorySlot] = []
@@ -177,6 +182,8 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], Compute]] = {
     "DSTT_OM": (DSTT, _one_by_one),
     "FuseFormer": (FuseFormer, _at_once),
     "FuseFormer_OM": (FuseFormer, _one_by_one),
+    "E2FGVI": (E2FGVI, _with_references),
+    "E2FGVI_HQ": (E2FGVIHQ, _with_references),
 }
 """How each network that a file may name is made and run."""
 

@@ -29,7 +29,9 @@ COMMANDS = (
     Command("demo", "viewmend.cli.demo", "Render and mend a moving procedural scene; needs nothing."),
     Command("mend", "viewmend.cli.mend", "Mend novel views of a capture."),
     Command("studio", "viewmend.cli.studio", "Write synthetic captures with exact truth."),
-    Command("train", "viewmend.cli.train", "Train a model on the studio."),
+    Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),
+    Command("samples", "viewmend.cli.samples", "Make training samples ahead."),
+    Command("evaluate", "viewmend.cli.evaluate", "Compare methods on fixed scenes and captures."),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 

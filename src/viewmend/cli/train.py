@@ -1,63 +1,168 @@
-"""`viewmend train`: run a recipe."""
+"""`viewmend train`: run a recipe, or go on with a run."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:
+    from viewmend.inpainting.inpainter import Inpainter
+    from viewmend.training.logs import Progress
+    from viewmend.training.plan import Recipe
+
+LINE_EVERY = 20
+"""Steps between lines where there is no terminal."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train a model on the studio; the averaged weights and a log are written to --out."""
+    """Train a model; --out gets its averaged weights, a log, pictures, and what it takes to go on.
+
+    The same command goes on with a run that was stopped, at any moment and in any way. Under torchrun the same
+    command uses many processes and machines.
+    """
 
     recipe: Annotated[str, tyro.conf.Positional] = "small"
-    """Name of the recipe."""
+    """Name of the recipe: small, small_rays, base, paper, finetune."""
     out: Path = Path("out/train")
-    """Folder for model.safetensors, config.json and log.jsonl."""
+    """Folder for all that is written."""
+    start: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Name or folder of a model to begin with (finetune: small by default)."""
     performers: Path | None = None
     """Folder of glTF characters for a share of the scenes; never one that is kept for tests."""
     motions: Path | None = None
     """Folder of BVH motions for them."""
-    start: str | None = None
-    """Name or folder of a model to go on from."""
+    capture: tuple[Path, ...] = ()
+    """Folders of captures of your own to learn from."""
+    shards: Path | None = None
+    """Folder that `viewmend samples` wrote; samples come from there alone."""
+    data_device: str | None = None
+    """Where samples are made, e.g. cuda; goes with --workers 0 then."""
     steps: int | None = None
-    """Instead of the recipe's."""
+    """Instead of the recipe's; so are all below."""
     minutes: float | None = None
-    """Instead of the recipe's."""
-    log_error_weight: float | None = None
-    """Weight of the logarithm of the squared error in the holes, instead of the recipe's."""
+    batch: int | None = None
+    streams: int | None = None
+    workers: int | None = None
+    learning_rate: float | None = None
+    checkpoint_every: int | None = None
+    validate_every: int | None = None
+    part: Literal["rays", "patches", "all"] | None = None
+    log_error: float | None = None
+    """Weight of the logarithm of the squared error in the holes."""
+    adversarial: float | None = None
+    """Weight of L_adv; the paper's is 0.01."""
+    adversarial_kind: Literal["gan", "hinge"] | None = None
+    discriminator: Literal["image", "clip"] | None = None
+    """What judges: single images, or clips (--clip)."""
+    clip: int | None = None
+    """Consecutive times in a sample."""
+    temporal: float | None = None
+    """Weight of the difference between consecutive outputs, warped."""
+    perceptual: float | None = None
+    """Weight of VGG16's features; needs --perceptual-weights."""
+    perceptual_weights: Path | None = None
+    """File of torchvision's vgg16."""
     seed: int = 0
     """Of weights and scenes."""
 
 
 def run(options: Options) -> int:
-    """Train, with a line on standard error every twenty steps."""
+    """Train, with a bar on a terminal, else a line every twenty steps."""
     from viewmend.cli.console import say
     from viewmend.inpainting.checkpoint import load_inpainter
-    from viewmend.training.loop import Progress, train
+    from viewmend.training.loop import train
+
+    name = options.start or ("small" if options.recipe == "finetune" else None)
+    start = load_inpainter(name) if name is not None else None
+    recipe = chosen_recipe(options, start)
+    with _Reporter(recipe.steps) as reporter:
+        try:
+            train(recipe, options.out, start, reporter.report)
+        except FloatingPointError as error:
+            raise ValueError(str(error)) from error
+    say(f"wrote {options.out}" if reporter.steps else f"{options.out}: this run was finished before; nothing to do")
+    return 0
+
+
+def chosen_recipe(options: Options, start: "Inpainter | None") -> "Recipe":
+    """The recipe with what the options change.
+
+    Raises:
+        ValueError: no such recipe, or options that do not go together.
+    """
+    from viewmend.training.plan import DataPlan
     from viewmend.training.recipes import RECIPES
 
     if options.recipe not in RECIPES:
-        raise ValueError(f"expected a recipe among {', '.join(RECIPES)}, got '{options.recipe}'")
-    recipe = RECIPES[options.recipe](options.performers, options.motions)
-    recipe = replace(
+        raise ValueError(f"expected a recipe among {', '.join(RECIPES)}, got '{options.recipe}'; see --help")
+    if options.recipe == "finetune" and not (options.capture or options.shards):
+        raise ValueError("expected --capture DIR for finetune, got none; name the folder of your capture")
+    if (options.performers is None) != (options.motions is None):
+        raise ValueError("expected --performers and --motions together, got one of them; give both folders")
+    data = DataPlan(
+        performers=options.performers,
+        motions=options.motions,
+        captures=options.capture,
+        shards=options.shards,
+        device=options.data_device or "cpu",
+        clip=options.clip or 1,
+    )
+    recipe = RECIPES[options.recipe](data)
+    if options.recipe == "finetune" and start is not None:
+        recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
+    loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
+    own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "part", "checkpoint_every")
+    values = {n: getattr(options, n) for n in (*own, "validate_every")}
+    return replace(
         recipe,
         seed=options.seed,
-        steps=options.steps or recipe.steps,
-        minutes=options.minutes or recipe.minutes,
-        log_error_weight=recipe.log_error_weight if options.log_error_weight is None else options.log_error_weight,
+        loss=replace(recipe.loss, **{n: v for n, v in loss.items() if v is not None}),
+        **{n: v for n, v in values.items() if v is not None},
     )
 
-    def report(entry: Progress) -> None:
-        if entry.step % 20 == 19:
-            rate = (entry.step + 1) * recipe.batch / entry.elapsed_s
-            say(
-                f"step {entry.step + 1}, {100 * entry.progress:.0f} %: L_in {entry.inside:.4f}, "
-                f"L_out {entry.outside:.4f}, {rate:.2f} samples/s"
-            )
 
-    start = load_inpainter(options.start) if options.start is not None else None
-    train(recipe, options.out, start, report)
-    say(f"wrote {options.out}")
-    return 0
+class _Reporter:
+    """Shows a run: a bar where there is a terminal, else a line now and then."""
+
+    def __init__(self, total: int) -> None:
+        import sys
+
+        self.steps = 0
+        self._total = total
+        self._live = sys.stderr.isatty()
+
+    def __enter__(self) -> "_Reporter":
+        if self._live:
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
+            self._bar = Progress(*columns, console=Console(stderr=True))
+            self._bar.start()
+            self._task = self._bar.add_task("training", total=1.0, text="making the first samples")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._bar.stop()
+
+    def report(self, progress: "Progress") -> None:
+        """One more step."""
+        from viewmend.cli.console import say
+
+        self.steps += 1
+        if self._live:
+            self._bar.update(self._task, completed=progress.progress, text=_line(progress))
+        elif progress.step % LINE_EVERY == 0:
+            say(_line(progress))
+
+
+def _line(progress: "Progress") -> str:
+    pace = progress.pace
+    left = "?" if pace.eta_s is None else f"{pace.eta_s / 60:.0f} min"
+    return (
+        f"step {progress.step}, {100 * progress.progress:.0f} %, {left} left: L_in {progress.costs.inside:.4f}, "
+        f"L_out {progress.costs.outside:.4f}, {pace.samples_per_s:.1f} samples/s, {100 * pace.waiting:.0f} % waiting"
+    )

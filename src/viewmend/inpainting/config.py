@@ -139,3 +139,8 @@ def small() -> InpainterConfig:
         prefill=True,
         rays=8,
     )
+
+
+def base() -> InpainterConfig:
+    """The paper's widths with all of our additions, 35 M parameters: for a data-centre GPU."""
+    return InpainterConfig(rope_unit="patch", rope_values=True, colour_path=True, prefill=True, rays=8)

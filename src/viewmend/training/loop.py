@@ -1,133 +1,189 @@
 """The training loop: batches, steps, averaged weights, logs, checkpoints."""
 
-import json
-import math
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from contextlib import nullcontext
+from dataclasses import astuple
 from pathlib import Path
-from random import Random
 
 import torch
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from viewmend.inpainting.checkpoint import save_inpainter
 from viewmend.inpainting.inpainter import Inpainter
-from viewmend.training.losses import ImageLoss, image_loss
-from viewmend.training.recipes import Recipe
+from viewmend.training.adversary import Adversary
+from viewmend.training.feed import FeedPosition, SampleFeed
+from viewmend.training.logs import Costs, Log, Progress
+from viewmend.training.model_card import model_card
+from viewmend.training.objective import Objective, Outcome
+from viewmend.training.plan import Recipe
+from viewmend.training.processes import Processes, processes
+from viewmend.training.run_files import FILE, RunState, load_run, save_run
+from viewmend.training.sample_files import sample_to_bytes
 from viewmend.training.samples import Sample
-from viewmend.training.scenes import SampleStream
-
-
-@dataclass(frozen=True)
-class Progress:
-    """One step of a run, as the log has it."""
-
-    step: int
-    progress: float
-    """Share of the run, 0 to 1."""
-    inside: float
-    """L_in of the batch."""
-    outside: float
-    """L_out of the batch."""
-    elapsed_s: float
-
-
-def batches(recipe: Recipe) -> Iterator[list[Sample]]:
-    """Endless batches: `fresh` new samples and the rest from the buffer of the last ones."""
-    random = Random(recipe.seed)
-    stream = iter(SampleStream(recipe.data, recipe.seed).loader(recipe.workers))
-    buffer: list[Sample] = []
-    while True:
-        fresh = [next(stream) for _ in range(recipe.fresh)]
-        again = random.sample(buffer, min(recipe.batch - recipe.fresh, len(buffer)))
-        for sample in fresh:
-            if len(buffer) < recipe.buffer:
-                buffer.append(sample)
-            else:
-                buffer[random.randrange(recipe.buffer)] = sample
-        yield fresh + again
-
-
-def batch_loss(model: Inpainter, batch: list[Sample]) -> ImageLoss:
-    """The objective of section 8 over a batch, through encoder, context and transformer."""
-    predictions = model([s.view for s in batch], [list(s.context) for s in batch], nearby=[s.nearby for s in batch])
-    return image_loss(
-        [p.inpainted for p in predictions],
-        [p.coverage for p in predictions],
-        [s.view.error for s in batch],
-        [s.truth.float() / 255 for s in batch],
-    )
-
-
-def rays_loss(model: Inpainter, batch: list[Sample], most_px: int) -> ImageLoss:
-    """The objective inside the holes, of what the ray reader makes of at most `most_px` random pixels of each view."""
-    assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
-    pixels = [torch.nonzero(s.view.error > 0) for s in batch]
-    pixels = [p[torch.randperm(len(p), device=p.device)[:most_px]] for p in pixels]
-    with model.autocast():
-        filled = model.ray_reader([s.view for s in batch], [s.nearby for s in batch], pixels)
-    one = torch.ones((), device=filled[0].device)
-    counted = [
-        torch.zeros_like(s.view.error).index_put(tuple(p.unbind(1)), one) for s, p in zip(batch, pixels, strict=True)
-    ]
-    nowhere = [torch.zeros_like(s.view.error) for s in batch]
-    return image_loss(filled, nowhere, counted, [s.truth.float() / 255 for s in batch])
-
-
-def learning_rate_factor(step: int, progress: float, warmup: int) -> float:
-    """Linear warm-up, then a cosine to zero as `progress` goes from 0 to 1."""
-    return min((step + 1) / warmup, 1.0) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+from viewmend.training.schedule import Schedule, learning_rate_factor
+from viewmend.training.sources import scene_source
+from viewmend.training.validation import Validation
 
 
 def train(
     recipe: Recipe, out: Path, start: Inpainter | None = None, report: Callable[[Progress], None] | None = None
 ) -> Path:
-    """Run a recipe; the averaged weights are in `out` every 100 steps and at the end, the log in out/log.jsonl.
+    """Run a recipe, or go on with the run that `out` holds; under torchrun, with all of its processes.
 
-    start: a model to go on from: its weights, wherever the recipe's model has one of the same name and shape.
-    report: told of each step.
+    In `out`: the averaged weights (model.safetensors, config.json, README.md), run.safetensors to go on from,
+    log.jsonl, and pictures of the validation. A run that goes on makes the very steps that it would have made.
+
+    Args:
+        recipe: what to do.
+        out: folder for all that is written.
+        start: a model to begin with: its weights, wherever the recipe's model has one of the same name and shape.
+        report: told of each step, in the first process.
 
     Raises:
-        FloatingPointError: a loss is not finite.
+        RunError: `out` holds a run of another recipe, or a damaged one.
+        FloatingPointError: a loss is not finite; the batch is saved in `out`.
     """
-    torch.manual_seed(recipe.seed)
-    out.mkdir(parents=True, exist_ok=True)
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model = _model(recipe, start).to(device)
-    average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema))
-    averaged = average.module
-    assert isinstance(averaged, Inpainter)
-    learned = [p for p in model.parameters() if p.requires_grad]
-    optimizer = torch.optim.AdamW(learned, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-    began, entry = time.monotonic(), Progress(-1, 0.0, 0.0, 0.0, 0.0)
-    with (out / "log.jsonl").open("a") as log:
-        for step, batch in enumerate(batches(recipe)):
-            elapsed_s = time.monotonic() - began
-            progress = max(step / recipe.steps, elapsed_s / 60 / recipe.minutes if recipe.minutes else 0.0)
-            if progress >= 1:
-                break
-            factor = learning_rate_factor(step, progress, recipe.warmup)
-            optimizer.param_groups[0]["lr"] = recipe.learning_rate * factor
-            batch = [sample.to(device) for sample in batch]
-            loss = rays_loss(model, batch, recipe.pixels) if recipe.part == "rays" else batch_loss(model, batch)
-            total = loss.total(recipe.log_error_weight)
-            if not torch.isfinite(total):
-                raise FloatingPointError(f"expected a finite loss, got {loss} at step {step}; lower the learning rate")
-            optimizer.zero_grad(set_to_none=True)
-            total.backward()
-            torch.nn.utils.clip_grad_norm_(learned, recipe.clip)
-            optimizer.step()
-            average.update_parameters(model)
-            entry = Progress(step, progress, loss.inside.item(), loss.outside.item(), elapsed_s)
-            log.write(json.dumps(asdict(entry)) + "\n")
-            log.flush()
-            if report is not None:
-                report(entry)
-            if step % 100 == 99:
-                save_inpainter(averaged, out, _card(recipe, entry))
-    save_inpainter(averaged, out, _card(recipe, entry))
+    with processes() as own:
+        run = Run(recipe, out, start, own)
+        for progress in run.steps():
+            if report is not None and own.first:
+                report(progress)
     return out
+
+
+class Run:
+    """A run in this process: model, averages, optimizers and streams of samples."""
+
+    def __init__(self, recipe: Recipe, out: Path, start: Inpainter | None, own: Processes) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        torch.manual_seed(recipe.seed)
+        self.recipe, self.out, self.own = recipe, out, own
+        self.model = _model(recipe, start).to(own.device)
+        self.objective = Objective(self.model, recipe).to(own.device)
+        self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema))
+        self.learned = [p for p in self.model.parameters() if p.requires_grad]
+        self.optimizer = torch.optim.AdamW(self.learned, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own) if recipe.loss.adversarial else None
+        self.state = RunState(0, 0.0, ())
+        self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
+        self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
+        if self.adversary is not None:
+            self._modules["discriminator"] = self.adversary.discriminator
+            self._optimizers["discriminator_optimizer"] = self.adversary.optimizer
+        if (out / FILE).exists():
+            self.state = load_run(out, recipe, self._modules, self._optimizers)
+        self.shared = own.share(self.objective)
+        self.streams = self._streams()
+        self.validation = Validation(recipe, out) if recipe.validate_every and own.first else None
+
+    def steps(self) -> Iterator[Progress]:
+        """Make all steps that are left; yields after each."""
+        schedule = Schedule(self.recipe, self.state.elapsed_s)
+        with Log(self.out, self.state.step, self.own.first) as log:
+            step = begun = self.state.step
+            while True:
+                at = self.own.furthest(schedule.progress(step))
+                if at >= 1:
+                    break
+                schedule.wait()
+                batches = [stream.batch(step, self.recipe.batch) for stream in self.streams]
+                schedule.got()
+                rate = self.recipe.learning_rate * learning_rate_factor(step, at, self.recipe.warmup)
+                for group in self.optimizer.param_groups:
+                    group["lr"] = rate
+                costs = self._step(step, batches)
+                step += 1
+                pace = schedule.made(step, sum(map(len, batches)) * self.own.count)
+                progress = Progress(step, at, rate, costs, schedule.elapsed_s(), pace)
+                log.add(progress)
+                if step % self.recipe.checkpoint_every == 0:
+                    self._save(step, schedule)
+                if self.validation is not None and step % self.recipe.validate_every == 0:
+                    log.validated(self.validation.judge(self.averaged, step))
+                yield progress
+            if step > self.state.step:
+                self._save(step, schedule)
+            if self.validation is not None and step > begun and step % self.recipe.validate_every:
+                log.validated(self.validation.judge(self.averaged, step))
+
+    @property
+    def averaged(self) -> Inpainter:
+        """The averaged weights, which are the result."""
+        module = self.average.module
+        assert isinstance(module, Inpainter)
+        return module
+
+    def _step(self, step: int, batches: list[list[Sample]]) -> Costs:
+        """One step of all weights, with the mean of the streams' gradients."""
+        self.optimizer.zero_grad(set_to_none=True)
+        costs = []
+        for number, batch in enumerate(batches):
+            batch = [sample.to(self.own.device) for sample in batch]
+            # Each stream draws from its own seed at each step: who computes it does not matter.
+            torch.manual_seed(_step_seed(self.recipe.seed, step, number * self.own.count + self.own.rank))
+            last = number + 1 == len(batches)
+            with nullcontext() if last else _without_meeting(self.shared):
+                outcome = self.shared(batch)
+                assert isinstance(outcome, Outcome)
+                total, adversarial, judged = outcome.total, 0.0, 0.0
+                if self.adversary is not None:
+                    term, judged = self.adversary.judge(batch, outcome.completed, 1 / len(batches))
+                    total, adversarial = total + self.recipe.loss.adversarial * term, float(term.detach())
+                self._demand_finite(total.detach(), step, batch)
+                (total / len(batches)).backward()
+            costs.append(_costs(outcome, total, adversarial, judged))
+        torch.nn.utils.clip_grad_norm_(self.learned, self.recipe.clip)
+        self.optimizer.step()
+        self.average.update_parameters(self.model)
+        if self.adversary is not None:
+            self.adversary.step()
+        return self._mean(costs)
+
+    def _mean(self, costs: list[Costs]) -> Costs:
+        values = torch.tensor([astuple(cost) for cost in costs], device=self.own.device).mean(0)
+        return Costs(*self.own.mean(values).tolist())
+
+    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample]) -> None:
+        if torch.isfinite(total):
+            return
+        folder = self.out / f"not-finite-{step:06d}"
+        folder.mkdir(exist_ok=True)
+        for number, sample in enumerate(batch):
+            (folder / f"{number:02d}.safetensors").write_bytes(sample_to_bytes(sample))
+        raise FloatingPointError(
+            f"expected a finite loss, got {float(total)} at step {step}; its batch is in {folder}: look at it, or "
+            "lower the learning rate and begin with the last checkpoint"
+        )
+
+    def _streams(self) -> list[SampleFeed]:
+        """This process's streams: numbers rank, rank + count and so on."""
+        recipe, own = self.recipe, self.own
+        count = max(recipe.streams, own.count)
+        if count % own.count:
+            raise ValueError(
+                f"expected as many streams for each process, got {count} for {own.count}; change either number"
+            )
+        if self.state.positions and len(self.state.positions) != count:
+            raise ValueError(
+                f"expected the {len(self.state.positions)} streams that the run began with, got {count}; start as many "
+                "processes as then"
+            )
+        streams = []
+        for number in range(own.rank, count, own.count):
+            seed = f"{recipe.seed}/{number}"
+            at: FeedPosition | None = self.state.positions[number] if self.state.positions else None
+            source = scene_source(recipe.data, seed)
+            streams.append(SampleFeed(source, seed, recipe.fresh, recipe.buffer, recipe.workers, at))
+        return streams
+
+    def _save(self, step: int, schedule: Schedule) -> None:
+        positions = self.own.gather([stream.position for stream in self.streams])
+        self.state = RunState(step, schedule.elapsed_s(), positions)
+        if self.own.first:
+            save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
+            save_run(self.out, self.recipe, self.state, self._modules, self._optimizers)
 
 
 def _model(recipe: Recipe, start: Inpainter | None) -> Inpainter:
@@ -142,15 +198,22 @@ def _model(recipe: Recipe, start: Inpainter | None) -> Inpainter:
     return model
 
 
-def _card(recipe: Recipe, entry: Progress) -> str:
-    """The model card: what trained these weights. What they score is for the evaluation to add."""
-    characters = "" if recipe.data.performers is None else f", {recipe.data.performers_share:.0%} of the scenes glTF"
-    return f"""# {recipe.name}
+def _costs(outcome: Outcome, total: torch.Tensor, adversarial: float, discriminator: float) -> Costs:
+    return Costs(
+        inside=float(outcome.image.inside.detach()),
+        outside=float(outcome.image.outside.detach()),
+        total=float(total.detach()),
+        temporal=float(outcome.temporal.detach()),
+        perceptual=float(outcome.perceptual.detach()),
+        adversarial=adversarial,
+        discriminator=discriminator,
+    )
 
-Trained by `viewmend train {recipe.name}`: {entry.step + 1} steps of {recipe.batch} samples in
-{entry.elapsed_s / 60:.0f} minutes ({entry.progress:.0%} of the schedule), seed {recipe.seed},
-torch {torch.__version__}, {torch.get_num_threads()} threads, CUDA {torch.cuda.is_available()}.
-Loss: L1 inside and outside of the holes (section 8), and {recipe.log_error_weight:g} x log10 of the squared error in
-them; averaged weights.
-Data: studio scenes made on the fly{characters}; no real captures, no test seeds, performers or motions.
-"""
+
+def _without_meeting(module: nn.Module):
+    """Gradients add up here, and meet those of other processes in a later backward pass."""
+    return module.no_sync() if isinstance(module, DistributedDataParallel) else nullcontext()
+
+
+def _step_seed(seed: int, step: int, stream: int) -> int:
+    return (seed * 1_000_003 + step) * 1_009 + stream

@@ -25,6 +25,13 @@ class Sample:
     """What the cameras near the view, the chosen ones first, saw at its time: for an inpainter that reads rays."""
     truth: UInt8[Tensor, "3 height width"]
     """F*, background black."""
+    previous: "Sample | None" = None
+    """The same camera one frame before, for losses over time."""
+
+    @property
+    def clip(self) -> tuple["Sample", ...]:
+        """This sample after those before it, the oldest first."""
+        return (self,) if self.previous is None else (*self.previous.clip, self)
 
     def to(self, device: torch.device | str) -> "Sample":
         """The same sample on `device`."""
@@ -38,14 +45,17 @@ class Sample:
             weights=self.view.weights.to(device),
         )
         context = tuple(c.to(device) for c in self.context)
-        return Sample(view, context, None if self.nearby is None else self.nearby.to(device), self.truth.to(device))
+        nearby = None if self.nearby is None else self.nearby.to(device)
+        previous = None if self.previous is None else self.previous.to(device)
+        return Sample(view, context, nearby, self.truth.to(device), previous)
 
 
 class LeaveOneOut:
     """The frames of one rig without one of its cameras, image and mask; proxies are computed once a time."""
 
     def __init__(self, frames: Mapping[int, MultiViewFrame], held: str, bounds: Bounds | None, hull: HullConfig):
-        self.frames = {time: frame.without([held]) for time, frame in frames.items()}
+        # Nobody may look at the true depth, and samples that wait in memory need not carry it.
+        self.frames = {time: replace(frame.without([held]), depth=None) for time, frame in frames.items()}
         self.held = held
         self.bounds = bounds
         self.hull = hull
@@ -55,7 +65,7 @@ class LeaveOneOut:
         """G[time], from the masks of the cameras that are left."""
         if time not in self._proxies:
             frame = self.frames[time]
-            assert frame.mask is not None, "the studio always knows its masks"
+            assert frame.mask is not None, "what trains has masks"
             self._proxies[time] = reconstruct(frame.mask, frame.cameras, self.bounds, self.hull)
         return self._proxies[time]
 
@@ -81,7 +91,7 @@ class LeaveOneOut:
             names = [n for n in view.chosen if n in self.frames[tau].cameras.names]
             frame = self.frames[tau].select(names)
             context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
-        assert truth.mask is not None, "the studio always knows its masks"
+        assert truth.mask is not None, "what trains has masks"
         around = view.around(rays)
         near = self.frames[time].select(around)
         nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None

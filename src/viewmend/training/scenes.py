@@ -1,55 +1,65 @@
-"""The studio's endless stream of training samples, made on the fly by worker processes."""
+"""Scenes, each a list of samples that follows from the plan, the seed and the scene's number alone."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from random import Random
-
-import torch
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from typing import Protocol, runtime_checkable
 
 from viewmend.capture.studio.imperfections import Imperfections
 from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import HullConfig
 from viewmend.rendering.view import RenderConfig
-from viewmend.training.recipes import DataPlan
+from viewmend.training.plan import DataPlan
 from viewmend.training.samples import LeaveOneOut, Sample
 from viewmend.views import MultiViewFrame
 
+FIRST_VALIDATION_SEED = 9000
+"""Procedural seeds from here on are kept for validation,"""
 FIRST_TEST_SEED = 10000
-"""Procedural seeds from here on are kept for tests and evaluation."""
+"""and from here on for tests and evaluation."""
+
+Truth = Callable[[str, int], MultiViewFrame]
+"""truth(name, time): what that camera, alone, should see at that time, with its mask."""
 
 
-class SampleStream(IterableDataset[Sample]):
-    """Samples of one random scene after another; the same seed and number of workers give the same samples."""
+@runtime_checkable
+class SceneSource(Protocol):
+    """Endless numbered scenes; a number always gives the same samples."""
 
-    def __init__(self, plan: DataPlan, seed: int) -> None:
-        super().__init__()
+    def scene(self, number: int) -> list[Sample]:
+        """The samples of scene `number`, in the order in which they are used; there may be none."""
+        ...
+
+
+class StudioScenes:
+    """Scenes of the studio, made on the fly."""
+
+    def __init__(self, plan: DataPlan, seed: str, seeds: range = range(FIRST_VALIDATION_SEED)) -> None:
+        """`seed` is of everything that is random but the performers, whose seeds are among `seeds`."""
         self.plan = plan
         self.seed = seed
+        self.seeds = seeds
 
-    def __iter__(self) -> Iterator[Sample]:
-        worker = get_worker_info()
-        number = 0 if worker is None else worker.id
+    def scene(self, number: int) -> list[Sample]:
+        """At each time some cameras of a random stage are left out in turn, and see the truth."""
         random = Random(f"{self.seed}/{number}")
-        while True:
-            yield from scene_samples(random_studio(self.plan, random), self.plan, random)
+        studio = Studio(random_stage(self.plan, random, self.seeds))
+        frames = {time: studio.read(time) for time in self.plan.times}
 
-    def loader(self, workers: int) -> Iterator[Sample]:
-        """The stream, made ahead by this many processes (0: by the caller's own, when asked)."""
-        if workers == 0:
-            return iter(self)
-        # Through files, not descriptors: a buffer of samples would run out of these.
-        torch.multiprocessing.set_sharing_strategy("file_system")
-        ahead = DataLoader(self, batch_size=None, num_workers=workers, prefetch_factor=8, persistent_workers=True)
-        return iter(ahead)
+        def truth(held: str, time: int) -> MultiViewFrame:
+            seen = studio.truth(studio.true_cameras.select([held]), time)
+            return replace(seen, cameras=studio.cameras.select([held]))
+
+        return rig_samples(frames, truth, None, self.plan, random)
 
 
-def random_studio(plan: DataPlan, random: Random) -> Studio:
+def random_stage(plan: DataPlan, random: Random, seeds: range = range(FIRST_VALIDATION_SEED)) -> StudioConfig:
     """A stage as real ones differ: who performs, how many cameras in which rig, and what is wrong with them."""
     flawed = random.random() < plan.imperfect_share
     strength = random.random() if flawed else 0.0
     config = StudioConfig(
-        seed=random.randrange(FIRST_TEST_SEED),
+        seed=random.choice(seeds),
         cameras=random.randint(*plan.cameras),
         rig=random.choice(("ring", "dome")),
         frames=max(plan.times) + 1,
@@ -67,26 +77,42 @@ def random_studio(plan: DataPlan, random: Random) -> Studio:
             mask_hard=flawed and random.random() < 0.6,
             calibration_px=strength * random.random(),
         ),
+        device=plan.device,
     )
     if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:
         config = replace(config, performers=plan.performers, motions=plan.motions)
-    return Studio(config)
+    return config
 
 
-def scene_samples(studio: Studio, plan: DataPlan, random: Random) -> Iterator[Sample]:
-    """Samples of one scene: at each time some cameras are left out in turn, and see the truth."""
-    frames: dict[int, MultiViewFrame] = {time: studio.read(time) for time in plan.times}
-    names = studio.cameras.names
-    hull = HullConfig(resolution=plan.hull_resolution)
+def rig_samples(
+    frames: Mapping[int, MultiViewFrame], truth: Truth, bounds: Bounds | None, plan: DataPlan, random: Random
+) -> list[Sample]:
+    """Some cameras of a rig are left out in turn, each at some of the times.
+
+    Args:
+        frames: what the rig saw, by time.
+        truth: of a camera that was left out.
+        bounds: the volume that may hold the subject, None to find it.
+        plan: how many cameras and times, and how views are rendered.
+        random: which.
+    """
+    times = sorted(frames)
+    ends = [t for t in times if all(t - back in frames for back in range(plan.clip))]
+    if not ends:
+        raise ValueError(f"expected {plan.clip} consecutive times for clips, got {times}; change the plan's times")
+    names = frames[times[-1]].cameras.names
+    samples = []
     for held in random.sample(names, min(plan.held_cameras, len(names))):
-        rig = LeaveOneOut(frames, held, None, hull)
-        for time in random.sample(plan.times, min(plan.targets_per_camera, len(plan.times))):
-            past = [t for t in reversed(plan.times) if t < time]
-            past = past[: random.choice((0, 0, 0, 1, len(past)))]
-            truth = replace(
-                studio.truth(studio.true_cameras.select([held]), time), cameras=studio.cameras.select([held])
-            )
-            cameras = random.choices(plan.context_cameras, weights=plan.context_weights)[0]
-            sample = rig.sample(time, past, truth, RenderConfig(cameras=cameras), plan.min_hole_px, plan.rays)
+        rig = LeaveOneOut(frames, held, bounds, HullConfig(resolution=plan.hull_resolution))
+        for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
+            reach = random.choice((0, 0, 0, 1, len(times)))
+            render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
+            sample = None
+            for time in range(end - plan.clip + 1, end + 1):
+                past = [t for t in reversed(times) if t < time][:reach]
+                least_px = plan.min_hole_px if time == end else 0
+                new = rig.sample(time, past, truth(held, time), render, least_px, plan.rays)
+                sample = new and replace(new, previous=sample)
             if sample is not None:
-                yield sample
+                samples.append(sample)
+    return samples

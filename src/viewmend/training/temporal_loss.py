@@ -5,10 +5,10 @@ counts where the two views' proxies agree that this is one surface, and where ei
 
 What it cannot tell: the proxy has no correspondence over time. A surface that slides along itself, a limb that moves
 across the picture at its own depth, or a turning ball keep their depth while their colour rightly changes, and so do
-colours that change with the light. The right answer therefore has a loss above zero (0.03 to 0.05 in four of the
-studio's scenes, no less than a smooth fill), and a large weight buys stillness with blur. Where the truth of both times
-is known, as in training, it can be given: then only those changes count that the truth does not have, and the truth has
-a loss of zero. What moved in depth by more than the tolerance is not counted in either case.
+colours that change with the light. The right answer therefore has a loss above zero (0.02 to 0.06 in four of the
+studio's scenes, hardly less than a smooth fill's), and a large weight buys stillness with blur. Where the truth of
+both times is known, as in training, it can be given: then only those changes count that the truth does not have, and
+the truth has a loss of zero. What moved in depth by more than the tolerance is not counted in either case.
 """
 
 from collections.abc import Sequence

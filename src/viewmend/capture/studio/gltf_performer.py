@@ -34,11 +34,14 @@ class GltfPerformer:
     clip: the lowest vertex stands on it in the median frame, or slightly above in clips with jumps.
     """
 
-    def __init__(self, character: Path, motion: Path, seed: int = 0, duration_s: float = 2.0) -> None:
-        """Load both files.
+    def __init__(
+        self, character: Path, motion: Path, seed: int = 0, duration_s: float = 2.0, cloth_variety: float = 0.0
+    ) -> None:
+        """Load both files; `cloth_variety` is the share of the character's garments that the seed changes.
 
         Raises:
             CaptureError: a file is unreadable, or its skeleton is not a human one.
+            ValueError: `cloth_variety` is not in [0, 1].
         """
         self.motion = read_bvh(motion)
         self.character = load_character(character)
@@ -46,6 +49,10 @@ class GltfPerformer:
             self._body: Retarget = retarget(self.character, self.motion)
         except ValueError as error:
             raise CaptureError(f"{character} with {motion}: {error}") from error
+        if cloth_variety != 0:
+            from viewmend.capture.studio.cloth import vary_cloth
+
+            self.character = vary_cloth(self.character, self._body.upright_from_file, cloth_variety, seed)
         self.description = f"{character.stem} doing {motion.stem}"
         generator = torch.Generator().manual_seed(seed)
         chance, turn = torch.rand(2, generator=generator).tolist()

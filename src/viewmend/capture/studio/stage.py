@@ -47,6 +47,9 @@ class StudioConfig:
     """A glTF character (.glb, .gltf), or a folder of which one is picked; None for a procedural scene."""
     motions: Path | None = None
     """A BVH motion, or a folder of which one is picked; goes with `performers`."""
+    cloth_variety: float = 0.0
+    """Share of a glTF character's garments that the seed dyes or makes of another cloth; 0 leaves it as its file says.
+    Procedural performers always wear what their seed says."""
     background: Literal["black", "stage"] = "black"
     """What the cameras see behind the subject; truth views always have black."""
     samples_per_side: int = 2
@@ -69,7 +72,7 @@ class Studio:
 
         Raises:
             CaptureError: performers or motions that are missing, none in their folder, or unreadable.
-            ValueError: sizes or counts that are not positive.
+            ValueError: sizes or counts that are not positive, a variety of cloth beyond [0, 1].
         """
         self.config = config = config or StudioConfig()
         size = (config.size_px, config.size_px) if isinstance(config.size_px, int) else config.size_px
@@ -198,7 +201,7 @@ def _cast(config: StudioConfig, seed: int) -> Performer:
     chance = np.random.default_rng(seed)
     character = _pick(config.performers, (".glb", ".gltf"), chance)
     motion = _pick(config.motions, (".bvh",), chance)
-    return GltfPerformer(character, motion, seed, config.frames / config.fps)
+    return GltfPerformer(character, motion, seed, config.frames / config.fps, config.cloth_variety)
 
 
 def _pick(place: Path, suffixes: tuple[str, ...], chance: np.random.Generator) -> Path:

@@ -1,0 +1,50 @@
+"""`viewmend evaluate parity`: whether our baselines compute what the published networks compute."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Compare DSTT, FuseFormer and E2FGVI, and their variants with memory, with outputs of the published networks.
+
+    Each file says which network to run and from which seed its weights and input are made. The largest absolute
+    difference is printed; the exit code is 1 where one is above 1e-3 or is not a number.
+    """
+
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """Parity files (.npz)."""
+    device: str = "cpu"
+    """Where to run the networks."""
+    json: bool = False
+    """Write one JSON list to standard output and nothing else there."""
+
+
+def run(options: Options) -> int:
+    """Run the command; the exit code."""
+    from dataclasses import asdict
+
+    from viewmend.baselines.parity import TOLERANCE, check
+    from viewmend.cli.console import busy, print_json
+
+    if not options.files:
+        raise ValueError("expected one or more parity files, got none; see viewmend evaluate parity --help")
+    results = []
+    for path in options.files:
+        with busy(f"running the network of {path.name}"):
+            result = check(path, options.device)
+        results.append({"file": str(path), **asdict(result), "passed": result.passed})
+        if not options.json:
+            verdict = "passed" if result.passed else f"FAILED: above {TOLERANCE:g}"
+            print(
+                f"{path}: {result.name}, {result.frames} frames, seed {result.seed}: largest difference "
+                f"{result.difference:.2e} (means {result.mean_difference:.2e}, standard deviations "
+                f"{result.std_difference:.2e}): {verdict}",
+                flush=True,
+            )
+    if options.json:
+        print_json(results)
+    return 0 if all(result["passed"] for result in results) else 1

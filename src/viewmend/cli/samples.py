@@ -1,0 +1,57 @@
+"""`viewmend samples`: make training samples ahead of a run."""
+
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from viewmend.cli.train import Options as TrainOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Write training samples as tar shards, for `viewmend train --shards`; a recipe's own, made once for many runs."""
+
+    out: Path
+    """Folder for shard-00000.tar and on."""
+    count: int = 960
+    """How many samples."""
+    recipe: str = "small"
+    """Whose kind of samples."""
+    performers: Path | None = None
+    """Folder of glTF characters for a share of the scenes; never one that is kept for tests."""
+    motions: Path | None = None
+    """Folder of BVH motions for them."""
+    capture: tuple[Path, ...] = ()
+    """Folders of captures of your own."""
+    workers: int = 2
+    """Processes that make samples."""
+    seed: int = 0
+    """Of the scenes."""
+
+
+def run(options: Options) -> int:
+    """Make them, and say how fast that went."""
+    import time
+
+    from viewmend.cli.console import say, track
+    from viewmend.cli.train import chosen_recipe
+    from viewmend.training.feed import samples_in_order
+    from viewmend.training.sample_files import write_shards
+    from viewmend.training.sources import scene_source
+
+    if options.count < 1:
+        raise ValueError(f"expected a count of at least 1, got {options.count}")
+    recipe = chosen_recipe(
+        TrainOptions(
+            recipe=options.recipe, performers=options.performers, motions=options.motions, capture=options.capture
+        ),
+        None,
+    )
+    source = scene_source(recipe.data, f"{options.seed}/0")
+    began = time.monotonic()
+    samples = islice((s for _, _, s in samples_in_order(source, 0, options.workers)), options.count)
+    shards = list(write_shards(track(samples, "samples", options.count), options.out))
+    rate = options.count / (time.monotonic() - began)
+    size_mb = sum(path.stat().st_size for path in shards) / 1e6
+    say(f"wrote {options.count} samples, {len(shards)} shards, {size_mb:.0f} MB to {options.out}: {rate:.1f} samples/s")
+    return 0

@@ -1,0 +1,197 @@
+"""From frames to scenes to sets: how the figures of a report are averaged."""
+
+import statistics
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+
+from viewmend.evaluation.cells import Cell
+from viewmend.evaluation.methods import REFERENCE
+from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Means. PSNR in dB, SSIM in [-1, 1], differences and shares in [0, 1]; None where there is nothing to average."""
+
+    psnr_holes: float | None
+    psnr_holes_fg: float | None
+    psnr_masked: float | None
+    ssim_masked: float | None
+    psnr_whole: float | None
+    ssim_whole: float | None
+    warp_error: float | None
+    warp_error_truth: float | None
+    change: float | None
+    change_truth: float | None
+    holes_of_hull: float | None
+    """Pixels of E as a share of those that the proxy covers;"""
+    holes_of_image: float | None
+    """and of all."""
+
+
+@dataclass(frozen=True)
+class CellScores:
+    """One cell, averaged over its frames."""
+
+    cell: Cell
+    scores: Scores
+    frames: int
+    thin_frames: int
+    """Of these, the frames left out of the scores in the holes: with fewer than `ENOUGH_HOLE_PX` pixels of E."""
+    empty_frames: int
+    """Of these, the frames with none."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method in a table."""
+
+    method: str
+    scores: Scores
+    """Means over scenes."""
+    over_reference: float | None
+    """`psnr_holes` over that of `REFERENCE`, mean over the scenes where both have it."""
+    below_reference: int
+    """In how many of these scenes it is below."""
+    scenes: int
+    scored_scenes: int
+    """Scenes with a frame that has enough holes."""
+    failed: int
+    step_ms_p50: float | None
+    """Of the inpainter's step, over all frames with holes;"""
+    step_ms_p95: float | None
+    """and the 95th percentile."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Methods on some scenes."""
+
+    title: str
+    rows: tuple[Row, ...]
+    frames: int
+    """Of all scenes together, as far as any method has them;"""
+    thin_frames: int
+    """left out of the scores in the holes;"""
+    empty_frames: int
+    """without any hole (they are among the former)."""
+
+
+def average_cell(cell: Cell) -> CellScores:
+    """Means over the frames; scores in the holes over those with enough pixels of the kind."""
+    frames = cell.frames
+    wide = [f for f in frames if f.hole_px >= ENOUGH_HOLE_PX]
+    inside = [f for f in frames if f.hole_fg_px >= ENOUGH_HOLE_PX]
+    scores = Scores(
+        psnr_holes=_mean(f.psnr_holes for f in wide),
+        psnr_holes_fg=_mean(f.psnr_holes_fg for f in inside),
+        psnr_masked=_mean(f.psnr_masked for f in wide),
+        ssim_masked=_mean(f.ssim_masked for f in wide),
+        psnr_whole=_mean(f.psnr_whole for f in frames),
+        ssim_whole=_mean(f.ssim_whole for f in frames),
+        warp_error=_mean(f.warp_error for f in frames),
+        warp_error_truth=_mean(f.warp_error_truth for f in frames),
+        change=_mean(f.change for f in frames),
+        change_truth=_mean(f.change_truth for f in frames),
+        holes_of_hull=_mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in frames),
+        holes_of_image=_mean(f.hole_px / f.image_px for f in frames),
+    )
+    return CellScores(cell, scores, len(frames), len(frames) - len(wide), sum(f.hole_px == 0 for f in frames))
+
+
+def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
+    """One for each set, and one over all sets first if there are several (the mean of the sets' means)."""
+    averaged = [average_cell(cell) for cell in cells]
+    sets = list(dict.fromkeys(cell.set for cell in cells))
+    per_set = [_table(name, [a for a in averaged if a.cell.set == name], methods) for name in sets]
+    if len(sets) < 2:
+        return per_set
+    return [_overall(per_set, averaged, methods), *per_set]
+
+
+def tables_by_kind(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
+    """For each set, one for each rig and each style that it has more than one of."""
+    averaged = [average_cell(cell) for cell in cells]
+    found = []
+    for name in dict.fromkeys(cell.set for cell in cells):
+        own = [a for a in averaged if a.cell.set == name]
+        for kind in ("rig", "style"):
+            values = list(dict.fromkeys(getattr(a.cell, kind) for a in own))
+            for value in values if len(values) > 1 else []:
+                part = [a for a in own if getattr(a.cell, kind) == value]
+                found.append(_table(f"{name}, {value}", part, methods))
+    return found
+
+
+def mean_scores(many: Sequence[Scores]) -> Scores:
+    """Field by field, over those that have one."""
+    return Scores(*(_mean(getattr(scores, f.name) for scores in many) for f in fields(Scores)))
+
+
+def _table(title: str, averaged: Sequence[CellScores], methods: Sequence[str]) -> Table:
+    # All methods of a scene saw the same frames: any cell that did not fail counts them.
+    scenes = {a.cell.key.scene: a for a in averaged if a.cell.error is None}
+    frames, thin, empty = (
+        sum(getattr(a, name) for a in scenes.values()) for name in ("frames", "thin_frames", "empty_frames")
+    )
+    return Table(title, tuple(_row(name, averaged) for name in methods), frames, thin, empty)
+
+
+def _row(method: str, averaged: Sequence[CellScores]) -> Row:
+    own = [a for a in averaged if a.cell.key.method == method]
+    done = [a for a in own if a.cell.error is None]
+    gains = _gains(done, averaged)
+    p50, p95 = step_ms(done)
+    return Row(
+        method=method,
+        scores=mean_scores([a.scores for a in done]),
+        over_reference=_mean(gains),
+        below_reference=sum(gain < 0 for gain in gains),
+        scenes=len(own),
+        scored_scenes=sum(a.scores.psnr_holes is not None for a in done),
+        failed=len(own) - len(done),
+        step_ms_p50=p50,
+        step_ms_p95=p95,
+    )
+
+
+def _overall(per_set: Sequence[Table], averaged: Sequence[CellScores], methods: Sequence[str]) -> Table:
+    rows = []
+    for n, name in enumerate(methods):
+        parts = [table.rows[n] for table in per_set]
+        p50, p95 = step_ms([a for a in averaged if a.cell.key.method == name and a.cell.error is None])
+        rows.append(
+            Row(
+                method=name,
+                scores=mean_scores([row.scores for row in parts]),
+                over_reference=_mean(row.over_reference for row in parts),
+                below_reference=sum(row.below_reference for row in parts),
+                scenes=sum(row.scenes for row in parts),
+                scored_scenes=sum(row.scored_scenes for row in parts),
+                failed=sum(row.failed for row in parts),
+                step_ms_p50=p50,
+                step_ms_p95=p95,
+            )
+        )
+    counts = (sum(getattr(t, name) for t in per_set) for name in ("frames", "thin_frames", "empty_frames"))
+    return Table("mean of the sets", tuple(rows), *counts)
+
+
+def _gains(done: Sequence[CellScores], averaged: Sequence[CellScores]) -> list[float]:
+    """Scene by scene, the PSNR in the holes over that of the reference."""
+    reference = {a.cell.key.scene: a.scores.psnr_holes for a in averaged if a.cell.key.method == REFERENCE}
+    pairs = ((a.scores.psnr_holes, reference.get(a.cell.key.scene)) for a in done)
+    return [own - other for own, other in pairs if own is not None and other is not None]
+
+
+def step_ms(done: Sequence[CellScores]) -> tuple[float | None, float | None]:
+    """Median and 95th percentile of the inpainter's step over frames that have a hole; None without any."""
+    taken = sorted(f.step_ms for a in done for f in a.cell.frames if f.hole_px)
+    if not taken:
+        return None, None
+    return statistics.median(taken), taken[min(len(taken) - 1, int(0.95 * len(taken)))]
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return statistics.fmean(there) if there else None

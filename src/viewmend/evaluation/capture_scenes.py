@@ -1,0 +1,128 @@
+"""Real captures as scenes: every camera is left out in turn, and seen from all the others or from a few."""
+
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from viewmend.capture.errors import CaptureError
+from viewmend.capture.plain import PlainCapture, open_capture
+from viewmend.evaluation.scenes import SceneFrame
+from viewmend.geometry.alignment import shared_offset
+from viewmend.geometry.cameras import Cameras
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureScene:
+    """One camera of a capture, left out; a shift that all images share is undone first, as `viewmend mend` does."""
+
+    name: str
+    set: str
+    rig: str
+    style: str
+    folder: Path
+    held: str
+    inputs: tuple[str, ...]
+    """Cameras that are looked at."""
+    count: int
+    """Frames from the first."""
+    fingerprint: str
+    """Of the capture's files."""
+
+    @property
+    def definition(self) -> str:
+        """The capture's fingerprint, which cameras, how many frames."""
+        return repr((self.fingerprint, self.held, self.inputs, self.count))
+
+    def frames(self, device: str) -> Iterator[SceneFrame]:
+        """Those in which the camera that was left out, and at least two of the inputs, have images."""
+        capture = _open(self.folder, (*self.inputs, self.held))
+        bounds = None if capture.bounds is None else capture.bounds.to(device)
+        offset_px = None
+        for time in range(self.count):
+            frame = capture.read(time)
+            inputs = frame.select([name for name in self.inputs if name in frame.cameras.names])
+            if self.held not in frame.cameras.names or len(inputs.cameras) < 2 or inputs.mask is None:
+                continue
+            if offset_px is None and bool((inputs.mask > 0).any()):
+                offset_px = shared_offset(inputs.mask, inputs.cameras, capture.bounds).offset_px
+            moved = replace(frame, cameras=frame.cameras.moved(*(offset_px or (0.0, 0.0)))).to(device)
+            yield SceneFrame(moved.select(inputs.cameras.names), moved.select([self.held]), bounds)
+
+
+def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) -> tuple[CaptureScene, ...]:
+    """Every camera of a capture left out in turn.
+
+    Args:
+        folder: of the capture.
+        inputs: "all" the others are looked at, or a number of cameras, `evenly_around`; where the camera that is left
+            out is one of these, the rest.
+        frames: how many from the first; None for all.
+
+    Raises:
+        CaptureError: the capture cannot be read, has no masks, or too few cameras.
+        ValueError: `inputs` or `frames` is no such number.
+    """
+    capture = _open(folder, None)
+    names = capture.cameras.names
+    if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
+        raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
+    if frames is not None and frames < 1:
+        raise ValueError(f"expected --frames of at least 1, got {frames}; leave it away for all")
+    looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
+    fingerprint, count = _fingerprint(folder), min(frames or len(capture.frame_ids), len(capture.frame_ids))
+    return tuple(
+        CaptureScene(
+            name=f"{capture.name}-{held}-from-{inputs}",
+            set=f"{capture.name} from {inputs}",
+            rig=f"{inputs} of {len(names)}",
+            style="capture",
+            folder=folder,
+            held=held,
+            inputs=tuple(name for name in looking if name != held),
+            count=count,
+            fingerprint=fingerprint,
+        )
+        for held in names
+    )
+
+
+def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
+    """Names of this many cameras, evenly in the order in which they stand around; the first is the rig's first.
+
+    Camera n of the ordered N is taken for n = floor(i N / count): for a ring, every so manieth.
+    """
+    eyes = (cameras.centers - cameras.centers.mean(0)).double()
+    first, second = torch.linalg.svd(eyes, full_matrices=False).Vh[:2]  # the plane that the cameras stand in
+    turn = 2 * math.pi
+    angle = torch.atan2(eyes @ second, eyes @ first)
+    around = (angle - angle[0]) % turn
+    if float(around[1]) > turn / 2:  # the way around in which names go up
+        around = (turn - around) % turn
+    order: Sequence[int] = around.argsort(stable=True).tolist()
+    return tuple(cameras.names[order[i * len(order) // count]] for i in range(count))
+
+
+def _open(folder: Path, names: Sequence[str] | None) -> PlainCapture:
+    capture = open_capture(folder, names)
+    if not capture.has_masks:
+        raise CaptureError(
+            f"{folder}: expected a 'mask' for every camera, got none: the visual hull is carved from them, and the "
+            "truth cut out; segment the foreground and name the files in cameras.json"
+        )
+    if len(capture.cameras) < 3:
+        raise CaptureError(f"{folder}: expected at least 3 cameras, one to leave out, got {len(capture.cameras)}")
+    return capture
+
+
+def _fingerprint(folder: Path) -> str:
+    """Changes when the calibration does, or name, size or time of any file: images are too many to read them all."""
+    folder = folder if folder.is_dir() else folder.parent
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    stats = [(str(path.relative_to(folder)), path.stat()) for path in files]
+    listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    calibration = (folder / "cameras.json").read_bytes()
+    return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()

@@ -1,0 +1,65 @@
+"""What an evaluation found, ready to be written in any form."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from viewmend.evaluation.averages import CellScores, Table, average_cell, tables, tables_by_kind
+from viewmend.evaluation.cells import PROTOCOL, Cell
+from viewmend.evaluation.methods import REFERENCE
+from viewmend.evaluation.provenance import Provenance
+from viewmend.evaluation.scene_run import RunSettings
+from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
+
+RULES = (
+    "One camera is left out, with its mask; its view is carved and rendered from the others, and completed as a "
+    "stream: one frame at a time, from past frames only. All methods complete the same rendered views.",
+    "Holes are the pixels with E > 0, not dilated, the same for compositing and for scores. The truth is the left-out "
+    "camera's image on black.",
+    'PSNR "holes" is over the pixels of E alone (reading a); "in mask" over those of them inside the true mask; '
+    '"masked" and its SSIM are of both images blackened outside E, over all pixels (reading b).',
+    "SSIM: Gaussian window of 11 x 11 pixels, sigma 1.5, mean of the channels, computed without padding.",
+    f"Frames with fewer than {ENOUGH_HOLE_PX} pixels of the kind are left out of scores in the holes, and counted.",
+    "Means are over the frames of a scene, then over the scenes of a set, then over sets.",
+    f"The gain over {REFERENCE} is the mean over the scenes in which both have a score.",
+    '"Warp" is the mean absolute difference from the frame before, warped by the true motion of the surface, over E '
+    '(in 255ths); "change" is that in place, over the pixels of E now or then. The truth is not 0 in '
+    "either: see its row.",
+    "Milliseconds are the inpainter's step alone (not hull and rendering), with its caches as in production, over the "
+    "frames with holes: median, and 95th percentile.",
+)
+"""What the figures mean; every report says so."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """All figures of an evaluation."""
+
+    protocol: int
+    settings: RunSettings
+    methods: tuple[str, ...]
+    identities: dict[str, str]
+    """What each method is: class, parameters, hash of its weights."""
+    tables: tuple[Table, ...]
+    """Over all sets if there are several, then each set."""
+    kinds: tuple[Table, ...]
+    """Each set's rigs and styles."""
+    cells: tuple[CellScores, ...]
+    """All of them, also those that failed."""
+    origins: tuple[Provenance, ...]
+    """Where the cells were computed: several if runs were resumed."""
+
+
+def make_report(cells: Sequence[Cell], methods: tuple[str, ...], settings: RunSettings) -> Report:
+    """Average the cells, in the order of scenes and methods in which they come."""
+    identities = {cell.key.method: cell.identity for cell in cells}
+    origins = tuple(dict.fromkeys(cell.provenance for cell in cells))
+    return Report(
+        protocol=PROTOCOL,
+        settings=settings,
+        methods=methods,
+        identities=identities,
+        tables=tuple(tables(cells, methods)),
+        kinds=tuple(tables_by_kind(cells, methods)),
+        cells=tuple(average_cell(cell) for cell in cells),
+        origins=origins,
+    )

@@ -1,0 +1,165 @@
+"""One scene through many methods: each frame is carved and rendered once, and all complete the same views."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from viewmend.contact_sheet import picture
+from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
+from viewmend.evaluation.methods import make_method
+from viewmend.evaluation.scenes import EvaluationScene
+from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe
+from viewmend.rendering.view import render_view
+from viewmend.views import CompletedView, IncompleteView
+
+Picture = UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """How scenes are run."""
+
+    device: str = "cpu"
+    precision: str = "float32"
+    """Of our networks: float32, or bfloat16 by autocast."""
+    pipeline: PipelineConfig = field(default_factory=PipelineConfig)
+    """Hull and renderer, the same for every method."""
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """One method on one scene."""
+
+    method: str
+    frames: tuple[FrameScores, ...]
+    """Empty if it failed."""
+    error: str | None
+    """Why it failed."""
+    picture: Picture | None
+    """The completed view at the time of the largest hole."""
+
+
+@dataclass(frozen=True)
+class SceneRun:
+    """All that came out of one scene: what a worker sends back."""
+
+    scene: str
+    runs: tuple[MethodRun, ...]
+    pictures: tuple[Picture, Picture, Picture] | None
+    """At the time of the largest hole: rendered view, E, truth. None if the scene could not be read or rendered."""
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """One time of a scene, as all methods are shown it."""
+
+    observation: Observation
+    view: IncompleteView
+    truth: TrueView
+    before: "_Moment | None"
+    largest: bool
+    """Whether no earlier hole was as large."""
+
+
+def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: RunSettings) -> SceneRun:
+    """Stream the held camera's view through the methods, one frame at a time, past frames only.
+
+    A function of its arguments alone, which can all be pickled: processes and clusters call it. What goes wrong becomes
+    the `error` of the method that it went wrong with, or of all if it is the scene's.
+    """
+    streams, pictures = [_Stream(name, settings) for name in methods], None
+    try:
+        with torch.no_grad():
+            for moment in _moments(scene, settings):
+                if moment.largest:
+                    view = moment.view
+                    pictures = picture(view.rgb), picture(view.error[None]), picture(moment.truth.rgb)
+                for stream in streams:
+                    stream.show(moment)
+        if pictures is None:
+            raise ValueError(f"{scene.name}: expected frames of the camera that is left out, got none")
+    except Exception as error:
+        return SceneRun(scene.name, tuple(MethodRun(name, (), _said(error), None) for name in methods), None)
+    return SceneRun(scene.name, tuple(stream.run() for stream in streams), pictures)
+
+
+def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]:
+    config, most, last = settings.pipeline, -1, None
+    for frame in scene.frames(settings.device):
+        camera = frame.truth.cameras
+        observation = observe(frame.inputs, frame.bounds, config)
+        chosen = () if last is None else last.view.chosen
+        view = render_view(
+            frame.inputs, observation.proxy, camera, config.render, chosen, source_depth=observation.depth
+        )
+        holes = int((view.error > 0).sum())
+        last = _Moment(observation, view, true_view(frame.truth, frame.came_from_px), last, holes > most)
+        yield last
+        most, last = max(most, holes), replace(last, before=None)
+
+
+class _Stream:
+    """One method's stream through the scene. Only its own work is in its milliseconds, and no first-use compilation."""
+
+    def __init__(self, method: str, settings: RunSettings) -> None:
+        self.method = method
+        self.settings = settings
+        self._error: str | None = None
+        self._inpainter: ViewInpainter | None = None
+        self._state: StreamState | None = None
+        self._last: Float[Tensor, "3 height width"] | None = None
+        self._scores: list[FrameScores] = []
+        self._picture: Picture | None = None
+
+    def show(self, moment: _Moment) -> None:
+        """Complete and score the next view; nothing once something went wrong."""
+        if self._error is not None:
+            return
+        try:
+            self._step(moment)
+        except Exception as error:
+            self._error = _said(error)
+
+    def _step(self, moment: _Moment) -> None:
+        view, config = moment.view, self.settings.pipeline
+        if self._inpainter is None or self._state is None:
+            self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
+            self._state = StreamState(self._inpainter.initial_state())
+            complete_view(view, moment.observation.apart(), self._state, self._inpainter, config)
+        # Depths that other methods asked for would be free for this one, and times depend on the list of methods.
+        mended = complete_view(view, moment.observation.apart(), self._state, self._inpainter, config)
+        rgb, before = mended.completed.rgb, None
+        _check(rgb, view)
+        if moment.before is not None and self._last is not None:
+            before = Before(self._last, moment.before.truth.rgb, moment.before.view.error)
+        completed = CompletedView(view, rgb)
+        self._scores.append(score_frame(completed, moment.truth, before, mended.stage_ms.inpainting))
+        self._state, self._last = mended.state, rgb
+        if moment.largest:
+            self._picture = picture(rgb)
+
+    def run(self) -> MethodRun:
+        """What came out."""
+        if self._error is not None:
+            return MethodRun(self.method, (), self._error, None)
+        return MethodRun(self.method, tuple(self._scores), None, self._picture)
+
+
+def _check(rgb: Tensor, view: IncompleteView) -> None:
+    """What every method owes: an image of the view's size, finite, and untouched outside E."""
+    if rgb.shape != view.rgb.shape:
+        raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; complete it in full")
+    if not bool(rgb.isfinite().all()):
+        raise ValueError("expected finite colours, got some that are not; look for a division by 0")
+    touched = int(((rgb != view.rgb).any(0) & (view.error == 0)).sum())
+    if touched:
+        raise ValueError(f"expected pixels with E = 0 as they were rendered, got {touched} changed; blend by E")
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -1,0 +1,129 @@
+"""What a training run is: model, data and schedule."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from viewmend.inpainting.config import InpainterConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataPlan:
+    """Which scenes a run sees, and how much of each."""
+
+    sizes_px: tuple[int, ...] = (224, 256, 320)
+    """Edge lengths of the studio's square images; each scene takes one."""
+    cameras: tuple[int, int] = (5, 20)
+    """Fewest and most cameras of a rig."""
+    times: tuple[int, ...] = (0, 10, 11, 12, 13)
+    """Frames of a scene that are drawn; every one is a target whose past is the window's share of the earlier ones."""
+    held_cameras: int = 4
+    """Cameras of a scene that are left out in turn."""
+    targets_per_camera: int = 3
+    """Times at which a camera that is left out gives a sample."""
+    clip: int = 1
+    """Consecutive times in a sample, for the terms of the loss that look at time; `times` must have that many."""
+    context_cameras: tuple[int, ...] = (2, 3, 4, 5)
+    """How many cameras colour a view and are its context,"""
+    context_weights: tuple[int, ...] = (2, 8, 2, 1)
+    """and how often each."""
+    rays: int = 0
+    """How many cameras near a view an inpainter that reads rays is given."""
+    imperfect_share: float = 0.6
+    """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
+    min_hole_px: int = 50
+    """Views that miss less are passed over."""
+    hull_resolution: int = 96
+    """Voxels along the hull's longest side (coarser than in production: it is done once for each left-out camera)."""
+    performers: Path | None = None
+    """Folder of glTF characters; without it all are procedural."""
+    motions: Path | None = None
+    """Folder of BVH motions for them."""
+    performers_share: float = 0.5
+    """Share of the studio's scenes whose performers come from these folders, where they are given."""
+    captures: tuple[Path, ...] = ()
+    """Folders of real captures."""
+    captures_share: float = 0.75
+    """Share of the scenes that come from them, where they are given."""
+    shards: Path | None = None
+    """Folder of tar files that `viewmend samples` wrote: samples come from there alone."""
+    device: str = "cpu"
+    """Where the studio draws, hulls are carved and views rendered."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossWeights:
+    """The objective's terms (section 8) and ours. A weight of 0 switches a term off."""
+
+    image: float = 1.0
+    """lambda_img, of L_in + L_out."""
+    log_error: float = 0.0
+    """Of log10 of the squared error in the holes, a tenth of -PSNR. Ours."""
+    adversarial: float = 0.0
+    """lambda_adv, of L_adv; the paper's is 0.01."""
+    adversarial_kind: Literal["gan", "hinge"] = "gan"
+    """The paper's objective, or the hinge."""
+    discriminator: Literal["image", "clip"] = "image"
+    """Whether D judges single images or clips of `DataPlan.clip` of them."""
+    temporal: float = 0.0
+    """Of the difference of consecutive outputs, warped by the proxy. Ours; needs clips."""
+    perceptual: float = 0.0
+    """Of VGG16's features around the holes. Ours; needs `perceptual_weights`."""
+    perceptual_weights: Path | None = None
+    """File of torchvision's vgg16."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """A named training run."""
+
+    name: str
+    model: InpainterConfig
+    data: DataPlan = field(default_factory=DataPlan)
+    loss: LossWeights = field(default_factory=LossWeights)
+    steps: int
+    minutes: float | None = None
+    """Ends the run by then, whatever its steps: the learning rate follows whichever is further along."""
+    batch: int = 8
+    """Samples a step and stream."""
+    fresh: int = 3
+    """New samples among them; the others come again from the buffer."""
+    buffer: int = 600
+    """How many of a stream's last samples are seen again."""
+    streams: int = 1
+    """Batches whose gradients are averaged in a step. As many processes share them as torchrun starts, and there is
+    at least one for each."""
+    learning_rate: float = 8e-4
+    discriminator_rate: float = 1e-4
+    """Learning rate of D's own optimiser."""
+    warmup: int = 60
+    weight_decay: float = 0.01
+    clip: float = 1.0
+    """Largest norm of the gradient."""
+    ema: float = 0.995
+    """Decay of the averaged weights, which are what is shipped."""
+    workers: int = 1
+    """Processes that make samples, for each that trains."""
+    part: Literal["rays", "patches", "all"] = "all"
+    """What is trained: the ray reader alone, on the fill that it makes, all but it, or both."""
+    pixels: int = 300
+    """For the rays alone: missing pixels that are read of each view, at most."""
+    bfloat16: bool = True
+    """Run the networks under autocast."""
+    checkpoint_every: int = 100
+    """Steps after which the run is written down, to go on from there."""
+    validate_every: int = 500
+    """Steps after which the averaged weights are judged on fixed scenes; 0: never."""
+    validation_views: int = 24
+    """How many views of these scenes."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        over_time = self.loss.temporal or (self.loss.adversarial and self.loss.discriminator == "clip")
+        if over_time and self.data.clip < 2:
+            raise ValueError(f"expected clips of 2 or more for a loss over time, got {self.data.clip}; set data.clip")
+        beyond = [n for n in ("adversarial", "temporal", "perceptual") if getattr(self.loss, n)]
+        if self.part == "rays" and beyond:
+            raise ValueError(f"expected no {' or '.join(beyond)} loss for rays alone, whose pixels are no image")
+        if not 0 < self.fresh <= self.batch:
+            raise ValueError(f"expected 1 to {self.batch} fresh samples in a batch of {self.batch}, got {self.fresh}")

@@ -1,0 +1,101 @@
+"""A run on disk: what it takes to go on (run.safetensors), whole or not there."""
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from viewmend.training.feed import FeedPosition
+from viewmend.training.plan import Recipe
+
+FILE = "run.safetensors"
+MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_every", "validate_every", "validation_views")
+"""Parts of a recipe that a run may go on with another value of."""
+
+
+class RunError(ValueError):
+    """A run that cannot go on: which file, what was expected, what came, the next step."""
+
+
+@dataclass(frozen=True)
+class RunState:
+    """Where a run is."""
+
+    step: int
+    """Steps that were made."""
+    elapsed_s: float
+    positions: tuple[FeedPosition, ...]
+    """Of all streams, in their order."""
+
+
+def save_run(
+    folder: Path, recipe: Recipe, state: RunState, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
+) -> None:
+    """Write the run; a file that was there is replaced in one move."""
+    tensors = {f"{name}/{key}": value for name, m in modules.items() for key, value in m.state_dict().items()}
+    for name, optimizer in optimizers.items():
+        tensors |= {f"{name}/{key}": value for key, value in _optimizer_tensors(optimizer).items()}
+    tensors = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+    metadata = {"state": json.dumps(asdict(state)), "recipe": json.dumps(_plain(recipe))}
+    partial = folder / f".{FILE}.{os.getpid()}"
+    save_file(tensors, partial, metadata)
+    partial.replace(folder / FILE)
+
+
+def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]) -> RunState:
+    """Put a run's values into the modules and optimizers that its recipe makes.
+
+    Raises:
+        RunError: the file is damaged, or another recipe wrote it.
+    """
+    path = folder / FILE
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        wrote, values = json.loads(metadata["recipe"]), json.loads(metadata["state"])
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{path}: expected a run to go on with, got {error}; remove the file to start anew") from error
+    mine = json.loads(json.dumps(_plain(recipe)))
+    other = [key for key in mine if key not in MAY_CHANGE and mine[key] != wrote.get(key)]
+    if other:
+        raise RunError(
+            f"{path}: expected a run of this recipe, got one that differs in {', '.join(other)}; write to another "
+            "folder, or give the options that it was started with"
+        )
+    for name, module in modules.items():
+        module.load_state_dict(_under(name, tensors))
+    for name, optimizer in optimizers.items():
+        _load_optimizer(optimizer, _under(name, tensors))
+    positions = tuple(FeedPosition(**position) for position in values["positions"])
+    return RunState(values["step"], values["elapsed_s"], positions)
+
+
+def _under(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    prefix = f"{name}/"
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+
+def _optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
+    states = optimizer.state_dict()["state"]
+    return {f"{number}/{key}": torch.as_tensor(v) for number, state in states.items() for key, v in state.items()}
+
+
+def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
+    states: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        number, key = name.split("/")
+        states.setdefault(int(number), {})[key] = value
+    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def _plain(recipe: Recipe) -> dict[str, Any]:
+    """The recipe as JSON has it."""
+    return json.loads(json.dumps(asdict(recipe), default=str))

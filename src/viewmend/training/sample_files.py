@@ -1,0 +1,138 @@
+"""Samples on disk: one safetensors file each; many of them in tar shards. Nothing is pickled."""
+
+import io
+import json
+import tarfile
+from collections.abc import Iterable, Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+
+from viewmend.geometry.cameras import Cameras
+from viewmend.training.samples import Sample
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
+
+KINDS = {kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Cameras)}
+"""The dataclasses that a sample is made of."""
+STRUCTURE = "structure"
+"""Name of the tensor that holds the sample without its tensors, as JSON."""
+
+
+class ShardError(ValueError):
+    """Samples that cannot be read: which file, what was expected, what came, the next step."""
+
+
+def sample_to_bytes(sample: Sample) -> bytes:
+    """A safetensors file with the sample's tensors, and the rest of it as JSON in a tensor of bytes."""
+    tensors: dict[str, torch.Tensor] = {}
+    structure = json.dumps(_taken_apart(sample, tensors)).encode()
+    tensors[STRUCTURE] = torch.frombuffer(bytearray(structure), dtype=torch.uint8)
+    return save(tensors)
+
+
+def sample_from_bytes(data: bytes) -> Sample:
+    """Inverse of `sample_to_bytes`.
+
+    Raises:
+        ShardError: these bytes are no sample.
+    """
+    try:
+        tensors = load(data)
+        sample = _put_together(json.loads(bytes(tensors.pop(STRUCTURE).tolist())), tensors)
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise ShardError(
+            f"expected a sample, got {len(data)} bytes that do not read ({error}); make it again"
+        ) from error
+    if not isinstance(sample, Sample):
+        raise ShardError(f"expected a sample, got a {type(sample).__name__}; make it again")
+    return sample
+
+
+def write_shards(samples: Iterable[Sample], folder: Path, per_shard: int = 48) -> Iterator[Path]:
+    """Tar files of so many samples each, shard-00000.tar and on, every one whole or not there; yields their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    pending: list[Sample] = []
+    number = 0
+    for sample in samples:
+        pending.append(sample)
+        if len(pending) == per_shard:
+            yield _write_shard(pending, folder / f"shard-{number:05d}.tar")
+            pending, number = [], number + 1
+    if pending:
+        yield _write_shard(pending, folder / f"shard-{number:05d}.tar")
+
+
+def read_shard(path: Path) -> list[Sample]:
+    """All samples of a shard.
+
+    Raises:
+        ShardError: the file is damaged.
+    """
+    try:
+        with tarfile.open(path) as tar:
+            files = [tar.extractfile(member) for member in tar.getmembers()]
+            return [sample_from_bytes(file.read()) for file in files if file is not None]
+    except (tarfile.TarError, OSError, ShardError) as error:
+        raise ShardError(f"{path}: expected a tar of samples ({error}); make this shard again") from error
+
+
+class ShardScenes:
+    """Shards as scenes, in another order each time all were used, and their samples too."""
+
+    def __init__(self, folder: Path, seed: str) -> None:
+        """Find the shards.
+
+        Raises:
+            ShardError: the folder has none.
+        """
+        self.paths = sorted(folder.glob("*.tar"))
+        self.seed = seed
+        if not self.paths:
+            raise ShardError(f"{folder}: expected tar files, found none; make some with `viewmend samples --out`")
+
+    def scene(self, number: int) -> list[Sample]:
+        """One shard."""
+        round_, position = divmod(number, len(self.paths))
+        order = Random(f"{self.seed}/shards/{round_}").sample(self.paths, len(self.paths))
+        samples = read_shard(order[position])
+        return Random(f"{self.seed}/{number}").sample(samples, len(samples))
+
+
+def _write_shard(samples: list[Sample], path: Path) -> Path:
+    partial = path.with_suffix(".partial")
+    with tarfile.open(partial, "w") as tar:
+        for number, sample in enumerate(samples):
+            data = sample_to_bytes(sample)
+            member = tarfile.TarInfo(f"{path.stem}-{number:04d}.safetensors")
+            member.size = len(data)
+            tar.addfile(member, io.BytesIO(data))
+    return partial.replace(path)
+
+
+def _taken_apart(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    """`value` as JSON can hold it; its tensors, numbered, go to `tensors`."""
+    if isinstance(value, torch.Tensor):
+        name = str(len(tensors))
+        tensors[name] = value.detach().cpu().contiguous().clone()
+        return {"tensor": name}
+    if is_dataclass(value):
+        parts = {f.name: _taken_apart(getattr(value, f.name), tensors) for f in fields(value)}
+        return {"kind": type(value).__name__, "fields": parts}
+    if isinstance(value, tuple):
+        return [_taken_apart(item, tensors) for item in value]
+    return value
+
+
+def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    if isinstance(value, list):
+        return tuple(_put_together(item, tensors) for item in value)
+    if isinstance(value, dict) and "tensor" in value:
+        return tensors[value["tensor"]]
+    if isinstance(value, dict):
+        return KINDS[value["kind"]](**{n: _put_together(part, tensors) for n, part in value["fields"].items()})
+    return value

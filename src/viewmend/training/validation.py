@@ -1,0 +1,97 @@
+"""The averaged weights on fixed views that training never sees: scores, and pictures to look at."""
+
+from dataclasses import dataclass, replace
+from itertools import count, islice
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.inpainting.classical import Telea
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.protocol import State
+from viewmend.metrics.image_quality import psnr
+from viewmend.training.plan import Recipe
+from viewmend.training.samples import Sample
+from viewmend.training.sources import scene_source
+
+SHOWN = 8
+"""Views in the picture."""
+TILE_PX = 256
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Means over the views, in dB."""
+
+    step: int
+    holes: float
+    """PSNR in the holes;"""
+    telea: float
+    """what Telea scores there."""
+    first_fill: float
+    """What the first fill scores, before any patch."""
+
+
+class Validation:
+    """Fixed views of a recipe's kind of data, made when they are first asked for."""
+
+    def __init__(self, recipe: Recipe, folder: Path) -> None:
+        """folder: for a picture after each judgement, validation-000500.png."""
+        self.recipe = recipe
+        self.folder = folder
+        self._samples: list[Sample] = []
+        self._telea: list[float] = []
+
+    @torch.no_grad()
+    def judge(self, model: Inpainter, step: int) -> Judgement:
+        """Mend every view, score it, and leave a picture of the first few."""
+        if not self._samples:
+            self._samples = self._views()
+            self._telea = [_score(_telea(sample), sample) for sample in self._samples]
+        training = model.training
+        model.eval()
+        device = next(model.parameters()).device
+        ours, fills, shown = [], [], []
+        for sample in self._samples:
+            on_device = sample.to(device)
+            made = model([on_device.view], [list(on_device.context)], nearby=[on_device.nearby])[0]
+            completed = made.completed.float().cpu()
+            ours.append(_score(completed, sample))
+            fills.append(_score(torch.where(sample.view.error > 0, made.filled.float().cpu(), completed), sample))
+            shown.append(torch.cat([sample.view.rgb, completed, sample.truth / 255], 2))
+        model.train(training)
+        _write(self.folder / f"validation-{step:06d}.png", shown[:SHOWN])
+        return Judgement(step, *(sum(x) / len(x) for x in (ours, self._telea, fills)))
+
+    def _views(self) -> list[Sample]:
+        # One view a scene and no clips: more scenes say more.
+        plan = replace(self.recipe.data, held_cameras=1, targets_per_camera=1, clip=1, device="cpu")
+        scenes = scene_source(plan, "validation", validation=True)
+        samples = (sample for number in count() for sample in scenes.scene(number))
+        return list(islice(samples, self.recipe.validation_views))
+
+
+def _telea(sample: Sample) -> Float[Tensor, "3 height width"]:
+    return Telea().step(sample.view, lambda *_: None, State())[0].rgb
+
+
+def _score(rgb: Float[Tensor, "3 height width"], sample: Sample) -> float:
+    score = psnr(rgb, sample.truth.float() / 255, sample.view.error > 0)
+    assert score is not None, "samples have holes"
+    return score
+
+
+def _write(path: Path, rows: list[Float[Tensor, "3 _h _w"]]) -> None:
+    """Rows of rendered, mended and true images, in one picture."""
+    import cv2
+
+    cv2.imwrite(str(path), picture(rows).permute(1, 2, 0).flip(2).numpy())
+
+
+def picture(rows: list[Float[Tensor, "3 _h _w"]]) -> UInt8[Tensor, "3 height width"]:
+    """Rows of three images each, all reduced to one size."""
+    same = [F.interpolate(r[None], (TILE_PX, 3 * TILE_PX), mode="bilinear", antialias=True)[0] for r in rows]
+    return (torch.cat(same, 1).clamp(0, 1) * 255).round().to(torch.uint8)

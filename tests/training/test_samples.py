@@ -1,0 +1,155 @@
+"""Samples come from the production pipeline, know nothing of the camera that is left out, and follow from numbers."""
+
+import tarfile
+from dataclasses import replace
+from random import Random
+
+import pytest
+import torch
+
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.geometry.hull import HullConfig
+from viewmend.rendering.view import RenderConfig
+from viewmend.training.capture_scenes import CaptureScenes, MixedScenes, reduced
+from viewmend.training.feed import SampleFeed, samples_in_order
+from viewmend.training.sample_files import (
+    ShardError,
+    ShardScenes,
+    read_shard,
+    sample_from_bytes,
+    sample_to_bytes,
+    write_shards,
+)
+from viewmend.training.samples import LeaveOneOut
+from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, StudioScenes, random_stage
+from viewmend.training.sources import scene_source
+
+
+@pytest.fixture(scope="module")
+def studio() -> Studio:
+    return Studio(StudioConfig(seed=3, cameras=5, frames=2, size_px=96))
+
+
+def same(a, b):
+    return sample_to_bytes(a) == sample_to_bytes(b)
+
+
+def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
+    held = studio.cameras.names[2]
+    frame = studio.read(1)
+    vandalised = replace(frame, rgb=frame.rgb.clone(), mask=frame.mask.clone())
+    vandalised.rgb[2] = 255
+    vandalised.mask[2] = 255
+    truth = studio.truth(studio.true_cameras.select([held]), 1)
+    samples = [
+        LeaveOneOut({1: f}, held, None, HullConfig(resolution=48)).sample(1, (), truth, RenderConfig(), 0)
+        for f in (frame, vandalised)
+    ]
+    first, second = samples
+    assert first is not None and second is not None
+    assert torch.equal(first.view.rgb, second.view.rgb) and torch.equal(first.view.error, second.view.error)
+    assert held not in first.view.chosen
+    assert all(held not in views.frame.cameras.names for views in first.context)
+
+
+def test_truth_is_black_where_the_mask_is_and_context_is_past(plan):
+    samples = StudioScenes(plan, "0").scene(0)
+    assert samples
+    for sample in samples:
+        times = [views.frame.time for views in sample.context]
+        assert times[0] == sample.view.time and times == sorted(times, reverse=True)
+        assert float(sample.view.error.sum()) >= plan.min_hole_px
+        assert not sample.truth[:, 0].any(), "the top row is background"
+
+
+def test_a_clip_is_one_camera_at_consecutive_times(plan):
+    samples = StudioScenes(replace(plan, clip=2), "0").scene(0)
+    assert samples
+    for sample in samples:
+        before, now = sample.clip
+        assert before.view.time == now.view.time - 1 and before.view.camera.names == now.view.camera.names
+    with pytest.raises(ValueError, match="expected 3 consecutive times"):
+        StudioScenes(replace(plan, clip=3), "0").scene(0)
+
+
+def test_no_stage_takes_a_seed_that_is_kept_for_validation_or_tests(plan):
+    random = Random(1)
+    seeds = [random_stage(plan, random).seed for _ in range(300)]
+    assert max(seeds) < FIRST_VALIDATION_SEED and len(set(seeds)) > 250
+    source = scene_source(plan, "validation", validation=True)
+    assert isinstance(source, StudioScenes)
+    assert source.seeds == range(FIRST_VALIDATION_SEED, FIRST_TEST_SEED)
+
+
+def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
+    source = StudioScenes(plan, "7")
+    alone, helped = (samples_in_order(source, 0, workers) for workers in (0, 2))
+    first = [next(alone) for _ in range(3)]
+    for (scene, number, sample), (other_scene, other_number, other) in zip(first, helped, strict=False):
+        assert (scene, number) == (other_scene, other_number) and same(sample, other)
+    helped.close()
+    feed = SampleFeed(source, "7", fresh=1, buffer=3, workers=0)
+    batches = [feed.batch(step, 2) for step in range(3)]
+    assert [len(batch) for batch in batches] == [1, 2, 2]
+    again = SampleFeed(source, "7", fresh=1, buffer=3, workers=0, start=feed.position)
+    for one, other in zip(feed.batch(3, 2), again.batch(3, 2), strict=True):
+        assert same(one, other)
+    assert feed.position == again.position
+
+
+class Empty:
+    def scene(self, number):
+        return []
+
+
+def test_scenes_without_holes_are_an_error_not_a_wait():
+    with pytest.raises(ValueError, match="got none in 100 scenes"):
+        SampleFeed(Empty(), "0", 1, 3, 0).batch(0, 1)
+
+
+def test_samples_come_back_from_disk_bit_for_bit_and_damage_is_noticed(plan, tmp_path):
+    samples = StudioScenes(replace(plan, clip=2), "0").scene(0)
+    assert all(same(sample_from_bytes(sample_to_bytes(s)), s) for s in samples)
+    paths = list(write_shards(samples, tmp_path, per_shard=1))
+    assert [path.name for path in paths] == [f"shard-{n:05d}.tar" for n in range(len(samples))]
+    scenes = ShardScenes(tmp_path, "0")
+    drawn = [scenes.scene(number)[0] for number in range(len(samples))]
+    assert {sample_to_bytes(s) for s in drawn} == {sample_to_bytes(s) for s in samples}
+    paths[0].write_bytes(paths[0].read_bytes()[:3000])
+    with pytest.raises(ShardError, match=r"shard-00000\.tar: expected a tar of samples"):
+        read_shard(paths[0])
+    with tarfile.open(tmp_path / "other.tar", "w") as tar:
+        tar.add(__file__, "notes.txt")
+    with pytest.raises(ShardError, match="expected a sample"):
+        read_shard(tmp_path / "other.tar")
+    with pytest.raises(ShardError, match="expected tar files, found none"):
+        ShardScenes(tmp_path / "nowhere", "0")
+
+
+def test_captures_are_scenes_whose_truth_is_the_camera_left_out(studio, plan):
+    scenes = CaptureScenes([studio], replace(plan, sizes_px=(64,)), "0")
+    samples = scenes.scene(0)
+    assert samples and all(same(a, b) for a, b in zip(samples, scenes.scene(0), strict=True))
+    for sample in samples:
+        held = sample.view.camera.names[0]
+        assert max(sample.truth.shape) == 64 and held not in sample.view.chosen
+        seen = reduced(studio.read(sample.view.time), 64).select([held])
+        expected = (seen.rgb[0].float() * (seen.mask[0].float() / 255)).round().to(torch.uint8)
+        assert torch.equal(sample.truth, expected)
+
+
+def test_a_mix_takes_its_share_from_each(plan):
+    class Counted(Empty):
+        asked = ()
+
+        def scene(self, number):
+            self.asked = (*self.asked, number)
+            return []
+
+    real, studio = Counted(), Counted()
+    mix = MixedScenes(real, studio, 0.75, "0")
+    for number in (*range(400), *range(400)):
+        mix.scene(number)
+    assert 0.68 < len(real.asked) / 800 < 0.82
+    assert real.asked[: len(real.asked) // 2] == real.asked[len(real.asked) // 2 :], "a number is always of one source"
+    assert {*real.asked, *studio.asked} == {*range(400)} and not {*real.asked} & {*studio.asked}
