@@ -21,6 +21,7 @@ class Command:
     """A subcommand: the module that runs it and its line in the overview."""
 
     name: str
+    """One word, or two: `evaluate parity` is found before `evaluate`."""
     module: str
     summary: str
 
@@ -32,6 +33,7 @@ COMMANDS = (
     Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),
     Command("samples", "viewmend.cli.samples", "Make training samples ahead."),
     Command("evaluate", "viewmend.cli.evaluate", "Compare methods on fixed scenes and captures."),
+    Command("evaluate parity", "viewmend.cli.parity", "Compare our baselines with the published networks."),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 
@@ -47,11 +49,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"viewmend {version('viewmend')}")
         return 0
-    command = next((c for c in COMMANDS if c.name == arguments[0]), None)
+    by_name = {c.name: c for c in COMMANDS}
+    command = by_name.get(" ".join(arguments[:2])) or by_name.get(arguments[0])
     if command is None:
         names = ", ".join(c.name for c in COMMANDS)
         return _fail(f"expected a command among {names}, got '{arguments[0]}'; see viewmend --help")
-    return _run(command, arguments[1:])
+    return _run(command, arguments[len(command.name.split()) :])
 
 
 def _run(command: Command, arguments: list[str]) -> int:
