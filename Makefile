@@ -27,7 +27,7 @@ format: .venv/installed
 
 .venv/installed: pyproject.toml constraints-cpu.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,dev]'
 	touch $@
 
 clean:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -29,14 +30,23 @@ class PipelineConfig:
     """How many past frames a stream keeps for cameras that it chooses anew: k_w n_w, the inpainter's window."""
 
 
+@runtime_checkable
+class DepthGiver(Protocol):
+    """All that an inpainter asks of G[t]; `GeometryProxy` is one, a renderer's own geometry may be another."""
+
+    def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
+        """z-depth of the surface in each camera, metres; 0 where there is none."""
+        ...
+
+
 @dataclass(frozen=True)
 class Observation:
     """One time of a stream, ready to be looked at; all viewers of that time share it."""
 
     frame: MultiViewFrame
     """What the cameras saw, with masks."""
-    proxy: GeometryProxy
-    """G[t]."""
+    proxy: GeometryProxy | DepthGiver
+    """G[t]; rendering needs a `GeometryProxy`, filling does not."""
     geometry_ms: float
     """What the proxy took."""
     _depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False, compare=False)
@@ -54,6 +64,10 @@ class Observation:
             rendered = torch.nn.functional.pad(rendered, (0, right, 0, below))  # padded as the images are
             self._depths.update(zip(new, rendered, strict=True))
         return torch.stack([self._depths[name] for name in names])
+
+    def known_depths(self) -> tuple[Float[Tensor, "height width"], ...]:
+        """Those that were rendered so far."""
+        return tuple(self._depths.values())
 
     def context(self, names: Sequence[str]) -> ContextViews | None:
         """What an inpainter may see of these cameras; those without a frame are left out, None if all are."""
@@ -132,14 +146,31 @@ def mend_view(
         config: the pipeline's.
         exclude: names of cameras whose images must not be used for this viewer.
     """
+    view, rendering_ms = view_of(observation, target, config, state.chosen, exclude)
+    return complete_view(view, observation, state, inpainter, config, exclude, rendering_ms)
+
+
+def view_of(
+    observation: Observation,
+    target: Cameras,
+    config: PipelineConfig,
+    chosen: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+) -> tuple[IncompleteView, float]:
+    """Render one novel view: the first half of `mend_view`, and the milliseconds that it took.
+
+    `chosen` are the cameras of the viewer's last view.
+
+    Raises:
+        ValueError: the observation's geometry is not a `GeometryProxy`, or no camera is left.
+    """
+    if not isinstance(observation.proxy, GeometryProxy):
+        got = type(observation.proxy).__name__
+        raise ValueError(f"expected a GeometryProxy to render, got {got}; render the view yourself and fill it then")
     frame, device = observation.frame, observation.frame.rgb.device
     start = _now(device)
-    view = render_view(
-        frame, observation.proxy, target, config.render, state.chosen, exclude, source_depth=observation.depth
-    )
-    rendering_ms = _ms_since(start, device)
-
-    return complete_view(view, observation, state, inpainter, config, exclude, rendering_ms)
+    view = render_view(frame, observation.proxy, target, config.render, chosen, exclude, source_depth=observation.depth)
+    return view, _ms_since(start, device)
 
 
 def complete_view(

@@ -9,12 +9,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.contact_sheet import picture
-from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
+from viewmend.evaluation.frame_scores import Before, FrameScores, Scorers, TrueView, score_frame, true_view
 from viewmend.evaluation.methods import make_method
 from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.inpainting.protocol import ViewInpainter
-from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe
-from viewmend.rendering.view import render_view
+from viewmend.metrics.image_quality import SsimWindow
+from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe, view_of
 from viewmend.views import CompletedView, IncompleteView
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -29,6 +29,12 @@ class RunSettings:
     """Of our networks: float32, or bfloat16 by autocast."""
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
     """Hull and renderer, the same for every method."""
+    ssim: SsimWindow = "gaussian"
+    """Over which windows SSIM is taken."""
+
+    def scorers(self) -> Scorers:
+        """How images are compared."""
+        return Scorers(ssim=self.ssim)
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,8 @@ def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: Run
     A function of its arguments alone, which can all be pickled: processes and clusters call it. What goes wrong becomes
     the `error` of the method that it went wrong with, or of all if it is the scene's.
     """
-    streams, pictures = [_Stream(name, settings) for name in methods], None
+    scorers, pictures = settings.scorers(), None
+    streams = [_Stream(name, settings, scorers) for name in methods]
     try:
         with torch.no_grad():
             for moment in _moments(scene, settings):
@@ -94,9 +101,7 @@ def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]
         camera = frame.truth.cameras
         observation = observe(frame.inputs, frame.bounds, config)
         chosen = () if last is None else last.view.chosen
-        view = render_view(
-            frame.inputs, observation.proxy, camera, config.render, chosen, source_depth=observation.depth
-        )
+        view, _ = view_of(observation, camera, config, chosen)
         holes = int((view.error > 0).sum())
         last = _Moment(observation, view, true_view(frame.truth, frame.came_from_px), last, holes > most)
         yield last
@@ -106,9 +111,10 @@ def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]
 class _Stream:
     """One method's stream through the scene. Only its own work is in its milliseconds, and no first-use compilation."""
 
-    def __init__(self, method: str, settings: RunSettings) -> None:
+    def __init__(self, method: str, settings: RunSettings, scorers: Scorers) -> None:
         self.method = method
         self.settings = settings
+        self._scorers = scorers
         self._error: str | None = None
         self._inpainter: ViewInpainter | None = None
         self._state: StreamState | None = None
@@ -138,7 +144,7 @@ class _Stream:
         if moment.before is not None and self._last is not None:
             before = Before(self._last, moment.before.truth.rgb, moment.before.view.error)
         completed = CompletedView(view, rgb)
-        self._scores.append(score_frame(completed, moment.truth, before, mended.stage_ms.inpainting))
+        self._scores.append(score_frame(completed, moment.truth, before, mended.stage_ms.inpainting, self._scorers))
         self._state, self._last = mended.state, rgb
         if moment.largest:
             self._picture = picture(rgb)

@@ -1,0 +1,243 @@
+"""A stream of frames that many viewers look at: what does not depend on a view is computed once (section 9)."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from torch import Tensor
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.proxy import GeometryProxy
+from viewmend.inpainting.context import ContextCache, ContextFrame, window_times
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.protocol import Source, State, ViewInpainter
+from viewmend.pipeline import (
+    DepthGiver,
+    Observation,
+    PipelineConfig,
+    StageMs,
+    StreamState,
+    complete_view,
+    observe,
+    view_of,
+)
+from viewmend.views import CompletedView, IncompleteView, MultiViewFrame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effort:
+    """How much work one view may cost; the default is all that the model was trained with."""
+
+    mend: bool = True
+    """False leaves the holes as they are rendered."""
+    top_k: int | None = None
+    """Context tokens that survive pruning; None takes the model's own."""
+    context_times: int | None = None
+    """How many of the window's times are context, the latest first (1: the view's own alone); None takes all."""
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """What one viewer carries from one view to the next: a value, which `Stream.view` gives anew."""
+
+    inpainter: State
+    chosen: tuple[str, ...] = ()
+    """The cameras of the last view."""
+
+
+@dataclass(frozen=True)
+class StreamView:
+    """What one viewer gets."""
+
+    completed: CompletedView
+    viewer: Viewer
+    """To ask for the next view with."""
+    stage_ms: StageMs
+    """`geometry` is what the proxy took for whoever came first."""
+
+
+@dataclass
+class _Moment:
+    """One time and what was computed for it."""
+
+    observation: Observation
+    encoded: dict[str, ContextFrame] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Bytes, without what is too small to count."""
+        frame, proxy = self.observation.frame, self.observation.proxy
+        tensors: list[Tensor | None] = [frame.rgb, frame.mask, *self.observation.known_depths()]
+        if isinstance(proxy, GeometryProxy):
+            tensors += [proxy.mesh.vertices, proxy.mesh.faces, proxy.normals]
+        for encoded in self.encoded.values():
+            tensors += [encoded.tokens, encoded.keys_values]
+        return sum(t.numel() * t.element_size() for t in tensors if t is not None)
+
+
+class Stream:
+    """Frames in, mended views out, for any number of viewers.
+
+    The geometry proxy, its depth in the cameras, and the encoded context with its keys and values are kept by time
+    and shared; each viewer pays for its own view alone. What a viewer carries along is a value that the caller
+    holds, so that no viewer can disturb another. Call it from one thread at a time.
+    """
+
+    def __init__(
+        self,
+        inpainter: ViewInpainter,
+        config: PipelineConfig | None = None,
+        bounds: Bounds | None = None,
+        memory_mb: float = 1000.0,
+    ) -> None:
+        """Begin a stream.
+
+        Args:
+            inpainter: what fills the holes, e.g. `load_inpainter("small")`.
+            config: how frames become proxies and views.
+            bounds: the volume that may hold the subject; None to find it from the masks.
+            memory_mb: the times looked at longest ago are forgotten above this; the newest never is.
+        """
+        self.inpainter = inpainter
+        self.config = config or PipelineConfig()
+        self.bounds = bounds
+        self.memory_mb = memory_mb
+        self._moments: OrderedDict[int, _Moment] = OrderedDict()
+
+    @property
+    def times(self) -> tuple[int, ...]:
+        """The times at hand, in order."""
+        return tuple(sorted(self._moments))
+
+    def push(self, frame: MultiViewFrame, geometry: DepthGiver | None = None) -> Observation:
+        """Take in what the cameras saw at one time; a time that is at hand already stays as it is.
+
+        Times may come in any order and with gaps. `geometry` replaces the visual hull: anything that knows its depth
+        in the cameras (`view` needs the hull, `mend` does not); the frame may lack masks then.
+
+        Raises:
+            ValueError: the frame has no masks, no foreground, or a single camera, and no `geometry` is given.
+        """
+        if frame.time not in self._moments:
+            frame = replace(frame, depth=None)  # the truth of synthetic captures: nobody looks at it here
+            bounds = None if self.bounds is None else self.bounds.to(frame.rgb.device)
+            given = None if geometry is None else Observation(frame, geometry, 0.0)
+            self._moments[frame.time] = _Moment(given or observe(frame, bounds, self.config))
+        self._moments.move_to_end(frame.time)
+        self._forget()
+        return self._moments[frame.time].observation
+
+    def viewer(self) -> Viewer:
+        """Someone who has seen nothing yet."""
+        return Viewer(self.inpainter.initial_state())
+
+    def view(
+        self,
+        target: Cameras,
+        viewer: Viewer | None = None,
+        time: int | None = None,
+        effort: Effort | None = None,
+        exclude: Sequence[str] = (),
+    ) -> StreamView:
+        """Render one novel view and fill what is missing in it.
+
+        Args:
+            target: the novel view's camera (one view), on the frames' device.
+            viewer: what the last view gave; None for a first look.
+            time: which of `times`; the latest by default.
+            effort: what it may cost.
+            exclude: names of cameras whose images must not be used.
+
+        Raises:
+            ValueError: that time is not at hand, or no camera is left.
+        """
+        moment = self._moment(time)
+        viewer = viewer or self.viewer()
+        view, rendering_ms = view_of(moment.observation, target, self.config, viewer.chosen, exclude)
+        return self._complete(view, moment, viewer, effort or Effort(), exclude, rendering_ms)
+
+    def mend(
+        self,
+        view: IncompleteView,
+        viewer: Viewer | None = None,
+        effort: Effort | None = None,
+        exclude: Sequence[str] = (),
+    ) -> StreamView:
+        """Fill what is missing in a view that any renderer made of a time that was pushed.
+
+        Name in `view.chosen` the cameras that coloured it, and in `view.nearest` all that may be looked at, the
+        closest first: holes are read from them.
+
+        Raises:
+            ValueError: the view's time is not at hand, or it names cameras that are not in the frame.
+        """
+        moment = self._moment(view.time)
+        unknown = sorted({*view.chosen, *view.nearest} - set(moment.observation.frame.cameras.names))
+        if unknown:
+            known = list(moment.observation.frame.cameras.names)
+            raise ValueError(f"expected a view of cameras among {known}, got {unknown}; correct chosen and nearest")
+        return self._complete(view, moment, viewer or self.viewer(), effort or Effort(), exclude, 0.0)
+
+    def _moment(self, time: int | None) -> _Moment:
+        if not self._moments or (time is not None and time not in self._moments):
+            raise ValueError(f"expected a time among those at hand, {self.times}, got {time}; push its frame first")
+        return self._moments[max(self._moments) if time is None else time]
+
+    def _complete(
+        self,
+        view: IncompleteView,
+        moment: _Moment,
+        viewer: Viewer,
+        effort: Effort,
+        exclude: Sequence[str],
+        rendering_ms: float,
+    ) -> StreamView:
+        if not effort.mend:
+            stages = StageMs(moment.observation.geometry_ms, rendering_ms, 0.0)
+            return StreamView(CompletedView(view, view.rgb), replace(viewer, chosen=view.chosen), stages)
+        past = self._past(view.time, effort)
+        frames = {(f.name, f.time): f for m in (*past, moment) for f in m.encoded.values()}
+        before = replace(viewer.inpainter, cache=ContextCache(frames))
+        state = StreamState(before, viewer.chosen, tuple(m.observation for m in past))
+        inpainter = _WithTopK(self.inpainter, effort.top_k)
+        mended = complete_view(view, moment.observation, state, inpainter, self.config, exclude, rendering_ms)
+        after = mended.state.inpainter
+        for (name, time), frame in after.cache.frames.items():
+            if time in self._moments:
+                self._moments[time].encoded.setdefault(name, frame)
+        for time in [*(m.observation.frame.time for m in past), view.time]:
+            self._moments.move_to_end(time)
+        self._forget()
+        return StreamView(mended.completed, Viewer(replace(after, cache=ContextCache()), view.chosen), mended.stage_ms)
+
+    def _past(self, time: int, effort: Effort) -> list[_Moment]:
+        """The moments before `time` that may be context, in order of time."""
+        if isinstance(self.inpainter, Inpainter):
+            window = window_times(time, self.inpainter.config)[: effort.context_times]
+        else:
+            window = range(time, time - self.config.history - 1, -1)[: effort.context_times]
+        return [self._moments[t] for t in sorted(window) if t < time and t in self._moments]
+
+    def _forget(self) -> None:
+        """Drops the times looked at longest ago until the others fit."""
+        size = {time: moment.size for time, moment in self._moments.items()}
+        while sum(size.values()) > 1e6 * self.memory_mb and len(self._moments) > 1:
+            time, _ = self._moments.popitem(last=False)
+            del size[time]
+
+
+class _WithTopK:
+    """An inpainter asked for another `top_k` than its config's; inpainters that do not prune stay as they are."""
+
+    def __init__(self, inpainter: ViewInpainter, top_k: int | None) -> None:
+        self._inpainter = inpainter
+        self._top_k = top_k
+
+    def initial_state(self) -> State:
+        return self._inpainter.initial_state()
+
+    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
+        if isinstance(self._inpainter, Inpainter):
+            return self._inpainter.step(view, source, state, self._top_k)
+        return self._inpainter.step(view, source, state)
