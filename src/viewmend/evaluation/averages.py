@@ -11,14 +11,25 @@ from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 
 @dataclass(frozen=True)
 class Scores:
-    """Means. PSNR in dB, SSIM in [-1, 1], differences and shares in [0, 1]; None where there is nothing to average."""
+    """Means of the `FrameScores` of these names; None where there is nothing to average."""
 
     psnr_holes: float | None
     psnr_holes_fg: float | None
     psnr_masked: float | None
-    ssim_masked: float | None
     psnr_whole: float | None
+    ssim_holes: float | None
+    ssim_holes_fg: float | None
+    ssim_masked: float | None
     ssim_whole: float | None
+    lpips_alex_holes: float | None
+    lpips_alex_holes_fg: float | None
+    lpips_alex_masked: float | None
+    lpips_alex_whole: float | None
+    lpips_vgg_holes: float | None
+    lpips_vgg_holes_fg: float | None
+    lpips_vgg_masked: float | None
+    lpips_vgg_whole: float | None
+    flicker: float | None
     warp_error: float | None
     warp_error_truth: float | None
     change: float | None
@@ -57,10 +68,18 @@ class Row:
     scored_scenes: int
     """Scenes with a frame that has enough holes."""
     failed: int
-    step_ms_p50: float | None
-    """Of the inpainter's step, over all frames with holes;"""
-    step_ms_p95: float | None
-    """and the 95th percentile."""
+    speed: "Speed | None"
+    """Of the inpainter's step, over all frames with holes; None without any."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """How long steps take."""
+
+    fps: float
+    """Frames a second if one step follows the other: 1000 over the mean."""
+    ms_p50: float
+    ms_p95: float
 
 
 @dataclass(frozen=True)
@@ -82,21 +101,18 @@ def average_cell(cell: Cell) -> CellScores:
     frames = cell.frames
     wide = [f for f in frames if f.hole_px >= ENOUGH_HOLE_PX]
     inside = [f for f in frames if f.hole_fg_px >= ENOUGH_HOLE_PX]
+    of = {"holes": wide, "masked": wide, "fg": inside}  # by the last word of a score's name
+    means = {f.name: _mean(getattr(frame, f.name) for frame in of.get(f.name.split("_")[-1], frames)) for f in SCORED}
     scores = Scores(
-        psnr_holes=_mean(f.psnr_holes for f in wide),
-        psnr_holes_fg=_mean(f.psnr_holes_fg for f in inside),
-        psnr_masked=_mean(f.psnr_masked for f in wide),
-        ssim_masked=_mean(f.ssim_masked for f in wide),
-        psnr_whole=_mean(f.psnr_whole for f in frames),
-        ssim_whole=_mean(f.ssim_whole for f in frames),
-        warp_error=_mean(f.warp_error for f in frames),
-        warp_error_truth=_mean(f.warp_error_truth for f in frames),
-        change=_mean(f.change for f in frames),
-        change_truth=_mean(f.change_truth for f in frames),
+        **means,
         holes_of_hull=_mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in frames),
         holes_of_image=_mean(f.hole_px / f.image_px for f in frames),
     )
     return CellScores(cell, scores, len(frames), len(frames) - len(wide), sum(f.hole_px == 0 for f in frames))
+
+
+SCORED = fields(Scores)[:-2]
+"""Those that frames have."""
 
 
 def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
@@ -141,7 +157,6 @@ def _row(method: str, averaged: Sequence[CellScores]) -> Row:
     own = [a for a in averaged if a.cell.key.method == method]
     done = [a for a in own if a.cell.error is None]
     gains = _gains(done, averaged)
-    p50, p95 = step_ms(done)
     return Row(
         method=method,
         scores=mean_scores([a.scores for a in done]),
@@ -150,8 +165,7 @@ def _row(method: str, averaged: Sequence[CellScores]) -> Row:
         scenes=len(own),
         scored_scenes=sum(a.scores.psnr_holes is not None for a in done),
         failed=len(own) - len(done),
-        step_ms_p50=p50,
-        step_ms_p95=p95,
+        speed=speed(done),
     )
 
 
@@ -159,7 +173,6 @@ def _overall(per_set: Sequence[Table], averaged: Sequence[CellScores], methods: 
     rows = []
     for n, name in enumerate(methods):
         parts = [table.rows[n] for table in per_set]
-        p50, p95 = step_ms([a for a in averaged if a.cell.key.method == name and a.cell.error is None])
         rows.append(
             Row(
                 method=name,
@@ -169,8 +182,7 @@ def _overall(per_set: Sequence[Table], averaged: Sequence[CellScores], methods: 
                 scenes=sum(row.scenes for row in parts),
                 scored_scenes=sum(row.scored_scenes for row in parts),
                 failed=sum(row.failed for row in parts),
-                step_ms_p50=p50,
-                step_ms_p95=p95,
+                speed=speed([a for a in averaged if a.cell.key.method == name and a.cell.error is None]),
             )
         )
     counts = (sum(getattr(t, name) for t in per_set) for name in ("frames", "thin_frames", "empty_frames"))
@@ -184,12 +196,13 @@ def _gains(done: Sequence[CellScores], averaged: Sequence[CellScores]) -> list[f
     return [own - other for own, other in pairs if own is not None and other is not None]
 
 
-def step_ms(done: Sequence[CellScores]) -> tuple[float | None, float | None]:
-    """Median and 95th percentile of the inpainter's step over frames that have a hole; None without any."""
+def speed(done: Sequence[CellScores]) -> Speed | None:
+    """Of the steps in frames that have a hole."""
     taken = sorted(f.step_ms for a in done for f in a.cell.frames if f.hole_px)
     if not taken:
-        return None, None
-    return statistics.median(taken), taken[min(len(taken) - 1, int(0.95 * len(taken)))]
+        return None
+    p95 = taken[min(len(taken) - 1, int(0.95 * len(taken)))]
+    return Speed(1000 / max(statistics.fmean(taken), 1e-6), statistics.median(taken), p95)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import read_rgb, write_image
 from viewmend.evaluation.frame_scores import FrameScores
 from viewmend.evaluation.methods import identity, make_method
@@ -105,12 +106,16 @@ class CellStore:
 
     def _read_image(self, name: str) -> Picture | None:
         path = self.folder / name
-        return read_rgb(path, str(path)) if path.is_file() else None
+        try:
+            return read_rgb(path, str(path)) if path.is_file() else None
+        except CaptureError:  # damaged: the figures stand without it
+            return None
 
 
 def cell_keys(scene: EvaluationScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
-    scene_digest = _digest([PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.pipeline)])
+    rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.pipeline), settings.ssim]
+    scene_digest = _digest(rules)
     return tuple(
         CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)
         for name, own in identities.items()

@@ -1,28 +1,50 @@
 """What one frame of one method scores against the camera that was left out (section 10)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from viewmend.evaluation.temporal import change, warp_error
-from viewmend.metrics.image_quality import psnr, ssim
+from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, psnr, ssim_map
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 from viewmend.views import CompletedView, MultiViewFrame
 
+ScoreMap = Callable[[Tensor, Tensor], Tensor | None]
+"""score(image, truth): a value for each pixel, NaN where there is none; None for images it cannot score."""
+
+
+@dataclass(frozen=True)
+class Scorers:
+    """How images are compared besides PSNR."""
+
+    ssim: SsimWindow = "gaussian"
+    lpips_alex: ScoreMap | None = None
+    """None without its weights."""
+    lpips_vgg: ScoreMap | None = None
+    """None without its weights."""
+
+
+SSIM_ONLY = Scorers()
 FOREGROUND = 128
 """A true mask from here on (of 255) is subject."""
-WINDOW_PX = 11
-"""The Gaussian SSIM's window: pixels that are equal within it count as 1."""
 
 
 @dataclass(frozen=True)
 class FrameScores:
-    """One frame. PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score."""
+    """One frame. PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score.
+
+    Each of PSNR, SSIM and LPIPS comes as `whole`, over all pixels; `holes`, over the pixels of E alone (reading a);
+    `holes_fg`, over those of them inside the true mask; and `masked`, of both images blackened outside E, over all
+    pixels of the image (reading b). SSIM and LPIPS over pixels are means of their maps there, seen unmasked.
+    """
 
     time: int
-    image_px: int
+    width_px: int
+    height_px: int
     hull_px: int
     """Pixels that the geometry proxy covers."""
     hole_px: int
@@ -30,26 +52,38 @@ class FrameScores:
     hole_fg_px: int
     """Of these, inside the true mask."""
     psnr_holes: float | None
-    """Over the pixels of E alone: reading (a)."""
     psnr_holes_fg: float | None
-    """Over those of them inside the true mask."""
     psnr_masked: float | None
-    """Both images blackened outside E, over all pixels of the image: reading (b)."""
-    ssim_masked: float | None
-    """SSIM of these images, as a whole."""
     psnr_whole: float
-    """Over all pixels."""
+    ssim_holes: float | None
+    ssim_holes_fg: float | None
+    ssim_masked: float | None
     ssim_whole: float | None
+    lpips_alex_holes: float | None
+    lpips_alex_holes_fg: float | None
+    lpips_alex_masked: float | None
+    lpips_alex_whole: float | None
+    lpips_vgg_holes: float | None
+    lpips_vgg_holes_fg: float | None
+    lpips_vgg_masked: float | None
+    lpips_vgg_whole: float | None
+    flicker: float | None
+    """The error's change from the frame before along the surface's true motion, over E; 0 for the truth."""
     warp_error: float | None
-    """From the frame before, along the surface's true motion, over E (`warp_error`)."""
+    """The view's own change from the frame before along the true motion, over E (`warp_error`)."""
     warp_error_truth: float | None
-    """The truth's own."""
+    """The truth's."""
     change: float | None
     """From the frame before, in place, over the pixels of E now or then (`change`)."""
     change_truth: float | None
-    """The truth's own."""
+    """The truth's."""
     step_ms: float
     """What the inpainter's step took."""
+
+    @property
+    def image_px(self) -> int:
+        """Pixels of the image."""
+        return self.width_px * self.height_px
 
 
 @dataclass(frozen=True)
@@ -79,66 +113,109 @@ def true_view(frame: MultiViewFrame, came_from_px: Float[Tensor, "height width 2
     return TrueView(frame.rgb[0].float() / 255 * (mask.float() / 255), mask >= FOREGROUND, came_from_px)
 
 
-def score_frame(completed: CompletedView, truth: TrueView, before: Before | None, step_ms: float) -> FrameScores:
+def score_frame(
+    completed: CompletedView,
+    truth: TrueView,
+    before: Before | None,
+    step_ms: float,
+    scorers: Scorers = SSIM_ONLY,
+) -> FrameScores:
     """All scores of one completed view. Holes are the pixels with E > 0, the same for every method."""
     view, rgb = completed.view, completed.rgb
     holes = view.error > 0
-    holes_fg = holes & truth.mask
-    any_hole = bool(holes.any())
+    pixels = _Pixels(rgb, truth.rgb, holes, holes & truth.mask)
     whole = psnr(rgb, truth.rgb)
     assert whole is not None, "images have pixels"
-    warped, changed = _temporal(completed, truth, before)
+    height, width = holes.shape
     return FrameScores(
         time=view.time,
-        image_px=holes.numel(),
+        width_px=width,
+        height_px=height,
         hull_px=int((view.mask > 0.5).sum()),
         hole_px=int(holes.sum()),
-        hole_fg_px=int(holes_fg.sum()),
+        hole_fg_px=int(pixels.holes_fg.sum()),
         psnr_holes=psnr(rgb, truth.rgb, holes),
-        psnr_holes_fg=psnr(rgb, truth.rgb, holes_fg),
-        psnr_masked=psnr(rgb * holes, truth.rgb * holes) if any_hole else None,
-        ssim_masked=_ssim(rgb * holes, truth.rgb * holes) if any_hole else None,
+        psnr_holes_fg=psnr(rgb, truth.rgb, pixels.holes_fg),
+        psnr_masked=psnr(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None,
         psnr_whole=whole,
-        ssim_whole=_ssim(rgb, truth.rgb),
-        warp_error=warped[0],
-        warp_error_truth=warped[1],
-        change=changed[0],
-        change_truth=changed[1],
+        **_by_map("ssim", partial(similarity, window=scorers.ssim), pixels),
+        **_by_map("lpips_alex", scorers.lpips_alex, pixels),
+        **_by_map("lpips_vgg", scorers.lpips_vgg, pixels),
+        **_temporal(completed, truth, before),
         step_ms=step_ms,
     )
 
 
-Pair = tuple[float | None, float | None]
-"""Of the method, and of the truth."""
+@dataclass(frozen=True)
+class _Pixels:
+    """Two images and what to compare them over."""
+
+    rgb: Float[Tensor, "3 height width"]
+    truth: Float[Tensor, "3 height width"]
+    holes: Bool[Tensor, "height width"]
+    holes_fg: Bool[Tensor, "height width"]
 
 
-def _temporal(completed: CompletedView, truth: TrueView, before: Before | None) -> tuple[Pair, Pair]:
+def _by_map(name: str, score: ScoreMap | None, pixels: _Pixels) -> dict[str, float | None]:
+    """The four readings of a score that has a map; NaN in the map, where it has no value, counts nowhere."""
+    holes, holes_fg = pixels.holes, pixels.holes_fg
+    names = [f"{name}_{kind}" for kind in ("whole", "holes", "holes_fg", "masked")]
+    seen = None if score is None else score(pixels.rgb, pixels.truth)
+    if score is None or seen is None:
+        return dict.fromkeys(names)
+    masked = score(pixels.rgb * holes, pixels.truth * holes) if bool(holes.any()) else None
+    maps = seen, seen[holes], seen[holes_fg], masked
+    return dict(zip(names, (_mean(values) for values in maps), strict=True))
+
+
+def _mean(values: Tensor | None) -> float | None:
+    there = values if values is None else values[values.isfinite()]
+    return None if there is None or not there.numel() else float(there.double().mean())
+
+
+def _temporal(completed: CompletedView, truth: TrueView, before: Before | None) -> dict[str, float | None]:
+    found: dict[str, float | None] = dict.fromkeys(TEMPORAL)
     if before is None:
-        return (None, None), (None, None)
+        return found
     holes = completed.view.error > 0
-    pairs = (completed.rgb, before.completed), (truth.rgb, before.truth)
-    changed = [change(now, then, holes | (before.error > 0), ENOUGH_HOLE_PX) for now, then in pairs]
-    warped: list[float | None] = [None, None]
-    if truth.came_from_px is not None:
-        warped = [warp_error(now, then, truth.came_from_px, holes, ENOUGH_HOLE_PX) for now, then in pairs]
-    return (warped[0], warped[1]), (changed[0], changed[1])
+    now_or_then = holes | (before.error > 0)
+    now, then, true_now, true_then = completed.rgb, before.completed, truth.rgb, before.truth
+    found["change"] = change(now, then, now_or_then, ENOUGH_HOLE_PX)
+    found["change_truth"] = change(true_now, true_then, now_or_then, ENOUGH_HOLE_PX)
+    if (moved := truth.came_from_px) is not None:
+        found["flicker"] = warp_error(now - true_now, then - true_then, moved, holes, ENOUGH_HOLE_PX)
+        found["warp_error"] = warp_error(now, then, moved, holes, ENOUGH_HOLE_PX)
+        found["warp_error_truth"] = warp_error(true_now, true_then, moved, holes, ENOUGH_HOLE_PX)
+    return found
 
 
-def _ssim(image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"]) -> float | None:
-    """`ssim` of whole images, computed only where they differ: windows in which they are equal have exactly 1."""
-    height, width = image.shape[1:]
+TEMPORAL = ("flicker", "warp_error", "warp_error_truth", "change", "change_truth")
+
+
+def similarity(
+    image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"], window: SsimWindow
+) -> Float[Tensor, "height width"] | None:
+    """`ssim_map` with a value for each pixel, NaN where the window leaves the image.
+
+    It is computed only where the images differ: windows in which they are equal have exactly 1.
+    """
+    size, (height, width) = SSIM_SIZE_PX[window], image.shape[1:]
+    if min(height, width) < size:
+        return None
+    found = torch.full((height, width), torch.nan, dtype=torch.float64, device=image.device)
+    half = size // 2
+    inner = found[half : height - half, half : width - half]
+    inner.fill_(1.0)
     differ = (image != truth).any(0)
-    if min(height, width) < WINDOW_PX or not bool(differ.any()):
-        return ssim(image, truth)
-    rows, columns = (_reach(torch.nonzero(differ.any(axis)), size) for axis, size in ((1, height), (0, width)))
-    part = ssim(image[:, rows, columns], truth[:, rows, columns])
-    assert part is not None, "the part is at least a window wide"
-    inner = WINDOW_PX - 1
-    windows = (rows.stop - rows.start - inner) * (columns.stop - columns.start - inner)
-    return 1 - (1 - part) * windows / ((height - inner) * (width - inner))
+    if bool(differ.any()):
+        rows, columns = (_reach(torch.nonzero(differ.any(axis)), n, size) for axis, n in ((1, height), (0, width)))
+        part = ssim_map(image[:, rows, columns], truth[:, rows, columns], window)
+        assert part is not None, "the part is at least a window wide"
+        inner[rows.start : rows.stop - 2 * half, columns.start : columns.stop - 2 * half] = part
+    return found
 
 
-def _reach(at: Tensor, size: int) -> slice:
+def _reach(at: Tensor, length: int, size: int) -> slice:
     """From the first to the last of these places, with all windows that hold one of them."""
-    reach = WINDOW_PX - 1
-    return slice(max(0, int(at.min()) - reach), min(size, int(at.max()) + reach + 1))
+    start, stop = max(0, int(at.min()) - size + 1), min(length, int(at.max()) + size)
+    return slice(min(start, length - size), max(stop, size))

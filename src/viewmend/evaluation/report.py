@@ -21,7 +21,9 @@ RULES = (
     f"Frames with fewer than {ENOUGH_HOLE_PX} pixels of the kind are left out of scores in the holes, and counted.",
     "Means are over the frames of a scene, then over the scenes of a set, then over sets.",
     f"The gain over {REFERENCE} is the mean over the scenes in which both have a score.",
-    '"Warp" is the mean absolute difference from the frame before, warped by the true motion of the surface, over E '
+    '"Flicker" is how much the error, completed view minus truth, differs from that of the frame before, warped by the '
+    "true motion of the surface: mean absolute difference over E, in 255ths; the truth has 0.",
+    '"Warp" is the mean absolute difference from the frame before, warped in the same way, over E '
     '(in 255ths); "change" is that in place, over the pixels of E now or then. The truth is not 0 in '
     "either: see its row.",
     "Milliseconds are the inpainter's step alone (not hull and rendering), with its caches as in production, over the "

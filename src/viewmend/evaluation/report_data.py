@@ -5,7 +5,7 @@ import io
 import json
 from dataclasses import asdict, fields
 
-from viewmend.evaluation.averages import CellScores, Scores, step_ms
+from viewmend.evaluation.averages import CellScores, Scores, speed
 from viewmend.evaluation.report import RULES, Report
 
 
@@ -37,7 +37,7 @@ def report_csv(report: Report) -> str:
 
 def _cell(averaged: CellScores) -> dict[str, object]:
     cell = averaged.cell
-    p50, p95 = step_ms([averaged])
+    taken = speed([averaged])
     return {
         "scene": cell.key.scene,
         "set": cell.set,
@@ -46,8 +46,7 @@ def _cell(averaged: CellScores) -> dict[str, object]:
         "method": cell.key.method,
         "error": cell.error,
         **{f.name: getattr(averaged.scores, f.name) for f in fields(Scores)},
-        "step_ms_p50": p50,
-        "step_ms_p95": p95,
+        **{name: getattr(taken, name, None) for name in ("fps", "ms_p50", "ms_p95")},
         "frames": averaged.frames,
         "thin_frames": averaged.thin_frames,
         "empty_frames": averaged.empty_frames,

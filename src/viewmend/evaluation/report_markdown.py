@@ -13,6 +13,7 @@ COLUMNS = (
     ("SSIM masked", "ssim_masked", 1, 5),
     ("whole, dB", "psnr_whole", 1, 2),
     ("SSIM whole", "ssim_whole", 1, 4),
+    ("flicker", "flicker", 255, 2),
     ("warp", "warp_error", 255, 2),
     ("change", "change", 255, 2),
 )
@@ -51,14 +52,13 @@ def _setting(report: Report) -> str:
 
 
 def _full(table: Table) -> str:
-    heads = ["method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "ms", "ms p95", "scenes", "failed"]
+    heads = ["method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "FPS", "ms", "ms p95", "scenes", "failed"]
     rows = [
         [
             row.method,
             _signed(row.over_reference),
             *(_number(getattr(row.scores, field), factor, digits) for _, field, factor, digits in COLUMNS),
-            _number(row.step_ms_p50, 1, 1),
-            _number(row.step_ms_p95, 1, 1),
+            *(_number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
             _scene_count(row),
             f"**{row.failed}**" if row.failed else "0",
         ]

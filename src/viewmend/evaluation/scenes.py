@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -44,6 +44,7 @@ class SceneFrame:
     """Where in the previous true image each pixel's surface point was (`came_from`); None where nobody knows."""
 
 
+@runtime_checkable
 class EvaluationScene(Protocol):
     """A stream with truth. Scenes can be pickled: they hold no frames, only how to get them."""
 

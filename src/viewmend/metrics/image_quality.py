@@ -4,14 +4,17 @@ One contract: a metric over no pixels is None (not a number that could be averag
 """
 
 import math
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
+SsimWindow = Literal["gaussian", "uniform7", "uniform65"]
+"""Wang et al.'s Gaussian (11 x 11, sigma 1.5), or the means over 7 x 7 or 65 x 65 pixels that others report."""
+SSIM_SIZE_PX: dict[str, int] = {"gaussian": 11, "uniform7": 7, "uniform65": 65}
 SSIM_SIGMA_PX = 1.5
-SSIM_REACH_PX = 5
-"""The Gaussian window of Wang et al. 2004: 11 x 11 pixels."""
 MAX_PSNR_DB = 100.0
 """What equal pixels score, so that means stay finite."""
 
@@ -37,10 +40,10 @@ def ssim(
     image: Float[Tensor, "channel height width"],
     truth: Float[Tensor, "channel height width"],
     pixels: Bool[Tensor, "height width"] | None = None,
+    window: SsimWindow = "gaussian",
 ) -> float | None:
-    """Structural similarity (Wang et al. 2004), in [-1, 1]: Gaussian window of sigma 1.5, the mean of the channels.
+    """Structural similarity (Wang et al. 2004), in [-1, 1]: the mean of `ssim_map`.
 
-    As published, only places whose window lies in the image count, and the variances are those of the population.
     With `pixels` both images are blackened outside them first, then compared as a whole: the paper's SSIM in the holes.
     No pixels, or an image smaller than the window, give None.
     """
@@ -48,17 +51,32 @@ def ssim(
         if not bool(pixels.any()):
             return None
         image, truth = image * pixels, truth * pixels
-    if min(image.shape[1:]) < 2 * SSIM_REACH_PX + 1:
+    similarity = ssim_map(image, truth, window)
+    return None if similarity is None else float(similarity.mean())
+
+
+def ssim_map(
+    image: Float[Tensor, "channel height width"],
+    truth: Float[Tensor, "channel height width"],
+    window: SsimWindow = "gaussian",
+) -> Float[Tensor, "inner_height inner_width"] | None:
+    """The similarity of each window that lies in the image, mean of the channels; None where the image is smaller.
+
+    The first is centred half a window (5, 3 or 32 pixels) from the top and from the left. As published, the Gaussian
+    window takes the variances of the population, the uniform ones (scikit-image's) those of a sample.
+    """
+    size = SSIM_SIZE_PX[window]
+    if min(image.shape[1:]) < size:
         return None
     x, y = image.double(), truth.double()
-    mean_x, mean_y = _windowed(x), _windowed(y)
-    variance_x = _windowed(x * x) - mean_x**2
-    variance_y = _windowed(y * y) - mean_y**2
-    covariance = _windowed(x * y) - mean_x * mean_y
+    mean_x, mean_y, square_x, square_y, product = _windowed(torch.cat([x, y, x * x, y * y, x * y]), window).chunk(5)
+    sample = 1.0 if window == "gaussian" else size**2 / (size**2 - 1)
+    variance_x = sample * (square_x - mean_x**2)
+    variance_y = sample * (square_y - mean_y**2)
+    covariance = sample * (product - mean_x * mean_y)
     c1, c2 = 0.01**2, 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
-    similarity /= (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
-    return float(similarity.mean())
+    return (similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean(0)
 
 
 def mask_iou(a: Bool[Tensor, "height width"], b: Bool[Tensor, "height width"]) -> float | None:
@@ -67,10 +85,13 @@ def mask_iou(a: Bool[Tensor, "height width"], b: Bool[Tensor, "height width"]) -
     return int((a & b).sum()) / either if either else None
 
 
-def _windowed(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel inner_height inner_width"]:
-    """Gaussian means of the windows that lie in the image."""
-    offset = torch.arange(-SSIM_REACH_PX, SSIM_REACH_PX + 1, device=image.device, dtype=image.dtype)
-    kernel = torch.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2)
+def _windowed(
+    image: Float[Tensor, "channel height width"], window: SsimWindow
+) -> Float[Tensor, "channel inner_height inner_width"]:
+    """Means over the windows that lie in the image."""
+    size = SSIM_SIZE_PX[window]
+    offset = torch.arange(size, device=image.device, dtype=image.dtype) - size // 2
+    kernel = torch.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2) if window == "gaussian" else torch.ones_like(offset)
     kernel = kernel / kernel.sum()
-    rows = torch.nn.functional.conv2d(image[:, None], kernel.view(1, 1, 1, -1))
-    return torch.nn.functional.conv2d(rows, kernel.view(1, 1, -1, 1))[:, 0]
+    across, down = (kernel.view(shape).expand(len(image), 1, -1, -1) for shape in ((1, 1, 1, -1), (1, 1, -1, 1)))
+    return F.conv2d(F.conv2d(image[None], across, groups=len(image)), down, groups=len(image))[0]

@@ -1,0 +1,101 @@
+"""From frames to tables, against plain loops."""
+
+import statistics
+
+import pytest
+import torch
+
+from viewmend.evaluation.averages import average_cell, speed, tables, tables_by_kind
+
+METHODS = ("ours", "telea")
+
+
+@pytest.fixture
+def cells(make_cell, make_frame, rng):
+    """Two sets of two and three scenes, random scores, some thin and empty frames, one failed cell."""
+
+    def number(high: float = 1.0) -> float:
+        return high * float(torch.rand((), generator=rng))
+
+    def frame(method: str, hole_px: int):
+        inside = hole_px // 2
+        scores = {"psnr_holes": number(30) if hole_px else None, "psnr_holes_fg": number(30) if inside else None}
+        return make_frame(hole_px=hole_px, hole_fg_px=inside, psnr_whole=number(30), step_ms=number(9), **scores)
+
+    found = []
+    for scene, (name, holes) in enumerate(
+        [("A", [60, 40, 200]), ("A", [10, 0]), ("B", [100]), ("B", [300, 99]), ("B", [51])]
+    ):
+        for method in METHODS:
+            failed = (scene, method) == (3, "ours")
+            frames = [] if failed else [frame(method, px) for px in holes]
+            found.append(make_cell(f"s{scene}", method, name, frames, "broke" if failed else None))
+    return found
+
+
+def twin(cells, method, score, enough, pixels="hole_px"):
+    """The mean over frames with enough pixels, then over scenes that have any."""
+    means = []
+    for cell in cells:
+        if cell.key.method == method:
+            values = [getattr(f, score) for f in cell.frames if getattr(f, pixels) >= enough]
+            if values:
+                means.append(sum(values) / len(values))
+    return sum(means) / len(means) if means else None
+
+
+def test_tables_are_means_of_frames_then_scenes_then_sets(cells):
+    overall, *per_set = tables(cells, METHODS)
+    assert [table.title for table in per_set] == ["A", "B"]
+    for n, method in enumerate(METHODS):
+        sets = [[c for c in cells if c.set == name] for name in "AB"]
+        for score, enough, pixels in (
+            ("psnr_holes", 50, "hole_px"),
+            ("psnr_holes_fg", 50, "hole_fg_px"),
+            ("psnr_whole", 0, "hole_px"),
+        ):
+            expected = [twin(own, method, score, enough, pixels) for own in sets]
+            got = [getattr(table.rows[n].scores, score) for table in per_set]
+            assert got == pytest.approx(expected)
+            assert getattr(overall.rows[n].scores, score) == pytest.approx(statistics.fmean(expected))
+
+
+def test_the_gain_is_over_scenes_that_both_have(cells):
+    _, _, b = tables(cells, METHODS)
+    pairs = [
+        [twin([c], m, "psnr_holes", 50) for m in METHODS for c in cells if (c.key.scene, c.key.method) == (s, m)]
+        for s in ("s2", "s4")
+    ]  # s3 of ours failed
+    gains = [own - telea for own, telea in pairs]
+    assert b.rows[0].over_reference == pytest.approx(statistics.fmean(gains))
+    assert b.rows[0].below_reference == sum(gain < 0 for gain in gains)
+    assert b.rows[1].over_reference == 0
+
+
+def test_what_is_left_out_is_counted(cells):
+    overall, a, b = tables(cells, METHODS)
+    assert (a.frames, a.thin_frames, a.empty_frames) == (5, 3, 1)
+    assert (b.frames, b.thin_frames, b.empty_frames) == (4, 0, 0)
+    assert (overall.frames, overall.thin_frames, overall.empty_frames) == (9, 3, 1)
+    assert (a.rows[0].scenes, a.rows[0].scored_scenes, a.rows[0].failed) == (2, 1, 0)
+    assert (b.rows[0].scenes, b.rows[0].scored_scenes, b.rows[0].failed) == (3, 2, 1)
+    assert (overall.rows[0].scenes, overall.rows[0].failed) == (5, 1)
+
+
+def test_one_set_needs_no_overall_table_and_one_kind_no_kinds(cells):
+    assert [table.title for table in tables(cells[:4], METHODS)] == ["A"]
+    assert tables_by_kind(cells, METHODS) == []
+
+
+def test_nothing_to_average_is_none(make_cell, make_frame):
+    scores = average_cell(make_cell("s", "telea", "A", [make_frame(hole_px=0, hole_fg_px=0)])).scores
+    assert scores.psnr_holes is None and scores.flicker is None and scores.psnr_whole == 30
+    assert scores.holes_of_hull == scores.holes_of_image == 0
+
+
+def test_speed_is_of_frames_with_holes(make_cell, make_frame):
+    frames = [make_frame(step_ms=float(ms)) for ms in range(1, 101)]
+    taken = speed([average_cell(make_cell("s", "telea", "A", [*frames, make_frame(hole_px=0, step_ms=1e9)]))])
+    assert taken is not None
+    assert (taken.fps, taken.ms_p50, taken.ms_p95) == (pytest.approx(1000 / 50.5), 50.5, 96)
+    assert speed([average_cell(make_cell("s", "telea", "A", []))]) is None

@@ -1,0 +1,128 @@
+"""The scores of a case made by hand, and the ways they are computed."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from viewmend.evaluation.frame_scores import Before, Scorers, TrueView, score_frame, similarity
+from viewmend.geometry.cameras import Cameras
+from viewmend.metrics.image_quality import ssim, ssim_map
+from viewmend.views import CompletedView, IncompleteView
+
+HEIGHT, WIDTH = 40, 50
+
+
+@pytest.fixture
+def case():
+    """A grey truth of 0.5; ours has 0.6 in a hole of 10 x 10, and 0.9 in the half of it that is background (black)."""
+    rgb, error = torch.full((3, HEIGHT, WIDTH), 0.5), torch.zeros(HEIGHT, WIDTH)
+    error[10:20, 20:30] = 1
+    truth, mask = rgb.clone(), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[10:20, 25:30] = False
+    truth[:, ~mask] = 0
+    ours = rgb.clone()
+    ours[:, 10:20, 20:25], ours[:, 10:20, 25:30] = 0.6, 0.9
+    camera = Cameras(("c",), torch.eye(3)[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]))
+    view = IncompleteView(
+        camera, rgb * (error == 0), torch.ones(HEIGHT, WIDTH), error, torch.ones(HEIGHT, WIDTH), (),
+        torch.zeros(0, HEIGHT, WIDTH), 7,
+    )  # fmt: skip
+    return CompletedView(view, ours), TrueView(truth, mask, None)
+
+
+def decibel(squared: float) -> float:
+    return -10 * math.log10(squared)
+
+
+def test_by_hand(case):
+    scores = score_frame(*case, None, 12.5)
+    assert (scores.time, scores.width_px, scores.height_px, scores.image_px) == (7, WIDTH, HEIGHT, 2000)
+    assert (scores.hull_px, scores.hole_px, scores.hole_fg_px, scores.step_ms) == (2000, 100, 50, 12.5)
+    squared = (0.01 + 0.81) / 2
+    assert scores.psnr_holes == pytest.approx(decibel(squared), abs=1e-4)
+    assert scores.psnr_holes_fg == pytest.approx(20, abs=1e-4)
+    assert scores.psnr_masked == pytest.approx(decibel(squared * 100 / 2000), abs=1e-4)  # the hole's share lifts it
+    assert scores.psnr_whole == pytest.approx(scores.psnr_masked)
+    assert scores.flicker is scores.change is scores.lpips_alex_whole is None
+
+
+def test_ssim_of_each_reading(case):
+    completed, truth = case
+    scores = score_frame(completed, truth, None, 1.0)
+    holes = completed.view.error > 0
+    seen = ssim_map(completed.rgb, truth.rgb)
+    assert seen is not None
+    assert scores.ssim_whole == pytest.approx(float(seen.mean()), abs=1e-12)
+    assert scores.ssim_holes == pytest.approx(float(seen[5:15, 15:25].mean()), abs=1e-12)
+    assert scores.ssim_holes_fg == pytest.approx(float(seen[5:15, 15:20].mean()), abs=1e-12)
+    assert scores.ssim_masked == pytest.approx(ssim(completed.rgb, truth.rgb, holes), abs=1e-12)
+
+
+def test_no_hole_has_no_score_in_holes(case):
+    completed, truth = case
+    view = replace(completed.view, error=torch.zeros(HEIGHT, WIDTH))
+    scores = score_frame(CompletedView(view, truth.rgb), truth, None, 1.0)
+    assert scores.psnr_holes is scores.psnr_masked is scores.ssim_holes is scores.ssim_masked is None
+    assert scores.ssim_whole == 1 and scores.psnr_whole == 100
+
+
+def test_other_scores_come_through_their_maps(case):
+    def score(image, truth):
+        return (image - truth).abs().mean(0)
+
+    scores = score_frame(*case, None, 1.0, Scorers(lpips_alex=score, lpips_vgg=lambda image, truth: None))
+    assert scores.lpips_alex_holes == pytest.approx(0.5)
+    assert scores.lpips_alex_holes_fg == pytest.approx(0.1)
+    assert scores.lpips_alex_whole == pytest.approx(scores.lpips_alex_masked) == pytest.approx(0.5 * 100 / 2000)
+    assert scores.lpips_vgg_whole is scores.lpips_vgg_holes is None
+
+
+@pytest.mark.parametrize("window", ["gaussian", "uniform7"])
+@pytest.mark.parametrize("where", [(0, 1, 0, 1), (36, 40, 44, 50), (0, 40, 0, 50), (5, 20, 30, 31)])
+def test_computing_only_where_images_differ_gives_the_same(rng, window, where):
+    truth = torch.rand(3, HEIGHT, WIDTH, generator=rng)
+    top, bottom, left, right = where
+    image = truth.clone()
+    image[:, top:bottom, left:right] = 0.3
+    expected, got = ssim_map(image, truth, window), similarity(image, truth, window)
+    assert expected is not None and got is not None
+    inner = got[got.isfinite()].view(expected.shape)
+    torch.testing.assert_close(inner, expected, rtol=0, atol=1e-12)
+
+
+@pytest.fixture
+def moving(rng):
+    """A texture that moves 3 pixels to the right and 1 down, in two frames, and where each pixel came from."""
+    texture = torch.rand(3, HEIGHT + 1, WIDTH + 3, generator=rng)
+    before, now = texture[:, 1:, 3:], texture[:, :-1, :-3]
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    source = torch.stack([x - 3, y - 1], -1)
+    inside = (source > 0).all(-1)
+    return before, now, torch.where(inside[..., None], source, torch.nan)
+
+
+def temporal(case, moving, ours_before, ours_now):
+    before, now, source = moving
+    completed, truth = case
+    view = completed.view
+    return score_frame(
+        CompletedView(view, ours_now), TrueView(now, truth.mask, source), Before(ours_before, before, view.error), 1.0
+    )
+
+
+def test_a_perfect_stream_flickers_not_at_all(case, moving):
+    before, now, _ = moving
+    scores = temporal(case, moving, before, now)
+    assert scores.flicker == 0
+    assert scores.warp_error == scores.warp_error_truth == pytest.approx(0, abs=1e-6)
+    assert scores.change == scores.change_truth > 0.1
+
+
+def test_an_error_that_moves_with_the_surface_does_not_flicker_and_one_that_stays_does(case, moving):
+    before, now, _ = moving
+    assert temporal(case, moving, before + 0.1, now + 0.1).flicker == pytest.approx(0, abs=1e-6)
+    assert temporal(case, moving, before, now + 0.1).flicker == pytest.approx(0.1, abs=1e-6)
+    stuck = temporal(case, moving, before, before)
+    assert stuck.change == 0 and stuck.flicker > 0.1 and stuck.warp_error == pytest.approx(stuck.flicker, abs=1e-6)

@@ -1,0 +1,154 @@
+"""Resumable, in processes as serially, and failures are shown."""
+
+import json
+import pickle
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from viewmend.evaluation import scene_run
+from viewmend.evaluation.cells import CellStore
+from viewmend.evaluation.runner import run_evaluation
+from viewmend.evaluation.scene_run import RunSettings
+from viewmend.inpainting.classical import Telea
+
+METHODS = ("telea", "unfilled")
+
+
+def run(scenes, folder, methods=METHODS, **how):
+    cells = [cell for found in run_evaluation(scenes, methods, CellStore(folder), **how) for cell in found]
+    return {(cell.key.scene, cell.key.method): cell for cell in cells}
+
+
+def figures(cells):
+    """All that does not depend on the clock."""
+    return {at: [replace(frame, step_ms=0.0) for frame in cell.frames] for at, cell in cells.items()}
+
+
+@pytest.fixture(scope="module")
+def whole(small_scenes, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, run(small_scenes, folder)
+
+
+def test_every_scene_has_every_method_and_they_differ(whole, small_scenes):
+    _, cells = whole
+    assert set(cells) == {(s.name, m) for s in small_scenes for m in METHODS}
+    assert all(cell.error is None and len(cell.frames) == 2 for cell in cells.values())
+    assert all(f.hole_px > 50 for cell in cells.values() for f in cell.frames)
+    telea, unfilled = (cells["s1", m].frames[0] for m in METHODS)
+    assert telea.psnr_holes > unfilled.psnr_holes
+    assert (telea.hole_px, telea.hull_px) == (unfilled.hole_px, unfilled.hull_px)
+
+
+def test_processes_compute_the_same_numbers(whole, small_scenes, tmp_path):
+    assert figures(run(small_scenes, tmp_path, jobs=2)) == figures(whole[1])
+
+
+def test_a_run_that_was_there_is_not_computed_again(whole, small_scenes, monkeypatch):
+    folder, cells = whole
+    monkeypatch.setattr("viewmend.evaluation.runner.evaluate_scene", None)
+    assert run(small_scenes, folder) == cells
+
+
+def test_a_killed_run_goes_on_where_it_was(whole, small_scenes, tmp_path):
+    scenes = tmp_path / "scenes"
+    scenes.write_bytes(pickle.dumps(small_scenes))
+    cells = tmp_path / "cells"
+    script = (
+        "import pickle, sys, pathlib; from viewmend.evaluation.cells import CellStore; "
+        "from viewmend.evaluation.runner import run_evaluation; scenes = pickle.loads(pathlib.Path(sys.argv[1])"
+        f".read_bytes()); print(*run_evaluation(scenes, {METHODS}, CellStore(pathlib.Path(sys.argv[2]))))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script, str(scenes), str(cells)], stdout=subprocess.DEVNULL)
+    while process.poll() is None and len(list(cells.glob("[!.]*.json"))) < len(METHODS):
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = {path: path.stat().st_mtime_ns for path in cells.glob("[!.]*.json")}
+    assert len(before) >= len(METHODS)
+    assert figures(run(small_scenes, cells)) == figures(whole[1])
+    assert all(path.stat().st_mtime_ns == at for path, at in before.items())
+
+
+@pytest.fixture
+def copied(whole, tmp_path):
+    """The cells of the whole run, to be harmed."""
+    return Path(shutil.copytree(whole[0], tmp_path / "copied"))
+
+
+def test_a_damaged_cell_is_computed_again(whole, small_scenes, copied):
+    path = next(p for p in copied.glob("s1*.json") if "telea" in p.name)
+    other = json.loads(path.read_text())
+    other["frames"][0].pop("psnr_holes")
+    store, key = CellStore(copied), whole[1]["s1", "telea"].key
+    assert store.load(key) == whole[1]["s1", "telea"]
+    for damage in ("", '{"key": ', "[]", '{"key": {}}', json.dumps(other)):
+        path.write_text(damage)
+        assert store.load(key) is None
+    assert figures(run(small_scenes, copied)) == figures(whole[1])
+    assert json.loads(path.read_text())["frames"][0]["psnr_holes"] == whole[1]["s1", "telea"].frames[0].psnr_holes
+
+
+def test_damaged_pictures_do_not_matter(whole, copied):
+    store, keys = CellStore(copied), [cell.key for cell in whole[1].values()]
+    assert all(store.picture(key) is not None and store.pictures(key) is not None for key in keys)
+    for path in copied.glob("*.png"):
+        path.write_bytes(path.read_bytes()[:100])
+    assert all(store.picture(key) is None and store.pictures(key) is None for key in keys)
+
+
+class FailsLater(Telea):
+    def step(self, view, source, state):
+        if view.time:
+            raise RuntimeError("no\nmore")
+        return super().step(view, source, state)
+
+
+class Paints(Telea):
+    def step(self, view, source, state):
+        completed, state = super().step(view, source, state)
+        return replace(completed, rgb=completed.rgb + 0.1), state
+
+
+@pytest.mark.parametrize(("inpainter", "said"), [(FailsLater, "no more"), (Paints, "pixels with E = 0")])
+def test_a_cell_that_fails_is_shown_tried_again_and_harms_no_other(
+    small_scenes, tmp_path, monkeypatch, whole, inpainter, said
+):
+    honest = scene_run.make_method
+    broken = lambda name, *how: inpainter() if name == "telea" else honest(name, *how)  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_run, "make_method", broken)
+        cells = run(small_scenes[:1], tmp_path)
+    assert said in cells["s1", "telea"].error and cells["s1", "telea"].frames == ()
+    assert cells["s1", "unfilled"].error is None
+    again = run(small_scenes[:1], tmp_path)
+    assert figures(again) == {at: f for at, f in figures(whole[1]).items() if at[0] == "s1"}
+
+
+def test_a_scene_that_fails_is_shown_for_every_method(small_scenes, tmp_path):
+    cells = run([replace(small_scenes[0], held="cam99")], tmp_path)
+    assert all("cam99" in cell.error for cell in cells.values()) and len(cells) == len(METHODS)
+
+
+def test_scenes_of_one_name_and_unknown_methods_are_refused(small_scenes, tmp_path):
+    with pytest.raises(ValueError, match="different names"):
+        run([small_scenes[0]] * 2, tmp_path)
+    with pytest.raises(ValueError, match="no-such-method"):
+        run(small_scenes, tmp_path, ("no-such-method",))
+
+
+def test_other_rules_are_other_cells(small_scenes, tmp_path):
+    from viewmend.evaluation.cells import cell_keys
+
+    usual = cell_keys(small_scenes[0], {"telea": "x"}, RunSettings())
+    for other in (RunSettings(ssim="uniform7"), RunSettings(precision="bfloat16")):
+        assert cell_keys(small_scenes[0], {"telea": "x"}, other) != usual
+    assert cell_keys(small_scenes[0], {"telea": "y"}, RunSettings()) != usual
+    assert cell_keys(replace(small_scenes[0], held="cam03"), {"telea": "x"}, RunSettings()) != usual
