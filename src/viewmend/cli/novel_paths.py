@@ -12,11 +12,10 @@ from torch import Tensor
 from viewmend.capture.studio.rigs import orbit
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.rigid import invert_rigid, is_rotation
+from viewmend.geometry.upright import upright
 
 FULL_TURN_GAP_RAD = math.radians(130)
 """A rig with a larger gap between neighbours does not stand all around: the orbit swings over what it sees."""
-AGREED_UP = 0.5
-"""Length of the mean of the images' up directions below which they do not agree."""
 STATIC_VIEWS = 60
 FRAMES_PER_TURN = 150
 
@@ -37,8 +36,7 @@ def orbit_around(
         views: how many cameras to give.
         frames_per_turn: length of a whole turn, or of a swing there and back.
     """
-    up = _up(cameras) if up is None else up.to(center)
-    up = up / up.norm()
+    up = upright(cameras) if up is None else up.to(center) / up.norm()
     offsets = cameras.centers - center
     distance = offsets.norm(dim=-1)
     elevation = torch.asin((offsets @ up / distance).clamp(-1, 1)).mean()
@@ -54,14 +52,6 @@ def orbit_around(
         up=up.cpu(),
         visible_m=visible_m,
     )
-
-
-def _up(cameras: Cameras) -> Float[Tensor, "3"]:
-    mean = -cameras.camera_from_world[:, 1, :3].mean(0)
-    if float(mean.norm()) >= AGREED_UP:
-        return mean
-    normal = torch.linalg.svd(cameras.centers - cameras.centers.mean(0)).Vh[2]
-    return normal if float(normal @ mean) >= 0 else -normal
 
 
 def _azimuths(offsets: Float[Tensor, "view 3"], up: Float[Tensor, "3"]) -> list[float]:

@@ -1,0 +1,245 @@
+"""Frames at hand: read or made ahead on a thread of their own, or pushed as they happen."""
+
+import contextlib
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from viewmend.capture.source import CaptureSource
+from viewmend.live.clock import Span
+from viewmend.views import MultiViewFrame
+
+RETRY_S = 1.0
+"""A source that failed is tried again after this long."""
+AHEAD = 3
+"""Frames that are read before they are asked for."""
+
+
+@dataclass(frozen=True)
+class SourceStatus:
+    """How a source is."""
+
+    state: str = "loading"
+    """loading, ready, failing or ended."""
+    error: str | None = None
+    """For people."""
+    name: str = ""
+
+
+class FrameSupply(Protocol):
+    """Where the service takes frames from; `read` never waits."""
+
+    changed: Callable[[], None]
+    """Called, on any thread, when there is more to see."""
+
+    @property
+    def status(self) -> SourceStatus:
+        """How the source is."""
+        ...
+
+    @property
+    def span(self) -> Span:
+        """The times that can be asked for."""
+        ...
+
+    def read(self, time: int) -> MultiViewFrame | None:
+        """The frame; None while it is on its way."""
+        ...
+
+    def start(self) -> None:
+        """Begin to read."""
+        ...
+
+    def stop(self) -> None:
+        """End, and let go of threads."""
+        ...
+
+
+class _Store:
+    """Frames by time; the oldest go first when there are too many bytes, or those that were asked for longest ago."""
+
+    def __init__(self, memory_mb: float, by_use: bool) -> None:
+        self._by_use = by_use
+        self._limit = 1e6 * memory_mb
+        self._frames: OrderedDict[int, MultiViewFrame] = OrderedDict()
+        self._bytes = 0
+
+    def __contains__(self, time: int) -> bool:
+        return time in self._frames
+
+    def put(self, time: int, frame: MultiViewFrame) -> None:
+        frame = replace(frame, depth=None, time=time)
+        self._frames[time] = frame
+        self._bytes += _size(frame)
+        while self._bytes > self._limit and len(self._frames) > 1:
+            self._bytes -= _size(self._frames.popitem(last=False)[1])
+
+    def get(self, time: int) -> MultiViewFrame | None:
+        if self._by_use and time in self._frames:
+            self._frames.move_to_end(time)
+        return self._frames.get(time)
+
+    @property
+    def oldest(self) -> int:
+        return min(self._frames, default=0)
+
+
+def _size(frame: MultiViewFrame) -> int:
+    return frame.rgb.numel() + (0 if frame.mask is None else frame.mask.numel())
+
+
+class ReadAhead:
+    """A recording: what is asked for and the frames after it are read first, then the rest while there is room.
+
+    `made` is for sources whose frames are made one after the other (the studio): only those can be asked for that are
+    there. The thread's priority is below that of all others.
+    """
+
+    def __init__(
+        self,
+        open_source: Callable[[], CaptureSource],
+        fps: float | None = None,
+        made: bool = False,
+        memory_mb: float = 1500.0,
+    ) -> None:
+        self.changed: Callable[[], None] = lambda: None
+        self._open, self._fps, self._made = open_source, fps, made
+        self._store = _Store(memory_mb, by_use=True)
+        self._lock = threading.Condition()
+        self._wanted = 0
+        self._status, self._span = SourceStatus(), Span()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
+
+    @property
+    def status(self) -> SourceStatus:
+        """How the source is."""
+        return self._status
+
+    @property
+    def span(self) -> Span:
+        """The times that can be asked for."""
+        return self._span
+
+    def start(self) -> None:
+        """Open the source and read ahead."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End after the frame that is being read."""
+        with self._lock:
+            self._stopped = True
+            self._lock.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
+
+    def read(self, time: int) -> MultiViewFrame | None:
+        """The frame; None while it is on its way."""
+        with self._lock:
+            if self._wanted != time:
+                self._wanted = time
+                self._lock.notify_all()
+            return self._store.get(time)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # Linux counts a thread as a process here
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        source: CaptureSource | None = None
+        while not self._stopped:
+            try:
+                if source is None:
+                    source = self._opened()
+                self._step(source)
+            except Exception as error:  # whatever a source does wrong, it is said, and tried again
+                self._status = replace(self._status, state="failing", error=f"{type(error).__name__}: {error}"[:400])
+                self.changed()
+                with self._lock:
+                    self._lock.wait_for(lambda: self._stopped, RETRY_S)
+
+    def _opened(self) -> CaptureSource:
+        source = self._open()
+        total = len(source.frame_ids)
+        fps = (self._fps or source.fps or 0.0) if total > 1 else 0.0
+        self._span = Span(0, 0 if self._made else total, total, fps)
+        self._status = replace(self._status, name=source.name)
+        return source
+
+    def _step(self, source: CaptureSource) -> None:
+        with self._lock:
+            time = self._next()
+            if time is None:
+                self._lock.wait_for(lambda: self._stopped or self._next() is not None)
+                return
+        frame = source.read(time)
+        with self._lock:
+            self._store.put(time, frame)
+            if self._made:
+                self._span = replace(self._span, end=max(self._span.end, time + 1))
+            self._status = replace(self._status, state="ready", error=None)
+        self.changed()
+
+    def _next(self) -> int | None:
+        """The time to read next."""
+        total = self._span.total or 0
+        if self._made and self._span.end < total:
+            return self._span.end
+        soon = [(self._wanted + n) % max(1, total) for n in range(min(AHEAD + 1, total))]
+        return next((time for time in soon if time not in self._store), None)
+
+
+class Pushed:
+    """A live rig: frames as they are pushed, numbered as they come; the oldest are forgotten."""
+
+    def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
+        self.changed: Callable[[], None] = lambda: None
+        self._fps = fps
+        self._store = _Store(memory_mb, by_use=False)
+        self._lock = threading.Lock()
+        self._status = SourceStatus(error="waiting for a rig to push frames", name="live")
+        self._span = Span(live=True, fps=fps or 15.0)
+
+    @property
+    def status(self) -> SourceStatus:
+        """How the source is."""
+        return self._status
+
+    @property
+    def span(self) -> Span:
+        """The times that can be asked for."""
+        return self._span
+
+    def start(self) -> None:
+        """Nothing to do: frames come by themselves."""
+
+    def stop(self) -> None:
+        """Nothing to do."""
+
+    def read(self, time: int) -> MultiViewFrame | None:
+        """The frame, None once it is forgotten."""
+        with self._lock:
+            return self._store.get(time)
+
+    def begin(self, name: str, fps: float) -> None:
+        """A rig has connected. What another one pushed before cannot be asked for any more."""
+        with self._lock:
+            self._span = replace(self._span, first=self._span.end, fps=self._fps or fps)
+            self._status = SourceStatus("loading", None, name)
+        self.changed()
+
+    def push(self, frame: MultiViewFrame) -> int:
+        """Take a frame in; the number it gets."""
+        with self._lock:
+            time = self._span.end
+            self._store.put(time, frame)
+            self._span = replace(self._span, first=max(self._span.first, self._store.oldest), end=time + 1)
+            self._status = replace(self._status, state="ready", error=None)
+        self.changed()
+        return time
+
+    def lost(self) -> None:
+        """The rig has gone."""
+        self._status = replace(self._status, state="failing", error="the rig has disconnected; waiting for it")
+        self.changed()

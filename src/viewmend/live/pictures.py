@@ -1,0 +1,101 @@
+"""What is sent of a view: pictures of several kinds, JPEG, and depth for re-projection."""
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8, UInt16
+from torch import Tensor
+
+from viewmend.views import CompletedView, IncompleteView
+
+Picture = UInt8[np.ndarray, "height width 3"]
+HOLE = (1.0, 0.15, 0.55)
+"""What marks missing pixels: no cloth nor skin is of that pink."""
+COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
+"""Of the first, second, ... chosen camera in `coverage`."""
+DEPTH_STRIDE = 4
+
+
+def picture(completed: CompletedView, mode: str) -> Picture:
+    """One of the protocol's modes as 8-bit RGB, on black.
+
+    rendered: F. holes: F with E in pink. mended: Fhat. depth: near is bright. coverage: which camera coloured what,
+    missing pixels pink.
+    """
+    view = completed.view
+    if mode == "mended":
+        return _eight_bit(completed.rgb)
+    if mode == "depth":
+        return _eight_bit(_shade(view.depth).expand(3, -1, -1))
+    base = _coverage(view) if mode == "coverage" else view.rgb
+    if mode == "rendered":
+        return _eight_bit(base)
+    pink = torch.tensor(HOLE, device=base.device)[:, None, None]
+    return _eight_bit(torch.lerp(base, pink.expand_as(base), view.error.clamp(0, 1)))
+
+
+def _coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    """The chosen cameras' colours, mixed as they colour each pixel, with the picture's own light and dark."""
+    palette = torch.tensor([COLOURS[n % len(COLOURS)] for n in range(len(view.chosen))], device=view.rgb.device) / 255
+    mixed = torch.einsum("chw,cr->rhw", view.weights, palette)
+    return mixed * (0.45 + 0.55 * view.rgb.mean(0))
+
+
+def _shade(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    surface = depth > 0
+    if not bool(surface.any()):
+        return torch.zeros_like(depth)
+    near, far = depth[surface].aminmax()
+    return torch.where(surface, 1 - 0.8 * (depth - near) / (far - near).clamp(min=1e-6), 0.0)
+
+
+def _eight_bit(rgb: Float[Tensor, "3 height width"]) -> Picture:
+    return (rgb.clamp(0, 1) * 255).round().byte().movedim(0, -1).contiguous().cpu().numpy()
+
+
+def to_jpeg(image: Picture, quality: int) -> bytes:
+    """JPEG, 4:4:4 from quality 90 on: coloured edges of cloth."""
+    import cv2
+
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    if quality >= 90:
+        options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    assert done, "images of 8 bit can be encoded"
+    return data.tobytes()
+
+
+@dataclass(frozen=True)
+class PackedDepth:
+    """Depth as the protocol sends it."""
+
+    data: bytes
+    width: int
+    height: int
+    near_m: float
+    far_m: float
+
+
+def pack_depth(depth: Float[Tensor, "height width"], stride: int = DEPTH_STRIDE) -> PackedDepth:
+    """Every so manieth pixel: inverse depth in 16 bit, differences along rows, zlib."""
+    height, width = depth.shape
+    rows = (torch.arange(-(-height // stride)) * stride + stride // 2).clamp(max=height - 1)
+    columns = (torch.arange(-(-width // stride)) * stride + stride // 2).clamp(max=width - 1)
+    z = depth[rows.to(depth.device)[:, None], columns.to(depth.device)].double().cpu().numpy()
+    surface = z > 0
+    near, far = (float(z[surface].min()), float(z[surface].max())) if surface.any() else (1.0, 2.0)
+    far = max(far, near * 1.001)
+    inverse = 1 / np.where(surface, z, near)
+    q = np.where(surface, 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far)), 0).astype(np.uint16)
+    deltas = np.diff(q, axis=1, prepend=np.uint16(0))
+    return PackedDepth(zlib.compress(deltas.tobytes(), 1), len(columns), len(rows), near, far)
+
+
+def unpack_depth(packed: PackedDepth) -> Float[np.ndarray, "height width"]:
+    """Inverse of `pack_depth`, metres; 0 where there is no surface."""
+    deltas: UInt16[np.ndarray, "height width"] = np.frombuffer(zlib.decompress(packed.data), np.uint16)
+    q = np.add.accumulate(deltas.reshape(packed.height, packed.width), axis=1, dtype=np.uint16)
+    inverse = 1 / packed.far_m + (q.astype(float) - 1) / 65534 * (1 / packed.near_m - 1 / packed.far_m)
+    return np.where(q > 0, 1 / inverse, 0.0)

@@ -1,0 +1,127 @@
+"""Where viewers stand: around the subject by angles, or anywhere by a matrix."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras, pinhole
+from viewmend.geometry.rigid import look_at, rigid
+from viewmend.geometry.upright import upright
+from viewmend.live.protocol import Camera
+
+
+@dataclass(frozen=True)
+class RigFrame:
+    """The subject's place in the world, and the view to begin with."""
+
+    center: Float[Tensor, "3"]
+    """The subject's, metres."""
+    up: Float[Tensor, "3"]
+    front: Float[Tensor, "3"]
+    """Horizontal: where azimuth 0 is;"""
+    side: Float[Tensor, "3"]
+    """and azimuth 90."""
+    azimuth: float
+    """Of the first view, degrees; so is the elevation."""
+    elevation: float
+    distance_m: float
+    fov_y: float
+    """Vertical field of view, degrees, for square pictures and wide ones; the shorter side's in tall ones."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Of the message `rig`."""
+        axes = {key: _list(getattr(self, key)) for key in ("center", "up", "front", "side")}
+        names = {"azimuth": self.azimuth, "elevation": self.elevation, "distance": self.distance_m, "fov_y": self.fov_y}
+        return axes | {"home": {name: round(value, 4) for name, value in names.items()}}
+
+
+def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> RigFrame:
+    """Axes about the subject: as `capture.studio.rigs.orbit` counts azimuths.
+
+    The first view is halfway between the first camera and its neighbour, as far and as high as the cameras on average,
+    and shows as much as they do.
+
+    Args:
+        cameras: the rig.
+        center: the subject's middle, metres.
+        up: the world's; None for what the images agree on.
+    """
+    cameras = cameras.to("cpu")
+    center, up = center.cpu().float(), upright(cameras) if up is None else (up / up.norm()).cpu().float()
+    ahead = torch.tensor([0.0, 0.0, 1.0]) if abs(float(up[2])) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
+    front = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
+    side = torch.linalg.cross(up, front)
+    offsets = cameras.centers - center
+    distance = offsets.norm(dim=-1)
+    azimuths = torch.rad2deg(torch.atan2(offsets @ side, offsets @ front))
+    after = ((azimuths - azimuths[0]) % 360).sort().values
+    gap = float(after[after > 1][0]) if bool((after > 1).any()) else 0.0
+    elevation = float(torch.rad2deg(torch.asin((offsets @ up / distance).clamp(-1, 1))).mean())
+    width, height = cameras.size_px[0].tolist()
+    fov_y = 2 * math.degrees(math.atan(min(width, height) / 2 / float(cameras.K[0, 1, 1])))
+    azimuth = round(float(azimuths[0]) + min(gap, 90.0) / 2, 2)
+    return RigFrame(center, up, front, side, azimuth, max(-80.0, min(80.0, elevation)), float(distance.mean()), fov_y)
+
+
+def view_camera(asked: Camera, frame: RigFrame, size_px: tuple[int, int], scale: float = 1.0) -> Cameras:
+    """The camera that was asked for, its image resampled by `scale` (sides rounded to even numbers, at least 16).
+
+    Args:
+        asked: pose and lens.
+        frame: fills in what was not said.
+        size_px: width and height that the lens speaks of.
+        scale: at most 1.
+    """
+    width, height = size_px
+    if asked.R is not None and asked.T is not None:
+        pose = rigid(torch.tensor(asked.R).view(3, 3), torch.tensor(asked.T))
+    else:
+        center = frame.center if asked.target is None else torch.tensor(asked.target)
+        azimuth, elevation = math.radians(asked.azimuth), math.radians(asked.elevation)
+        flat = math.cos(azimuth) * frame.front + math.sin(azimuth) * frame.side
+        distance_m = frame.distance_m if asked.distance is None else asked.distance
+        eye = center + distance_m * (math.cos(elevation) * flat + math.sin(elevation) * frame.up)
+        pose = look_at(eye, center, frame.up)
+    if asked.lens is not None:
+        fx, fy, cx, cy = asked.lens
+        K = [[fx, 0.0, width / 2 if cx is None else cx], [0.0, fy, height / 2 if cy is None else cy], [0.0, 0.0, 1.0]]
+        camera = Cameras(("view",), torch.tensor([K]), pose[None], torch.tensor([[width, height]]))
+    else:
+        fov_rad = math.radians(frame.fov_y if asked.fov_y is None else asked.fov_y)
+        if asked.fov_y is None and height > width:  # what the shorter side shows stays
+            fov_rad = 2 * math.atan(math.tan(fov_rad / 2) * height / width)
+        camera = pinhole(fov_rad, width, height, pose)
+    if scale < 1:
+        camera = camera.resized(*(max(16, 2 * round(side * scale / 2)) for side in size_px))
+    return camera
+
+
+def cameras_json(cameras: Cameras) -> list[dict[str, Any]]:
+    """Each camera as the protocol says it."""
+    poses, centers = cameras.camera_from_world.cpu(), cameras.centers.cpu()
+    return [
+        {
+            "name": name,
+            "width": int(cameras.size_px[n, 0]),
+            "height": int(cameras.size_px[n, 1]),
+            "K": _list(cameras.K[n]),
+            "R": _list(poses[n, :3, :3]),
+            "T": _list(poses[n, :3, 3]),
+            "center": _list(centers[n]),
+        }
+        for n, name in enumerate(cameras.names)
+    ]
+
+
+def bounds_json(bounds: Bounds) -> dict[str, list[float]]:
+    """A box as the protocol says it."""
+    return {"low": _list(bounds.low), "high": _list(bounds.high)}
+
+
+def _list(tensor: Tensor) -> list[float]:
+    return [round(float(value), 6) for value in tensor.flatten()]
