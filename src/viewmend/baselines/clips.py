@@ -1,12 +1,12 @@
 """What an online baseline looks at, and when (Thiry et al. 2024, "Towards Online Real-Time ... Transformers")."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
-Frames = Float[Tensor, "frame 3 height width"]
+Frames = Float[Tensor, "_frame 3 height width"]
 """Frames of one time in [-1, 1], 0 in the holes: the view first, then what cameras see, if the variant shows them."""
 
 
@@ -21,6 +21,7 @@ class Clip:
     """Times further back, latest first."""
 
 
+@runtime_checkable
 class OnlineNetwork(Protocol):
     """A published network that completes the latest frame of a stream."""
 

@@ -80,7 +80,7 @@ def stitch(
     return total / weights.clamp_min(1e-9)
 
 
-def resized(image: Image, size: tuple[int, int]) -> Image:
+def resized(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 newheight newwidth"]:
     """Bicubic, anti-aliased, in [0, 1]."""
     return interpolate(image[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
 
