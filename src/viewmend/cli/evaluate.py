@@ -8,7 +8,7 @@ import tyro
 
 if TYPE_CHECKING:
     from viewmend.evaluation.cells import Cell, CellStore
-    from viewmend.evaluation.scene_run import RunSettings
+    from viewmend.evaluation.report import Report
     from viewmend.evaluation.scenes import EvaluationScene
 
 
@@ -27,7 +27,10 @@ class Options:
     """Folder for the results."""
     methods: str = "all"
     """Names with commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, a shipped model's name, a
-    model's folder; all for everything that is shipped."""
+    model's folder, a baseline like dstt-o-def, FILE.py:NAME; all for everything that is shipped, baselines for those
+    of the paper's first table."""
+    weights: Path | None = None
+    """Folder of published weights, looked in first; without theirs, baselines are n/a."""
     performers: Path | None = None
     """Folder of the people of Q: glTF characters in it or in its test/, BVH motions in its motions/test/, motions/ or
     beside them."""
@@ -61,36 +64,38 @@ def run(options: Options) -> int:
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     from viewmend.cli.console import say, track
     from viewmend.evaluation.cells import CellStore
-    from viewmend.evaluation.methods import method_names
+    from viewmend.evaluation.methods import method_names, split_missing
+    from viewmend.evaluation.report import make_report
     from viewmend.evaluation.runner import run_evaluation
     from viewmend.evaluation.scene_run import RunSettings
 
     _check_device(options.device)
+    if options.weights is not None:
+        _look_first_in(options.weights)
     methods, settings = method_names(options.methods), RunSettings(device=options.device, precision=options.precision)
+    available, missing = split_missing(methods, options.device)
+    if missing:
+        say(f"n/a, as the report explains: {', '.join(missing)}")
     scenes = [scene for name in options.sets for scene in _set(name, options)]
     store = CellStore(options.out / "cells")
-    total, cells = len(scenes) * len(methods), []
-    steps = run_evaluation(scenes, methods, store, settings, options.jobs)
+    total, cells = len(scenes) * len(available), []
+    steps = run_evaluation(scenes, available, store, settings, options.jobs)
     for cell in track((cell for found in steps for cell in found), "evaluating", total):
         cells.append(cell)
         if cell.error is not None:
             say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
     order = {key: n for n, key in enumerate((s.name, m) for s in scenes for m in methods)}
     cells.sort(key=lambda cell: order[cell.key.scene, cell.key.method])
-    _write(options, cells, methods, settings, store)
+    _write(options, make_report(cells, methods, settings, missing), cells, store)
     return 1 if any(cell.error is not None for cell in cells) else 0
 
 
-def _write(
-    options: Options, cells: "list[Cell]", methods: tuple[str, ...], settings: "RunSettings", store: "CellStore"
-) -> None:
+def _write(options: Options, report: "Report", cells: "list[Cell]", store: "CellStore") -> None:
     from viewmend.cli.console import say
-    from viewmend.evaluation.report import make_report
     from viewmend.evaluation.report_data import report_csv, report_json
     from viewmend.evaluation.report_markdown import markdown, summary
     from viewmend.evaluation.report_sheets import write_sheets
 
-    report = make_report(cells, methods, settings)
     for name, text in (("md", markdown(report)), ("csv", report_csv(report)), ("json", report_json(report))):
         (options.out / f"report.{name}").write_text(text, encoding="utf-8")
     write_sheets(cells, store, options.out / "sheets")
@@ -112,6 +117,18 @@ def _set(name: str, options: Options) -> "list[EvaluationScene]":
         return list(performer_set(options.performers, options.motions, frames, options.size)[: options.scenes])
     inputs = [part.strip() for part in options.inputs.split(",") if part.strip()]
     return [s for number in inputs for s in capture_set(Path(name), number, options.frames)[: options.scenes]]
+
+
+def _look_first_in(folder: Path) -> None:
+    """For weights, also in the processes that this one starts."""
+    import os
+
+    from viewmend.metrics.weights import PLACES_VARIABLE
+
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected a folder of weights, found none; check --weights")
+    others = os.environ.get(PLACES_VARIABLE)
+    os.environ[PLACES_VARIABLE] = os.pathsep.join([str(folder.resolve()), *([others] if others else [])])
 
 
 def _check_device(device: str) -> None:

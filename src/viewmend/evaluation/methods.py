@@ -1,22 +1,31 @@
-"""The methods of an evaluation, by name: one entry each in `METHODS`; any other name is a model's."""
+"""The methods of an evaluation, by name: an entry of `METHODS`, a baseline, a class in a file, or a model's folder."""
 
 import hashlib
+import importlib.util
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
+from viewmend.baselines.published import is_baseline, make_baseline
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
 from viewmend.inpainting.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.inpainting.reprojection_fill import ReprojectionFill
+from viewmend.metrics.weights import MissingWeightsError
 
 REFERENCE = "telea"
 """Tables show how much better than this one every other is."""
+
+
+class MethodMissing(ValueError):  # noqa: N818
+    """A known method whose weights are not here: its row is n/a, and this is the reason."""
 
 
 @dataclass(frozen=True)
@@ -36,26 +45,37 @@ METHODS: tuple[Method, ...] = (
     Method("reprojection", lambda device: ReprojectionFill()),
     Method("unfilled", lambda device: Unfilled()),
 )
+BASELINES = tuple(
+    f"{network}-o-{framing}{weights}"
+    for network in ("dstt", "fuseformer", "e2fgvi")
+    for weights in ("", "-finetuned")
+    for framing in ("def", "win", "mul")
+)
+"""Those of the paper's Table 1, in its order: pretrained, then fine-tuned. `baselines.published` knows more."""
 
 
 def method_names(selection: str) -> tuple[str, ...]:
-    """Names in a list with commas; "all" stands for the shipped models and all of `METHODS`.
+    """Names in a list with commas; "all" stands for the shipped models and all of `METHODS`, "baselines" for these.
 
     Raises:
         ValueError: no name is there.
     """
-    names: list[str] = []
-    for name in (part.strip() for part in selection.split(",")):
-        names += [*shipped_models(), *(m.name for m in METHODS)] if name == "all" else [name] if name else []
+    groups = {"all": (*shipped_models(), *(m.name for m in METHODS)), "baselines": BASELINES}
+    names = [
+        name for part in selection.split(",") if part.strip() for name in groups.get(part.strip(), (part.strip(),))
+    ]
     if not names:
         raise ValueError(f"expected --methods all, or names with commas, got '{selection}'")
     return tuple(dict.fromkeys(names))
 
 
 def make_method(name: str, device: str = "cpu", precision: str = "float32") -> ViewInpainter:
-    """The inpainter of this name: an entry of `METHODS`, a shipped model, or a model's folder.
+    """The inpainter of this name: an entry of `METHODS`, a baseline, FILE.py:NAME, a shipped model, a model's folder.
+
+    FILE.py:NAME is what NAME in that file, called with the device, returns.
 
     Raises:
+        MethodMissing: its weights are not here.
         ValueError: there is none, or it cannot be loaded (`CheckpointError`); no such precision.
     """
     if precision not in ("float32", "bfloat16"):
@@ -63,12 +83,60 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
     for method in METHODS:
         if method.name == name:
             return method.make(device)
+    if is_baseline(name):
+        try:
+            return make_baseline(name, device)
+        except MissingWeightsError as error:
+            raise MethodMissing(str(error)) from error
+    if ".py:" in name:
+        return _from_file(name)(device)
     if name not in shipped_models() and not Path(name).is_dir():
         known = ", ".join([*shipped_models(), *(m.name for m in METHODS)])
-        raise ValueError(f"expected a method among {known}, or a model's folder, got '{name}'; see --methods")
+        raise ValueError(
+            f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
+            f"'{name}'; see --methods"
+        )
     inpainter = load_inpainter(name, device)
     inpainter.compute_dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
     return inpainter
+
+
+def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[str, ...], dict[str, str]]:
+    """The methods that can be made, and why each of the others is n/a.
+
+    Raises:
+        ValueError: a method is unknown, or broken.
+    """
+    missing = {}
+    for name in names:
+        try:
+            make_method(name, device)
+        except MethodMissing as error:
+            missing[name] = str(error)
+    return tuple(name for name in names if name not in missing), missing
+
+
+def _from_file(name: str) -> Callable[[str], ViewInpainter]:
+    """NAME of FILE.py:NAME; its module's name has the file's hash, so that a changed file is another method."""
+    file, _, wanted = name.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise ValueError(f"expected FILE.py:NAME, got '{name}', and there is no such file; check the path")
+    module_name = f"{path.stem}_{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+    if module_name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(module_name, path)
+        assert spec is not None and spec.loader is not None, "the suffix is .py"
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[module_name] = module  # before it runs: dataclasses look their module up
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[module_name]
+            raise
+    make = getattr(sys.modules[module_name], wanted, None)
+    if not callable(make):
+        raise ValueError(f"expected '{wanted}' in {path} to be a class or a function, found none; check FILE.py:NAME")
+    return cast(Callable[[str], ViewInpainter], make)
 
 
 def identity(inpainter: object) -> str:

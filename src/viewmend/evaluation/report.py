@@ -47,11 +47,15 @@ class Report:
     """Each set's rigs and styles."""
     cells: tuple[CellScores, ...]
     """All of them, also those that failed."""
+    missing: dict[str, str]
+    """Methods without what they need here, which have no cells, and the reason: their rows are n/a."""
     origins: tuple[Provenance, ...]
     """Where the cells were computed: several if runs were resumed."""
 
 
-def make_report(cells: Sequence[Cell], methods: tuple[str, ...], settings: RunSettings) -> Report:
+def make_report(
+    cells: Sequence[Cell], methods: tuple[str, ...], settings: RunSettings, missing: dict[str, str] | None = None
+) -> Report:
     """Average the cells, in the order of scenes and methods in which they come."""
     identities = {cell.key.method: cell.identity for cell in cells}
     origins = tuple(dict.fromkeys(cell.provenance for cell in cells))
@@ -63,5 +67,6 @@ def make_report(cells: Sequence[Cell], methods: tuple[str, ...], settings: RunSe
         tables=tuple(tables(cells, methods)),
         kinds=tuple(tables_by_kind(cells, methods)),
         cells=tuple(average_cell(cell) for cell in cells),
+        missing=missing or {},
         origins=origins,
     )

@@ -17,6 +17,7 @@ def report_json(report: Report) -> str:
         "settings": asdict(report.settings),
         "methods": report.methods,
         "identities": report.identities,
+        "missing": report.missing,
         "origins": [asdict(origin) for origin in report.origins],
         "tables": [asdict(table) for table in report.tables],
         "kinds": [asdict(table) for table in report.kinds],

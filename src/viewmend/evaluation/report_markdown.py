@@ -24,6 +24,8 @@ def markdown(report: Report) -> str:
     """The whole report."""
     parts = ["# Evaluation", _setting(report)]
     parts += [_full(table) for table in report.tables]
+    if report.missing:
+        parts += ["## Not available", "\n".join(f"* {name}: {reason}" for name, reason in report.missing.items())]
     if report.kinds:
         parts += ["## By rig and style", "PSNR in the holes, dB; gain over " + REFERENCE + ".", _kinds(report)]
     parts += ["## Scenes", "PSNR in the holes, dB.", _scenes(report)]
@@ -53,19 +55,22 @@ def _setting(report: Report) -> str:
 
 def _full(table: Table) -> str:
     heads = ["method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "FPS", "ms", "ms p95", "scenes", "failed"]
-    rows = [
-        [
-            row.method,
-            _signed(row.over_reference),
-            *(_number(getattr(row.scores, field), factor, digits) for _, field, factor, digits in COLUMNS),
-            *(_number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
-            _scene_count(row),
-            f"**{row.failed}**" if row.failed else "0",
-        ]
-        for row in table.rows
-    ]
+    rows = [_method_row(row, len(heads)) for row in table.rows]
     rows.append(_truth_row([row.scores for row in table.rows], len(heads)))
     return f"## {table.title}\n\n{_holes(table)}\n\n{_grid(heads, rows)}"
+
+
+def _method_row(row: Row, width: int) -> list[str]:
+    if not row.scenes:
+        return [row.method, *["n/a"] * (width - 1)]
+    return [
+        row.method,
+        _signed(row.over_reference),
+        *(_number(getattr(row.scores, field), factor, digits) for _, field, factor, digits in COLUMNS),
+        *(_number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
+        _scene_count(row),
+        f"**{row.failed}**" if row.failed else "0",
+    ]
 
 
 def _holes(table: Table) -> str:
@@ -102,7 +107,7 @@ def _scenes(report: Report) -> str:
     for scene in dict.fromkeys(c.cell.key.scene for c in report.cells):
         own = [of.get((scene, method)) for method in report.methods]
         shown = [
-            "-" if c is None else "**failed**" if c.cell.error is not None else _number(c.scores.psnr_holes, 1, 2)
+            "n/a" if c is None else "**failed**" if c.cell.error is not None else _number(c.scores.psnr_holes, 1, 2)
             for c in own
         ]
         share = next((c.scores.holes_of_hull for c in own if c is not None and c.cell.error is None), None)
@@ -119,7 +124,7 @@ def _grid(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
-def _number(value: float | None, factor: float, digits: int) -> str:
+def _number(value: float | None, factor: int, digits: int) -> str:
     return "-" if value is None else f"{factor * value:.{digits}f}"
 
 
