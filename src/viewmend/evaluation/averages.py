@@ -4,8 +4,13 @@ import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
+import torch
+
 from viewmend.evaluation.cells import Cell
 from viewmend.evaluation.methods import REFERENCE
+from viewmend.evaluation.scorers import KINDS
+from viewmend.metrics.vfid import frechet_distance
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 
 
@@ -68,8 +73,19 @@ class Row:
     scored_scenes: int
     """Scenes with a frame that has enough holes."""
     failed: int
+    vfid: "Vfid"
     speed: "Speed | None"
     """Of the inpainter's step, over all frames with holes; None without any."""
+
+
+@dataclass(frozen=True)
+class Vfid:
+    """Distances of a method's videos from the truth's, by `scorers.KINDS`; None without I3D or with one video."""
+
+    whole_eval: float | None
+    masked_eval: float | None
+    whole_train: float | None
+    masked_train: float | None
 
 
 @dataclass(frozen=True)
@@ -165,6 +181,7 @@ def _row(method: str, averaged: Sequence[CellScores]) -> Row:
         scenes=len(own),
         scored_scenes=sum(a.scores.psnr_holes is not None for a in done),
         failed=len(own) - len(done),
+        vfid=vfid([a.cell for a in done]),
         speed=speed(done),
     )
 
@@ -182,6 +199,7 @@ def _overall(per_set: Sequence[Table], averaged: Sequence[CellScores], methods: 
                 scenes=sum(row.scenes for row in parts),
                 scored_scenes=sum(row.scored_scenes for row in parts),
                 failed=sum(row.failed for row in parts),
+                vfid=Vfid(**{kind: _mean(getattr(row.vfid, kind) for row in parts) for kind in KINDS}),
                 speed=speed([a for a in averaged if a.cell.key.method == name and a.cell.error is None]),
             )
         )
@@ -194,6 +212,15 @@ def _gains(done: Sequence[CellScores], averaged: Sequence[CellScores]) -> list[f
     reference = {a.cell.key.scene: a.scores.psnr_holes for a in averaged if a.cell.key.method == REFERENCE}
     pairs = ((a.scores.psnr_holes, reference.get(a.cell.key.scene)) for a in done)
     return [own - other for own, other in pairs if own is not None and other is not None]
+
+
+def vfid(cells: Sequence[Cell]) -> Vfid:
+    """Between all videos of these cells and of their scenes' truths."""
+    pairs = [(c.features, c.true_features) for c in cells if c.features is not None and c.true_features is not None]
+    if not pairs:
+        return Vfid(*[None] * len(KINDS))
+    sides = {kind: [torch.from_numpy(np.concatenate([p[n][kind] for p in pairs])) for n in (0, 1)] for kind in KINDS}
+    return Vfid(**{kind: frechet_distance(*side) for kind, side in sides.items()})
 
 
 def speed(done: Sequence[CellScores]) -> Speed | None:

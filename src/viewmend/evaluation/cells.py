@@ -4,9 +4,10 @@ import hashlib
 import json
 import re
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from viewmend.evaluation.methods import identity, make_method
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, Picture, RunSettings, SceneRun
 from viewmend.evaluation.scenes import EvaluationScene
+from viewmend.evaluation.scorers import KINDS, Features
 
 PROTOCOL = 1
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
@@ -55,6 +57,14 @@ class Cell:
     frames: tuple[FrameScores, ...]
     error: str | None
     provenance: Provenance
+    features: Features | None = field(default=None, repr=False, compare=False)
+    """Of the method's videos;"""
+    true_features: Features | None = field(default=None, repr=False, compare=False)
+    """and of the truth's. In files of their own."""
+
+
+REMEMBERED = tuple(f.name for f in fields(Cell) if f.compare)
+"""What the cell's file holds."""
 
 
 @dataclass(frozen=True)
@@ -77,20 +87,29 @@ class CellStore:
         """The cell, None if it is not there, or cannot be read."""
         try:
             values = json.loads((self.folder / f"{key.stem}.json").read_text())
-            return _cell(values) if values["key"] == asdict(key) else None
+            if values["key"] != asdict(key):
+                return None
+            features, truth = (self._read_features(f"{stem}.npz") for stem in (key.stem, key.scene_stem))
+            return replace(_cell(values), features=features, true_features=truth)
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
     def save(self, cell: Cell, run: MethodRun) -> None:
-        """Remember a cell: the picture first, so that a cell that is there is whole."""
+        """Remember a cell: the picture and the features first, so that a cell that is there is whole."""
         if run.picture is not None:
             self._write_image(f"{cell.key.stem}.png", run.picture)
-        text = json.dumps(asdict(cell), indent=1, allow_nan=False) + "\n"
+        if run.features is not None:
+            self._write_features(f"{cell.key.stem}.npz", run.features)
+        values = asdict(replace(cell, features=None, true_features=None))
+        text = json.dumps({name: values[name] for name in REMEMBERED}, indent=1, allow_nan=False) + "\n"
         _replace(self.folder / f"{cell.key.stem}.json", lambda path: path.write_text(text))
 
-    def save_pictures(self, key: CellKey, pictures: tuple[Picture, Picture, Picture]) -> None:
-        """Remember what all methods of a scene share: rendered view, E, truth."""
-        self._write_image(f"{key.scene_stem}.png", np.concatenate(pictures, 1))
+    def save_scene(self, key: CellKey, run: SceneRun) -> None:
+        """Remember what all methods of a scene share: rendered view, E, truth, and its videos' features."""
+        if run.pictures is not None:
+            self._write_image(f"{key.scene_stem}.png", np.concatenate(run.pictures, 1))
+        if run.features is not None:
+            self._write_features(f"{key.scene_stem}.npz", run.features)
 
     def picture(self, key: CellKey) -> Picture | None:
         """The completed view of a cell; None if there is none."""
@@ -100,6 +119,20 @@ class CellStore:
         """What all methods of the scene share; None if there is none."""
         strip = self._read_image(f"{key.scene_stem}.png")
         return None if strip is None else CellPictures(*(np.ascontiguousarray(p) for p in np.split(strip, 3, 1)))
+
+    def _write_features(self, name: str, features: Features) -> None:
+        def write(path: Path) -> None:
+            with path.open("wb") as file:
+                np.savez(file, **features)  # pyright: ignore[reportArgumentType]
+
+        _replace(self.folder / name, write)
+
+    def _read_features(self, name: str) -> Features | None:
+        try:
+            with (self.folder / name).open("rb") as file, np.load(file) as arrays:
+                return {kind: arrays[kind] for kind in KINDS}
+        except (OSError, ValueError, KeyError, BadZipFile):  # without them there is no VFID, all else stands
+            return None
 
     def _write_image(self, name: str, image: Picture) -> None:
         _replace(self.folder / name, lambda path: write_image(path, image))
@@ -115,7 +148,7 @@ class CellStore:
 def cell_keys(scene: EvaluationScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.pipeline), settings.ssim]
-    scene_digest = _digest(rules)
+    scene_digest = _digest([*rules, *settings.networks])
     return tuple(
         CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)
         for name, own in identities.items()
@@ -151,6 +184,8 @@ def to_cells(
                 one.frames,
                 one.error,
                 provenance,
+                one.features,
+                run.features,
             ),
             one,
         )
@@ -169,9 +204,8 @@ def _digest(parts: list[Any]) -> str:
 
 def _cell(values: dict[str, Any]) -> Cell:
     values = dict(values)
-    known = {f.name for f in fields(Cell)}
-    if set(values) != known:
-        raise ValueError(f"expected a cell with {sorted(known)}, got {sorted(values)}")
+    if set(values) != set(REMEMBERED):
+        raise ValueError(f"expected a cell with {sorted(REMEMBERED)}, got {sorted(values)}")
     values["key"] = CellKey(**values["key"])
     values["frames"] = tuple(FrameScores(**frame) for frame in values["frames"])
     values["provenance"] = Provenance(**values["provenance"])

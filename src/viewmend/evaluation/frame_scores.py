@@ -1,6 +1,5 @@
 """What one frame of one method scores against the camera that was left out (section 10)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -8,27 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from viewmend.evaluation.scorers import SSIM_ONLY, ScoreMap, Scorers
 from viewmend.evaluation.temporal import change, warp_error
 from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, psnr, ssim_map
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 from viewmend.views import CompletedView, MultiViewFrame
 
-ScoreMap = Callable[[Tensor, Tensor], Tensor | None]
-"""score(image, truth): a value for each pixel, NaN where there is none; None for images it cannot score."""
-
-
-@dataclass(frozen=True)
-class Scorers:
-    """How images are compared besides PSNR."""
-
-    ssim: SsimWindow = "gaussian"
-    lpips_alex: ScoreMap | None = None
-    """None without its weights."""
-    lpips_vgg: ScoreMap | None = None
-    """None without its weights."""
-
-
-SSIM_ONLY = Scorers()
 FOREGROUND = 128
 """A true mask from here on (of 255) is subject."""
 

@@ -71,8 +71,7 @@ def run_evaluation(
 
 
 def _remember(store: CellStore, cells: list[tuple[Cell, MethodRun]], run: SceneRun, key: CellKey) -> None:
-    if run.pictures is not None:
-        store.save_pictures(key, run.pictures)
+    store.save_scene(key, run)
     for cell, one in cells:
         store.save(cell, one)
 
@@ -104,7 +103,7 @@ def _alone(task: Task, settings: RunSettings, threads: int) -> SceneRun:
             return _result(pool.submit(evaluate_scene, task.scene, task.methods, settings))
         except BrokenProcessPool as error:
             said = f"the process died ({error}); is there enough memory?"
-            return SceneRun(task.scene.name, tuple(MethodRun(name, (), said, None) for name in task.methods), None)
+            return SceneRun(task.scene.name, tuple(MethodRun(name, (), said) for name in task.methods))
 
 
 def _result(future: Future[SceneRun]) -> SceneRun:

@@ -9,9 +9,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.contact_sheet import picture
-from viewmend.evaluation.frame_scores import Before, FrameScores, Scorers, TrueView, score_frame, true_view
+from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
 from viewmend.evaluation.methods import make_method
 from viewmend.evaluation.scenes import EvaluationScene
+from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.metrics.image_quality import SsimWindow
 from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe, view_of
@@ -31,10 +32,8 @@ class RunSettings:
     """Hull and renderer, the same for every method."""
     ssim: SsimWindow = "gaussian"
     """Over which windows SSIM is taken."""
-
-    def scorers(self) -> Scorers:
-        """How images are compared."""
-        return Scorers(ssim=self.ssim)
+    networks: tuple[str, ...] = ()
+    """Of `scorers.NETWORKS`, those to compare with."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,10 @@ class MethodRun:
     """Empty if it failed."""
     error: str | None
     """Why it failed."""
-    picture: Picture | None
+    picture: Picture | None = None
     """The completed view at the time of the largest hole."""
+    features: Features | None = None
+    """Of its videos, for VFID; None without I3D."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,10 @@ class SceneRun:
 
     scene: str
     runs: tuple[MethodRun, ...]
-    pictures: tuple[Picture, Picture, Picture] | None
+    pictures: tuple[Picture, Picture, Picture] | None = None
     """At the time of the largest hole: rendered view, E, truth. None if the scene could not be read or rendered."""
+    features: Features | None = None
+    """Of the truth's videos."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,8 @@ def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: Run
     A function of its arguments alone, which can all be pickled: processes and clusters call it. What goes wrong becomes
     the `error` of the method that it went wrong with, or of all if it is the scene's.
     """
-    scorers, pictures = settings.scorers(), None
+    scorers = load_scorers(settings.ssim, settings.networks, settings.device)
+    pictures, videos = None, VideoFeatures(scorers.i3d)
     streams = [_Stream(name, settings, scorers) for name in methods]
     try:
         with torch.no_grad():
@@ -86,13 +90,14 @@ def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: Run
                 if moment.largest:
                     view = moment.view
                     pictures = picture(view.rgb), picture(view.error[None]), picture(moment.truth.rgb)
+                videos.add(moment.truth.rgb, moment.view.error > 0)
                 for stream in streams:
                     stream.show(moment)
         if pictures is None:
             raise ValueError(f"{scene.name}: expected frames of the camera that is left out, got none")
     except Exception as error:
-        return SceneRun(scene.name, tuple(MethodRun(name, (), _said(error), None) for name in methods), None)
-    return SceneRun(scene.name, tuple(stream.run() for stream in streams), pictures)
+        return SceneRun(scene.name, tuple(MethodRun(name, (), _said(error)) for name in methods))
+    return SceneRun(scene.name, tuple(stream.run() for stream in streams), pictures, videos.features())
 
 
 def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]:
@@ -121,6 +126,7 @@ class _Stream:
         self._last: Float[Tensor, "3 height width"] | None = None
         self._scores: list[FrameScores] = []
         self._picture: Picture | None = None
+        self._videos = VideoFeatures(scorers.i3d)
 
     def show(self, moment: _Moment) -> None:
         """Complete and score the next view; nothing once something went wrong."""
@@ -145,6 +151,7 @@ class _Stream:
             before = Before(self._last, moment.before.truth.rgb, moment.before.view.error)
         completed = CompletedView(view, rgb)
         self._scores.append(score_frame(completed, moment.truth, before, mended.stage_ms.inpainting, self._scorers))
+        self._videos.add(rgb, view.error > 0)
         self._state, self._last = mended.state, rgb
         if moment.largest:
             self._picture = picture(rgb)
@@ -152,8 +159,8 @@ class _Stream:
     def run(self) -> MethodRun:
         """What came out."""
         if self._error is not None:
-            return MethodRun(self.method, (), self._error, None)
-        return MethodRun(self.method, tuple(self._scores), None, self._picture)
+            return MethodRun(self.method, (), self._error)
+        return MethodRun(self.method, tuple(self._scores), None, self._picture, self._videos.features())
 
 
 def _check(rgb: Tensor, view: IncompleteView) -> None:
