@@ -152,3 +152,19 @@ def test_other_rules_are_other_cells(small_scenes, tmp_path):
         assert cell_keys(small_scenes[0], {"telea": "x"}, other) != usual
     assert cell_keys(small_scenes[0], {"telea": "y"}, RunSettings()) != usual
     assert cell_keys(replace(small_scenes[0], held="cam03"), {"telea": "x"}, RunSettings()) != usual
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
+    pytest.importorskip("ray", reason="Ray is not installed")
+    script = (
+        "import pickle, sys, pathlib; from viewmend.evaluation.cells import CellStore; "
+        "from viewmend.evaluation.runner import run_evaluation; scenes = pickle.loads(pathlib.Path(sys.argv[1])"
+        f".read_bytes()); print(*run_evaluation(scenes, {METHODS}, CellStore(pathlib.Path(sys.argv[2])), ray='local'))"
+    )
+    (tmp_path / "scenes").write_bytes(pickle.dumps(small_scenes))
+    # In a process of its own: Ray leaves sockets and threads behind, which count as mistakes here.
+    command = [sys.executable, "-c", script, str(tmp_path / "scenes"), str(tmp_path / "cells")]
+    subprocess.run(command, check=True, capture_output=True)
+    assert len(list((tmp_path / "cells").glob("*.json"))) == len(METHODS) * len(small_scenes)
+    assert figures(run(small_scenes, tmp_path / "cells")) == figures(whole[1])

@@ -1,4 +1,4 @@
-"""Runs scenes x methods, in this process or in several, and goes on where an earlier run stopped."""
+"""Runs scenes x methods, here, in processes or on a cluster, and goes on where an earlier run stopped."""
 
 import multiprocessing
 import os
@@ -6,22 +6,16 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
 
 from viewmend.evaluation.cells import Cell, CellKey, CellStore, cell_keys, method_identities, to_cells
 from viewmend.evaluation.provenance import provenance
+from viewmend.evaluation.ray_cluster import run_on_ray
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
 from viewmend.evaluation.scenes import EvaluationScene
-
-
-@dataclass(frozen=True)
-class Task:
-    """One call of `evaluate_scene`."""
-
-    scene: EvaluationScene
-    methods: tuple[str, ...]
+from viewmend.evaluation.tasks import Task
 
 
 def run_evaluation(
@@ -30,6 +24,7 @@ def run_evaluation(
     store: CellStore,
     settings: RunSettings | None = None,
     jobs: int = 1,
+    ray: str | None = None,
 ) -> Iterator[list[Cell]]:
     """The cells of one scene after another, as they are there: remembered ones first, the others once computed.
 
@@ -41,9 +36,10 @@ def run_evaluation(
         store: where cells are remembered.
         settings: device, precision, hull and renderer.
         jobs: processes; 1 works in this one.
+        ray: address of a Ray cluster that does the work instead (`ray_cluster`).
 
     Raises:
-        ValueError: a method cannot be made, two scenes have one name, or `jobs` is not positive.
+        ValueError: a method cannot be made, two scenes have one name, `jobs` is not positive, or there is no cluster.
     """
     settings = settings or RunSettings()
     names = [scene.name for scene in scenes]
@@ -64,7 +60,11 @@ def run_evaluation(
     jobs = min(jobs, max(1, len(tasks)))
     threads = torch.get_num_threads() if jobs == 1 else max(1, (os.cpu_count() or 1) // jobs)
     origin = provenance(settings.device, threads, jobs)
-    for task, run in _run(tasks, settings, jobs, threads):
+    runs = _run(tasks, settings, jobs, threads)
+    if ray is not None:
+        origin = replace(origin, device=f"the Ray cluster {ray}", threads=1)
+        runs = run_on_ray(tasks, settings, ray)
+    for task, run in runs:
         cells = to_cells(task.scene, run, keys[task.scene.name], identities, origin)
         _remember(store, cells, run, keys[task.scene.name][0])
         yield [cell for cell, _ in cells]
