@@ -62,12 +62,13 @@ class FrameMs:
     """What its size does not change: reading, geometry."""
     pixels: float
     """Rendering and encoding."""
-    filling: float
+    filling: float | None
+    """None where nothing was to be filled."""
 
     @property
     def total(self) -> float:
         """All of it."""
-        return self.shared + self.pixels + self.filling
+        return self.shared + self.pixels + (self.filling or 0.0)
 
 
 class Budget:
@@ -85,7 +86,8 @@ class Budget:
         self.levels = tuple(levels)
         self.index = len(levels) // 2
         self.measured_ms = 0.0
-        self._taken: deque[tuple[Level, FrameMs]] = deque(maxlen=MEMORY)
+        # Each brought to the full level, as far as it depends on the level.
+        self._shared, self._pixels, self._filling = (deque[float](maxlen=MEMORY) for _ in range(3))
         self._patience, self._calm, self._since_up = PATIENCE, 0, PROBATION
 
     @property
@@ -95,16 +97,17 @@ class Budget:
 
     def predicted_ms(self, level: Level) -> float:
         """What a view of this level would take; 0 before the first frame."""
-        if not self._taken:
-            return 0.0
-        pixels = median(ms.pixels / was.scale**2 for was, ms in self._taken) * level.scale**2
-        filling = median(ms.filling / was.filling for was, ms in self._taken) * level.filling
-        return median(ms.shared for _, ms in self._taken) + pixels + filling
+        filling = median(self._filling) * level.filling if self._filling else 0.0
+        pixels = median(self._pixels) * level.scale**2 if self._pixels else 0.0
+        return (median(self._shared) if self._shared else 0.0) + pixels + filling
 
     def took(self, level: Level, ms: FrameMs) -> None:
         """Learn from a frame, and choose the next one's level."""
         self.measured_ms = ms.total
-        self._taken.append((level, ms))
+        self._shared.append(ms.shared)
+        self._pixels.append(ms.pixels / level.scale**2)
+        if ms.filling is not None:
+            self._filling.append(ms.filling / level.filling)
         self._since_up += 1
         if self._since_up == PROBATION:
             self._patience = PATIENCE

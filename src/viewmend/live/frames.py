@@ -8,7 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
 from viewmend.capture.source import CaptureSource
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.live.clock import Span
 from viewmend.views import MultiViewFrame
 
@@ -19,6 +25,17 @@ AHEAD = 3
 
 
 @dataclass(frozen=True)
+class Rig:
+    """What is known of a source's cameras and stage."""
+
+    name: str
+    bounds: Bounds | None
+    up: Float[Tensor, "3"] | None
+    number: int = 0
+    """Another one means: another rig, another stream."""
+
+
+@dataclass(frozen=True)
 class SourceStatus:
     """How a source is."""
 
@@ -26,7 +43,6 @@ class SourceStatus:
     """loading, ready, failing or ended."""
     error: str | None = None
     """For people."""
-    name: str = ""
 
 
 class FrameSupply(Protocol):
@@ -38,6 +54,11 @@ class FrameSupply(Protocol):
     @property
     def status(self) -> SourceStatus:
         """How the source is."""
+        ...
+
+    @property
+    def rig(self) -> Rig | None:
+        """What is known of the cameras; None before the source is open."""
         ...
 
     @property
@@ -58,7 +79,7 @@ class FrameSupply(Protocol):
         ...
 
 
-class _Store:
+class FrameStore:
     """Frames by time; the oldest go first when there are too many bytes, or those that were asked for longest ago."""
 
     def __init__(self, memory_mb: float, by_use: bool) -> None:
@@ -71,6 +92,7 @@ class _Store:
         return time in self._frames
 
     def put(self, time: int, frame: MultiViewFrame) -> None:
+        """Keep a frame as that of this time."""
         frame = replace(frame, depth=None, time=time)
         self._frames[time] = frame
         self._bytes += _size(frame)
@@ -78,17 +100,44 @@ class _Store:
             self._bytes -= _size(self._frames.popitem(last=False)[1])
 
     def get(self, time: int) -> MultiViewFrame | None:
+        """The frame, None where it is not at hand."""
         if self._by_use and time in self._frames:
             self._frames.move_to_end(time)
         return self._frames.get(time)
 
     @property
     def oldest(self) -> int:
+        """The first time at hand."""
         return min(self._frames, default=0)
 
 
 def _size(frame: MultiViewFrame) -> int:
     return frame.rgb.numel() + (0 if frame.mask is None else frame.mask.numel())
+
+
+def shrunk(frame: MultiViewFrame, max_side_px: int | None) -> MultiViewFrame:
+    """The frame with images (area averages) no larger than this; as it is if they are not, or without a limit."""
+    largest = int(frame.cameras.size_px.max()) if len(frame.cameras) else 0
+    if max_side_px is None or largest <= max_side_px:
+        return frame
+    sizes = (frame.cameras.size_px * (max_side_px / largest)).round().clamp(min=1).long().tolist()
+    cameras = concatenate_cameras([frame.cameras[n].resized(*size) for n, size in enumerate(sizes)])
+    width, height = cameras.max_size_px
+    rgb = torch.zeros(len(sizes), 3, height, width, dtype=torch.uint8)
+    mask = None if frame.mask is None else torch.zeros(len(sizes), height, width, dtype=torch.uint8)
+    for n, (w, h) in enumerate(sizes):
+        full_w, full_h = frame.cameras.size_px[n].tolist()
+        rgb[n, :, :h, :w] = _area(frame.rgb[n, :, :full_h, :full_w], w, h)
+        if mask is not None and frame.mask is not None:
+            mask[n, :h, :w] = _area(frame.mask[n, None, :full_h, :full_w], w, h)[0]
+    return replace(frame, cameras=cameras, rgb=rgb, mask=mask, depth=None)
+
+
+def _area(image: UInt8[Tensor, "channel height width"], width: int, height: int) -> UInt8[Tensor, "channel h w"]:
+    import cv2
+
+    small = cv2.resize(image.movedim(0, -1).numpy(), (width, height), interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(small).reshape(height, width, -1).movedim(-1, 0)
 
 
 class ReadAhead:
@@ -104,13 +153,15 @@ class ReadAhead:
         fps: float | None = None,
         made: bool = False,
         memory_mb: float = 1500.0,
+        max_side_px: int | None = None,
     ) -> None:
         self.changed: Callable[[], None] = lambda: None
-        self._open, self._fps, self._made = open_source, fps, made
-        self._store = _Store(memory_mb, by_use=True)
+        self._open, self._fps, self._made, self._max_side_px = open_source, fps, made, max_side_px
+        self._store = FrameStore(memory_mb, by_use=True)
         self._lock = threading.Condition()
         self._wanted = 0
         self._status, self._span = SourceStatus(), Span()
+        self._rig: Rig | None = None
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
 
@@ -118,6 +169,11 @@ class ReadAhead:
     def status(self) -> SourceStatus:
         """How the source is."""
         return self._status
+
+    @property
+    def rig(self) -> Rig | None:
+        """What is known of the cameras; None before the source is open."""
+        return self._rig
 
     @property
     def span(self) -> Span:
@@ -164,7 +220,7 @@ class ReadAhead:
         total = len(source.frame_ids)
         fps = (self._fps or source.fps or 0.0) if total > 1 else 0.0
         self._span = Span(0, 0 if self._made else total, total, fps)
-        self._status = replace(self._status, name=source.name)
+        self._rig = Rig(source.name, source.bounds, source.up)
         return source
 
     def _step(self, source: CaptureSource) -> None:
@@ -173,7 +229,7 @@ class ReadAhead:
             if time is None:
                 self._lock.wait_for(lambda: self._stopped or self._next() is not None)
                 return
-        frame = source.read(time)
+        frame = shrunk(source.read(time), self._max_side_px)
         with self._lock:
             self._store.put(time, frame)
             if self._made:
@@ -188,58 +244,3 @@ class ReadAhead:
             return self._span.end
         soon = [(self._wanted + n) % max(1, total) for n in range(min(AHEAD + 1, total))]
         return next((time for time in soon if time not in self._store), None)
-
-
-class Pushed:
-    """A live rig: frames as they are pushed, numbered as they come; the oldest are forgotten."""
-
-    def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
-        self.changed: Callable[[], None] = lambda: None
-        self._fps = fps
-        self._store = _Store(memory_mb, by_use=False)
-        self._lock = threading.Lock()
-        self._status = SourceStatus(error="waiting for a rig to push frames", name="live")
-        self._span = Span(live=True, fps=fps or 15.0)
-
-    @property
-    def status(self) -> SourceStatus:
-        """How the source is."""
-        return self._status
-
-    @property
-    def span(self) -> Span:
-        """The times that can be asked for."""
-        return self._span
-
-    def start(self) -> None:
-        """Nothing to do: frames come by themselves."""
-
-    def stop(self) -> None:
-        """Nothing to do."""
-
-    def read(self, time: int) -> MultiViewFrame | None:
-        """The frame, None once it is forgotten."""
-        with self._lock:
-            return self._store.get(time)
-
-    def begin(self, name: str, fps: float) -> None:
-        """A rig has connected. What another one pushed before cannot be asked for any more."""
-        with self._lock:
-            self._span = replace(self._span, first=self._span.end, fps=self._fps or fps)
-            self._status = SourceStatus("loading", None, name)
-        self.changed()
-
-    def push(self, frame: MultiViewFrame) -> int:
-        """Take a frame in; the number it gets."""
-        with self._lock:
-            time = self._span.end
-            self._store.put(time, frame)
-            self._span = replace(self._span, first=max(self._span.first, self._store.oldest), end=time + 1)
-            self._status = replace(self._status, state="ready", error=None)
-        self.changed()
-        return time
-
-    def lost(self) -> None:
-        """The rig has gone."""
-        self._status = replace(self._status, state="failing", error="the rig has disconnected; waiting for it")
-        self.changed()

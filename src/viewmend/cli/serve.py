@@ -1,0 +1,140 @@
+"""`viewmend serve`: walk around the subject in a browser, while it happens."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from viewmend.capture.source import CaptureSource
+    from viewmend.live.frames import FrameSupply
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Open a page where a person walks around the subject: rendered, its holes, and mended, live.
+
+    The page is at the address that is printed; nothing else is needed, and it asks nothing of anywhere else. Only this
+    machine can open it, unless --host and --token say otherwise. docs/live.md has the rest: the keys, the clock, the
+    budget, single pictures over HTTP, how to push a live rig.
+    """
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|studio|live")] = "studio"
+    """A capture folder (with cameras.json and masks), 'studio' for a synthetic scene made on the spot, or 'live' for a
+    rig that pushes its frames."""
+    port: int = 8008
+    """Port; 0 takes a free one."""
+    host: str = "127.0.0.1"
+    """Address to bind to; another than this machine's own needs --token."""
+    token: str | None = None
+    """What viewers must know."""
+    model: str | None = None
+    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
+    fps: float | None = None
+    """Frames a second, instead of the capture's."""
+    budget_ms: float = 100.0
+    """Milliseconds that a view may take: what it is made with is chosen by that, frame by frame. 0: always all."""
+    width: int = 1024
+    """The longest side of the cameras' images: larger ones are made smaller when they are read."""
+    context: int = 3
+    """How many cameras colour a view and are the inpainter's context."""
+    viewers: int = 8
+    """How many may watch at once."""
+    cameras: int = 8
+    """Cameras of the studio's ring."""
+    frames: int = 60
+    """Length of the studio's scene."""
+    size: int = 320
+    """Width and height of the studio's images."""
+    seed: int = 10001
+    """Of the studio's scene."""
+    device: str = "cpu"
+    """Where to compute: cpu, or cuda."""
+    memory_mb: float = 3000.0
+    """For frames at hand and what was computed of them."""
+
+
+def run(options: Options) -> int:
+    """Serve until interrupted."""
+    _check(options)
+    try:
+        import starlette  # noqa: F401
+        import uvicorn  # noqa: F401
+    except ImportError:
+        raise ValueError("viewmend serve needs its extra; run: pip install 'viewmend[live]'") from None
+    from viewmend.cli.console import say
+    from viewmend.cli.mending import load_named
+    from viewmend.live.listener import Server
+    from viewmend.live.protocol import Limits
+    from viewmend.live.renderer import Renderer
+    from viewmend.live.server import LiveServer, ServerConfig
+    from viewmend.live.service import RenderService
+    from viewmend.pipeline import PipelineConfig
+    from viewmend.rendering.view import RenderConfig
+
+    config = ServerConfig(
+        host=options.host,
+        port=options.port,
+        token=options.token,
+        budget_ms=options.budget_ms or None,
+        model=options.model or "small",
+        limits=Limits(viewers=options.viewers),
+    )
+    supply = _supply(options)
+    inpainter = load_named(options.model, None, options.device)
+    pipeline = PipelineConfig(render=RenderConfig(cameras=options.context))
+    renderer = Renderer(supply, inpainter, pipeline, options.device, memory_mb=options.memory_mb / 2)
+    server = Server(LiveServer(RenderService(renderer, supply), config), config, pushes=options.source == "live")
+    with server.bound() as address:
+        query = f"/?token={options.token}" if options.token else "/"
+        say(f"open {address}{query}   (Ctrl-C stops it)")
+        server.run_bound()
+    return 0
+
+
+def _check(options: Options) -> None:
+    """What can be said before anything heavy is imported."""
+    positive = ("width", "context", "viewers", "cameras", "frames", "size", "memory_mb")
+    wrong = [name for name in positive if not getattr(options, name) > 0]
+    wrong += [name for name in ("budget_ms", "port") if not getattr(options, name) >= 0]
+    if options.fps is not None and not 0 < options.fps <= 240:
+        wrong.append("fps")
+    if wrong or options.port > 65535:
+        name = (wrong or ["port"])[0]
+        raise ValueError(f"expected a sensible --{name.replace('_', '-')}, got {getattr(options, name)}; see --help")
+
+
+def _supply(options: Options) -> "FrameSupply":
+    from viewmend.live.frames import ReadAhead
+    from viewmend.live.pushed import Pushed
+
+    memory_mb = options.memory_mb / 2
+    if options.source == "live":
+        return Pushed(options.fps, memory_mb)
+    if options.source == "studio":
+        return ReadAhead(_studio(options), options.fps, made=True, memory_mb=memory_mb, max_side_px=options.width)
+    from viewmend.capture.plain import open_capture
+
+    capture = open_capture(Path(options.source))
+    if not capture.has_masks:
+        raise ValueError(
+            f"{options.source}: expected a capture with masks, got one without; segment the foreground and name the "
+            "files as each camera's 'mask'"
+        )
+    return ReadAhead(lambda: capture, options.fps, memory_mb=memory_mb, max_side_px=options.width)
+
+
+def _studio(options: Options) -> Callable[[], "CaptureSource"]:
+    """Opens the studio; called on the thread that makes its frames, so that the page is there at once."""
+
+    def open_studio() -> "CaptureSource":
+        from viewmend.capture.studio.stage import Studio, StudioConfig
+
+        config = StudioConfig(
+            seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
+        )
+        return Studio(config)
+
+    return open_studio

@@ -1,0 +1,89 @@
+"""Who may ask, and how often."""
+
+import hmac
+import time
+from collections import deque
+from urllib.parse import urlsplit
+
+from starlette.requests import HTTPConnection
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is this machine's alone."""
+    return host in LOOPBACK or host.startswith("127.")
+
+
+class Guard:
+    """Checks the token, the origin, and on loopback the name by which the server is called."""
+
+    def __init__(self, host: str, token: str | None) -> None:
+        """Guard a server.
+
+        Raises:
+            ValueError: the address is not loopback's and there is no token.
+        """
+        if not is_loopback(host) and not token:
+            raise ValueError(
+                f"expected --token with --host {host}: whoever reaches that address could watch; choose a long random "
+                "token, or leave --host away"
+            )
+        self._local = is_loopback(host)
+        self.token = token
+
+    def stranger(self, connection: HTTPConnection) -> str | None:
+        """Why a request comes from a page that is not ours; None if it does not.
+
+        A page elsewhere has another `Origin`; one that made its own name resolve to this machine calls us by it.
+        """
+        host = connection.headers.get("host", "")
+        if self._local and not is_loopback(_name(host)):
+            return f"expected a request to localhost, got one to '{host[:60]}'; open the address that was printed"
+        origin = connection.headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return f"expected a request of our own page, got one of '{origin[:60]}'"
+        return None
+
+    def lacks_token(self, connection: HTTPConnection) -> bool:
+        """Whether the token is wanted and not given."""
+        if not self.token:
+            return False
+        scheme, _, given = connection.headers.get("authorization", "").partition(" ")
+        if scheme.lower() != "bearer":
+            given = connection.query_params.get("token", "")
+        return not hmac.compare_digest(given.encode(errors="replace"), self.token.encode())
+
+
+def _name(host: str) -> str:
+    """A `Host` header without its port."""
+    return host[1:].split("]")[0] if host.startswith("[") else host.rsplit(":", 1)[0]
+
+
+class Rate:
+    """So many events a second on average, twice as many at once."""
+
+    def __init__(self, per_s: float) -> None:
+        self._per_s = per_s
+        self._left, self._at = 2 * per_s, time.monotonic()
+
+    def allows(self) -> bool:
+        """Whether one more is within it."""
+        now = time.monotonic()
+        self._left = min(2 * self._per_s, self._left + (now - self._at) * self._per_s)
+        self._at = now
+        self._left -= self._left >= 1
+        return self._left >= 1
+
+
+class Patience:
+    """Ends after so many faults in so many seconds."""
+
+    def __init__(self, faults: int = 20, within_s: float = 10.0) -> None:
+        self._at: deque[float] = deque(maxlen=faults)
+        self._within_s = within_s
+
+    def ends(self) -> bool:
+        """One more fault; whether it was one too many."""
+        self._at.append(time.monotonic())
+        return len(self._at) == self._at.maxlen and self._at[-1] - self._at[0] < self._within_s

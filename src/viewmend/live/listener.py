@@ -1,0 +1,81 @@
+"""uvicorn as the live server uses it: its port is taken before anything is said, silent connections are closed."""
+
+import contextlib
+import socket
+import time
+from collections.abc import Iterator
+from weakref import WeakKeyDictionary
+
+import uvicorn
+
+from viewmend.live.server import LiveServer, ServerConfig
+
+PUSH_BYTES = 64_000_000
+SILENT_S = 10.0
+"""A connection that asks for nothing is closed after so long."""
+
+
+class Server(uvicorn.Server):
+    """uvicorn, which also closes connections that ask for nothing."""
+
+    def __init__(self, server: LiveServer, config: ServerConfig, pushes: bool) -> None:
+        """Set up; `pushes` allows messages as large as a rig's frames."""
+        self._socket: socket.socket | None = None
+        super().__init__(
+            uvicorn.Config(
+                server.app(),
+                host=config.host,
+                port=config.port,
+                ws="websockets-sansio",
+                ws_max_size=PUSH_BYTES if pushes else 4 * config.limits.max_message_bytes,
+                ws_ping_interval=5.0,
+                ws_ping_timeout=10.0,
+                ws_per_message_deflate=False,
+                limit_concurrency=256,
+                timeout_graceful_shutdown=5,
+                log_level="warning",
+                access_log=False,
+                server_header=False,
+            )
+        )
+        self._since: WeakKeyDictionary[object, float] = WeakKeyDictionary()
+
+    @contextlib.contextmanager
+    def bound(self) -> Iterator[str]:
+        """The server's address, once its port is taken.
+
+        Raises:
+            OSError: somebody else has the port.
+        """
+        config = self.config
+        family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+        with socket.socket(family, socket.SOCK_STREAM) as listener:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                listener.bind((config.host, config.port))
+            except OSError as error:
+                what = error.strerror or str(error)
+                raise OSError(f"port {config.port} of {config.host}: {what}; choose another --port") from None
+            self._socket = listener
+            name = f"[{config.host}]" if ":" in config.host else config.host
+            yield f"http://{name}:{listener.getsockname()[1]}"
+
+    def run_bound(self) -> None:
+        """Serve until stopped (Ctrl-C, SIGTERM, or `should_exit`)."""
+        assert self._socket is not None, "bound() comes first"
+        self.run(sockets=[self._socket])
+
+    async def on_tick(self, counter: int) -> bool:
+        """Called ten times a second."""
+        if counter % 10 == 0:
+            self._close_silent()
+        return await super().on_tick(counter)
+
+    def _close_silent(self) -> None:
+        now = time.monotonic()
+        for connection in list(self.server_state.connections):
+            # An HTTP connection without a request so far; sockets of viewers have other watchmen.
+            if getattr(connection, "cycle", connection) is not None:
+                self._since.pop(connection, None)
+            elif now - self._since.setdefault(connection, now) > SILENT_S and connection.transport is not None:
+                connection.transport.close()

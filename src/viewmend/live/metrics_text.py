@@ -1,0 +1,33 @@
+"""/metrics: counters and gauges as Prometheus reads them."""
+
+from viewmend.live.connection import Lobby
+from viewmend.live.service import STAGES
+
+
+def metrics_text(lobby: Lobby) -> str:
+    """Everything that is counted."""
+    service = lobby.service
+    counts = dict(service.counts)
+    dropped = sum(seat.dropped for seat in list(lobby.seats))
+    ready = int(service.ready and service.supply.status.state == "ready")
+    lines = [
+        *_metric("viewmend_up", "gauge", "1 while views can be rendered.", {"": ready}),
+        *_metric("viewmend_viewers", "gauge", "Viewers connected.", {"": len(lobby.seats)}),
+        *_metric("viewmend_frames_total", "counter", "Views rendered.", {"": counts["frames"]}),
+        *_metric("viewmend_shared_total", "counter", "Views of an already known time.", {"": counts["shared"]}),
+        *_metric("viewmend_dropped", "gauge", "Looks of present viewers replaced before rendered.", {"": dropped}),
+        *_metric("viewmend_errors_total", "counter", "Views that failed.", {"": counts["errors"]}),
+        *_metric("viewmend_source_frames", "gauge", "Frames that can be asked for.", {"": service.supply.span.end}),
+        *_metric(
+            "viewmend_stage_seconds_total",
+            "counter",
+            "Seconds spent in each stage.",
+            {f'{{stage="{stage}"}}': counts[f"{stage}_us"] / 1e6 for stage in STAGES},
+        ),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _metric(name: str, kind: str, text: str, values: dict[str, float]) -> list[str]:
+    rows = [f"{name}{labels} {value:g}" for labels, value in values.items()]
+    return [f"# HELP {name} {text}", f"# TYPE {name} {kind}", *rows]

@@ -1,0 +1,84 @@
+"""Rendered views as the binary messages that are sent."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+from viewmend.live.pictures import COLOURS, DEPTH_STRIDE, pack_depth, picture, to_jpeg
+from viewmend.live.poses import cameras_json
+from viewmend.live.protocol import Look, pack
+from viewmend.live.renderer import Ask, Rendered
+from viewmend.views import CompletedView
+
+
+@dataclass(frozen=True)
+class FrameInfo:
+    """What a frame's header says besides its pictures."""
+
+    frame: int
+    full: bool
+    wait_ms: float
+    dropped: int
+
+
+def frame_message(look: Look, ask: Ask, rendered: Rendered, info: FrameInfo) -> tuple[bytes, dict[str, float]]:
+    """The message, and the milliseconds of every stage."""
+    start = time.perf_counter()
+    parts, data = [], []
+    for eye, completed in enumerate(rendered.completed):
+        for mode in look.modes:
+            data.append(to_jpeg(picture(completed, mode), look.quality))
+            parts.append({"kind": "image", "eye": eye, "mode": mode, "codec": "jpeg", "bytes": len(data[-1])})
+        if look.depth:
+            part, packed = _depth_part(eye, completed)
+            parts.append(part)
+            data.append(packed)
+    stage_ms = {
+        "geometry": rendered.geometry_ms,
+        "rendering": rendered.rendering_ms,
+        "inpainting": rendered.inpainting_ms,
+        "encode": 1000 * (time.perf_counter() - start),
+    }
+    stage_ms |= {"wait": info.wait_ms, "total": info.wait_ms + sum(stage_ms.values())}
+    first = rendered.completed[0].view
+    keys = ("K", "R", "T")
+    header: dict[str, Any] = {
+        "frame": info.frame,
+        "look": look.id,
+        "sent_ms": look.sent_ms,
+        "time": rendered.time,
+        "width": first.mask.shape[1],
+        "height": first.mask.shape[0],
+        "full": info.full,
+        "cameras": [{k: c[k] for k in keys} for v in rendered.completed for c in cameras_json(v.view.camera)],
+        "chosen": list(first.chosen),
+        "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.chosen))],
+        "holes": round(hole_fraction(rendered.completed[0]), 5),
+        "top_k": ask.effort.top_k,
+        "context_times": ask.effort.context_times,
+        "stage_ms": {stage: round(ms, 2) for stage, ms in stage_ms.items()},
+        "dropped": info.dropped,
+        "parts": parts,
+    }
+    return pack(header, data), stage_ms
+
+
+def hole_fraction(completed: CompletedView) -> float:
+    """Pixels of E as a share of the subject's."""
+    return float((completed.view.error > 0).sum()) / max(1.0, float((completed.view.mask > 0).sum()))
+
+
+def _depth_part(eye: int, completed: CompletedView) -> tuple[dict[str, Any], bytes]:
+    packed = pack_depth(completed.view.depth)
+    part = {
+        "kind": "depth",
+        "eye": eye,
+        "bytes": len(packed.data),
+        "encoding": "u16-delta-zlib",
+        "width": packed.width,
+        "height": packed.height,
+        "stride": DEPTH_STRIDE,
+        "near_m": packed.near_m,
+        "far_m": packed.far_m,
+    }
+    return part, packed.data

@@ -1,0 +1,89 @@
+"""Pushing a rig's frames to `viewmend serve live` (needs `viewmend[live]`)."""
+
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+from torch import Tensor
+from websockets.sync.client import connect
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.live.poses import bounds_json, cameras_json
+from viewmend.live.protocol import VERSION, pack
+from viewmend.views import MultiViewFrame
+
+
+class Publisher:
+    """A rig's connection; a context manager. Frames are undistorted, with masks.
+
+    Raises:
+        ConnectionError: the server refuses; says why.
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        url: str = "ws://127.0.0.1:8008",
+        token: str | None = None,
+        fps: float = 15.0,
+        name: str = "live rig",
+        up: Tensor | None = None,
+        bounds: Bounds | None = None,
+    ) -> None:
+        query = f"?token={token}" if token else ""
+        self._socket = connect(f"{url}/push{query}", max_size=None, compression=None)
+        rig = {
+            "type": "rig",
+            "version": VERSION,
+            "name": name,
+            "fps": fps,
+            "up": None if up is None else up.tolist(),
+            "bounds": None if bounds is None else bounds_json(bounds),
+            "cameras": cameras_json(cameras),
+        }
+        self._socket.send(json.dumps(rig))
+        self._answer()
+
+    def __enter__(self) -> "Publisher":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Say goodbye."""
+        self._socket.close()
+
+    def push(self, frame: MultiViewFrame, quality: int = 92) -> int:
+        """Send what the cameras see now; the number that it gets. Waits until the server has it.
+
+        Raises:
+            ValueError: the frame has no masks.
+        """
+        if frame.mask is None:
+            raise ValueError("expected a frame with masks, got one without; segment the images first")
+        images: list[dict[str, Any]] = []
+        parts: list[bytes] = []
+        for view, name in enumerate(frame.cameras.names):
+            width, height = frame.cameras.size_px[view].tolist()
+            rgb = frame.rgb[view, :, :height, :width].movedim(0, -1).cpu().numpy()
+            bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+            mask = frame.mask[view, :height, :width].cpu().numpy()
+            for kind, data in (("rgb", _encoded(".jpg", bgr, quality)), ("mask", _encoded(".png", mask, quality))):
+                images.append({"camera": name, "kind": kind, "bytes": len(data)})
+                parts.append(data)
+        self._socket.send(pack({"images": images}, parts))
+        return self._answer()["frame"]
+
+    def _answer(self) -> dict[str, Any]:
+        answer = json.loads(self._socket.recv(timeout=30))
+        if answer["type"] == "error":
+            raise ConnectionError(answer["message"])
+        return answer
+
+
+def _encoded(suffix: str, image: np.ndarray, quality: int) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    return cv2.imencode(suffix, image, options)[1].tobytes()

@@ -1,0 +1,236 @@
+"""The server: what is asked over HTTP and WebSocket goes to the render service and back."""
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from importlib.metadata import version
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket
+
+from viewmend.live.connection import Lobby, ViewerConnection
+from viewmend.live.errands import PathErrand, PictureErrand, can_export, parse_path, parse_query
+from viewmend.live.fields import Fields, ProtocolError, read_json
+from viewmend.live.guard import Guard
+from viewmend.live.metrics_text import metrics_text
+from viewmend.live.page_files import HEADERS, page_files
+from viewmend.live.protocol import Limits
+from viewmend.live.push import receive_rig
+from viewmend.live.pushed import Pushed
+from viewmend.live.service import RenderService
+
+PICTURE_S = 60.0
+EXPORT_S = 3600.0
+PICTURES_AT_ONCE = 4
+BODY_BYTES = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerConfig:
+    """Where and for whom."""
+
+    host: str = "127.0.0.1"
+    port: int = 8008
+    token: str | None = None
+    budget_ms: float | None = 100.0
+    model: str = "small"
+    """What `welcome` and /health call it."""
+    limits: Limits = field(default_factory=Limits)
+
+
+class LiveServer:
+    """The routes, and what they share."""
+
+    def __init__(self, service: RenderService, config: ServerConfig) -> None:
+        self._service = service
+        self._guard = Guard(config.host, config.token)
+        self._config = config
+        self._files = page_files()
+        self._pictures = 0
+        self._exporting = False
+        self._pushing = False
+        self._version = version("viewmend")
+        about = {
+            "server": f"viewmend {self._version}",
+            "model": config.model,
+            "codecs": ["jpeg"],
+            "export": can_export(),
+            "token_needed": bool(config.token),
+        }
+        self.lobby = Lobby(service, config.limits, config.budget_ms, about)
+
+    def app(self) -> Starlette:
+        """The ASGI application; its lifespan starts and stops the service."""
+        routes = [
+            Route("/", self._open(self._index)),
+            Route("/page/{name:path}", self._open(self._page)),
+            Route("/health", self._guarded(self._health)),
+            Route("/metrics", self._guarded(self._metrics)),
+            Route("/frame.jpg", self._guarded(self._picture)),
+            Route("/path.mp4", self._guarded(self._export), methods=["POST"]),
+            WebSocketRoute("/ws", self._viewer),
+            WebSocketRoute("/push", self._push),
+        ]
+        return Starlette(routes=routes, lifespan=self._lifespan)
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
+        self._service.start()
+        try:
+            yield
+        finally:
+            await asyncio.to_thread(self._service.stop)
+
+    def _open(self, answer: Callable[[Request], Response]) -> Callable[[Request], Awaitable[Response]]:
+        """A route for which no token is needed: the page holds no secret."""
+
+        async def checked(request: Request) -> Response:
+            stranger = self._guard.stranger(request)
+            return _refusal(403, stranger) if stranger else answer(request)
+
+        return checked
+
+    def _guarded(self, answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+        async def checked(request: Request) -> Response:
+            stranger = self._guard.stranger(request)
+            if stranger:
+                return _refusal(403, stranger)
+            if self._guard.lacks_token(request):
+                return _refusal(401, "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN")
+            try:
+                return await answer(request)
+            except ProtocolError as error:
+                return _refusal(400, str(error))
+
+        return checked
+
+    def _index(self, request: Request) -> Response:
+        return self._file("index.html")
+
+    def _page(self, request: Request) -> Response:
+        return self._file(request.path_params["name"])
+
+    def _file(self, name: str) -> Response:
+        file = self._files.get(name)
+        if file is None:
+            return _refusal(404, "there is no such file of the page")
+        return Response(file.content, media_type=file.media_type, headers=HEADERS)
+
+    async def _health(self, request: Request) -> Response:
+        source = self.lobby.source_json()
+        error = source["error"] or source["model_error"]
+        failing = source["source"] == "failing" or (error is not None and source["source"] != "loading")
+        status = "failing" if failing else "ok" if self._service.ready else "loading"
+        rig = self._service.supply.rig
+        health = {
+            "status": status,
+            "source": source["source"],
+            "name": None if rig is None else rig.name,
+            "model": self._config.model,
+            "error": error,
+            "viewers": len(self.lobby.seats),
+            "version": self._version,
+        }
+        return JSONResponse(health, 503 if failing else 200)
+
+    async def _metrics(self, request: Request) -> Response:
+        return PlainTextResponse(metrics_text(self.lobby), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+    async def _picture(self, request: Request) -> Response:
+        look, at = parse_query(dict(request.query_params), self._config.limits)
+        if self._pictures >= PICTURES_AT_ONCE:
+            return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
+        errand = PictureErrand(look, at)
+        self._pictures += 1
+        try:
+            image, rendered = await self._wait(request, errand, errand.done, PICTURE_S)
+        except (TimeoutError, RuntimeError) as error:
+            return _refusal(503, str(error) or "the frame did not come in time; see /health")
+        finally:
+            self._pictures -= 1
+        stages = ("geometry", "rendering", "inpainting")
+        timing = ", ".join(f"{stage};dur={getattr(rendered, f'{stage}_ms'):.1f}" for stage in stages)
+        headers = {"Server-Timing": timing, "X-Viewmend-Time": str(rendered.time), "Cache-Control": "no-store"}
+        return Response(image, media_type="image/jpeg", headers=headers)
+
+    async def _export(self, request: Request) -> Response:
+        if not can_export():
+            return _refusal(501, "videos need PyAV; run: pip install 'viewmend[video]'")
+        if self._exporting:
+            return _refusal(409, "another path is being rendered; ask again")
+        body = b""
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > BODY_BYTES:
+                return _refusal(413, f"expected at most {BODY_BYTES} bytes")
+        errand = PathErrand(parse_path(Fields(read_json(body)), self._config.limits))
+        self._exporting = True
+        try:
+            video = await self._wait(request, errand, errand.done, EXPORT_S)
+        except (TimeoutError, RuntimeError) as error:
+            return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
+        finally:
+            self._exporting = False
+        return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
+
+    async def _wait(self, request: Request, errand: PictureErrand | PathErrand, done: Future, limit_s: float):
+        """The errand's result; it is given up when the client goes."""
+        self._service.join(errand)
+        end = time.monotonic() + limit_s
+        try:
+            while not done.done():
+                await asyncio.wait([asyncio.wrap_future(done)], timeout=0.5)
+                if not done.done() and (time.monotonic() > end or await request.is_disconnected()):
+                    raise TimeoutError
+            return done.result()
+        finally:
+            self._service.leave(errand)
+            done.cancel()
+
+    async def _welcome(self, socket: WebSocket) -> bool:
+        """Accept a socket, or refuse it: strangers at the door, those without the token with a word."""
+        if self._guard.stranger(socket):
+            await socket.close()
+            return False
+        await socket.accept()
+        if self._guard.lacks_token(socket):
+            note = {"type": "error", "code": 4401, "message": "expected ?token=TOKEN", "fatal": True}
+            await socket.send_text(json.dumps(note))
+            await socket.close(4401)
+            return False
+        return True
+
+    async def _viewer(self, socket: WebSocket) -> None:
+        if await self._welcome(socket):
+            await ViewerConnection(socket, self.lobby).run()
+
+    async def _push(self, socket: WebSocket) -> None:
+        supply = self._service.supply
+        if not await self._welcome(socket):
+            return
+        if not isinstance(supply, Pushed) or self._pushing:
+            why = (
+                "another rig is pushing"
+                if self._pushing
+                else "this server shows a recording; start viewmend serve live"
+            )
+            await socket.send_text(json.dumps({"type": "error", "code": 4409, "message": why, "fatal": True}))
+            await socket.close(4409)
+            return
+        self._pushing = True
+        try:
+            await receive_rig(socket, supply)
+        finally:
+            self._pushing = False
+            supply.lost()
+
+
+def _refusal(status: int, message: str | None) -> Response:
+    return JSONResponse({"error": message}, status, headers={"Cache-Control": "no-store"})
