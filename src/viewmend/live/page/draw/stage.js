@@ -1,0 +1,187 @@
+// The canvas: the last frame as seen from the newest pose, and the rig on top.
+
+import { buildProgram } from "./program.js";
+import { LinePainter } from "./lines.js";
+import { clipFromPicture, clipFromPixels, clipFromWorld, samePlace } from "./projection.js";
+import { planeOf } from "./surface.js";
+
+/** @typedef {import("./projection.js").Viewpoint} Viewpoint */
+/** @typedef {import("./surface.js").Surface} Surface */
+/** @typedef {import("../link/frames.js").Header} Header */
+
+/**
+ * @typedef {object} Shown what is known of the last frame
+ * @property {Header} header
+ * @property {{modes: Record<string, import("../link/pictures.js").Picture>, surface: Surface | null}[]} eyes
+ */
+
+/**
+ * @typedef {object} Wish
+ * @property {{mode: string, until: number}[]} parts modes from left to right, each until a share of the viewport's width
+ * @property {boolean} reproject
+ * @property {boolean} rig
+ */
+
+const VERTEX = `#version 300 es
+layout(location = 0) in vec3 place;
+uniform mat4 clip;
+out vec3 pixel;
+void main() {
+  pixel = vec3(place.xy * place.z, place.z);
+  gl_Position = clip * vec4(pixel, 1.0);
+}`;
+const FRAGMENT = `#version 300 es
+precision highp float;
+uniform sampler2D picture;
+uniform vec2 size;
+uniform float tone;
+in vec3 pixel;
+out vec4 colour;
+void main() {
+  colour = vec4(texture(picture, pixel.xy / pixel.z / size).rgb * tone, 1.0);
+}`;
+/** What was hidden when the picture was taken shows its neighbours' colours, dimmed. */
+const STRETCHED_TONE = 0.4;
+
+export class Stage {
+  /** @param {HTMLCanvasElement} canvas */
+  constructor(canvas) {
+    this.canvas = canvas;
+    const options = { alpha: false, antialias: false, powerPreference: "high-performance" };
+    const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
+    if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
+    this.gl = gl;
+    /** @type {Header | null} */
+    this.header = null;
+    /** @type {any[]} */
+    this.eyes = [];
+    this.prepare();
+  }
+
+  /** (Re)create all that lives on the GPU. */
+  prepare() {
+    this.header = null;
+    this.eyes = [];
+    this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone"]);
+    this.lines = new LinePainter(this.gl);
+  }
+
+  /** Take a frame: its pictures become textures and are closed. @param {Shown} shown */
+  take(shown) {
+    const { gl } = this;
+    const { width, height } = shown.header;
+    shown.eyes.forEach((eye, index) => {
+      const kept = (this.eyes[index] ??= { textures: {}, mesh: null });
+      kept.modes = Object.keys(eye.modes);
+      for (const [mode, picture] of Object.entries(eye.modes)) {
+        kept.textures[mode] ??= texture(gl);
+        gl.bindTexture(gl.TEXTURE_2D, kept.textures[mode]);
+        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, picture);
+        picture.close();
+      }
+      kept.mesh = upload(gl, kept.mesh, eye.surface);
+      kept.quad = upload(gl, kept.quad, planeOf(width, height, 1));
+    });
+    this.eyes.length = shown.eyes.length;
+    this.header = shown.header;
+  }
+
+  /** Make the whole canvas black. */
+  clear() {
+    const { gl } = this;
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+  }
+
+  /** Draw into a part of the current framebuffer, which it clears. @param {Viewpoint} viewer @param {number[]} viewport x, y, width, height in pixels, y up @param {Wish} wish @param {number} [eye] */
+  draw(viewer, viewport, wish, eye = 0) {
+    const { gl } = this;
+    const [x, y, width, height] = viewport;
+    gl.viewport(x, y, width, height);
+    gl.scissor(x, y, width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
+    if (this.header && kept) {
+      let start = 0;
+      for (const { mode, until } of wish.parts) {
+        const [from, to] = [Math.round(start * width), Math.round(until * width)];
+        gl.scissor(x + from, y, Math.max(0, to - from), height);
+        this.#picture(viewer, kept, kept.textures[kept.modes.includes(mode) ? mode : kept.modes[0]], wish, eye);
+        start = until;
+      }
+      gl.scissor(x, y, width, height);
+    }
+    if (wish.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
+  }
+
+  /** @param {Viewpoint} viewer @param {any} kept @param {WebGLTexture} picture @param {Wish} wish @param {number} eye */
+  #picture(viewer, kept, picture, wish, eye) {
+    const { gl } = this;
+    const header = /** @type {Header} */ (this.header);
+    const { program, at } = /** @type {any} */ (this.painter);
+    const source = header.cameras[Math.min(eye, header.cameras.length - 1)];
+    const still = !wish.reproject || samePlace(source, header.width, header.height, viewer);
+    gl.useProgram(program);
+    gl.bindTexture(gl.TEXTURE_2D, picture);
+    gl.uniform2f(at.size, header.width, header.height);
+    gl.uniform1f(at.tone, 1);
+    if (still) {
+      gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
+      gl.bindVertexArray(kept.quad.array);
+      gl.drawElements(gl.TRIANGLES, kept.quad.solid, gl.UNSIGNED_INT, 0);
+      if (!wish.rig || !kept.mesh) return;
+      gl.colorMask(false, false, false, false);
+    }
+    const mesh = kept.mesh ?? kept.quad;
+    gl.uniformMatrix4fv(at.clip, false, this.#clip(source, viewer, kept));
+    gl.bindVertexArray(mesh.array);
+    gl.drawElements(gl.TRIANGLES, mesh.solid, gl.UNSIGNED_INT, 0);
+    gl.uniform1f(at.tone, STRETCHED_TONE);
+    gl.drawElements(gl.TRIANGLES, mesh.stretched, gl.UNSIGNED_INT, 4 * mesh.solid);
+    gl.colorMask(true, true, true, true);
+  }
+
+  /** Without depth the picture is a plane as far away as the viewer's target. @param {any} source @param {Viewpoint & {distance?: number}} viewer @param {any} kept */
+  #clip(source, viewer, kept) {
+    const clip = clipFromPicture(source, viewer);
+    if (!kept.mesh) for (let i = 0; i < 12; i++) clip[i] *= viewer.distance ?? 1;
+    return clip;
+  }
+}
+
+/** @param {WebGL2RenderingContext} gl */
+function texture(gl) {
+  const made = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, made);
+  for (const [name, value] of [
+    [gl.TEXTURE_MIN_FILTER, gl.LINEAR],
+    [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
+    [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE],
+    [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
+  ]) {
+    gl.texParameteri(gl.TEXTURE_2D, name, value);
+  }
+  return made;
+}
+
+/** @param {WebGL2RenderingContext} gl @param {any} kept buffers to use again @param {Surface | null} surface */
+function upload(gl, kept, surface) {
+  if (!surface) return null;
+  const mesh = kept ?? { array: gl.createVertexArray(), vertices: gl.createBuffer(), indices: gl.createBuffer() };
+  gl.bindVertexArray(mesh.array);
+  gl.bindBuffer(gl.ARRAY_BUFFER, mesh.vertices);
+  gl.bufferData(gl.ARRAY_BUFFER, surface.vertices, gl.DYNAMIC_DRAW);
+  gl.enableVertexAttribArray(0);
+  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.indices);
+  const [solid, stretched] = [surface.solid.length, surface.stretched.length];
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, 4 * (solid + stretched), gl.DYNAMIC_DRAW);
+  gl.bufferSubData(gl.ELEMENT_ARRAY_BUFFER, 0, surface.solid);
+  if (stretched) gl.bufferSubData(gl.ELEMENT_ARRAY_BUFFER, 4 * solid, surface.stretched);
+  gl.bindVertexArray(null);
+  return Object.assign(mesh, { solid, stretched });
+}

@@ -1,0 +1,103 @@
+// The WebSocket to the server: hello, messages as events, and a new try when it breaks.
+
+const VERSION = 1;
+const LONGEST_WAIT_MS = 15000;
+/** Close codes after which another try is pointless. */
+const FINAL = {
+  4401: "This server asks for a token. Open the address that it printed when it started.",
+  4426: "This page and the server are of different versions. Reload the page.",
+};
+const REASONS = { 4429: "Too many messages.", 4503: "All places are taken.", 1001: "The server has stopped." };
+
+/** @param {string} path @param {string | null} token */
+export function address(path, token) {
+  const url = new URL(path, location.href);
+  url.search = token === null ? "" : new URLSearchParams({ token }).toString();
+  return url;
+}
+
+/**
+ * Events: "message" (detail: a JSON message), "frame" (detail: ArrayBuffer), and "status" (detail: {status, text, wait_s})
+ * where status is "connecting", "open", "lost" (another try in wait_s) or "refused".
+ */
+export class Connection extends EventTarget {
+  /** @param {string | null} token @param {string[]} codecs */
+  constructor(token, codecs) {
+    super();
+    this.token = token;
+    this.codecs = codecs;
+    this.failures = 0;
+    /** @type {WebSocket | null} */
+    this.socket = null;
+    this.timer = 0;
+    this.refused = false;
+    document.addEventListener("visibilitychange", () => this.#visibility());
+  }
+
+  open() {
+    clearTimeout(this.timer);
+    this.#status("connecting", "Connecting");
+    const url = address("/ws", this.token);
+    url.protocol = url.protocol.replace("http", "ws");
+    const socket = new WebSocket(url);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    socket.onopen = () => this.send({ type: "hello", version: VERSION, codecs: this.codecs });
+    socket.onmessage = ({ data }) => this.#receive(data);
+    socket.onclose = ({ code, reason }) => {
+      if (this.socket === socket) this.#closed(code, reason);
+    };
+  }
+
+  /** @param {object} message @returns {boolean} whether it went out */
+  send(message) {
+    if (this.socket?.readyState !== WebSocket.OPEN) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
+  }
+
+  /** @param {string | ArrayBuffer} data */
+  #receive(data) {
+    if (typeof data !== "string") {
+      this.dispatchEvent(new CustomEvent("frame", { detail: data }));
+      return;
+    }
+    const message = JSON.parse(data);
+    if (message.type === "welcome") {
+      this.failures = 0;
+      this.#status("open", "Connected");
+    }
+    this.dispatchEvent(new CustomEvent("message", { detail: message }));
+  }
+
+  /** @param {number} code @param {string} reason */
+  #closed(code, reason) {
+    this.socket = null;
+    const final = /** @type {any} */ (FINAL)[code];
+    if (final) {
+      this.refused = true;
+      this.#status("refused", final);
+      return;
+    }
+    this.failures += 1;
+    const wait = Math.min(LONGEST_WAIT_MS, 500 * 2 ** (this.failures - 1));
+    const why = /** @type {any} */ (REASONS)[code] ?? (reason || "The connection is lost.");
+    this.#status("lost", why, wait / 1000);
+    if (!document.hidden) this.timer = setTimeout(() => this.open(), wait);
+  }
+
+  /** A hidden page costs the server nothing; it comes back when it is looked at. */
+  #visibility() {
+    if (document.hidden) {
+      this.timer = setTimeout(() => this.socket?.close(1000, "hidden"), 10000);
+    } else {
+      clearTimeout(this.timer);
+      if (!this.socket && !this.refused) this.open();
+    }
+  }
+
+  /** @param {string} status @param {string} text @param {number} [wait_s] */
+  #status(status, text, wait_s = 0) {
+    this.dispatchEvent(new CustomEvent("status", { detail: { status, text, wait_s } }));
+  }
+}

@@ -1,0 +1,275 @@
+// The page: puts the parts together and repaints when something changed.
+
+import { Stage } from "./draw/stage.js";
+import { rigLines } from "./draw/rig.js";
+import { Headset, headsetThere } from "./headset.js";
+import { Connection } from "./link/connection.js";
+import { decodable } from "./link/pictures.js";
+import { ViewerLink } from "./link/viewer.js";
+import { Settings } from "./settings.js";
+import { CameraList } from "./ui/cameras.js";
+import { buildControls } from "./ui/controls.js";
+import { byId } from "./ui/dom.js";
+import { Layout } from "./ui/layout.js";
+import { MODES, buildModes, placeDivider } from "./ui/modes.js";
+import { Notices } from "./ui/notices.js";
+import { PathPanel } from "./ui/paths.js";
+import { Statistics } from "./ui/statistics.js";
+import { buildTools, screenshot } from "./ui/tools.js";
+import { Transport } from "./ui/transport.js";
+import { listenToGestures } from "./view/gestures.js";
+import { Keys } from "./view/keys.js";
+import { contained, lensOf, resize, sizeFor } from "./view/lens.js";
+import { degrees } from "./view/matrix.js";
+import { Motion } from "./view/motion.js";
+import { extrinsicsOf } from "./view/pose.js";
+import { Resolution } from "./draw/resolution.js";
+
+const query = new URLSearchParams(location.search);
+const token = query.get("token");
+const LIMITS = { max_side_px: 2048, max_pixels: 2 ** 21 };
+
+class Page {
+  constructor() {
+    this.canvas = byId("picture");
+    this.settings = new Settings(query);
+    this.stage = new Stage(this.canvas);
+    this.motion = new Motion(window.matchMedia("(prefers-reduced-motion: reduce)").matches);
+    this.resolution = new Resolution();
+    this.limits = LIMITS;
+    this.painted = 0;
+    this.scheduled = false;
+    this.connection = new Connection(token, ["jpeg"]);
+    this.link = new ViewerLink(this.connection);
+    this.notices = new Notices(() => this.connection.open());
+    this.statistics = new Statistics();
+    this.transport = new Transport(this.link);
+    this.layout = new Layout(this.settings, () => this.wake());
+    this.cameras = new CameraList((camera) => this.snap(camera));
+    this.headset = new Headset(this.stage, {
+      look: (eyes, side) => this.link.look({ ...this.wanted(), eyes, width: side, height: side, depth: true, moving: false }),
+      wish: () => this.wish(0.5),
+      ended: () => this.wake(),
+    });
+    const { motion, transport, notices, settings } = this;
+    this.paths = new PathPanel({ motion, transport, notices, settings, token, wake: () => this.wake() });
+    buildModes(settings);
+    this.controls = buildControls(settings, motion, () => this.wake());
+    this.keys = new Keys(motion, this.actions(), () => this.wake());
+    listenToGestures(this.canvas, motion, () => this.viewer().lens.fx, () => this.wake());
+    settings.addEventListener("change", () => this.wake());
+    this.listen();
+  }
+
+  /** What keys and tools do. @returns {Record<string, () => void>} */
+  actions() {
+    const { settings, transport } = this;
+    const flip = (/** @type {"rig" | "reproject" | "panel"} */ name) => () => settings.set(name, !settings.get(name));
+    const modes = Object.keys(MODES).map((mode, index) => [`Digit${index + 1}`, () => settings.set("mode", mode)]);
+    const { tools } = this;
+    return {
+      ...Object.fromEntries(modes),
+      KeyR: () => this.reset(), Home: () => this.reset(),
+      KeyF: () => this.controls.movement(this.motion.mode === "fly" ? "orbit" : "fly"),
+      KeyN: () => this.cameras.next(1), KeyB: () => this.cameras.next(-1),
+      KeyG: flip("rig"), KeyT: flip("reproject"), KeyH: flip("panel"),
+      KeyP: tools.shot, KeyC: () => this.paths.toggleRecording(), "?": tools.help,
+      Space: () => transport.toggle(), KeyL: () => transport.live(),
+      Comma: () => transport.step(-1), Period: () => transport.step(1),
+      BracketLeft: () => transport.faster(-1), BracketRight: () => transport.faster(1),
+    };
+  }
+
+  /** Built on first use: keys and buttons share them. */
+  get tools() {
+    this.builtTools ??= buildTools({
+      settings: this.settings,
+      reset: () => this.reset(),
+      shot: () => screenshot(this.canvas, () => this.paint(), `viewmend-${String(this.transport.shown).padStart(4, "0")}.png`, this.notices),
+      headset: () => this.headset.enter(this.motion.rig, this.motion.pose),
+      notices: this.notices,
+    });
+    return this.builtTools;
+  }
+
+  reset() {
+    if (this.motion.rig) this.motion.reset();
+    this.wake();
+  }
+
+  /** To a camera's place, so that its whole picture is in view. @param {any} camera */
+  snap(camera) {
+    const { free } = this.frame();
+    const f = Math.min((free.width / camera.width) * camera.K[0], (free.height / camera.height) * camera.K[4]);
+    const side = Math.min(free.height, 1.45 * free.width);
+    this.motion.snap(camera, degrees(2 * Math.atan(side / 2 / f)));
+    this.wake();
+  }
+
+  listen() {
+    const on = (/** @type {EventTarget} */ from, /** @type {string} */ name, /** @type {(detail: any) => void} */ react) =>
+      from.addEventListener(name, (event) => react(/** @type {CustomEvent} */ (event).detail));
+    on(this.connection, "status", (status) => this.notices.connect(status));
+    on(this.link, "welcome", (welcome) => {
+      this.limits = welcome.limits;
+      this.controls.codecs(welcome.codecs);
+      this.paths.offer(welcome.export);
+      this.wake();
+    });
+    on(this.link, "rig", (rig) => {
+      byId("source").textContent = rig.name;
+      document.title = `${rig.name} · viewmend live`;
+      this.motion.place(rig);
+      this.cameras.set(rig);
+      this.chosen([], undefined);
+      this.wake();
+    });
+    on(this.link, "state", (state) => this.notices.source(state));
+    on(this.link, "stats", (stats) => (this.statistics.server = stats));
+    on(this.link, "error", ({ message }) => this.notices.toast(message, "error"));
+    on(this.link, "picture", (shown) => this.take(shown));
+    on(this.link, "trouble", (text) => this.trouble(text));
+    this.canvas.addEventListener("webglcontextlost", (/** @type {Event} */ event) => event.preventDefault());
+    this.canvas.addEventListener("webglcontextrestored", () => {
+      this.stage.prepare();
+      this.link.lastLook = "";
+      this.chosen([], undefined);
+      this.wake();
+    });
+  }
+
+  /** A picture that cannot be decoded: video falls back to JPEG. @param {string} text */
+  trouble(text) {
+    if (this.settings.get("codec") === "jpeg") {
+      this.notices.toast(`A picture is broken: ${text}`, "error");
+      return;
+    }
+    this.notices.toast("This browser cannot decode the video; JPEG it is.", "error");
+    this.settings.set("codec", "jpeg");
+    byId("codec").value = "jpeg";
+  }
+
+  /** @param {any} shown */
+  take(shown) {
+    const { header } = shown;
+    this.stage.take(shown);
+    this.chosen(header.chosen, this.settings.modes.includes("coverage") ? header.colours : undefined);
+    this.transport.picture(header.time);
+    this.notices.arrived();
+    this.paint();
+    const latency = this.statistics.picture(header, shown.bytes);
+    Object.assign(this.canvas.dataset, { frame: header.frame, look: header.look, time: header.time, full: header.full });
+    this.canvas.dispatchEvent(new CustomEvent("framepainted", { detail: { header, bytes: shown.bytes, latency_ms: latency } }));
+  }
+
+  /** @param {string[]} names @param {number[][] | undefined} colours */
+  chosen(names, colours) {
+    if (!this.motion.rig || (!this.cameras.use(names, colours) && this.stage.lines?.count)) return;
+    this.stage.lines?.set(rigLines(this.motion.rig, names, colours));
+  }
+
+  /** Where the picture is on the page, and the part of it that nothing covers. */
+  frame() {
+    const { page, free } = this.layout;
+    const [width, height] = this.settings.get("size").split("x").map(Number);
+    if (!(width > 0 && height > 0)) return { box: page, free };
+    const box = contained(free, width / height);
+    return { box, free: box };
+  }
+
+  /** The newest pose as a camera of the picture's box. */
+  viewer() {
+    const { box, free } = this.frame();
+    const { pose, rig } = this.motion;
+    if (!pose) return { R: [1, 0, 0, 0, 1, 0, 0, 0, 1], T: [0, 0, 0], lens: lensOf(box, free, 50), distance: 1, box };
+    return { ...extrinsicsOf(rig, pose), lens: lensOf(box, free, pose.fov), distance: pose.distance, box };
+  }
+
+  /** The part of a look that does not depend on the pose. */
+  wanted() {
+    const { settings } = this;
+    return {
+      modes: settings.modes,
+      top_k: settings.get("topK"),
+      adaptive: settings.get("adaptive"),
+      depth: settings.get("reproject") || settings.get("rig"),
+      codec: settings.get("codec"),
+    };
+  }
+
+  /** Ask for the view at the newest pose. */
+  ask() {
+    if (!this.motion.pose || this.headset.session) return;
+    const { R, T, lens, box } = this.viewer();
+    const [fixedWidth, fixedHeight] = this.settings.get("size").split("x").map(Number);
+    const size = fixedWidth > 0 ? { width: fixedWidth, height: fixedHeight } : sizeFor(box, this.settings.get("side"), this.limits);
+    this.controls.size(size);
+    const { fx, fy, cx, cy } = resize(lens, size.width, size.height);
+    this.link.look({ camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving: this.motion.moving });
+  }
+
+  /** @param {number} divider its place as a share of the viewport's width @returns {import("./draw/stage.js").Wish} */
+  wish(divider) {
+    const { settings } = this;
+    const split = settings.get("mode") === "split";
+    const parts = split
+      ? [{ mode: settings.get("left"), until: divider }, { mode: settings.get("right"), until: 1 }]
+      : [{ mode: settings.get("mode"), until: 1 }];
+    return { parts, reproject: settings.get("reproject"), rig: settings.get("rig") };
+  }
+
+  paint() {
+    const viewer = this.viewer();
+    const { box } = viewer;
+    const { width, height } = this.layout.page;
+    const ratio = this.resolution.ratio;
+    const [w, h] = [Math.round(width * ratio), Math.round(height * ratio)];
+    if (this.canvas.width !== w) this.canvas.width = w;
+    if (this.canvas.height !== h) this.canvas.height = h;
+    const x = placeDivider(this.settings, this.settings.get("size") ? box : this.layout.free);
+    const divider = Math.min(1, Math.max(0, (x - box.left) / box.width));
+    const viewport = [box.left, height - box.top - box.height, box.width, box.height].map((value) => Math.round(value * ratio));
+    this.stage.clear();
+    this.stage.draw(viewer, viewport, this.wish(divider));
+    this.cameras.place(this.settings.get("rig"), viewer, box);
+    this.statistics.repaints.mark();
+    this.controls.fov(this.motion.pose?.fov ?? 50);
+  }
+
+  /** Repaint at the display's next refresh, and on while something moves. */
+  wake() {
+    if (this.scheduled) return;
+    this.scheduled = true;
+    requestAnimationFrame((now) => this.refresh(now));
+  }
+
+  /** @param {number} now */
+  refresh(now) {
+    this.scheduled = false;
+    const elapsed = Math.min(100, Math.max(1, now - this.painted));
+    this.painted = now;
+    const held = this.keys.step(elapsed);
+    const busy = this.paths.step(now);
+    const stepped = this.motion.step(elapsed);
+    const moving = this.motion.moving;
+    this.resolution.refreshed(elapsed, stepped || busy);
+    this.ask();
+    this.paint();
+    if (held || busy || stepped || moving || this.link.late) this.wake();
+  }
+
+  async start() {
+    this.connection.codecs = await decodable();
+    this.connection.open();
+    if (await headsetThere()) byId("tool-headset").hidden = false;
+    this.wake();
+  }
+}
+
+try {
+  void new Page().start();
+} catch (error) {
+  byId("cover").dataset.kind = "error";
+  byId("cover-title").textContent = "This does not work here";
+  byId("cover-text").textContent = /** @type {Error} */ (error).message;
+}

@@ -1,0 +1,64 @@
+// The sections "View" and "Quality", and the switches that appear twice.
+
+import { byId, element, radioGroup, setSlider } from "./dom.js";
+
+const TOKENS = [64, 128, 256, 512, 1024, 2048, null];
+const CODECS = { jpeg: "JPEG", vp9: "VP9 video", h264: "H.264 video" };
+
+/** @typedef {import("../settings.js").Settings} Settings */
+
+/** @param {Settings} settings @param {import("../view/motion.js").Motion} motion @param {() => void} wake */
+export function buildControls(settings, motion, wake) {
+  const showMovement = radioGroup(byId("movement"), (value) => {
+    motion.mode = value === "fly" ? "fly" : "orbit";
+    showMovement(value);
+  });
+  byId("fov").addEventListener("input", () => {
+    motion.lens(Number(byId("fov").value));
+    wake();
+  });
+  for (const name of /** @type {("reproject" | "adaptive" | "rig")[]} */ (["reproject", "adaptive", "rig"])) {
+    const box = byId(name);
+    box.addEventListener("change", () => settings.set(name, box.checked));
+    settings.watch([name], () => (box.checked = settings.get(name)));
+  }
+  byId("tool-rig").addEventListener("click", () => settings.set("rig", !settings.get("rig")));
+  settings.watch(["rig"], () => byId("tool-rig").setAttribute("aria-pressed", String(settings.get("rig"))));
+  byId("quality").addEventListener("input", () => settings.set("topK", TOKENS[Number(byId("quality").value)]));
+  settings.watch(["topK"], () => {
+    const topK = settings.get("topK");
+    const place = TOKENS.findIndex((tokens) => tokens !== null && topK !== null && tokens >= topK);
+    setSlider(byId("quality"), place < 0 ? TOKENS.length - 1 : place);
+    const text = topK === null ? "all" : `best ${topK} patches`;
+    byId("quality-value").textContent = text;
+    byId("quality").setAttribute("aria-valuetext", text);
+  });
+  byId("side").addEventListener("input", () => settings.set("side", Number(byId("side").value)));
+  settings.watch(["side"], () => setSlider(byId("side"), settings.get("side")));
+  byId("codec").addEventListener("change", () => settings.set("codec", byId("codec").value));
+  return {
+    /** @param {string} mode */
+    movement(mode) {
+      motion.mode = mode === "fly" ? "fly" : "orbit";
+      showMovement(mode);
+    },
+    /** @param {string[]} codecs that both sides can */
+    codecs(codecs) {
+      const list = byId("codec");
+      list.replaceChildren(...codecs.map((value) => element("option", { value, textContent: /** @type {any} */ (CODECS)[value] ?? value })));
+      if (!codecs.includes(settings.get("codec"))) settings.set("codec", "jpeg");
+      list.value = settings.get("codec");
+      list.closest("label").hidden = codecs.length < 2;
+    },
+    /** @param {number} fov degrees */
+    fov(fov) {
+      setSlider(byId("fov"), Math.round(fov));
+      byId("fov-value").textContent = `${Math.round(fov)}°`;
+    },
+    /** @param {{width: number, height: number}} size of the picture asked for */
+    size({ width, height }) {
+      const text = `${width} × ${height}`;
+      if (byId("side-value").textContent !== text) byId("side-value").textContent = text;
+    },
+  };
+}

@@ -1,0 +1,89 @@
+// Which picture is shown, and the divider of "side by side".
+
+import { clamp } from "../view/matrix.js";
+import { byId, element, radioGroup } from "./dom.js";
+
+/** @typedef {import("../settings.js").Settings} Settings */
+
+export const MODES = {
+  rendered: "Rendered",
+  holes: "Holes",
+  mended: "Mended",
+  split: "Side by side",
+  depth: "Depth",
+  coverage: "Coverage",
+};
+
+/** @param {Settings} settings */
+export function buildModes(settings) {
+  const strip = byId("modes");
+  for (const [value, text] of Object.entries(MODES)) {
+    const button = element("button", { type: "button", textContent: text });
+    button.setAttribute("role", "radio");
+    button.dataset.value = value;
+    strip.append(button);
+  }
+  const show = radioGroup(strip, (value) => settings.set("mode", value));
+  settings.watch(["mode"], () => show(settings.get("mode")));
+
+  for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
+    const list = byId(`split-${side}`);
+    for (const [value, text] of Object.entries(MODES)) {
+      if (value !== "split") list.append(element("option", { value, textContent: text }));
+    }
+    list.addEventListener("change", () => settings.set(side, list.value));
+    settings.watch([side, "mode"], () => {
+      list.value = settings.get(side);
+      byId(`${side}-name`).textContent = /** @type {any} */ (MODES)[settings.get(side)];
+      byId(`${side}-name`).hidden = settings.get("mode") !== "split";
+      byId("split-modes").hidden = settings.get("mode") !== "split";
+    });
+  }
+  buildDivider(settings);
+}
+
+/** @param {Settings} settings */
+function buildDivider(settings) {
+  const divider = byId("divider");
+  const move = (/** @type {number} */ x) => {
+    const { left, width } = freeBox(divider);
+    settings.set("divider", clamp((x - left) / width, 0, 1));
+  };
+  divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => {
+    divider.setPointerCapture(event.pointerId);
+    event.preventDefault();
+    divider.focus();
+  });
+  divider.addEventListener("pointermove", (/** @type {PointerEvent} */ event) => {
+    if (divider.hasPointerCapture(event.pointerId)) move(event.clientX);
+  });
+  divider.addEventListener("keydown", (/** @type {KeyboardEvent} */ event) => {
+    const step = { ArrowLeft: -0.02, ArrowRight: 0.02, Home: -1, End: 1 }[event.key];
+    if (step === undefined) return;
+    event.preventDefault();
+    settings.set("divider", clamp(settings.get("divider") + step, 0, 1));
+  });
+}
+
+/** Layout writes the free part of the page on the stage. @param {HTMLElement} divider */
+function freeBox(divider) {
+  const { freeLeft, freeWidth } = /** @type {HTMLElement} */ (divider.parentElement).dataset;
+  return { left: Number(freeLeft), width: Math.max(1, Number(freeWidth)) };
+}
+
+/**
+ * Put the divider and the two names where they belong.
+ * @param {Settings} settings @param {import("../view/lens.js").Box} free @returns {number} the divider's x, CSS pixels
+ */
+export function placeDivider(settings, free) {
+  const divider = byId("divider");
+  const at = settings.get("divider");
+  const x = free.left + at * free.width;
+  divider.hidden = settings.get("mode") !== "split";
+  divider.style.transform = `translateX(${x}px)`;
+  divider.style.setProperty("--grip", `${free.top + 0.5 * free.height}px`);
+  divider.setAttribute("aria-valuenow", String(Math.round(100 * at)));
+  byId("left-name").style.left = `${free.left + 12}px`;
+  byId("right-name").style.right = `${window.innerWidth - free.left - free.width + 12}px`;
+  return x;
+}

@@ -1,0 +1,149 @@
+// The section "Camera path": record, add views, play, and export as MP4 by the server.
+
+import { address } from "../link/connection.js";
+import { lensOf } from "../view/lens.js";
+import { FPS, Track } from "../view/track.js";
+import { extrinsicsOf } from "../view/pose.js";
+import { byId, download } from "./dom.js";
+
+/**
+ * @typedef {object} Surroundings
+ * @property {import("../view/motion.js").Motion} motion
+ * @property {import("./transport.js").Transport} transport
+ * @property {import("./notices.js").Notices} notices
+ * @property {import("../settings.js").Settings} settings
+ * @property {string | null} token
+ * @property {() => void} wake
+ */
+
+export class PathPanel {
+  /** @param {Surroundings} around */
+  constructor(around) {
+    this.around = around;
+    this.track = new Track();
+    this.recording = false;
+    /** @type {{since: number, hands: number} | null} */
+    this.playing = null;
+    this.exporting = 0;
+    this.canExport = true;
+    byId("path-record").addEventListener("click", () => this.toggleRecording());
+    byId("path-add").addEventListener("click", () => this.#add());
+    byId("path-play").addEventListener("click", () => this.#play());
+    byId("path-clear").addEventListener("click", () => {
+      this.track.clear();
+      this.playing = null;
+      this.#show();
+    });
+    byId("path-export").addEventListener("click", () => this.#export());
+    this.#show();
+  }
+
+  /** @param {boolean} can whether the server writes MP4 */
+  offer(can) {
+    this.canExport = can;
+    this.#show();
+  }
+
+  toggleRecording() {
+    this.playing = null;
+    this.recording = !this.recording && this.around.motion.pose !== null;
+    if (this.recording) this.track.start(performance.now());
+    this.#show();
+    this.around.wake();
+  }
+
+  #add() {
+    const { motion, transport } = this.around;
+    if (!motion.goal) return;
+    if (this.track.recordingSince >= 0) this.track.clear();
+    this.recording = false;
+    this.track.add(motion.goal, transport.shown);
+    this.#show();
+  }
+
+  #play() {
+    this.recording = false;
+    this.playing = this.playing ? null : { since: performance.now(), hands: this.around.motion.hands };
+    this.#show();
+    this.around.wake();
+  }
+
+  /** Once a repaint. @param {number} now ms @returns {boolean} whether the next repaint must come */
+  step(now) {
+    const { motion, transport } = this.around;
+    if (this.recording && motion.pose) {
+      if (!this.track.record(motion.pose, transport.shown, now)) this.toggleRecording();
+      this.#show();
+    }
+    if (this.playing) {
+      const seconds = (now - this.playing.since) / 1000;
+      const over = seconds >= this.track.seconds || motion.hands !== this.playing.hands;
+      if (motion.hands === this.playing.hands) motion.put(this.track.at(Math.min(seconds, this.track.seconds)));
+      if (over) this.playing = null;
+      if (over) this.#show();
+    }
+    return this.recording || this.playing !== null;
+  }
+
+  #show() {
+    const { points, seconds, recordingSince } = this.track;
+    const ready = points.length > 1 && !this.recording;
+    const record = byId("path-record");
+    record.setAttribute("aria-pressed", String(this.recording));
+    record.lastElementChild.textContent = this.recording ? "Stop" : "Record";
+    byId("path-play").disabled = !ready;
+    byId("path-play").textContent = this.playing ? "Stop playing" : "Play";
+    byId("path-clear").disabled = !points.length || this.recording;
+    const button = byId("path-export");
+    button.disabled = !ready || !this.canExport || this.exporting > 0;
+    button.classList.toggle("busy", this.exporting > 0);
+    button.textContent = this.exporting ? "Rendering the film" : "Export MP4";
+    let text = "Record your own movement, or add views: the film goes through them.";
+    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s`;
+    if (!this.canExport) text = "The server cannot write MP4. There, install viewmend[video].";
+    if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
+  }
+
+  /** What is posted: cameras and times of the film's frames. */
+  #request() {
+    const { motion, transport, settings } = this.around;
+    const [width, height] = byId("path-size").value.split("x").map(Number);
+    const box = { left: 0, top: 0, width, height };
+    const short = (/** @type {number} */ value) => Number(value.toFixed(6));
+    const moments = this.track.moments;
+    const poses = moments.map((seconds) => {
+      const pose = this.track.at(seconds);
+      const { R, T } = extrinsicsOf(motion.rig, pose);
+      const { fx, fy, cx, cy } = lensOf(box, box, pose.fov);
+      return { R: R.map(short), T: T.map(short), fx: short(fx), fy: short(fy), cx, cy };
+    });
+    const still = byId("path-time").value === "still";
+    const range = transport.state ?? { first: 0, end: 1 };
+    const times = moments.map((seconds) =>
+      still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
+    );
+    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1] };
+  }
+
+  async #export() {
+    const { notices, token } = this.around;
+    this.exporting = performance.now();
+    this.#show();
+    try {
+      const headers = { "content-type": "application/json" };
+      const body = JSON.stringify(this.#request());
+      const answer = await fetch(address("/path.mp4", token), { method: "POST", headers, body });
+      if (!answer.ok) {
+        const said = await answer.json().catch(() => ({}));
+        throw new Error(said.error ?? `the server answered ${answer.status}`);
+      }
+      download(await answer.blob(), "viewmend-path.mp4");
+      notices.toast(`The film is ready (${((performance.now() - this.exporting) / 1000).toFixed(0)} s)`);
+    } catch (error) {
+      notices.toast(`No film: ${/** @type {Error} */ (error).message}`, "error");
+    } finally {
+      this.exporting = 0;
+      this.#show();
+    }
+  }
+}

@@ -1,0 +1,150 @@
+// Figures: how fast, how late, what each stage costs, with the last frames as a small plot.
+
+import { byId, element } from "./dom.js";
+
+const STAGES = {
+  read: ["Reading", "#6ea8fe"],
+  geometry: ["Geometry", "#4fc3b1"],
+  rendering: ["Rendering", "#f0c04c"],
+  inpainting: ["Mending", "#ef7fa7"],
+  encode: ["Encoding", "#a58bf0"],
+  wait: ["Waiting", "#56606d"],
+};
+const HISTORY = 120;
+const LATENCIES = 60;
+
+/** @param {number[]} values @param {number} share */
+function quantile(values, share) {
+  const sorted = [...values].sort((a, b) => a - b);
+  return sorted.length ? sorted[Math.min(sorted.length - 1, Math.floor(share * sorted.length))] : NaN;
+}
+
+/** Times of events within the last two seconds. */
+class Rate {
+  constructor() {
+    /** @type {number[]} */
+    this.times = [];
+  }
+
+  mark() {
+    this.times.push(performance.now());
+    if (this.times.length > 400) this.times.splice(0, 200);
+  }
+
+  get perSecond() {
+    const start = performance.now() - 2000;
+    return this.times.filter((time) => time > start).length / 2;
+  }
+}
+
+export class Statistics {
+  constructor() {
+    this.pictures = new Rate();
+    this.repaints = new Rate();
+    /** @type {number[]} */
+    this.latencies = [];
+    /** @type {Record<string, number>[]} */
+    this.history = [];
+    /** @type {any} */
+    this.server = null;
+    /** @type {any} */
+    this.header = null;
+    this.answered = 0;
+    this.bytes = 0;
+    this.#build();
+    setInterval(() => this.#show(), 500);
+  }
+
+  #build() {
+    /** @type {Record<string, HTMLElement>} */
+    this.figures = {};
+    for (const [name, text] of [
+      ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "pose to pixel"],
+      ["holes", "holes"], ["size", "picture"], ["kb", "a frame"],
+      ["dropped", "dropped"], ["viewers", "viewers"], ["budget", "budget"],
+    ]) {
+      const value = element("dd", { id: `figure-${name}`, textContent: "–" });
+      this.figures[name] = value;
+      byId("figures").append(element("div", {}, element("dt", { textContent: text }), value));
+    }
+    /** @type {Record<string, HTMLElement>} */
+    this.stages = {};
+    for (const [name, [text, colour]] of Object.entries({ ...STAGES, total: ["Total", ""] })) {
+      const value = element("output", { textContent: "–" });
+      const swatch = element("i");
+      swatch.style.setProperty("--colour", colour || "transparent");
+      byId("stages").append(element("li", { className: name }, swatch, text, value));
+      this.stages[name] = value;
+    }
+  }
+
+  /** A picture is on the canvas. @param {any} header @param {number} bytes @returns {number | null} pose to pixel, if it answers a new look */
+  picture(header, bytes) {
+    this.pictures.mark();
+    this.header = header;
+    this.bytes = bytes;
+    this.history.push(header.stage_ms);
+    if (this.history.length > HISTORY) this.history.shift();
+    if (header.look <= this.answered) return null;
+    this.answered = header.look;
+    const latency = performance.now() - header.sent_ms;
+    this.latencies.push(latency);
+    if (this.latencies.length > LATENCIES) this.latencies.shift();
+    return latency;
+  }
+
+  #show() {
+    if (!this.header || !byId("section-stats").offsetParent) return;
+    const { figures, header, server } = this;
+    const put = (/** @type {string} */ name, /** @type {string} */ value, unit = "") => {
+      figures[name].replaceChildren(value, element("small", { textContent: unit }));
+    };
+    put("fps", this.pictures.perSecond.toFixed(1));
+    put("repaints", this.repaints.perSecond.toFixed(0));
+    const latency = quantile(this.latencies, 0.5);
+    put("latency", Number.isNaN(latency) ? "–" : latency.toFixed(0), " ms");
+    put("holes", (100 * header.holes).toFixed(1), " %");
+    put("size", `${header.width}×${header.height}`);
+    put("kb", (this.bytes / 1000).toFixed(0), " kB");
+    put("dropped", String(header.dropped));
+    put("viewers", String(server?.viewers ?? "–"));
+    put("budget", server?.budget ? server.budget.target_ms.toFixed(0) : "none", server?.budget ? " ms" : "");
+    const recent = this.history.slice(-20);
+    for (const name of Object.keys(this.stages)) {
+      const mean = recent.reduce((sum, stages) => sum + (stages[name] ?? 0), 0) / recent.length;
+      this.stages[name].textContent = `${mean.toFixed(1)} ms`;
+    }
+    this.#plot();
+  }
+
+  #plot() {
+    const canvas = byId("plot");
+    const ratio = Math.min(2, window.devicePixelRatio);
+    const [width, height] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
+    canvas.width = width;
+    canvas.height = height;
+    const pen = canvas.getContext("2d");
+    const sums = this.history.map((stages) => Object.keys(STAGES).reduce((sum, name) => sum + (stages[name] ?? 0), 0));
+    const top = 1.15 * Math.max(10, quantile(sums, 0.97));
+    const bar = width / HISTORY;
+    this.history.forEach((stages, index) => {
+      let y = height;
+      const x = width - (this.history.length - index) * bar;
+      for (const [name, [, colour]] of Object.entries(STAGES)) {
+        const part = ((stages[name] ?? 0) / top) * height;
+        pen.fillStyle = colour;
+        pen.fillRect(x, y - part, Math.max(1, bar - 0.5), part);
+        y -= part;
+      }
+    });
+    const step = [5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((ms) => top / ms <= 3.2) ?? 10000;
+    pen.font = `${10 * ratio}px system-ui, sans-serif`;
+    for (let ms = step; ms < top; ms += step) {
+      const y = Math.round(height * (1 - ms / top)) + 0.5;
+      pen.fillStyle = "#ffffff26";
+      pen.fillRect(0, y, width, 1);
+      pen.fillStyle = "#c3cad2";
+      pen.fillText(`${ms} ms`, 5 * ratio, y - 3 * ratio);
+    }
+  }
+}
