@@ -33,7 +33,12 @@ class Adversary:
 
         completed: Fhat of every view of the batch, clip by clip.
         """
-        truth, made, error = self._images(batch, completed)
+        return self.judge_images(*self._images(batch, completed), share)
+
+    def judge_images(
+        self, truth: list[Tensor], made: list[Tensor], error: list[Tensor], share: float
+    ) -> tuple[Float[Tensor, ""], float]:
+        """The same of F*, Fhat and E as the discriminator takes them."""
         own_loss = discriminator_objective(self.discriminator, truth, made, error, self.kind)
         (own_loss * share).backward()
         return inpainter_objective(self.discriminator, made, error, self.kind), float(own_loss.detach())

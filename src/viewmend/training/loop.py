@@ -28,7 +28,11 @@ from viewmend.training.validation import Validation
 
 
 def train(
-    recipe: Recipe, out: Path, start: Inpainter | None = None, report: Callable[[Progress], None] | None = None
+    recipe: Recipe,
+    out: Path,
+    start: nn.Module | None = None,
+    report: Callable[[Progress], None] | None = None,
+    kind: "type[Run] | None" = None,
 ) -> Path:
     """Run a recipe, or go on with the run that `out` holds; under torchrun, with all of its processes.
 
@@ -40,13 +44,14 @@ def train(
         out: folder for all that is written.
         start: a model to begin with: its weights, wherever the recipe's model has one of the same name and shape.
         report: told of each step, in the first process.
+        kind: what runs; a subclass trains something else than our model.
 
     Raises:
         RunError: `out` holds a run of another recipe, or a damaged one.
         FloatingPointError: a loss is not finite; the batch is saved in `out`.
     """
     with processes() as own:
-        run = Run(recipe, out, start, own)
+        run = (kind or Run)(recipe, out, start, own)
         for progress in run.steps():
             if report is not None and own.first:
                 report(progress)
@@ -54,17 +59,20 @@ def train(
 
 
 class Run:
-    """A run in this process: model, averages, optimizers and streams of samples."""
+    """A run in this process: model, averages, optimizers and streams of samples.
 
-    def __init__(self, recipe: Recipe, out: Path, start: Inpainter | None, own: Processes) -> None:
+    Subclasses that train another network override the methods from `_make_model` on.
+    """
+
+    def __init__(self, recipe: Recipe, out: Path, start: nn.Module | None, own: Processes) -> None:
         out.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(recipe.seed)
         self.recipe, self.out, self.own = recipe, out, own
-        self.model = _model(recipe, start).to(own.device)
-        self.objective = Objective(self.model, recipe).to(own.device)
+        self.model = self._make_model(start).to(own.device)
+        self.objective = self._make_objective(start).to(own.device)
         self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema))
         self.learned = [p for p in self.model.parameters() if p.requires_grad]
-        self.optimizer = torch.optim.AdamW(self.learned, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+        self.optimizer = self._make_optimizer()
         self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own) if recipe.loss.adversarial else None
         self.state = RunState(0, 0.0, ())
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
@@ -76,7 +84,7 @@ class Run:
             self.state = load_run(out, recipe, self._modules, self._optimizers)
         self.shared = own.share(self.objective)
         self.streams = self._streams()
-        self.validation = Validation(recipe, out) if recipe.validate_every and own.first else None
+        self.validation = self._make_validation() if recipe.validate_every and own.first else None
 
     def steps(self) -> Iterator[Progress]:
         """Make all steps that are left; yields after each."""
@@ -90,7 +98,7 @@ class Run:
                 schedule.wait()
                 batches = [stream.batch(step, self.recipe.batch) for stream in self.streams]
                 schedule.got()
-                rate = self.recipe.learning_rate * learning_rate_factor(step, at, self.recipe.warmup)
+                rate = self.recipe.learning_rate * self._rate_factor(step, at)
                 for group in self.optimizer.param_groups:
                     group["lr"] = rate
                 costs = self._step(step, batches)
@@ -109,11 +117,36 @@ class Run:
                 log.validated(self.validation.judge(self.averaged, step))
 
     @property
-    def averaged(self) -> Inpainter:
+    def averaged(self) -> nn.Module:
         """The averaged weights, which are the result."""
-        module = self.average.module
-        assert isinstance(module, Inpainter)
-        return module
+        return self.average.module
+
+    def _make_model(self, start: nn.Module | None) -> nn.Module:
+        assert start is None or isinstance(start, Inpainter)
+        return _model(self.recipe, start)
+
+    def _make_objective(self, start: nn.Module | None) -> nn.Module:
+        """A module whose call on a batch of samples is an `Outcome`."""
+        assert isinstance(self.model, Inpainter)
+        return Objective(self.model, self.recipe)
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        recipe = self.recipe
+        return torch.optim.AdamW(self.learned, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
+
+    def _make_validation(self) -> Validation | None:
+        return Validation(self.recipe, self.out)
+
+    def _rate_factor(self, step: int, progress: float) -> float:
+        return learning_rate_factor(step, progress, self.recipe.warmup)
+
+    def _judge(self, adversary: Adversary, batch: list[Sample], outcome: Outcome, share: float):
+        """See `Adversary.judge`."""
+        return adversary.judge(batch, outcome.completed, share)
+
+    def _write_model(self) -> None:
+        assert isinstance(self.averaged, Inpainter)
+        save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
 
     def _step(self, step: int, batches: list[list[Sample]]) -> Costs:
         """One step of all weights, with the mean of the streams' gradients."""
@@ -129,7 +162,7 @@ class Run:
                 assert isinstance(outcome, Outcome)
                 total, adversarial, judged = outcome.total, 0.0, 0.0
                 if self.adversary is not None:
-                    term, judged = self.adversary.judge(batch, outcome.completed, 1 / len(batches))
+                    term, judged = self._judge(self.adversary, batch, outcome, 1 / len(batches))
                     total, adversarial = total + self.recipe.loss.adversarial * term, float(term.detach())
                 self._demand_finite(total.detach(), step, batch)
                 (total / len(batches)).backward()
@@ -182,7 +215,7 @@ class Run:
         positions = self.own.gather([stream.position for stream in self.streams])
         self.state = RunState(step, schedule.elapsed_s(), positions)
         if self.own.first:
-            save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
+            self._write_model()
             save_run(self.out, self.recipe, self.state, self._modules, self._optimizers)
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.inpainting.classical import Telea
-from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.protocol import State
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.plan import Recipe
@@ -46,7 +45,7 @@ class Validation:
         self._telea: list[float] = []
 
     @torch.no_grad()
-    def judge(self, model: Inpainter, step: int) -> Judgement:
+    def judge(self, model: nn.Module, step: int) -> Judgement:
         """Mend every view, score it, and leave a picture of the first few."""
         if not self._samples:
             self._samples = self._views()
