@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d, pad
 
@@ -29,7 +29,7 @@ class Window:
     top: int
     left: int
 
-    def of(self, picture: Float[Tensor, "*stack height width"], size: tuple[int, int]) -> Tensor:
+    def of(self, picture: Shaped[Tensor, "*stack height width"], size: tuple[int, int]) -> Tensor:
         """What the picture shows there."""
         return picture[..., self.top : self.top + size[0], self.left : self.left + size[1]]
 

@@ -1,14 +1,17 @@
 """`viewmend train`: run a recipe, or go on with a run."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 if TYPE_CHECKING:
-    from viewmend.inpainting.inpainter import Inpainter
+    from torch import nn
+
     from viewmend.training.logs import Progress
+    from viewmend.training.loop import Run
     from viewmend.training.plan import Recipe
 
 LINE_EVERY = 20
@@ -24,11 +27,13 @@ class Options:
     """
 
     recipe: Annotated[str, tyro.conf.Positional] = "small"
-    """Name of the recipe: small, small_rays, base, paper, finetune."""
+    """Name of the recipe: small, small_rays, base, paper, finetune; or a published network's, to fine-tune it: dstt,
+    fuseformer, e2fgvi, e2fgvi-hq."""
     out: Path = Path("out/train")
     """Folder for all that is written."""
     start: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Name or folder of a model to begin with (finetune: small by default)."""
+    """Name or folder of a model to begin with (finetune: small by default). For a published network its checkpoint, a
+    run's folder, or pretrained for the file among the known weights; without it, random weights."""
     performers: Path | None = None
     """Folder of glTF characters for a share of the scenes; never one that is kept for tests."""
     motions: Path | None = None
@@ -71,32 +76,49 @@ class Options:
 def run(options: Options) -> int:
     """Train, with a bar on a terminal, else a line every twenty steps."""
     from viewmend.cli.console import say
-    from viewmend.inpainting.checkpoint import load_inpainter
     from viewmend.training.loop import train
 
-    name = options.start or ("small" if options.recipe == "finetune" else None)
-    start = load_inpainter(name) if name is not None else None
+    start, kind = _start(options)
     recipe = chosen_recipe(options, start)
     with _Reporter(recipe.steps) as reporter:
         try:
-            train(recipe, options.out, start, reporter.report)
+            train(recipe, options.out, start, reporter.report, kind)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
     say(f"wrote {options.out}" if reporter.steps else f"{options.out}: this run was finished before; nothing to do")
     return 0
 
 
-def chosen_recipe(options: Options, start: "Inpainter | None") -> "Recipe":
+def _start(options: Options) -> "tuple[nn.Module | None, type[Run]]":
+    """What to begin with, and what kind of run it is."""
+    from viewmend.baselines.published import NETWORKS, load_baseline
+    from viewmend.inpainting.checkpoint import load_inpainter
+    from viewmend.training.baseline_run import BaselineRun
+    from viewmend.training.loop import Run
+
+    name = options.start or ("small" if options.recipe == "finetune" else None)
+    if options.recipe not in NETWORKS:
+        return load_inpainter(name) if name is not None else None, Run
+    weights = "" if name == "pretrained" else f"@{name}"
+    return load_baseline(options.recipe, weights) if name is not None else None, BaselineRun
+
+
+def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     """The recipe with what the options change.
 
     Raises:
         ValueError: no such recipe, or options that do not go together.
     """
+    from viewmend.baselines.published import NETWORKS
+    from viewmend.inpainting.inpainter import Inpainter
+    from viewmend.training.baseline_run import baseline_recipe
     from viewmend.training.plan import DataPlan
     from viewmend.training.recipes import RECIPES
 
-    if options.recipe not in RECIPES:
-        raise ValueError(f"expected a recipe among {', '.join(RECIPES)}, got '{options.recipe}'; see --help")
+    networks = {name: partial(baseline_recipe, name, started=start is not None) for name in NETWORKS}
+    recipes = RECIPES | networks
+    if options.recipe not in recipes:
+        raise ValueError(f"expected a recipe among {', '.join(recipes)}, got '{options.recipe}'; see --help")
     if options.recipe == "finetune" and not (options.capture or options.shards):
         raise ValueError("expected --capture DIR for finetune, got none; name the folder of your capture")
     if (options.performers is None) != (options.motions is None):
@@ -109,8 +131,8 @@ def chosen_recipe(options: Options, start: "Inpainter | None") -> "Recipe":
         device=options.data_device or "cpu",
         clip=options.clip or 1,
     )
-    recipe = RECIPES[options.recipe](data)
-    if options.recipe == "finetune" and start is not None:
+    recipe = recipes[options.recipe](data)
+    if options.recipe == "finetune" and isinstance(start, Inpainter):
         recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
     own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "part", "checkpoint_every")

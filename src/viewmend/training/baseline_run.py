@@ -1,0 +1,106 @@
+"""Fine-tuning of the published networks: the same samples and the same loop as ours, their authors' parameters."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from viewmend.baselines.e2fgvi import E2FGVI
+from viewmend.baselines.published import NETWORKS, TRAINED
+from viewmend.baselines.token_transformer import NATIVE_PX, TokenTransformer
+from viewmend.training.adversary import BETAS, Adversary
+from viewmend.training.baseline_objective import BaselineObjective, BaselineOutcome
+from viewmend.training.loop import Run
+from viewmend.training.model_card import model_card
+from viewmend.training.objective import Outcome
+from viewmend.training.plan import DataPlan, LossWeights, Recipe
+from viewmend.training.samples import Sample
+
+CLIP = 5
+"""Consecutive views in the authors' training clips."""
+FULL_RATE = 0.8
+"""Share of a run at the full learning rate; the rest is at a tenth."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaselineRecipe(Recipe):
+    """A run that trains a network of `NETWORKS`, named as it is. Its `part` and our terms of the loss say nothing."""
+
+    model: None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Nothing of ours."""
+    size_px: tuple[int, int] = NATIVE_PX
+    """Height and width of the frames that it is trained on."""
+    started: bool = False
+    """Whether it began with a checkpoint; E2FGVI's flow is only compared then, with the checkpoint's."""
+
+
+def baseline_recipe(network: str, data: DataPlan, started: bool = False) -> BaselineRecipe:
+    """The authors' parameters: Adam with betas (0, 0.99), 1e-4 for both networks, hinge of T-PatchGAN with 0.01.
+
+    Theirs too: a tenth of the rate in the last fifth, neither warm-up nor clipping nor averaging. What the hardware
+    sets is not: steps, and the batch (theirs is 8).
+    """
+    clip = data.clip if data.clip > 1 else CLIP
+    return BaselineRecipe(
+        name=network,
+        data=replace(data, clip=clip, times=(0, *range(10, 10 + clip)), rays=0),
+        loss=LossWeights(adversarial=0.01, adversarial_kind="hinge", discriminator="clip"),
+        steps=2000,
+        minutes=40.0,
+        batch=8,
+        fresh=1,
+        buffer=100,
+        learning_rate=1e-4,
+        discriminator_rate=1e-4,
+        warmup=1,
+        weight_decay=0.0,
+        clip=1e6,
+        ema=0.0,
+        bfloat16=False,
+        validate_every=0,
+        started=started,
+    )
+
+
+class BaselineRun(Run):
+    """A run of a `BaselineRecipe` from the network `start`; its model.safetensors has the official keys."""
+
+    recipe: BaselineRecipe
+
+    def _make_model(self, start: nn.Module | None) -> nn.Module:
+        network = NETWORKS[self.recipe.name]()
+        network.check_size(*self.recipe.size_px)
+        if start is not None:
+            network.load_state_dict(start.state_dict())
+        return network.train()
+
+    def _make_objective(self, start: nn.Module | None) -> nn.Module:
+        assert isinstance(self.model, TokenTransformer | E2FGVI)
+        return BaselineObjective(self.model, self.recipe.size_px, self.recipe.bfloat16, start)
+
+    def _make_optimizer(self) -> torch.optim.Optimizer:
+        return torch.optim.Adam(self.learned, lr=self.recipe.learning_rate, betas=BETAS)
+
+    def _make_validation(self) -> None:
+        raise ValueError(f"expected --validate-every 0 for {self.recipe.name}, whose views `evaluate` judges")
+
+    def _rate_factor(self, step: int, progress: float) -> float:
+        return 1.0 if progress < FULL_RATE else 0.1
+
+    def _judge(self, adversary: Adversary, batch: list[Sample], outcome: Outcome, share: float):
+        assert isinstance(outcome, BaselineOutcome)
+        truth = [(clip.truth.transpose(0, 1) + 1) / 2 for clip in outcome.clips]
+        made = [(images.transpose(0, 1) + 1) / 2 for images in outcome.composed]
+        return adversary.judge_images(truth, made, [clip.holes.float() for clip in outcome.clips], share)
+
+    def _write_model(self) -> None:
+        weights = {key: value.detach().cpu().contiguous() for key, value in self.averaged.state_dict().items()}
+        partial = self.out / f".{TRAINED}"
+        save_file(weights, partial, {"format": "pt", "network": self.recipe.name})
+        partial.replace(self.out / TRAINED)
+        begun = "a checkpoint, whose licence goes on" if self.recipe.started else "random weights"
+        card = (
+            model_card(self.recipe, self.state) + f"\nBegan with {begun}. A method: {self.recipe.name}-o-def@FOLDER.\n"
+        )
+        (self.out / "README.md").write_text(card)
