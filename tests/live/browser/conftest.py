@@ -1,0 +1,129 @@
+"""A real Chromium, and pages of it that look at a stand-in server; skipped where there is none."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+import pytest
+from live.browser.stand_in import StandIn
+
+SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
+
+
+def find_chromium() -> str | None:
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    return os.environ.get("VIEWMEND_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+
+
+@pytest.fixture(scope="session")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra: pip install 'viewmend[browser]'")
+    executable = find_chromium()
+    if executable is None:
+        pytest.skip("no Chromium: install the system's package, or name one in VIEWMEND_CHROMIUM")
+    with playwright.sync_playwright() as control:
+        opened = control.chromium.launch(executable_path=executable, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+class View:
+    """A page and what a test does with it."""
+
+    def __init__(self, page, server: StandIn, errors: list[str]) -> None:
+        self.page, self.server, self.errors = page, server, errors
+
+    def until(self, condition: str | Callable[[], object], seconds: float = 10.0) -> None:
+        """Wait for a JavaScript expression or a function to be true."""
+        end = time.monotonic() + seconds
+        while not (self.page.evaluate(condition) if isinstance(condition, str) else condition()):
+            assert time.monotonic() < end, f"waited {seconds} s for {condition}"
+            self.page.wait_for_timeout(20)
+
+    def data(self, name: str) -> str | None:
+        return self.page.locator("#picture").get_attribute(f"data-{name}")
+
+    def settle(self) -> None:
+        """Wait until the picture is the full answer to the last look, and the view rests."""
+        self.page.wait_for_timeout(60)
+
+        def answered() -> bool:
+            looks = self.server.looks
+            return bool(looks) and not looks[-1].get("moving") and self.data("look") == str(looks[-1]["id"])
+
+        self.until(answered)
+        self.page.wait_for_timeout(200)
+        self.until(answered)
+
+    def pixels(self) -> np.ndarray:
+        """What a person sees, (height, width, 3) RGB."""
+        return cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+    def picture(self) -> np.ndarray:
+        """The canvas alone, as it is painted."""
+        hidden = (
+            "header, aside, footer, nav, .labels, .divider, .corner, .cover, .toasts { visibility: hidden !important }"
+        )
+        style = self.page.add_style_tag(content=hidden)
+        shown = self.pixels()
+        style.evaluate("e => e.remove()")
+        return shown
+
+    def drag(self, dx: int, dy: int, button: str = "left", steps: int = 4) -> None:
+        x, y = self.middle()
+        mouse = self.page.mouse
+        mouse.move(x, y)
+        mouse.down(button=button)
+        mouse.move(x + dx, y + dy, steps=steps)
+        mouse.up(button=button)
+
+    def middle(self) -> tuple[float, float]:
+        """Of the part of the page that nothing covers."""
+        x, y = self.page.evaluate(
+            "['--middle', '--centre'].map(n => parseFloat(document.body.style.getPropertyValue(n)))"
+        )
+        return x, y
+
+    def tab(self, name: str) -> None:
+        """Open a section of the controls where they lie behind tabs."""
+        tab = self.page.locator(f"#tabs button[data-section={name}]")
+        if tab.is_visible() and tab.get_attribute("aria-expanded") == "false":
+            tab.click()
+
+
+def opened(browser, server: StandIn, size: str, query: str = "", **options) -> Iterator[View]:
+    width, height = SIZES[size]
+    touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
+    context = browser.new_context(viewport={"width": width, "height": height}, **touch, **options)
+    page = context.new_page()
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+    page.goto(server.url + query)
+    yield View(page, server, errors)
+    context.close()
+    assert not errors, errors
+
+
+@pytest.fixture
+def server() -> Iterator[StandIn]:
+    with StandIn() as started:
+        yield started
+
+
+@pytest.fixture(params=list(SIZES))
+def view(browser, server, request) -> Iterator[View]:
+    """A page that shows its first full picture, at both sizes."""
+    for one in opened(browser, server, request.param):
+        one.settle()
+        yield one
+
+
+@pytest.fixture
+def desktop(browser, server) -> Iterator[View]:
+    for one in opened(browser, server, "desktop"):
+        one.settle()
+        yield one

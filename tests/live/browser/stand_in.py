@@ -1,0 +1,252 @@
+"""A server that speaks docs/live-protocol.md with a synthetic scene, for quick tests of the page alone."""
+
+import asyncio
+import io
+import json
+import struct
+import threading
+import time
+import zlib
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import uvicorn
+from live.browser import scene
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from viewmend.live.page_files import HEADERS, page_files
+
+MODES = ["rendered", "holes", "mended", "depth", "coverage"]
+LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
+
+
+@dataclass
+class Seen:
+    """One viewer, and what it said."""
+
+    socket: WebSocket
+    loop: asyncio.AbstractEventLoop
+    look: dict | None = None
+    time: float = 0.0
+    playing: bool = False
+    live: bool = True
+    speed: float = 1.0
+    acknowledged: int = 0
+    sent: int = 0
+    answered: tuple = ()
+    encoders: dict = field(default_factory=dict)
+
+
+@dataclass
+class StandIn:
+    """The server, in a thread of its own; tests read what it heard and change what it says."""
+
+    playing: bool = False
+    video: bool = True
+    source: str = "ready"
+    error: str | None = None
+    model_error: str | None = None
+    hold: bool = False
+    """True sends no frames."""
+    refuse: int | None = None
+    """A code to close new sockets with."""
+    broken: bool = False
+    """True sends pictures that cannot be decoded."""
+    looks: list[dict] = field(default_factory=list)
+    clocks: list[dict] = field(default_factory=list)
+    paths: list[dict] = field(default_factory=list)
+    hellos: list[dict] = field(default_factory=list)
+    viewers: list[Seen] = field(default_factory=list)
+
+    def __enter__(self) -> "StandIn":
+        self.files = page_files()
+        routes = [Route("/", self._file), Route("/page/{name:path}", self._file)]
+        routes += [Route("/path.mp4", self._film, methods=["POST"]), WebSocketRoute("/ws", self._viewer)]
+        config = uvicorn.Config(
+            Starlette(routes=routes), port=0, log_level="error", ws="websockets-sansio", lifespan="off"
+        )
+        self.server = uvicorn.Server(config)
+        self.thread = threading.Thread(target=self.server.run, daemon=True)
+        self.thread.start()
+        while not self.server.started:
+            time.sleep(0.01)
+        self.port = self.server.servers[0].sockets[0].getsockname()[1]
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.drop()
+        self.server.should_exit = True
+        self.thread.join(5)
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}/"
+
+    def drop(self) -> None:
+        """Break all connections."""
+        for viewer in self.viewers:
+            asyncio.run_coroutine_threadsafe(viewer.socket.close(1011), viewer.loop)
+
+    async def _file(self, request: Request) -> Response:
+        file = self.files.get(request.path_params.get("name", "index.html"))
+        if file is None:
+            return JSONResponse({"error": "no such file"}, 404)
+        return Response(file.content, media_type=file.media_type, headers=HEADERS)
+
+    async def _film(self, request: Request) -> Response:
+        body = json.loads(await request.body())
+        self.paths.append(body)
+        return Response(await asyncio.to_thread(film, body), media_type="video/mp4")
+
+    async def _viewer(self, socket: WebSocket) -> None:
+        await socket.accept()
+        if self.refuse is not None:
+            await socket.close(self.refuse)
+            return
+        viewer = Seen(socket, asyncio.get_running_loop(), playing=self.playing)
+        self.viewers.append(viewer)
+        talk = asyncio.create_task(self._talk(viewer))
+        try:
+            while True:
+                await self._hear(viewer, json.loads(await socket.receive_text()))
+        except (WebSocketDisconnect, RuntimeError):
+            talk.cancel()
+        finally:
+            self.viewers.remove(viewer)
+
+    async def _hear(self, viewer: Seen, message: dict) -> None:
+        kind = message["type"]
+        if kind == "hello":
+            self.hellos.append(message)
+            codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
+            about = {"version": 1, "viewer": 1, "server": "stand-in", "model": "none", "modes": MODES, "codecs": codecs}
+            more = {"export": True, "budget_ms": None, "limits": LIMITS, "token_needed": False}
+            await viewer.socket.send_json({"type": "welcome", **about, **more})
+            await viewer.socket.send_json(scene.rig())
+        elif kind == "look":
+            self.looks.append(message)
+            viewer.look = message
+        elif kind == "ack":
+            viewer.acknowledged = message["frame"]
+        elif kind == "clock":
+            self.clocks.append(message)
+            viewer.playing = message.get("playing", viewer.playing)
+            viewer.speed = message.get("speed", viewer.speed)
+            viewer.time = float(message.get("seek", viewer.time))
+            if "seek" in message or viewer.speed != 1 or not viewer.playing:
+                viewer.live = False
+            if message.get("live"):
+                viewer.live, viewer.playing, viewer.speed = True, True, 1.0
+
+    async def _talk(self, viewer: Seen) -> None:
+        last, told = time.monotonic(), 0.0
+        while True:
+            now = time.monotonic()
+            if viewer.playing:
+                viewer.time = (viewer.time + 10 * viewer.speed * (now - last)) % scene.FRAMES
+            last = now
+            if now - told > 0.1:
+                told = now
+                await viewer.socket.send_json(self._state(viewer))
+            if viewer.look and not self.hold and viewer.acknowledged == viewer.sent:
+                wanted = (viewer.look["id"], int(viewer.time))
+                if wanted != viewer.answered:
+                    viewer.answered = wanted
+                    viewer.sent += 1
+                    await viewer.socket.send_bytes(await asyncio.to_thread(self._frame, viewer))
+            await asyncio.sleep(0.005)
+
+    def _state(self, viewer: Seen) -> dict:
+        source = {"source": self.source, "error": self.error, "model_error": self.model_error}
+        span = {"first": 0, "end": scene.FRAMES, "total": scene.FRAMES, "loops": True, "kind": "recording"}
+        clock = {"time": int(viewer.time), "playing": viewer.playing, "speed": viewer.speed, "live": viewer.live}
+        return {"type": "state", **source, **span, **clock, "behind": 0, "buffering": False}
+
+    def _frame(self, viewer: Seen) -> bytes:
+        look, now = dict(viewer.look or {}), int(viewer.time)
+        eyes = look.get("eyes") or [look["camera"]]
+        part = 0.5 if look.get("moving") and look.get("adaptive", True) else 1.0
+        width, height = (max(16, 2 * int(part * look[side] / 2)) for side in ("width", "height"))
+        parts, data, cameras, share = [], [], [], 0.0
+        for eye, camera in enumerate(eyes):
+            x, y = width / look["width"], height / look["height"]
+            lens = {"fx": camera["fx"] * x, "fy": camera["fy"] * y, "cx": camera["cx"] * x, "cy": camera["cy"] * y}
+            K = [lens["fx"], 0, lens["cx"], 0, lens["fy"], lens["cy"], 0, 0, 1]
+            cameras.append({"K": K, "R": camera["R"], "T": camera["T"]})
+            rgb, z, points = scene.render({**camera, **lens}, width, height, now)
+            share = scene.hole_share(z, points)
+            for mode in look.get("modes", ["mended"]):
+                image = scene.picture(rgb, z, points, mode)
+                about, content = self._encode(viewer, image, look.get("codec", "jpeg"), (eye, mode))
+                parts.append({"kind": "image", "eye": eye, "mode": mode, **about})
+                data.append(content)
+            if look.get("depth"):
+                about, content = depth_part(z, 2)
+                parts.append({"eye": eye, **about})
+                data.append(content)
+        header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
+        header |= {"height": height, "full": part == 1.0, "cameras": cameras, "chosen": scene.CHOSEN, "holes": share}
+        header |= {"top_k": look.get("top_k"), "context_times": 3, "dropped": 0, "colours": scene.COLOURS}
+        stages = {"read": 1.0, "geometry": 8.0, "rendering": 6.0, "inpainting": 30.0 + 10 * np.sin(now), "encode": 2.0}
+        header["stage_ms"] = {**stages, "wait": 1.0, "total": sum(stages.values()) + 1}
+        header["parts"] = [about | {"bytes": len(content)} for about, content in zip(parts, data, strict=True)]
+        text = json.dumps(header).encode()
+        return b"VMF1" + struct.pack("<I", len(text)) + text + b"".join(data)
+
+    def _encode(self, viewer: Seen, image: np.ndarray, codec: str, stream: tuple) -> tuple[dict, bytes]:
+        if codec == "jpeg":
+            data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+        else:
+            data = video_key_frame(image, codec)
+        about = {"codec": codec, "key": True, "codec_string": CODEC_STRINGS.get(codec)}
+        return about, b"\xff\xd8broken" if self.broken else data
+
+
+CODEC_STRINGS = {"vp9": "vp09.00.20.08", "h264": "avc1.42E01F"}
+
+
+def video_key_frame(image: np.ndarray, codec: str) -> bytes:
+    """A key frame by itself."""
+    import av
+
+    encoder = av.CodecContext.create({"vp9": "libvpx-vp9", "h264": "libx264"}[codec], "w")
+    encoder.height, encoder.width = image.shape[:2]
+    encoder.pix_fmt, encoder.time_base, encoder.bit_rate = "yuv420p", "1/30", 8_000_000
+    fast = {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0"}
+    encoder.options = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline"} if codec == "h264" else fast
+    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24").reformat(format="yuv420p")
+    return b"".join(bytes(packet) for packet in [*encoder.encode(frame), *encoder.encode(None)])
+
+
+def depth_part(z: np.ndarray, stride: int) -> tuple[dict, bytes]:
+    q, near, far = scene.pack_depth(z, stride)
+    deltas = np.diff(q, axis=1, prepend=np.uint16(0)).astype("<u2")
+    about = {"kind": "depth", "encoding": "u16-delta-zlib", "width": q.shape[1], "height": q.shape[0]}
+    return about | {"stride": stride, "near_m": near, "far_m": far}, zlib.compress(deltas.tobytes(), 1)
+
+
+def film(body: dict) -> bytes:
+    """The posted path as MP4."""
+    import av
+
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=body["fps"])
+        stream.width, stream.height, stream.pix_fmt = body["width"], body["height"], "yuv420p"
+        for pose, now in zip(body["poses"], body["times"], strict=True):
+            image = scene.picture(*scene.render(pose, body["width"], body["height"], now), body["mode"])
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")))
+        container.mux(stream.encode(None))
+    return file.getvalue()
+
+
+if __name__ == "__main__":
+    with StandIn(playing=True) as server:
+        print(server.url)
+        while True:
+            time.sleep(1)
