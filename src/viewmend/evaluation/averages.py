@@ -110,6 +110,8 @@ class Table:
     """left out of the scores in the holes;"""
     empty_frames: int
     """without any hole (they are among the former)."""
+    sizes_px: tuple[tuple[int, int], ...]
+    """Widths and heights of their views."""
 
 
 def average_cell(cell: Cell) -> CellScores:
@@ -166,7 +168,8 @@ def _table(title: str, averaged: Sequence[CellScores], methods: Sequence[str]) -
     frames, thin, empty = (
         sum(getattr(a, name) for a in scenes.values()) for name in ("frames", "thin_frames", "empty_frames")
     )
-    return Table(title, tuple(_row(name, averaged) for name in methods), frames, thin, empty)
+    sizes = dict.fromkeys((f.width_px, f.height_px) for a in scenes.values() for f in a.cell.frames)
+    return Table(title, tuple(_row(name, averaged) for name in methods), frames, thin, empty, tuple(sizes))
 
 
 def _row(method: str, averaged: Sequence[CellScores]) -> Row:
@@ -203,8 +206,9 @@ def _overall(per_set: Sequence[Table], averaged: Sequence[CellScores], methods: 
                 speed=speed([a for a in averaged if a.cell.key.method == name and a.cell.error is None]),
             )
         )
-    counts = (sum(getattr(t, name) for t in per_set) for name in ("frames", "thin_frames", "empty_frames"))
-    return Table("mean of the sets", tuple(rows), *counts)
+    frames, thin, empty = (sum(getattr(t, name) for t in per_set) for name in ("frames", "thin_frames", "empty_frames"))
+    sizes = dict.fromkeys(size for table in per_set for size in table.sizes_px)
+    return Table("mean of the sets", tuple(rows), frames, thin, empty, tuple(sizes))
 
 
 def _gains(done: Sequence[CellScores], averaged: Sequence[CellScores]) -> list[float]:

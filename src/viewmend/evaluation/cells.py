@@ -13,10 +13,11 @@ import numpy as np
 
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import read_rgb, write_image
+from viewmend.evaluation.film import FILM_FRAMES, Picture, frames_of
 from viewmend.evaluation.frame_scores import FrameScores
 from viewmend.evaluation.methods import identity, make_method
 from viewmend.evaluation.provenance import Provenance
-from viewmend.evaluation.scene_run import MethodRun, Picture, RunSettings, SceneRun
+from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.scorers import KINDS, Features
 
@@ -98,6 +99,8 @@ class CellStore:
         """Remember a cell: the picture and the features first, so that a cell that is there is whole."""
         if run.picture is not None:
             self._write_image(f"{cell.key.stem}.png", run.picture)
+        if run.film is not None:
+            self._write_image(f"{cell.key.stem}.jpg", run.film)
         if run.features is not None:
             self._write_features(f"{cell.key.stem}.npz", run.features)
         values = asdict(replace(cell, features=None, true_features=None))
@@ -108,6 +111,8 @@ class CellStore:
         """Remember what all methods of a scene share: rendered view, E, truth, and its videos' features."""
         if run.pictures is not None:
             self._write_image(f"{key.scene_stem}.png", np.concatenate(run.pictures, 1))
+        if run.film is not None:
+            self._write_image(f"{key.scene_stem}.jpg", run.film)
         if run.features is not None:
             self._write_features(f"{key.scene_stem}.npz", run.features)
 
@@ -119,6 +124,20 @@ class CellStore:
         """What all methods of the scene share; None if there is none."""
         strip = self._read_image(f"{key.scene_stem}.png")
         return None if strip is None else CellPictures(*(np.ascontiguousarray(p) for p in np.split(strip, 3, 1)))
+
+    def film(self, cell: Cell) -> list[Picture]:
+        """The first frames of a cell; () if there are none."""
+        strip = self._read_image(f"{cell.key.stem}.jpg")
+        return [] if strip is None or not cell.frames else frames_of(strip, min(FILM_FRAMES, len(cell.frames)))
+
+    def scene_film(self, cell: Cell) -> tuple[list[Picture], list[Picture]]:
+        """The first frames of the cell's scene: as rendered, and the truth."""
+        strip = self._read_image(f"{cell.key.scene_stem}.jpg")
+        if strip is None or not cell.frames:
+            return [], []
+        count = min(FILM_FRAMES, len(cell.frames))
+        rendered, truth = (frames_of(part, count) for part in np.split(strip, 2, 1))
+        return rendered, truth
 
     def _write_features(self, name: str, features: Features) -> None:
         def write(path: Path) -> None:

@@ -15,9 +15,14 @@ RULES = (
     "stream: one frame at a time, from past frames only. All methods complete the same rendered views.",
     "Holes are the pixels with E > 0, not dilated, the same for compositing and for scores. The truth is the left-out "
     "camera's image on black.",
-    'PSNR "holes" is over the pixels of E alone (reading a); "in mask" over those of them inside the true mask; '
-    '"masked" and its SSIM are of both images blackened outside E, over all pixels (reading b).',
-    "SSIM: Gaussian window of 11 x 11 pixels, sigma 1.5, mean of the channels, computed without padding.",
+    'Each score has four readings: "whole", over all pixels; "holes", over the pixels of E alone (a); "in mask", over '
+    'those of them inside the true mask; "masked", of both images blackened outside E, over all pixels (b). SSIM and '
+    'LPIPS in "holes" and "in mask" are means of their maps there, of unmasked images.',
+    "SSIM: Gaussian window of 11 x 11 pixels, sigma 1.5, unless the setting says another; mean of the channels; only "
+    "windows that lie in the image.",
+    "LPIPS 0.1 of AlexNet and VGG16. VFID: I3D's Mixed_5c, a mean vector for each video of up to 16 frames in [0, 1], "
+    "Frechet distance over all videos of the table; I3D in evaluation mode, and as published scripts run it, in "
+    'training mode ("train"). Networks without their weights are n/a.',
     f"Frames with fewer than {ENOUGH_HOLE_PX} pixels of the kind are left out of scores in the holes, and counted.",
     "Means are over the frames of a scene, then over the scenes of a set, then over sets.",
     f"The gain over {REFERENCE} is the mean over the scenes in which both have a score.",
@@ -27,7 +32,8 @@ RULES = (
     '(in 255ths); "change" is that in place, over the pixels of E now or then. The truth is not 0 in '
     "either: see its row.",
     "Milliseconds are the inpainter's step alone (not hull and rendering), with its caches as in production, over the "
-    "frames with holes: median, and 95th percentile.",
+    "frames with holes: FPS by their mean, median, 95th percentile. Each stream's first step is run twice and the "
+    "second is timed, so that nothing is compiled in it.",
 )
 """What the figures mean; every report says so."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from viewmend.capture.images import write_image
 from viewmend.contact_sheet import Tile, contact_sheet
 from viewmend.evaluation.cells import Cell, CellPictures, CellStore, slug
-from viewmend.evaluation.scene_run import Picture
+from viewmend.evaluation.film import Picture
 
 TILE_PX = 288
 CLOSE_SHARE = 6
@@ -30,16 +30,23 @@ def write_sheets(cells: Sequence[Cell], store: CellStore, folder: Path) -> list[
     return written
 
 
-def _rows(cells: Sequence[Cell], shared: CellPictures, store: CellStore) -> list[list[Tile]]:
-    columns: list[tuple[str, Picture | None]] = [("rendered", shared.rendered), ("E", shared.error)]
+def columns(cells: Sequence[Cell], shared: CellPictures, store: CellStore) -> list[tuple[str, Picture | None]]:
+    """A scene's pictures with their labels: rendered, E, each method, truth; None for a method that failed."""
+    shown: list[tuple[str, Picture | None]] = [("rendered", shared.rendered), ("E", shared.error)]
     for cell in cells:
-        failed = cell.error is not None
-        columns.append((f"{cell.key.method}: failed" if failed else _label(cell), store.picture(cell.key)))
-    columns.append(("truth", shared.truth))
+        if cell.error is None:
+            shown.append((_label(cell), store.picture(cell.key)))
+        else:
+            shown.append((f"{cell.key.method}: failed", None))
+    return [*shown, ("truth", shared.truth)]
+
+
+def _rows(cells: Sequence[Cell], shared: CellPictures, store: CellStore) -> list[list[Tile]]:
+    shown = columns(cells, shared, store)
     top, left, side = largest_hole(shared.error)
     close = slice(top, top + side), slice(left, left + side)
-    whole = [Tile(label, image) for label, image in columns]
-    near = [Tile("", None if image is None else np.ascontiguousarray(image[close])) for _, image in columns]
+    whole = [Tile(label, image) for label, image in shown]
+    near = [Tile("", None if image is None else np.ascontiguousarray(image[close])) for _, image in shown]
     return [whole, near]
 
 

@@ -5,10 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.contact_sheet import picture
+from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
 from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
 from viewmend.evaluation.methods import make_method
 from viewmend.evaluation.scenes import EvaluationScene
@@ -17,8 +18,6 @@ from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.metrics.image_quality import SsimWindow
 from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe, view_of
 from viewmend.views import CompletedView, IncompleteView
-
-Picture = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +46,8 @@ class MethodRun:
     """Why it failed."""
     picture: Picture | None = None
     """The completed view at the time of the largest hole."""
+    film: Picture | None = None
+    """Its first frames (`film.film`)."""
     features: Features | None = None
     """Of its videos, for VFID; None without I3D."""
 
@@ -59,6 +60,8 @@ class SceneRun:
     runs: tuple[MethodRun, ...]
     pictures: tuple[Picture, Picture, Picture] | None = None
     """At the time of the largest hole: rendered view, E, truth. None if the scene could not be read or rendered."""
+    film: Picture | None = None
+    """The first frames: as rendered, and beside them the truth."""
     features: Features | None = None
     """Of the truth's videos."""
 
@@ -82,22 +85,20 @@ def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: Run
     the `error` of the method that it went wrong with, or of all if it is the scene's.
     """
     scorers = load_scorers(settings.ssim, settings.networks, settings.device)
-    pictures, videos = None, VideoFeatures(scorers.i3d)
+    shown = _Shown(VideoFeatures(scorers.i3d))
     streams = [_Stream(name, settings, scorers) for name in methods]
     try:
         with torch.no_grad():
             for moment in _moments(scene, settings):
-                if moment.largest:
-                    view = moment.view
-                    pictures = picture(view.rgb), picture(view.error[None]), picture(moment.truth.rgb)
-                videos.add(moment.truth.rgb, moment.view.error > 0)
+                shown.add(moment)
                 for stream in streams:
                     stream.show(moment)
-        if pictures is None:
+        if shown.pictures is None:
             raise ValueError(f"{scene.name}: expected frames of the camera that is left out, got none")
     except Exception as error:
         return SceneRun(scene.name, tuple(MethodRun(name, (), _said(error)) for name in methods))
-    return SceneRun(scene.name, tuple(stream.run() for stream in streams), pictures, videos.features())
+    runs = tuple(stream.run(shown.box) for stream in streams)
+    return SceneRun(scene.name, runs, shown.pictures, shown.film(), shown.videos.features())
 
 
 def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]:
@@ -111,6 +112,34 @@ def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]
         last = _Moment(observation, view, true_view(frame.truth, frame.came_from_px), last, holes > most)
         yield last
         most, last = max(most, holes), replace(last, before=None)
+
+
+class _Shown:
+    """What is kept of a scene to be shown beside every method's."""
+
+    def __init__(self, videos: VideoFeatures) -> None:
+        self.videos = videos
+        self.pictures: tuple[Picture, Picture, Picture] | None = None
+        self.box: Box | None = None
+        self._rendered: list[Picture] = []
+        self._truth: list[Picture] = []
+
+    def add(self, moment: _Moment) -> None:
+        """One more time."""
+        view, truth = moment.view, moment.truth
+        self.videos.add(truth.rgb, view.error > 0)
+        if moment.largest:
+            self.pictures = picture(view.rgb), picture(view.error[None]), picture(truth.rgb)
+        if len(self._truth) < FILM_FRAMES:
+            box = subject_box((view.mask > 0) | truth.mask)
+            self.box = box if self.box is None else self.box if box is None else self.box.around(box)
+            self._rendered.append(picture(view.rgb))
+            self._truth.append(picture(truth.rgb))
+
+    def film(self) -> Picture | None:
+        """As rendered, and beside it the truth."""
+        strips = [film(frames, self.box) for frames in (self._rendered, self._truth)]
+        return None if strips[0] is None or strips[1] is None else np.concatenate([strips[0], strips[1]], 1)
 
 
 class _Stream:
@@ -127,6 +156,7 @@ class _Stream:
         self._scores: list[FrameScores] = []
         self._picture: Picture | None = None
         self._videos = VideoFeatures(scorers.i3d)
+        self._frames: list[Picture] = []
 
     def show(self, moment: _Moment) -> None:
         """Complete and score the next view; nothing once something went wrong."""
@@ -152,15 +182,18 @@ class _Stream:
         completed = CompletedView(view, rgb)
         self._scores.append(score_frame(completed, moment.truth, before, mended.stage_ms.inpainting, self._scorers))
         self._videos.add(rgb, view.error > 0)
+        if len(self._frames) < FILM_FRAMES:
+            self._frames.append(picture(rgb))
         self._state, self._last = mended.state, rgb
         if moment.largest:
             self._picture = picture(rgb)
 
-    def run(self) -> MethodRun:
-        """What came out."""
+    def run(self, box: Box | None) -> MethodRun:
+        """What came out; `box` is what its film shows."""
         if self._error is not None:
             return MethodRun(self.method, (), self._error)
-        return MethodRun(self.method, tuple(self._scores), None, self._picture, self._videos.features())
+        strip, features = film(self._frames, box), self._videos.features()
+        return MethodRun(self.method, tuple(self._scores), None, self._picture, strip, features)
 
 
 def _check(rgb: Tensor, view: IncompleteView) -> None:

@@ -88,9 +88,7 @@ KNOWN: tuple[KnownWeights, ...] = (
         "ruiliu-ai/FuseFormer",
         "none stated",
     ),
-    KnownWeights(
-        "e2fgvi", ("E2FGVI-CVPR22.pth", "E2FGVI.pth"), "E2FGVI's generator", "MCG-NKU/E2FGVI", "CC BY-NC 4.0"
-    ),
+    KnownWeights("e2fgvi", ("E2FGVI-CVPR22.pth", "E2FGVI.pth"), "E2FGVI's generator", "MCG-NKU/E2FGVI", "CC BY-NC 4.0"),
     KnownWeights(
         "e2fgvi-hq",
         ("E2FGVI-HQ-CVPR22.pth", "E2FGVI-HQ.pth"),
@@ -142,14 +140,24 @@ def checked_weights(known: KnownWeights) -> Path:
 
 def verify_weights(path: Path, known: KnownWeights) -> None:
     """Check the file's hash, where one was published; WeightsError if it is another's."""
-    data = path.read_bytes()
-    sha256 = hashlib.sha256(data).hexdigest()
-    git_sha1 = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
-    if not sha256.startswith(known.sha256) or not git_sha1.startswith(known.git_sha1):
+    if not verified(path, known):
+        sha256, git_sha1 = hashes(path)
         raise WeightsError(
-            f"{path}: expected {known.what} ({_hashes(known)}), got a file of {len(data)} bytes with SHA-256 {sha256}, "
-            f"git name {git_sha1}; it is damaged or another version, get it from {known.source}"
+            f"{path}: expected {known.what} ({_hashes(known)}), got a file of {path.stat().st_size} bytes with SHA-256 "
+            f"{sha256}, git name {git_sha1}; it is damaged or another version, get it from {known.source}"
         )
+
+
+def verified(path: Path, known: KnownWeights) -> bool:
+    """Whether a file has the hash that was published, if one was."""
+    sha256, git_sha1 = hashes(path)
+    return sha256.startswith(known.sha256) and git_sha1.startswith(known.git_sha1)
+
+
+def hashes(path: Path) -> tuple[str, str]:
+    """A file's SHA-256, and its name in git."""
+    data = path.read_bytes()
+    return hashlib.sha256(data).hexdigest(), hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
 
 
 def load_tensors(path: Path) -> dict[str, Tensor]:

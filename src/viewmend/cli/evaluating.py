@@ -1,0 +1,172 @@
+"""What the commands that evaluate share: their options, the scenes that these mean, and the run."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from viewmend.evaluation.cells import Cell, CellStore
+    from viewmend.evaluation.report import Report
+    from viewmend.evaluation.scene_run import RunSettings
+    from viewmend.evaluation.scenes import EvaluationScene
+
+POSITIVE = ("frames", "scenes", "size", "jobs", "closest")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Scenes, and how they are run."""
+
+    out: Path
+    """Folder for the results."""
+    weights: Path | None = None
+    """Folder of published weights, looked in first; what lacks its weights is n/a (see viewmend weights)."""
+    performers: Path | None = None
+    """Folder of the people of Q: glTF characters in it or in its test/, BVH motions in its motions/test/, motions/ or
+    beside them."""
+    motions: Path | None = None
+    """Folder of BVH motions, if they are elsewhere."""
+    inputs: str = "all"
+    """How many cameras of a capture are looked at: all, or a number of them, evenly around; several with commas."""
+    closest: int = 3
+    """How many of these colour a view: the closest to it."""
+    frames: int | None = None
+    """Of each scene, from the first. 10 for P and Q by default, all of a capture."""
+    scenes: int | None = None
+    """Only the first so many of each set, for a quick look."""
+    size: int = 512
+    """Width and height of the views of P and Q."""
+    ssim: Literal["gaussian", "uniform7", "uniform65"] = "gaussian"
+    """Windows of SSIM: Gaussian of 11 x 11 pixels, or uniform ones of 7 x 7 or 65 x 65, as others use."""
+    jobs: int = 1
+    """Processes that share the work. Milliseconds are only comparable within a run."""
+    ray: str | None = None
+    """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
+    device: str = "cpu"
+    """Where to compute: cpu, or cuda."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of our networks."""
+    video: bool = True
+    """Put short videos into the report's page (needs viewmend[video]; pictures side by side without)."""
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What came out."""
+
+    report: "Report"
+    cells: "list[Cell]"
+    store: "CellStore"
+
+    @property
+    def failed(self) -> bool:
+        """Whether any cell failed."""
+        return any(cell.error is not None for cell in self.cells)
+
+
+def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evaluated:
+    """Run the methods on the sets, saying what fails and what cannot be had; cells in the order of the sets.
+
+    Raises:
+        ValueError: an option cannot be met.
+    """
+    _check(options, sets)
+    from viewmend.cli.console import say, track
+    from viewmend.evaluation.cells import CellStore
+    from viewmend.evaluation.methods import method_names, split_missing
+    from viewmend.evaluation.report import make_report
+    from viewmend.evaluation.runner import run_evaluation
+    from viewmend.evaluation.scorers import available_networks
+
+    if options.weights is not None:
+        _look_first_in(options.weights)
+    names = method_names(methods)
+    available, missing = split_missing(names, options.device)
+    networks, missing_networks = available_networks()
+    settings = _settings(options, networks)
+    missing |= missing_networks
+    if missing:
+        say(f"n/a, as the report explains: {', '.join(missing)}")
+    scenes = [scene for name in sets for scene in scenes_of(name, options)]
+    store, cells = CellStore(options.out / "cells"), []
+    steps = run_evaluation(scenes, available, store, settings, options.jobs, options.ray)
+    total = len(scenes) * len(available)
+    for cell in track((cell for found in steps for cell in found), "evaluating", total):
+        cells.append(cell)
+        if cell.error is not None:
+            say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
+    order = {key: n for n, key in enumerate((s.name, m) for s in scenes for m in names)}
+    cells.sort(key=lambda cell: order[cell.key.scene, cell.key.method])
+    return Evaluated(make_report(cells, names, settings, missing), cells, store)
+
+
+def write_report(options: RunOptions, found: Evaluated) -> None:
+    """OUT/report.md, .csv, .json and .html, and OUT/sheets/."""
+    from viewmend.cli.console import say
+    from viewmend.evaluation.report_data import report_csv, report_json
+    from viewmend.evaluation.report_markdown import markdown
+    from viewmend.evaluation.report_page import page
+    from viewmend.evaluation.report_sheets import write_sheets
+
+    report, cells, store = found.report, found.cells, found.store
+    forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
+    forms["html"] = page(report, cells, store, options.video)
+    for name, text in forms.items():
+        (options.out / f"report.{name}").write_text(text, encoding="utf-8")
+    write_sheets(cells, store, options.out / "sheets")
+    say(f"wrote {options.out}")
+
+
+def scenes_of(name: str, options: RunOptions) -> "list[EvaluationScene]":
+    """The scenes of P, of Q, or of a capture."""
+    from viewmend.evaluation.capture_scenes import capture_set
+    from viewmend.evaluation.scenes import FRAMES, performer_set, procedural_set
+
+    frames = options.frames or FRAMES
+    if name == "P":
+        return list(procedural_set(frames, options.size)[: options.scenes])
+    if name == "Q":
+        if options.performers is None:
+            raise ValueError("expected --performers DIR for set Q, got none; P needs nothing")
+        return list(performer_set(options.performers, options.motions, frames, options.size)[: options.scenes])
+    inputs = [part.strip() for part in options.inputs.split(",") if part.strip()]
+    return [s for number in inputs for s in capture_set(Path(name), number, options.frames)[: options.scenes]]
+
+
+def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
+    from viewmend.evaluation.scene_run import RunSettings
+    from viewmend.pipeline import PipelineConfig
+    from viewmend.rendering.view import RenderConfig
+
+    return RunSettings(
+        device=options.device,
+        precision=options.precision,
+        pipeline=PipelineConfig(render=RenderConfig(cameras=options.closest)),
+        ssim=options.ssim,
+        networks=networks,
+    )
+
+
+def _check(options: RunOptions, sets: tuple[str, ...]) -> None:
+    wrong = [n for n in POSITIVE if (v := getattr(options, n)) is not None and v < 1]
+    if wrong or not sets:
+        got = f"--{wrong[0]} {getattr(options, wrong[0])}" if wrong else "no set"
+        raise ValueError(f"expected at least one set, and positive numbers, got {got}; P needs nothing")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+    import torch
+
+    if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
+        raise ValueError(f"expected a device that is there, got '{options.device}'; use --device cpu")
+
+
+def _look_first_in(folder: Path) -> None:
+    """For weights, also in the processes that this one starts."""
+    import os
+
+    from viewmend.metrics.weights import PLACES_VARIABLE
+
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected a folder of weights, found none; check --weights")
+    others = os.environ.get(PLACES_VARIABLE)
+    os.environ[PLACES_VARIABLE] = os.pathsep.join([str(folder.resolve()), *([others] if others else [])])

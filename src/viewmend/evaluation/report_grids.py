@@ -1,0 +1,138 @@
+"""The tables of a report, as cells of text that any form can show."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+from viewmend.evaluation.averages import Row, Scores, Table
+from viewmend.evaluation.methods import REFERENCE
+from viewmend.evaluation.report import Report
+
+COLUMNS = (
+    ("holes, dB", "psnr_holes", 1, 2),
+    ("in mask", "psnr_holes_fg", 1, 2),
+    ("masked", "psnr_masked", 1, 2),
+    ("SSIM masked", "ssim_masked", 1, 5),
+    ("whole, dB", "psnr_whole", 1, 2),
+    ("SSIM whole", "ssim_whole", 1, 4),
+    ("flicker", "flicker", 255, 2),
+    ("warp", "warp_error", 255, 2),
+    ("change", "change", 255, 2),
+)
+"""Of the main table: heading, field of `Scores`, factor, decimals."""
+TRUTHS = ("warp_error", "change")
+"""Of these the truth has some, too."""
+READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
+"""How each score is read, and the end of its field."""
+SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 5), ("LPIPS Alex", "lpips_alex", 4), ("LPIPS VGG", "lpips_vgg", 4))
+"""Each score, the beginning of its field, decimals."""
+VFIDS = ("VFID whole", "VFID masked", "VFID whole, train", "VFID masked, train")
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of text; `**bold**` and `*italic*` as in Markdown."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def setting_lines(report: Report) -> list[str]:
+    """How, where and by which code the figures came about."""
+    settings = report.settings
+    lines = [
+        f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
+        f"{settings.pipeline.render.cameras} closest cameras; SSIM {settings.ssim}."
+    ]
+    return lines + [
+        f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "
+        f"{o.jobs} process{'es' if o.jobs > 1 else ''} of {o.threads} threads, load {o.load}."
+        for o in report.origins
+    ]
+
+
+def holes_line(table: Table) -> str:
+    """How much there is to fill, and what is left out."""
+    sizes = " and ".join(f"{width} x {height}" for width, height in table.sizes_px)
+    of_hull, of_image = (
+        next((v for row in table.rows if (v := getattr(row.scores, name)) is not None), None)
+        for name in ("holes_of_hull", "holes_of_image")
+    )
+    return (
+        f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
+        f"{number(of_image, 100, 3)} % of the image; {table.thin_frames} frames with too few hole pixels left out, "
+        f"{table.empty_frames} of them with none."
+    )
+
+
+def main_grid(table: Table) -> Grid:
+    """The scores that tell most, speed, and what failed; the truth's own change in the last row."""
+    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "FPS", "ms", "ms p95", "scenes", "failed")
+    rows = [_method_row(row, len(heads)) for row in table.rows]
+    return Grid(heads, (*rows, _truth_row([row.scores for row in table.rows], len(heads))))
+
+
+def readings_grid(table: Table) -> Grid:
+    """All scores in all readings, and VFID."""
+    heads = ("method", *(f"{score} {reading}" for score, _, _ in SCORES for reading, _ in READINGS), *VFIDS)
+    rows = []
+    for row in table.rows:
+        cells = [
+            number(getattr(row.scores, f"{field}_{end}"), 1, digits, "n/a")
+            for _, field, digits in SCORES
+            for _, end in READINGS
+        ]
+        rows.append((row.method, *cells, *(number(value, 1, 4, "n/a") for value in asdict(row.vfid).values())))
+    return Grid(heads, tuple(rows))
+
+
+def kinds_grid(report: Report) -> Grid:
+    """PSNR in the holes by rig and style, and the gain over the reference."""
+    rows = [
+        (table.title, *(f"{number(r.scores.psnr_holes, 1, 2)} ({_signed(r.over_reference)})" for r in table.rows))
+        for table in report.kinds
+    ]
+    return Grid(("kind", *report.methods), tuple(rows))
+
+
+def scenes_grid(report: Report) -> Grid:
+    """PSNR in the holes of each scene."""
+    of = {(c.cell.key.scene, c.cell.key.method): c for c in report.cells}
+    rows = []
+    for scene in dict.fromkeys(c.cell.key.scene for c in report.cells):
+        own = [of.get((scene, method)) for method in report.methods]
+        shown = [
+            "n/a" if c is None else "**failed**" if c.cell.error is not None else number(c.scores.psnr_holes, 1, 2)
+            for c in own
+        ]
+        share = next((c.scores.holes_of_hull for c in own if c is not None and c.cell.error is None), None)
+        rows.append((scene, number(share, 100, 2), *shown))
+    return Grid(("scene", "holes, % of the hull", *report.methods), tuple(rows))
+
+
+def number(value: float | None, factor: int, digits: int, none: str = "-") -> str:
+    """A number with so many decimals, `none` for none."""
+    return none if value is None else f"{factor * value:.{digits}f}"
+
+
+def _method_row(row: Row, width: int) -> tuple[str, ...]:
+    if not row.scenes:
+        return (row.method, *["n/a"] * (width - 1))
+    return (
+        row.method,
+        _signed(row.over_reference),
+        *(number(getattr(row.scores, field), factor, digits) for _, field, factor, digits in COLUMNS),
+        *(number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
+        str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
+        f"**{row.failed}**" if row.failed else "0",
+    )
+
+
+def _truth_row(scores: Sequence[Scores], width: int) -> tuple[str, ...]:
+    """The truth's own change, which a perfect method would show."""
+    of = {name: next((v for s in scores if (v := getattr(s, f"{name}_truth")) is not None), None) for name in TRUTHS}
+    shown = [number(of[field], factor, digits) if field in of else "" for _, field, factor, digits in COLUMNS]
+    return ("*truth*", "", *shown, *[""] * (width - 2 - len(shown)))
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.2f}"
