@@ -84,6 +84,7 @@ def test_every_camera_image_is_encoded_once_whoever_looks():
     walk(stream, range(3), A, B, A, camera_at(145, "c"))
     assert len(model.encoded) == len(set(model.encoded)) and len(model.encoded) >= 3 * 4
     before = len(model.encoded)
+    stream.view(camera_at(320, "d"), None, 2, Effort(context_times=0))  # other cameras, no context
     for time in (0, 2, 1):  # seeking back and forth finds everything there
         stream.view(A, None, time)
     assert len(model.encoded) == before

@@ -123,9 +123,9 @@ def observe(frame: MultiViewFrame, bounds: Bounds | None, config: PipelineConfig
             "expected a capture with masks, got one without: the visual hull is carved from them; segment the "
             "foreground and name the files as each camera's 'mask'"
         )
-    start = _now(frame.rgb.device)
+    start = now_s(frame.rgb.device)
     proxy = reconstruct(frame.mask, frame.cameras, bounds, config.hull)
-    return Observation(frame, proxy, _ms_since(start, frame.rgb.device))
+    return Observation(frame, proxy, ms_since(start, frame.rgb.device))
 
 
 def mend_view(
@@ -168,9 +168,9 @@ def view_of(
         got = type(observation.proxy).__name__
         raise ValueError(f"expected a GeometryProxy to render, got {got}; render the view yourself and fill it then")
     frame, device = observation.frame, observation.frame.rgb.device
-    start = _now(device)
+    start = now_s(device)
     view = render_view(frame, observation.proxy, target, config.render, chosen, exclude, source_depth=observation.depth)
-    return view, _ms_since(start, device)
+    return view, ms_since(start, device)
 
 
 def complete_view(
@@ -194,20 +194,22 @@ def complete_view(
     def source(time: int, names: tuple[str, ...]) -> ContextViews | None:
         return at[time].context([n for n in names if n not in exclude]) if time in at else None
 
-    start = _now(device)
+    start = now_s(device)
     completed, inpainter_state = inpainter.step(view, source, state.inpainter)
-    inpainting_ms = _ms_since(start, device)
+    inpainting_ms = ms_since(start, device)
 
     history = (*past, observation) if config.history else ()
     stages = StageMs(observation.geometry_ms, rendering_ms, inpainting_ms)
     return MendedView(completed, StreamState(inpainter_state, view.chosen, history), stages)
 
 
-def _now(device: torch.device) -> float:
+def now_s(device: torch.device) -> float:
+    """Seconds, once the device has done what was asked of it."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
-def _ms_since(start: float, device: torch.device) -> float:
-    return 1000 * (_now(device) - start)
+def ms_since(start: float, device: torch.device) -> float:
+    """Milliseconds since `now_s` gave `start`."""
+    return 1000 * (now_s(device) - start)

@@ -4,6 +4,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import torch
 from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
@@ -19,6 +20,8 @@ from viewmend.pipeline import (
     StageMs,
     StreamState,
     complete_view,
+    ms_since,
+    now_s,
     observe,
     view_of,
 )
@@ -34,7 +37,8 @@ class Effort:
     top_k: int | None = None
     """Context tokens that survive pruning; None takes the model's own."""
     context_times: int | None = None
-    """How many of the window's times are context, the latest first (1: the view's own alone); None takes all."""
+    """How many of the window's times are context, the latest first (1: the view's own alone); None takes all. With 0
+    holes are still read from the cameras along rays, if the model does that, but no camera image is encoded."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,9 @@ class StreamView:
     viewer: Viewer
     """To ask for the next view with."""
     stage_ms: StageMs
-    """`geometry` is what the proxy took for whoever came first."""
+    """`geometry` is what the proxy took for whoever came first; `inpainting` is without `encoding_ms`."""
+    encoding_ms: float = 0.0
+    """What was encoded of the cameras' images, for all to use, because this view was the first to need it."""
 
 
 @dataclass
@@ -196,20 +202,31 @@ class Stream:
         if not effort.mend:
             stages = StageMs(moment.observation.geometry_ms, rendering_ms, 0.0)
             return StreamView(CompletedView(view, view.rgb), replace(viewer, chosen=view.chosen), stages)
-        past = self._past(view.time, effort)
-        frames = {(f.name, f.time): f for m in (*past, moment) for f in m.encoded.values()}
-        before = replace(viewer.inpainter, cache=ContextCache(frames))
-        state = StreamState(before, viewer.chosen, tuple(m.observation for m in past))
-        inpainter = _WithTopK(self.inpainter, effort.top_k)
+        moments = [*self._past(view.time, effort), moment]
+        encoding_ms = self._encode(view, moments if effort.context_times != 0 else [])
+        frames = {(f.name, f.time): f for m in moments for f in m.encoded.values()}
+        before = replace(viewer.inpainter, cache=ContextCache(frames if effort.context_times != 0 else {}))
+        state = StreamState(before, viewer.chosen, tuple(m.observation for m in moments[:-1]))
+        inpainter = _WithEffort(self.inpainter, effort)
         mended = complete_view(view, moment.observation, state, inpainter, self.config, exclude, rendering_ms)
-        after = mended.state.inpainter
-        for (name, time), frame in after.cache.frames.items():
-            if time in self._moments:
-                self._moments[time].encoded.setdefault(name, frame)
-        for time in [*(m.observation.frame.time for m in past), view.time]:
-            self._moments.move_to_end(time)
+        for m in moments:
+            self._moments.move_to_end(m.observation.frame.time)
         self._forget()
-        return StreamView(mended.completed, Viewer(replace(after, cache=ContextCache()), view.chosen), mended.stage_ms)
+        after = Viewer(replace(mended.state.inpainter, cache=ContextCache()), view.chosen)
+        return StreamView(mended.completed, after, mended.stage_ms, encoding_ms)
+
+    @torch.no_grad()
+    def _encode(self, view: IncompleteView, moments: Sequence[_Moment]) -> float:
+        """Encode what the view's cameras saw at these times and nobody needed before; the milliseconds."""
+        if not isinstance(self.inpainter, Inpainter) or not bool((view.error > 0).any()):
+            return 0.0
+        start = now_s(view.rgb.device)
+        missing = [(m, m.observation.context([n for n in view.chosen if n not in m.encoded])) for m in moments]
+        fresh = [(m, views) for m, views in missing if views is not None]
+        encoded = self.inpainter.encode_contexts([views for _, views in fresh])
+        for (moment, _), frames in zip(fresh, encoded, strict=True):
+            moment.encoded.update({frame.name: frame for frame in frames})
+        return ms_since(start, view.rgb.device)
 
     def _past(self, time: int, effort: Effort) -> list[_Moment]:
         """The moments before `time` that may be context, in order of time."""
@@ -227,17 +244,28 @@ class Stream:
             del size[time]
 
 
-class _WithTopK:
-    """An inpainter asked for another `top_k` than its config's; inpainters that do not prune stay as they are."""
+class _WithEffort:
+    """An inpainter that does as much as it is asked to; inpainters other than ours stay as they are."""
 
-    def __init__(self, inpainter: ViewInpainter, top_k: int | None) -> None:
+    def __init__(self, inpainter: ViewInpainter, effort: Effort) -> None:
         self._inpainter = inpainter
-        self._top_k = top_k
+        self._effort = effort
 
     def initial_state(self) -> State:
         return self._inpainter.initial_state()
 
     def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
-        if isinstance(self._inpainter, Inpainter):
-            return self._inpainter.step(view, source, state, self._top_k)
-        return self._inpainter.step(view, source, state)
+        if not isinstance(self._inpainter, Inpainter):
+            return self._inpainter.step(view, source, state)
+        if self._effort.context_times == 0:
+            return self._without_context(self._inpainter, view, source), state
+        return self._inpainter.step(view, source, state, self._effort.top_k)
+
+    @torch.no_grad()
+    def _without_context(self, inpainter: Inpainter, view: IncompleteView, source: Source) -> CompletedView:
+        if not bool((view.error > 0).any()):
+            return CompletedView(view, view.rgb)
+        around = view.around(inpainter.config.rays)
+        nearby = source(view.time, around) if around else None
+        prediction = inpainter.predict([view], [()], self._effort.top_k, [nearby])[0]
+        return CompletedView(view, prediction.completed)

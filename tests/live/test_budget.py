@@ -20,7 +20,9 @@ class Device:
         size = 0.3 + 0.7 * level.scale**2
         context = 1 - self.context_share * (1 - level.context_times / 7)
         by = 1 + self.noise * self.chance.uniform(-1, 1)
-        return FrameMs(self.shared * by, self.pixels * level.scale**2 * by, self.filling * size * context * by)
+        encoding = 0.2 * self.filling * by if level.context_times else None
+        filling = 0.8 * self.filling * size * context * by
+        return FrameMs(self.shared * by, self.pixels * level.scale**2 * by, filling, encoding)
 
 
 def run(budget: Budget, device: Device, frames: int) -> tuple[list[int], list[float]]:

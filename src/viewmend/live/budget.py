@@ -5,7 +5,8 @@ The control law, docs/live.md in code:
 * Levels are a ladder of efforts, from all that the model can do down to a small picture with little context. What is
   given up first: older context, then context tokens, then resolution.
 * What a level will take is predicted from the medians of the last `MEMORY` frames' stage times, each brought to that
-  level: shared work stays, rendering and encoding go with the pixels, filling with pixels, tokens and times.
+  level: geometry stays, rendering and encoding go with the pixels, filling with pixels, tokens and times, and the
+  cameras' images are encoded at levels with context only.
 * Down, at once: when the prediction for the present level is above the target, to the highest level predicted to take
   at most `AIM` of it. A single slow frame moves no median, three of five do.
 * Up, one level, when the level above is predicted to take at most `AIM` of the target for `patience` frames in a row.
@@ -32,7 +33,7 @@ class Level:
     scale: float
     """Of width and height."""
     context_times: int
-    """Of the window's times, the latest first."""
+    """Of the window's times, the latest first; 0: no camera image is encoded."""
     top_k: int | None
     """Context tokens that survive pruning; None for all."""
 
@@ -40,11 +41,11 @@ class Level:
     def filling(self) -> float:
         """Work of filling, relative to the full level's."""
         tokens = min(self.top_k or 2048, 2048) / 2048
-        return self.scale**2 * (0.35 + 0.35 * self.context_times / 7 + 0.3 * tokens)
+        return self.scale**2 * (0.4 + 0.4 * self.context_times / 7 + 0.2 * tokens)
 
 
 LADDER = (
-    *(Level(scale, 1, 256) for scale in (0.25, 0.3, 0.35, 0.42, 0.5, 0.6, 0.7, 0.84)),
+    *(Level(scale, 0, 256) for scale in (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)),
     Level(1.0, 1, 256),
     Level(1.0, 2, 512),
     Level(1.0, 4, 1024),
@@ -58,17 +59,18 @@ FULL = LADDER[-1]
 class FrameMs:
     """Milliseconds of a frame's stages."""
 
-    shared: float
-    """What its size does not change: reading, geometry."""
+    geometry: float
     pixels: float
-    """Rendering and encoding."""
+    """Rendering, and encoding the picture."""
     filling: float | None
     """None where nothing was to be filled."""
+    context: float | None = None
+    """Encoding the cameras' images; None at a level without."""
 
     @property
     def total(self) -> float:
         """All of it."""
-        return self.shared + self.pixels + (self.filling or 0.0)
+        return self.geometry + self.pixels + (self.filling or 0.0) + (self.context or 0.0)
 
 
 class Budget:
@@ -87,7 +89,7 @@ class Budget:
         self.index = len(levels) // 2
         self.measured_ms = 0.0
         # Each brought to the full level, as far as it depends on the level.
-        self._shared, self._pixels, self._filling = (deque[float](maxlen=MEMORY) for _ in range(3))
+        self._geometry, self._pixels, self._filling, self._context = (deque[float](maxlen=MEMORY) for _ in range(4))
         self._patience, self._calm, self._since_up = PATIENCE, 0, PROBATION
 
     @property
@@ -97,17 +99,19 @@ class Budget:
 
     def predicted_ms(self, level: Level) -> float:
         """What a view of this level would take; 0 before the first frame."""
-        filling = median(self._filling) * level.filling if self._filling else 0.0
-        pixels = median(self._pixels) * level.scale**2 if self._pixels else 0.0
-        return (median(self._shared) if self._shared else 0.0) + pixels + filling
+        filling = level.filling + (_median(self._context) if level.context_times else 0.0)
+        return _median(self._geometry) + _median(self._pixels) * level.scale**2 + _median(self._filling) * filling
 
     def took(self, level: Level, ms: FrameMs) -> None:
         """Learn from a frame, and choose the next one's level."""
         self.measured_ms = ms.total
-        self._shared.append(ms.shared)
+        self._geometry.append(ms.geometry)
         self._pixels.append(ms.pixels / level.scale**2)
         if ms.filling is not None:
             self._filling.append(ms.filling / level.filling)
+        if ms.context is not None and ms.filling:
+            # As a share of filling, which is measured at all levels: so it is known how a level without has changed.
+            self._context.append(ms.context / (ms.filling / level.filling))
         self._since_up += 1
         if self._since_up == PROBATION:
             self._patience = PATIENCE
@@ -124,3 +128,7 @@ class Budget:
             self._patience = min(MOST_PATIENCE, 2 * self._patience)
         good = [n for n in range(self.index) if self.predicted_ms(self.levels[n]) <= AIM * self.target_ms]
         self.index, self._calm, self._since_up = max(good, default=0), 0, PROBATION
+
+
+def _median(values: Sequence[float]) -> float:
+    return median(values) if values else 0.0

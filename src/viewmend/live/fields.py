@@ -45,7 +45,7 @@ class Fields:
         """The value, unchecked."""
         return self.values[key] if self.has(key) else default
 
-    def number(self, key: str, low: float, high: float, default: float | None = None) -> float:
+    def number(self, key: str, low: float | int, high: float | int, default: float | int | None = None) -> float:
         """A finite number within bounds."""
         value: Any = self.get(key, default)
         if not _is_number(value) or not low <= value <= high:
@@ -96,7 +96,7 @@ class Fields:
             raise ProtocolError(f"expected '{key}' as short texts, got {str(value)[:40]!r}")
         return tuple(dict.fromkeys(value))
 
-    def numbers(self, key: str, count: int, most: float) -> tuple[float, ...]:
+    def numbers(self, key: str, count: int, most: float | int) -> tuple[float, ...]:
         """So many numbers, none larger."""
         value = self.items(key, count)
         if len(value) != count or not all(_is_number(v) and -most <= v <= most for v in value):

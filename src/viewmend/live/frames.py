@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, UInt8
@@ -45,6 +45,7 @@ class SourceStatus:
     """For people."""
 
 
+@runtime_checkable
 class FrameSupply(Protocol):
     """Where the service takes frames from; `read` never waits."""
 

@@ -35,6 +35,7 @@ def frame_message(look: Look, ask: Ask, rendered: Rendered, info: FrameInfo) -> 
             data.append(packed)
     stage_ms = {
         "geometry": rendered.geometry_ms,
+        "context": rendered.context_ms,
         "rendering": rendered.rendering_ms,
         "inpainting": rendered.inpainting_ms,
         "encode": 1000 * (time.perf_counter() - start),

@@ -2,10 +2,10 @@
 
 import asyncio
 import json
-from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 from starlette.websockets import WebSocket
 
 from viewmend.geometry.bounds import Bounds
@@ -116,7 +116,7 @@ def _frame(message: bytes, cameras: Cameras) -> MultiViewFrame:
     return MultiViewFrame(seen, rgb, mask, 0)
 
 
-def _decoded(data: bytes, name: str, kind: str, cameras: Cameras) -> np.ndarray[Any, Any]:
+def _decoded(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.ndarray, "height width *channel"]:
     import cv2
 
     width, height = cameras.size_px[cameras.names.index(name)].tolist()

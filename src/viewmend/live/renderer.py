@@ -35,6 +35,8 @@ class Rendered:
     viewer: Viewer
     geometry_ms: float
     """0 where another viewer has paid for it."""
+    context_ms: float
+    """Likewise: encoding camera images."""
     rendering_ms: float
     inpainting_ms: float
 
@@ -116,6 +118,7 @@ class Renderer:
             tuple(view.completed for view in views),
             views[0].viewer,
             geometry_ms,
+            sum(view.encoding_ms for view in views),
             sum(view.stage_ms.rendering for view in views),
             sum(view.stage_ms.inpainting for view in views),
         )

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from viewmend.live.budget import FULL, Budget, FrameMs, Level
 from viewmend.live.clock import Clock, Span
@@ -17,7 +17,7 @@ from viewmend.stream import Effort, Viewer
 
 REFINE_S = 0.25
 """A view that has been still for so long is rendered with all that the model can do."""
-MOVING = Level(0.5, 1, 256)
+MOVING = Level(0.5, 0, 256)
 """What a moving view is made with where no budget says."""
 
 
@@ -35,6 +35,7 @@ class Scene:
     """Viewers that were served in the last second, this one included."""
 
 
+@runtime_checkable
 class Seat(Protocol):
     """Somebody who wants views; all calls come from the render thread, under the service's lock but for `show`."""
 
@@ -164,7 +165,8 @@ class ViewerSeat:
         if self.budget is not None:
             pixels = stage_ms["rendering"] + stage_ms["encode"]
             filling = stage_ms["inpainting"] if ask.effort.mend else None
-            self.budget.took(self._level, FrameMs(rendered.geometry_ms, pixels, filling))
+            context = stage_ms["context"] if filling is not None and self._level.context_times else None
+            self.budget.took(self._level, FrameMs(stage_ms["geometry"], pixels, filling, context))
         self.in_flight, self.in_flight_since = info.frame, now
         self._deliver(message)
 

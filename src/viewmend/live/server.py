@@ -155,7 +155,7 @@ class LiveServer:
             return _refusal(503, str(error) or "the frame did not come in time; see /health")
         finally:
             self._pictures -= 1
-        stages = ("geometry", "rendering", "inpainting")
+        stages = ("geometry", "context", "rendering", "inpainting")
         timing = ", ".join(f"{stage};dur={getattr(rendered, f'{stage}_ms'):.1f}" for stage in stages)
         headers = {"Server-Timing": timing, "X-Viewmend-Time": str(rendered.time), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)

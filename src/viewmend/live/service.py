@@ -15,7 +15,7 @@ TICK_S = 0.004
 IDLE_S = 0.05
 AFTER_ERROR_S = 0.5
 
-STAGES = ("geometry", "rendering", "inpainting", "encode")
+STAGES = ("geometry", "context", "rendering", "inpainting", "encode")
 COUNTED = ("frames", "shared", "errors", *(f"{stage}_us" for stage in STAGES))
 
 log = logging.getLogger("viewmend.live")
@@ -141,7 +141,7 @@ class RenderService:
             return True
         self.error = None
         self.counts.update({"frames": 1, "shared": int(rendered.geometry_ms == 0)})
-        taken = (rendered.geometry_ms, rendered.rendering_ms, rendered.inpainting_ms, encode_ms)
+        taken = [*(getattr(rendered, f"{stage}_ms") for stage in STAGES[:-1]), encode_ms]
         self.counts.update({f"{stage}_us": round(1000 * ms) for stage, ms in zip(STAGES, taken, strict=True)})
         return True
 

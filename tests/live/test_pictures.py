@@ -1,0 +1,66 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from reference.ball import camera_at, photograph
+
+from viewmend.live.pictures import COLOURS, pack_depth, picture, to_jpeg, unpack_depth
+from viewmend.views import CompletedView, IncompleteView
+
+
+@pytest.fixture
+def completed() -> CompletedView:
+    """The ball's left half is coloured by one camera, the right half by another; a square is missing."""
+    camera = camera_at(10, "t")
+    frame = photograph(camera)
+    mask = (frame.mask[0] > 0).float()
+    error = torch.zeros_like(mask)
+    error[20:26, 20:26] = 1
+    weights = torch.zeros(2, 48, 48)
+    weights[0, :, :24], weights[1, :, 24:] = 1, 1
+    rgb = frame.rgb[0] / 255
+    shown = rgb * (1 - error)
+    view = IncompleteView(camera, shown, mask, error, frame.depth[0], ("a", "b"), weights * mask * (1 - error), 0)
+    return CompletedView(view, rgb)
+
+
+def test_every_mode_shows_what_it_says(completed):
+    rgb = (completed.rgb.movedim(0, -1) * 255).numpy()
+    images = {mode: picture(completed, mode) for mode in ("rendered", "holes", "mended", "depth", "coverage")}
+    assert all(image.shape == (48, 48, 3) and image.dtype == np.uint8 for image in images.values())
+    assert np.abs(images["mended"] - rgb).max() <= 1
+    assert images["rendered"][22, 22].tolist() == [0, 0, 0]
+    assert images["holes"][22, 22].tolist() == [255, 38, 140] == images["coverage"][22, 22].tolist()
+    assert (images["holes"][12] == images["rendered"][12]).all()
+    depth = images["depth"][..., 0]
+    assert depth[0, 0] == 0 and depth[24, 24] > depth[24, 12] > 0
+    left, right = images["coverage"][24, 18].astype(float), images["coverage"][24, 30].astype(float)
+    assert np.allclose(left / left.max(), np.array(COLOURS[0]) / max(COLOURS[0]), atol=0.02)
+    assert np.allclose(right / right.max(), np.array(COLOURS[1]) / max(COLOURS[1]), atol=0.02)
+
+
+@pytest.mark.parametrize("quality", [85, 95])
+def test_jpeg_comes_back(completed, quality):
+    image = picture(completed, "mended")
+    back = cv2.imdecode(np.frombuffer(to_jpeg(image, quality), np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.abs(back.astype(int) - image).mean() < 5
+
+
+@pytest.mark.parametrize("size", [(48, 48), (47, 50), (3, 2)])
+def test_depth_comes_back_where_it_was_taken(size):
+    rows, columns = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
+    depth = 1.5 + rows / 100 + columns / 37
+    depth[rows < columns / 2] = 0
+    packed = pack_depth(depth)
+    back = unpack_depth(packed)
+    expected = np.zeros((packed.height, packed.width))
+    for i in range(packed.height):
+        for j in range(packed.width):
+            expected[i, j] = depth[min(4 * i + 2, size[0] - 1), min(4 * j + 2, size[1] - 1)]
+    assert back.shape == expected.shape and np.abs(back - expected).max() < 1e-4
+
+
+def test_depth_of_nothing_is_nothing():
+    assert (unpack_depth(pack_depth(torch.zeros(20, 20))) == 0).all()
+    flat = unpack_depth(pack_depth(torch.full((20, 20), 2.0)))
+    assert np.allclose(flat, 2.0, atol=1e-4)

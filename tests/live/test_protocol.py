@@ -1,0 +1,151 @@
+import json
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from viewmend.live.fields import Fields, ProtocolError
+from viewmend.live.protocol import Ack, Camera, ClockChange, Hello, Limits, Look, Ping, pack, parse, unpack
+
+LIMITS = Limits()
+
+
+def said(**message):
+    return parse(json.dumps(message), LIMITS)
+
+
+def test_every_message_is_understood():
+    assert said(type="hello", version=1, codecs=["h264", "theora", "jpeg"]) == Hello(1, ("jpeg", "h264"))
+    assert said(type="ack", frame=3) == Ack(3)
+    assert said(type="ping", sent_ms=1.5) == Ping(1.5)
+    assert said(type="clock", seek=4, speed=2) == ClockChange(None, 2.0, 4, False)
+    assert said(type="clock", playing=False, live=True) == ClockChange(False, None, None, True)
+    assert said(type="look") == Look()
+    look = said(type="look", id=7, camera={"azimuth": 20, "target": [1, 2, 3]}, modes=["holes", "mended"], top_k=None)
+    assert look.eyes == (Camera(azimuth=20.0, target=(1.0, 2.0, 3.0)),) and look.modes == ("holes", "mended")
+    two = said(type="look", eyes=[{"fx": 100}, {"fx": 100, "cx": 3}])
+    assert [eye.lens for eye in two.eyes] == [(100.0, 100.0, None, None), (100.0, 100.0, 3.0, None)]
+    turned = said(type="look", camera={"R": [0, 1, 0, -1, 0, 0, 0, 0, 1], "T": [0, 0, 2], "fov_y": 40})
+    assert turned.eyes[0].T == (0.0, 0.0, 2.0) and turned.eyes[0].fov_y == 40
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        ({"type": "shout"}, "expected 'type' among"),
+        ({"type": "look", "width": 5000}, "from 16 to 2048, got '5000'"),
+        ({"type": "look", "width": 2048, "height": 2048}, "at most 2100000 pixels, got 2048 x 2048"),
+        ({"type": "look", "width": 1024, "height": 1100, "eyes": [{}, {}]}, "at most 2100000 pixels"),
+        ({"type": "look", "width": 99.5}, "a whole number"),
+        ({"type": "look", "modes": ["mended", "mendet"]}, "one or two modes"),
+        ({"type": "look", "modes": []}, "a list of 1 to 2"),
+        ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, -1], "T": [0, 0, 0]}}, "to be a rotation"),
+        ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}, "'T'"),
+        ({"type": "look", "camera": {"distance": -1}}, "'distance'"),
+        ({"type": "look", "camera": [1]}, "a JSON object"),
+        ({"type": "look", "moving": 1}, "true or false"),
+        ({"type": "ack", "frame": True}, "'frame' as a number"),
+        ({"type": "clock", "speed": 99}, "from 0.05 to 4"),
+        ({"type": "hello"}, "'version'"),
+        ([1, 2], "a JSON object"),
+    ],
+)
+def test_what_is_off_is_named(message, words):
+    with pytest.raises(ProtocolError, match=words):
+        parse(json.dumps(message), LIMITS)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "NaN", '{"type": "ack", "frame": NaN}', '{"type":"ping","sent_ms":1e999}', "[" * 9000, "9" * 9000]
+)
+def test_what_is_no_json_is_refused(text):
+    with pytest.raises(ProtocolError):
+        parse(text, LIMITS)
+
+
+def test_long_messages_are_refused():
+    with pytest.raises(ProtocolError, match="at most 16384 bytes"):
+        parse(" " * 20_000, LIMITS)
+
+
+KEYS = st.sampled_from(
+    [
+        "type",
+        "id",
+        "sent_ms",
+        "camera",
+        "eyes",
+        "width",
+        "height",
+        "modes",
+        "top_k",
+        "scale",
+        "moving",
+        "depth",
+        "codec",
+        "quality",
+        "frame",
+        "version",
+        "codecs",
+        "seek",
+        "playing",
+        "speed",
+        "live",
+        "R",
+        "T",
+        "azimuth",
+        "elevation",
+        "distance",
+        "target",
+        "fov_y",
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+    ]
+)
+LEAVES = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(["look", "clock"])
+)
+VALUES = st.recursive(LEAVES, lambda v: st.lists(v, max_size=9) | st.dictionaries(KEYS, v, max_size=4), max_leaves=12)
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.dictionaries(KEYS, VALUES, max_size=8), st.sampled_from(["look", "clock", "ack", "hello", "ping", None]))
+def test_anything_is_understood_or_refused(message, kind):
+    message = message if kind is None else message | {"type": kind}
+    try:
+        understood = parse(json.dumps(message), LIMITS)
+    except ProtocolError as error:
+        assert len(str(error)) < 400
+    else:
+        if isinstance(understood, Look):
+            assert understood.width * understood.height <= LIMITS.max_pixels and len(understood.eyes) in (1, 2)
+            assert all(math.isfinite(v) for eye in understood.eyes for v in (eye.azimuth, *(eye.R or ())))
+
+
+def test_binary_messages_come_back_as_they_were():
+    header = {"frame": 3, "parts": [{"kind": "image", "bytes": 2}, {"kind": "depth", "bytes": 0}]}
+    message = pack(header, [b"ab", b""])
+    assert unpack(message) == (header, [b"ab", b""])
+    for cut in range(len(message)):
+        with pytest.raises(ProtocolError):
+            unpack(message[:cut])
+    with pytest.raises(ProtocolError):
+        unpack(message + b"x")
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=64), st.integers(0, 2**32 - 1))
+def test_binary_garbage_is_refused(garbage, length):
+    for message in (garbage, b"VMF1" + garbage, b"VMF1" + length.to_bytes(4, "little") + garbage):
+        with pytest.raises(ProtocolError):
+            unpack(message)
+
+
+def test_fields_treat_null_as_absent():
+    given = Fields({"a": None, "b": "x" * 300})
+    assert not given.has("a") and given.number("a", 0, 1, 0.5) == 0.5
+    with pytest.raises(ProtocolError, match="at most 200 letters"):
+        given.text("b")
