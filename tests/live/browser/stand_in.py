@@ -8,6 +8,7 @@ import threading
 import time
 import zlib
 from dataclasses import dataclass, field
+from fractions import Fraction
 
 import cv2
 import numpy as np
@@ -216,7 +217,7 @@ def video_key_frame(image: np.ndarray, codec: str) -> bytes:
 
     encoder = av.CodecContext.create({"vp9": "libvpx-vp9", "h264": "libx264"}[codec], "w")
     encoder.height, encoder.width = image.shape[:2]
-    encoder.pix_fmt, encoder.time_base, encoder.bit_rate = "yuv420p", "1/30", 8_000_000
+    encoder.pix_fmt, encoder.time_base, encoder.bit_rate = "yuv420p", Fraction(1, 30), 8_000_000
     fast = {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0"}
     encoder.options = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline"} if codec == "h264" else fast
     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24").reformat(format="yuv420p")

@@ -31,7 +31,7 @@ def test_it_shows_a_picture_and_says_what_it_understands(page):
 def test_every_control_has_a_name(page):
     nameless = page.page.evaluate(
         "[...document.querySelectorAll('button, input, select, [role=slider], [role=img], canvas')]"
-        ".filter(e => ![e.textContent, e.getAttribute('aria-label'), e.closest('label')?.textContent].some(t => t?.trim()))"
+        ".filter(e => ![e.textContent, e.ariaLabel, e.closest('label')?.textContent].some(t => t?.trim()))"
         ".map(e => e.outerHTML)"
     )
     assert nameless == []

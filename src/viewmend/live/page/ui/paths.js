@@ -92,7 +92,7 @@ export class PathPanel {
     record.setAttribute("aria-pressed", String(this.recording));
     record.lastElementChild.textContent = this.recording ? "Stop" : "Record";
     byId("path-play").disabled = !ready;
-    byId("path-play").textContent = this.playing ? "Stop playing" : "Play";
+    byId("path-play").textContent = this.playing ? "Stop" : "Preview";
     byId("path-clear").disabled = !points.length || this.recording;
     const button = byId("path-export");
     button.disabled = !ready || !this.canExport || this.exporting > 0;

@@ -1,0 +1,228 @@
+"""Every control does what it says, in a real browser: pictures, quality, time, overlays."""
+
+import cv2
+import numpy as np
+import pytest
+from live.browser import scene
+from live.browser.conftest import opened
+from live.browser.stand_in import StandIn
+
+pytestmark = pytest.mark.slow
+
+
+def share(pixels: np.ndarray, colour: tuple[int, int, int], tolerance: int = 60) -> float:
+    return float((np.abs(pixels - np.array(colour)).max(-1) < tolerance).mean())
+
+
+def choose(view, name: str) -> None:
+    view.page.locator("#modes").get_by_role("radio", name=name).click()
+    view.settle()
+
+
+def test_modes_show_their_pictures(view):
+    seen = {}
+    for name in ("Mended", "Rendered", "Holes", "Depth", "Coverage"):
+        choose(view, name)
+        assert view.server.looks[-1]["modes"] == [name.lower()]
+        seen[name] = view.picture()
+    assert share(seen["Holes"], scene.PINK) > 0.004 > share(seen["Mended"], scene.PINK)
+    black = {name: (pixels.max(-1) < 20).mean() for name, pixels in seen.items()}
+    assert black["Rendered"] > black["Mended"] + 0.004
+    depth = seen["Depth"][seen["Depth"].max(-1) > 60]
+    assert np.abs(depth[:, 0] - depth[:, 2]).max() < 30
+    for colour in scene.COLOURS:
+        assert share(seen["Coverage"], tuple(colour)) > 0.01
+
+
+def test_digits_choose_modes(desktop):
+    for digit, mode in zip("123456", ["rendered", "holes", "mended", None, "depth", "coverage"], strict=True):
+        desktop.page.keyboard.press(digit)
+        desktop.settle()
+        assert desktop.server.looks[-1]["modes"] == ([mode] if mode else ["rendered", "mended"])
+
+
+def test_side_by_side_has_a_divider_that_is_dragged(view):
+    choose(view, "Side by side")
+    view.tab("view")
+    view.page.locator("#split-left").select_option("holes")
+    view.page.locator("#split-right").select_option("coverage")
+    view.settle()
+    assert view.server.looks[-1]["modes"] == ["holes", "coverage"]
+    view.tab("view")
+    split = view.page.locator("#divider")
+    box = split.bounding_box()
+    middle = int(box["x"] + box["width"] / 2)
+    shown = view.picture()
+    blue = tuple(scene.COLOURS[1])
+    assert share(shown[:, :middle], scene.PINK) > 0.002
+    assert share(shown[:, middle:], scene.PINK) == 0
+    assert share(shown[:, middle:], tuple(scene.COLOURS[0])) + share(shown[:, middle:], blue) > 0.01
+    x, y = view.middle()
+    view.page.mouse.move(middle, y)
+    view.page.mouse.down()
+    view.page.mouse.move(middle - 150, y, steps=3)
+    view.page.mouse.up()
+    view.page.wait_for_timeout(100)
+    assert share(view.picture()[:, middle - 120 :], scene.PINK) == 0
+    at = float(split.get_attribute("aria-valuenow"))
+    split.focus()
+    view.page.keyboard.press("ArrowRight")
+    view.until(lambda: float(split.get_attribute("aria-valuenow")) == pytest.approx(at + 2, abs=1))
+
+
+def test_quality_and_resolution_sliders(view):
+    view.tab("quality")
+    assert view.server.looks[-1]["top_k"] is None
+    view.page.locator("#quality").fill("2")
+    view.page.locator("#side").fill("512")
+    view.settle()
+    look = view.server.looks[-1]
+    width, height = view.page.viewport_size["width"], view.page.viewport_size["height"]
+    assert look["top_k"] == 256
+    assert look["width"] * look["height"] == pytest.approx(512**2, rel=0.05)
+    assert look["width"] / look["height"] == pytest.approx(width / height, rel=0.03)
+    assert view.page.locator("#side-value").inner_text() == f"{look['width']} × {look['height']}"
+    assert "256" in view.page.locator("#quality-value").inner_text()
+
+
+def test_moving_may_cost_pixels_or_not(desktop):
+    sizes = []
+    for adaptive in (True, False):
+        desktop.page.locator("#adaptive").set_checked(adaptive)
+        desktop.settle()
+        start = len(desktop.server.looks)
+        desktop.drag(120, 0, steps=12)
+        desktop.settle()
+        looks = desktop.server.looks[start:]
+        assert any(look["moving"] and look["adaptive"] == adaptive for look in looks)
+        sizes.append(desktop.data("full"))
+    assert sizes == ["true", "true"]
+
+
+def test_pause_seek_step_speed_and_live(view):
+    page, server = view.page, view.server
+    still = view.picture()
+    page.locator("#seek").fill("20")
+    view.until(lambda: view.data("time") == "20")
+    assert (np.abs(still - view.picture()).max(-1) > 60).mean() > 0.001
+    assert page.locator("#time").inner_text() == f"21 / {scene.FRAMES}"
+    page.locator("#picture").focus()
+    page.keyboard.press(".")
+    view.until(lambda: view.data("time") == "21")
+    page.keyboard.press(",")
+    view.until(lambda: view.data("time") == "20")
+    assert page.locator("#live").get_attribute("aria-pressed") == "false"
+    page.get_by_role("button", name="Play", exact=True).click()
+    view.until(lambda: view.data("time") not in ("20", "21"))
+    page.get_by_role("button", name="Pause", exact=True).click()
+    view.until(lambda: server.clocks[-1].get("playing") is False)
+    page.locator("#speed").select_option("2")
+    view.until(lambda: server.clocks[-1].get("speed") == 2)
+    page.keyboard.press("Escape")
+    page.locator("#picture").focus()
+    page.keyboard.press("[")
+    view.until(lambda: server.clocks[-1].get("speed") == 1)
+    page.locator("#live").click()
+    view.until(lambda: server.clocks[-1].get("live") is True)
+    view.until(lambda: page.locator("#live").get_attribute("aria-pressed") == "true")
+    page.locator("#picture").focus()
+    page.keyboard.press("Space")
+    view.until(lambda: server.clocks[-1] == {"type": "clock", "playing": False})
+
+
+def test_the_rig_is_drawn_and_the_cameras_in_use_stand_out(view):
+    before = view.picture()
+    view.page.get_by_role("button", name="Show the cameras").click()
+    view.settle()
+    assert (np.abs(before - view.picture()).max(-1) > 30).sum() > 300
+    assert view.page.locator("#labels button", has_text="cam").count() == scene.CAMERAS
+    view.tab("cameras")
+    used = view.page.locator("#cameras button[data-used]").all_inner_texts()
+    assert used == scene.CHOSEN
+    assert view.page.locator("#camera-count").inner_text() == "2 of 4 in use"
+    view.page.locator("#rig").set_checked(False)
+    view.settle()
+    assert view.page.locator("#labels").is_hidden()
+
+
+def test_a_label_in_the_picture_leads_to_its_camera(desktop):
+    desktop.page.keyboard.press("g")
+    desktop.settle()
+    labels = desktop.page.locator("#labels button:visible")
+    names = [label.inner_text() for label in labels.all()]
+    label = next(one for one in labels.all() if 40 < one.bounding_box()["x"] < 900 and one.bounding_box()["y"] > 60)
+    place = names.index(label.inner_text())
+    wanted = next(c for c in scene.rig()["cameras"] if c["name"] == names[place])
+    label.click()
+    desktop.settle()
+    np.testing.assert_allclose(desktop.server.looks[-1]["camera"]["R"], wanted["R"], atol=1e-6)
+
+
+def test_statistics_are_shown(view):
+    view.tab("stats")
+    view.page.locator("#play").click()
+    view.until(lambda: float(view.page.locator("#figure-fps").inner_text().replace("–", "0")) > 1)
+    for name in ("latency", "holes", "kb", "dropped", "size", "repaints"):
+        assert view.page.locator(f"#figure-{name}").inner_text() != "–"
+    assert view.page.locator("#stages").inner_text().count("ms") == 7
+    drawn = view.page.evaluate(
+        "(() => { const p = document.querySelector('#plot');"
+        " return new Set(p.getContext('2d').getImageData(0, 0, p.width, p.height).data).size })()"
+    )
+    assert drawn > 10
+
+
+@pytest.mark.parametrize("how", ["button", "key"])
+def test_a_screenshot_is_what_is_seen(desktop, tmp_path, how):
+    with desktop.page.expect_download() as waiting:
+        if how == "key":
+            desktop.page.keyboard.press("p")
+        else:
+            desktop.page.get_by_role("button", name="Save a screenshot").click()
+    path = tmp_path / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    assert path.name == "viewmend-0000.png"
+    saved = cv2.imread(str(path))[..., ::-1].astype(int)
+    assert np.abs(saved - desktop.picture()).mean() < 1
+
+
+def test_help_opens_and_closes(view):
+    view.page.get_by_role("button", name="Help").click()
+    help_ = view.page.get_by_role("dialog")
+    assert help_.is_visible()
+    assert "to the live edge" in help_.inner_text()
+    view.page.get_by_role("button", name="Close the help").click()
+    assert help_.is_hidden()
+    view.page.keyboard.press("?")
+    assert help_.is_visible()
+
+
+def test_the_panel_makes_room(desktop):
+    x, _ = desktop.middle()
+    desktop.page.keyboard.press("h")
+    desktop.settle()
+    assert desktop.page.locator("#panel").is_hidden()
+    assert desktop.middle()[0] > x + 100
+
+
+@pytest.mark.parametrize("codec", ["vp9", "h264"])
+def test_video_is_decoded_when_both_sides_can(desktop, codec):
+    pytest.importorskip("av")
+    if codec not in desktop.server.hellos[0]["codecs"]:
+        pytest.skip(f"this Chromium has no {codec}")
+    before = desktop.picture()
+    desktop.page.locator("#codec").select_option(codec)
+    desktop.settle()
+    assert desktop.server.looks[-1]["codec"] == codec
+    assert np.abs(desktop.picture() - before).mean() < 4
+    desktop.drag(100, 0)
+    desktop.settle()
+    assert np.abs(desktop.picture() - before).mean() > 2
+
+
+def test_a_browser_without_video_is_offered_jpeg_alone(browser):
+    with StandIn(video=False) as server:
+        for view in opened(browser, server, "desktop"):
+            view.settle()
+            assert view.page.locator("#codec").is_hidden()
+            assert view.server.looks[-1]["codec"] == "jpeg"
