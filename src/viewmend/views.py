@@ -77,6 +77,19 @@ class ContextViews:
 
 
 @dataclass(frozen=True)
+class Silhouettes:
+    """The masks of a rig at one time, without its images."""
+
+    mask: UInt8[Tensor, "view height width"]
+    """Foreground, 0 to 255."""
+    cameras: Cameras
+
+    def to(self, device: torch.device | str) -> "Silhouettes":
+        """The same on `device`."""
+        return Silhouettes(self.mask.to(device), self.cameras.to(device))
+
+
+@dataclass(frozen=True)
 class IncompleteView:
     """A rendered novel view and what is missing in it: F[t], M[t], E[t] of section 1."""
 
@@ -97,6 +110,9 @@ class IncompleteView:
     time: int
     nearest: tuple[str, ...] = ()
     """Names of all cameras that an inpainter may look at, the closest first; () where the renderer does not say."""
+    silhouettes: Silhouettes | None = None
+    """The masks of these cameras at the view's time: they say more exactly than the proxy whether a pixel shows the
+    subject at all. None where the renderer does not say."""
 
     def around(self, count: int) -> tuple[str, ...]:
         """Names of this many cameras: the chosen ones, then the closest others."""

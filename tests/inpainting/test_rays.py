@@ -10,6 +10,7 @@ from reference.rays_twin import follow_twin
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.rays import FAR, NEAR, OFFSETS, OUTLINE, follow, windows
+from viewmend.views import Silhouettes
 
 
 def turned(cameras: Cameras, angle: float) -> Cameras:
@@ -26,13 +27,25 @@ def test_following_equals_its_twin(rng):
     depth = nearby.depth + 0.2 * torch.rand(nearby.depth.shape, generator=rng) * (nearby.depth > 0)
     frame = replace(nearby.frame, cameras=turned(nearby.frame.cameras, 0.55))
     nearby = replace(nearby, frame=frame, depth=depth)
+    rig = context(5, ("left", "third", "right", "novel")).frame
+    masks = (torch.rand(rig.rgb[:, 0].shape, generator=rng) * 256).byte()
+    incomplete = replace(incomplete, silhouettes=Silhouettes(masks, turned(rig.cameras, 0.55)))
     pixels = torch.nonzero(incomplete.error > 0)
     pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
     samples = follow(incomplete, pixels, nearby)
     features, occupancy = follow_twin(incomplete, pixels, nearby, OFFSETS, NEAR, FAR, OUTLINE)
     assert 0 < samples.features[..., 8].mean() < 1, "some points are out of view"
     assert torch.allclose(samples.features.double(), torch.from_numpy(features), atol=2e-3)
-    assert torch.allclose(samples.occupancy.double(), torch.from_numpy(occupancy), atol=1e-3)
+    assert torch.allclose(samples.occupancy.double(), torch.from_numpy(occupancy), atol=2e-3)
+    assert 0.05 < (samples.occupancy < 0.9).float().mean() < 0.95
+
+
+def test_without_silhouettes_the_nearby_masks_count():
+    incomplete, nearby = view(5), context(5)
+    assert nearby.frame.mask is not None
+    pixels = torch.nonzero(incomplete.error > 0)[::20]
+    told = replace(incomplete, silhouettes=Silhouettes(nearby.frame.mask, nearby.frame.cameras))
+    assert torch.equal(follow(incomplete, pixels, nearby).occupancy, follow(told, pixels, nearby).occupancy)
 
 
 def test_cameras_agree_on_the_colour_of_a_point_on_the_surface():

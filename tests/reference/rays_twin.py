@@ -5,14 +5,14 @@ from reference.blend_twin import unit
 
 
 def follow_twin(view, pixels, nearby, offsets, near, far, outline):
-    """Features [pixel point view 10] and occupancy [pixel point], in double precision."""
+    """Features [pixel point view 10] and occupancy [pixel point 2], in double precision."""
     depth = view.depth.double().numpy()
     focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
     covered = np.sort(depth[depth > 0])
     size_m = np.sqrt((view.mask > 0).sum().item()) * covered[(len(covered) - 1) // 2] / focal
     pose = np.linalg.inv(view.camera.camera_from_world[0].double().numpy())
     features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 10))
-    occupancy = np.ones(features.shape[:2])
+    occupancy = np.ones((*features.shape[:2], 2))
     for number, (row, column) in enumerate(pixels.tolist()):
         ray = np.linalg.inv(view.camera.K[0].double().numpy()) @ [column + 0.5, row + 0.5, 1]
         for point, offset in enumerate(offsets):
@@ -20,8 +20,8 @@ def follow_twin(view, pixels, nearby, offsets, near, far, outline):
             for camera in range(features.shape[2]):
                 seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far, outline)
                 features[number, point, camera] = seen
-                if seen[8]:
-                    occupancy[number, point] = min(occupancy[number, point], seen[3])
+            masks = [see_mask(at, view.silhouettes, camera) for camera in range(len(view.silhouettes.cameras))]
+            occupancy[number, point] = sorted([*masks, 1.0, 1.0])[:2]
     return features, occupancy
 
 
@@ -51,6 +51,21 @@ def look(point, viewer, view, nearby, index, size_m, near, far, outline):
     chosen = camera.names[0] in view.chosen
     around = mean_around(frame.mask.double().numpy() / 255, index, u, v, outline)
     return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, around])
+
+
+def see_mask(point, silhouettes, index):
+    """The mask of one camera at a point, 1 where it is out of view."""
+    camera = silhouettes.cameras[index]
+    x, y, z = (camera.camera_from_world[0].double().numpy() @ [*point, 1])[:3]
+    if z <= 0:
+        return 1.0
+    u, v, _ = camera.K[0].double().numpy() @ [x / z, y / z, 1]
+    width, height = camera.size_px[0].tolist()
+    if not (0 <= u < width and 0 <= v < height):
+        return 1.0
+    rows, columns = silhouettes.mask.shape[1:]
+    around = [(r, c, share) for r, c, share in four_beyond(u, v) if 0 <= r < rows and 0 <= c < columns]
+    return sum(share * float(silhouettes.mask[index, r, c]) / 255 for r, c, share in around)
 
 
 def mean_around(masks, index, u, v, outline):

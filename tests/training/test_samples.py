@@ -42,7 +42,7 @@ def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
     vandalised.mask[2] = 255
     truth = studio.truth(studio.true_cameras.select([held]), 1)
     samples = [
-        LeaveOneOut({1: f}, held, None, HullConfig(resolution=48)).sample(1, (), truth, RenderConfig(), 0)
+        LeaveOneOut({1: f}, held, None, HullConfig(resolution=48)).sample(1, (1,), truth, RenderConfig(), 0)
         for f in (frame, vandalised)
     ]
     first, second = samples

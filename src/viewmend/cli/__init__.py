@@ -28,12 +28,16 @@ class Command:
 
 COMMANDS = (
     Command("demo", "viewmend.cli.demo", "Render and mend a moving procedural scene; needs nothing."),
+    Command("serve", "viewmend.cli.serve", "Walk around the subject in a browser, live."),
     Command("mend", "viewmend.cli.mend", "Mend novel views of a capture."),
     Command("studio", "viewmend.cli.studio", "Write synthetic captures with exact truth."),
     Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),
     Command("samples", "viewmend.cli.samples", "Make training samples ahead."),
+    Command("ablation", "viewmend.cli.ablation", "Train every variant of the model and compare them."),
     Command("evaluate", "viewmend.cli.evaluate", "Compare methods on fixed scenes and captures."),
     Command("evaluate parity", "viewmend.cli.parity", "Compare our baselines with the published networks."),
+    Command("evaluate paper-table", "viewmend.cli.paper_table", "The paper's tables on your data, beside its figures."),
+    Command("weights", "viewmend.cli.weights", "List and check weights of others' networks."),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 

@@ -140,6 +140,7 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     return replace(
         recipe,
         seed=options.seed,
+        fresh=min(recipe.fresh, options.batch or recipe.batch),
         loss=replace(recipe.loss, **{n: v for n, v in loss.items() if v is not None}),
         **{n: v for n, v in values.items() if v is not None},
     )

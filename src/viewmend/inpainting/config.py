@@ -50,6 +50,8 @@ class InpainterConfig:
     """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
     attention_scale: Literal["model", "head"] = "model"
     """Scores are divided by the root of D ("model", the paper's formula) or of a head's channels."""
+    context_cameras: int | None = None
+    """How many cameras are context, whatever number coloured the view; None: those that did."""
     past_geometry: Literal["own", "current"] = "own"
     """Geometry that carries a past patch into the view: that of its own time, or of now (the paper's)."""
     n_c: int = 3
@@ -77,8 +79,9 @@ class InpainterConfig:
             raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
         if self.rays and not self.prefill:
             raise ValueError(f"expected prefill with rays (they make the fill), got rays {self.rays} without")
-        if self.top_k is not None and self.top_k < 1:
-            raise ValueError(f"expected top_k of at least 1 or none, got {self.top_k}")
+        for name in ("top_k", "context_cameras"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise ValueError(f"expected {name} of at least 1 or none, got {value}")
 
     @property
     def in_channels(self) -> int:

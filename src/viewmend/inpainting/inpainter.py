@@ -89,7 +89,11 @@ class Inpainter(nn.Module):
         top_k: int | None = None,
         nearby: Sequence[ContextViews | None] | None = None,
     ) -> list[Prediction]:
-        """`predict`, whose contexts may also be camera images; these are encoded first, all in one batch."""
+        """`predict`, whose contexts may also be camera images; these are encoded first, all in one batch.
+
+        Of the images, those that `step` would not look at are passed over.
+        """
+        contexts = [self._looked_at(*own) for own in zip(views, contexts, strict=True)]
         fresh = [item for context in contexts for item in context if isinstance(item, ContextViews)]
         encoded = iter(self.encode_contexts(fresh))
         frames = [
@@ -172,17 +176,30 @@ class Inpainter(nn.Module):
     ) -> tuple[CompletedView, State]:
         """The completed view and the state for the next one (section 9).
 
-        `source` is asked for frames of `view.chosen` that the window needs and the state has not, and for those of
-        `view.nearest` that `rays` reads now; a view without holes comes back at once, without asking it.
+        `source` is asked for frames of `view.chosen` (or `context_cameras`) that the window needs and the state has
+        not, and for those of `view.nearest` that `rays` reads now; a view without holes comes back at once, unasked.
         """
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
         fresh, nearby = self._look(view, source, state.cache)
         frames = [frame for group in self.encode_contexts(fresh) for frame in group]
         cache = state.cache.add(frames, view.time, self.config)
-        context = cache.find(view.chosen, window_times(view.time, self.config))
+        context = cache.find(self._context_names(view), window_times(view.time, self.config))
         prediction = self.predict([view], [context], top_k, [nearby])[0]
         return CompletedView(view, prediction.completed), State(cache)
+
+    def _context_names(self, view: IncompleteView) -> tuple[str, ...]:
+        """The cameras that are context."""
+        count = self.config.context_cameras
+        return view.chosen if count is None else view.around(count)
+
+    def _looked_at(
+        self, view: IncompleteView, context: Sequence[ContextFrame | ContextViews]
+    ) -> list[ContextFrame | ContextViews]:
+        """The context without images of times and cameras that are not the config's."""
+        names, times = self._context_names(view), window_times(view.time, self.config)
+        kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
+        return [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]
 
     def _look(
         self, view: IncompleteView, source: Source, cache: ContextCache
@@ -191,7 +208,7 @@ class Inpainter(nn.Module):
         around = view.around(self.config.rays)
         fresh, nearby = [], None
         for time in window_times(view.time, self.config):
-            new = cache.missing(view.chosen, time)
+            new = cache.missing(self._context_names(view), time)
             names = tuple(dict.fromkeys((*new, *around))) if time == view.time else new
             seen = source(time, names) if names else None
             if seen is not None:

@@ -38,7 +38,7 @@ class RayReader(nn.Module):
             nn.Linear(width + RAY_CHANNELS + 8, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
         )
         self.trust = nn.Linear(width, 1)
-        self.point = nn.Sequential(nn.Linear(width + 8, width), nn.GELU(), nn.Linear(width, POINT_FEATURES))
+        self.point = nn.Sequential(nn.Linear(width + 9, width), nn.GELU(), nn.Linear(width, POINT_FEATURES))
         widths = (WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), 2 * width)
         layers = [(nn.Conv2d(before, after, 3), nn.GELU()) for before, after in pairwise(widths)]
         self.around = nn.Sequential(*(part for layer in layers for part in layer))
@@ -102,14 +102,14 @@ class RayReader(nn.Module):
         variance = CONTRAST * (prior * (rgb - mean) ** 2).sum(2, keepdim=True)
         looked = self.look(seen)
         together = looked + (prior * looked).sum(2, keepdim=True)
-        occupancy = samples.occupancy[..., None]
-        shown = [seen, mean.expand_as(rgb), variance.expand_as(rgb), together, occupancy[..., None].expand_as(prior)]
+        occupied = samples.occupancy[..., None, :1].expand_as(prior)
+        shown = [seen, mean.expand_as(rgb), variance.expand_as(rgb), together, occupied]
         compared = self.compare(torch.cat([*shown, prior], -1))
         scores = self.trust(compared).float() + (prior + 1e-4).log()
         trust = inside * scores.masked_fill(inside == 0, -1e4).softmax(2)
         colour = (trust * rgb).sum(2)
         spread = CONTRAST * (trust * (rgb - colour[:, :, None]) ** 2).sum(2)
-        features = [(trust * compared).sum(2), colour, spread, occupancy, (trust**2).sum(2)]
+        features = [(trust * compared).sum(2), colour, spread, samples.occupancy, (trust**2).sum(2)]
         return colour, self.point(torch.cat(features, -1))
 
 
@@ -117,7 +117,7 @@ def _follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: Contex
     if nearby is not None and len(pixels):
         return follow(view, pixels, nearby)
     shape = (len(pixels), len(OFFSETS))
-    return RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(shape))
+    return RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 2))
 
 
 def _surroundings(

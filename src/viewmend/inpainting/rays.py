@@ -5,16 +5,18 @@ in the images: where a ray passes it, cameras that see it agree. So the ray is f
 of its points looked up in each camera (as in IBRNet, Wang et al., CVPR 2021, which renders whole views so).
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project, unproject
 from viewmend.inpainting.prefill import pull_push
-from viewmend.views import ContextViews, IncompleteView
+from viewmend.views import ContextViews, IncompleteView, Silhouettes
 
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Where a ray is looked at: z-depth behind the proxy, in subject sizes."""
@@ -35,8 +37,9 @@ class RaySamples:
     between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view,
     and the mask's mean around: where the outlines of two cameras meet, a hull is fattest. All 0 for a point out of
     view."""
-    occupancy: Float[Tensor, "pixel point"]
-    """Least mask of the cameras that have the point in view: 0 where one sees background there."""
+    occupancy: Float[Tensor, "pixel point 2"]
+    """Least and second least mask of all cameras of the rig that have the point in view: 0 where one sees background
+    there, and where another does, too; 1 where there is no such camera."""
 
     def padded(self, views: int) -> "RaySamples":
         """The same with cameras behind that see nothing, `views` in all."""
@@ -66,20 +69,18 @@ def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: Context
 
     at, z = project(points, cameras)
     inside = (z > 0) & (at >= 0).all(-1) & (at < cameras.size_px[:, None]).all(-1)
-    covered = (nearby.depth > 0).to(z)
-    mask = covered if frame.mask is None else frame.mask.to(z) / 255
-    images = torch.cat([frame.rgb.to(z) / 255 * mask[:, None], torch.stack([mask, covered, nearby.depth], 1)], 1)
-    seen = _bilinear(images, at) * inside[..., None]
+    seen = _seen(nearby, at) * inside[..., None]
     coverage, surface_m = seen[..., 4], seen[..., 5] / seen[..., 4].clamp_min(0.05)
     behind = torch.where(coverage > 0.3, (z - surface_m) / size_m, 0.0)
     to_viewer = F.normalize(view.camera.centers[0] - points, dim=-1)
     cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1)
     chosen = z.new_tensor([name in view.chosen for name in cameras.names])[:, None].expand_as(z)
+    mask = frame.mask if frame.mask is not None else 255 * (nearby.depth > 0).to(torch.uint8)
     around = _mean_around(mask, at)
     place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z), around], -1)
     features = torch.cat([seen[..., :4], place * inside[..., None]], -1).movedim(0, 1)
-    # A camera more that sees nothing, for the minimum over none.
-    occupancy = F.pad(torch.where(inside, seen[..., 3], 1.0), (0, 0, 0, 1), value=1.0).amin(0)
+    silhouettes = view.silhouettes or Silhouettes(mask, cameras)
+    occupancy = _least_masks(points, silhouettes)
     shape = (len(pixels), len(OFFSETS))
     return RaySamples(features.unflatten(0, shape), occupancy.unflatten(0, shape))
 
@@ -94,22 +95,59 @@ def windows(
     return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
 
 
+def _seen(nearby: ContextViews, at: Float[Tensor, "view point 2"]) -> Float[Tensor, "view point 6"]:
+    """RGB before black, mask, whether the proxy is there and its depth, between pixel centres; zeros beyond.
+
+    Only four pixels a point are looked at: whole images would take longer to convert than to read.
+    """
+    frame = nearby.frame
+    view = torch.arange(len(frame.cameras), device=at.device)[:, None]
+    seen = at.new_zeros(*at.shape[:2], 6)
+    for row, column, share in _corners(at, nearby.depth.shape[1:]):
+        depth = nearby.depth[view, row, column]
+        covered = (depth > 0).to(at)
+        mask = covered if frame.mask is None else frame.mask[view, row, column].to(at) / 255
+        rgb = frame.rgb[view, :, row, column].to(at) / 255 * mask[..., None]
+        seen += share[..., None] * torch.cat([rgb, torch.stack([mask, covered, depth], -1)], -1)
+    return seen
+
+
+def _corners(
+    at: Float[Tensor, "view point 2"], size: Sequence[int]
+) -> Iterator[tuple[Int[Tensor, "view point"], Int[Tensor, "view point"], Float[Tensor, "view point"]]]:
+    """Row, column and bilinear share of the four pixels around each place; a share of 0 for those beyond the image."""
+    height, width = size
+    at = at.clamp(-4, 4 * max(size)) - 0.5
+    first = at.floor()
+    right, below = (at - first).unbind(-1)
+    for down, across in product((0, 1), (0, 1)):
+        column, row = (first[..., 0] + across).long(), (first[..., 1] + down).long()
+        there = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        share = (right if across else 1 - right) * (below if down else 1 - below) * there
+        yield row.clamp(0, height - 1), column.clamp(0, width - 1), share
+
+
+def _least_masks(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> Float[Tensor, "point 2"]:
+    """The two smallest mask values at each point; a camera that has it not in view says 1."""
+    cameras, mask = silhouettes.cameras, silhouettes.mask
+    at, z = project(points, cameras)
+    inside = (z > 0) & (at >= 0).all(-1) & (at < cameras.size_px[:, None]).all(-1)
+    view = torch.arange(len(cameras), device=mask.device)[:, None]
+    corners = _corners(at, mask.shape[1:])
+    value = sum((share * mask[view, row, column] for row, column, share in corners), torch.zeros_like(z)) / 255
+    value = F.pad(torch.where(inside, value, 1.0), (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
+    return value.topk(2, dim=0, largest=False).values.T
+
+
 def _mean_around(
-    mask: Float[Tensor, "view height width"], at: Float[Tensor, "view point 2"]
+    mask: UInt8[Tensor, "view height width"], at: Float[Tensor, "view point 2"]
 ) -> Float[Tensor, "view point"]:
     """Masks averaged over squares of `OUTLINE` subjects, sampled between the squares."""
-    subject_px = float(mask.sum((1, 2)).mean().sqrt())
-    side = max(1, round(OUTLINE * subject_px))
+    share = mask.to(at) / 255
+    side = max(1, round(OUTLINE * float(share.sum((1, 2)).mean().sqrt())))
     rows, cols = (-(-size // side) for size in mask.shape[1:])
     height, width = mask.shape[1:]
-    coarse = F.avg_pool2d(F.pad(mask[:, None], (0, cols * side - width, 0, rows * side - height)), side)
-    return _bilinear(coarse, at / side)[..., 0]
-
-
-def _bilinear(
-    images: Float[Tensor, "view channel height width"], at: Float[Tensor, "view point 2"]
-) -> Float[Tensor, "view point channel"]:
-    """Images sampled between pixel centres, zeros beyond."""
-    size = torch.tensor([images.shape[3], images.shape[2]], device=at.device)
-    grid = (2 * at / size - 1).clamp(-4, 4)[:, :, None]
-    return F.grid_sample(images, grid, align_corners=False)[..., 0].movedim(1, 2)
+    coarse = F.avg_pool2d(F.pad(share[:, None], (0, cols * side - width, 0, rows * side - height)), side)[:, 0]
+    view = torch.arange(len(mask), device=at.device)[:, None]
+    corners = _corners(at / side, coarse.shape[1:])
+    return sum((share * coarse[view, row, column] for row, column, share in corners), torch.zeros_like(at[..., 0]))

@@ -14,7 +14,7 @@ from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering.blending import BlendConfig, blend
 from viewmend.rendering.error_rules import Evidence, error_rule
 from viewmend.rendering.selection import select_closest, select_covering
-from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 """The proxy's depth in the frame's cameras of these names."""
@@ -79,7 +79,11 @@ def render_view(
     error = error_rule(config.error_rule)(Evidence(mask, depth, blended))
     coloured = mask * (error < 1)
     weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
-    return IncompleteView(target, blended.rgb * coloured, mask, error, depth, chosen, weights, frame.time, nearest)
+    seen = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)
+    silhouettes = None if seen.mask is None else Silhouettes(seen.mask, seen.cameras)
+    return IncompleteView(
+        target, blended.rgb * coloured, mask, error, depth, chosen, weights, frame.time, nearest, silhouettes
+    )
 
 
 def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:

@@ -62,9 +62,13 @@ class Objective(nn.Module):
         if not self.recipe.loss.temporal:
             return completed[0].new_zeros(())
         made = iter(completed)
-        clips = [[CompletedView(sample.view, next(made)) for sample in last.clip] for last in batch]
+        clips = [[(CompletedView(s.view, next(made)), s.truth.float() / 255) for s in last.clip] for last in batch]
         pairs = [pair for clip in clips for pair in pairwise(clip)]
-        return temporal_loss([before for before, _ in pairs], [now for _, now in pairs])
+        return temporal_loss(
+            [before for (before, _), _ in pairs],
+            [now for _, (now, _) in pairs],
+            [(earlier, later) for (_, earlier), (_, later) in pairs],
+        )
 
     def _perceptual(self, views: list[Sample], completed: tuple[Tensor, ...]) -> Float[Tensor, ""]:
         """The difference of VGG16's features around the holes."""

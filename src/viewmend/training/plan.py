@@ -27,6 +27,12 @@ class DataPlan:
     """How many cameras colour a view and are its context,"""
     context_weights: tuple[int, ...] = (2, 8, 2, 1)
     """and how often each."""
+    past: tuple[int, ...] = (0, 0, 0, 1, 99)
+    """How many of the earlier times are context; each target takes one of these."""
+    context: bool = True
+    """Whether samples have context; rays alone need none, and are smaller without."""
+    least_context: int = 0
+    """So many cameras are context at least, whatever number coloured the view: for models that look at so many."""
     rays: int = 0
     """How many cameras near a view an inpainter that reads rays is given."""
     imperfect_share: float = 0.6
@@ -41,6 +47,8 @@ class DataPlan:
     """Folder of BVH motions for them."""
     performers_share: float = 0.5
     """Share of the studio's scenes whose performers come from these folders, where they are given."""
+    cloth_variety: tuple[float, float] = (0.0, 1.0)
+    """Least and largest share of these performers' garments that are dyed or made of another cloth."""
     captures: tuple[Path, ...] = ()
     """Folders of real captures."""
     captures_share: float = 0.75

@@ -28,6 +28,7 @@ def small_rays(data: DataPlan) -> Recipe:
     return replace(
         small(data),
         name="small_rays",
+        data=_for(small_model(), replace(data, context=False)),
         part="rays",
         loss=LossWeights(log_error=2.0),
         steps=6000,

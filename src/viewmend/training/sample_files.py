@@ -15,9 +15,9 @@ from safetensors.torch import load, save
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.training.samples import Sample
-from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
-KINDS = {kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Cameras)}
+KINDS = {kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras)}
 """The dataclasses that a sample is made of."""
 STRUCTURE = "structure"
 """Name of the tensor that holds the sample without its tensors, as JSON."""

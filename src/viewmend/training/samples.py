@@ -43,6 +43,7 @@ class Sample:
             error=self.view.error.to(device),
             depth=self.view.depth.to(device),
             weights=self.view.weights.to(device),
+            silhouettes=self.view.silhouettes and self.view.silhouettes.to(device),
         )
         context = tuple(c.to(device) for c in self.context)
         nearby = None if self.nearby is None else self.nearby.to(device)
@@ -72,27 +73,28 @@ class LeaveOneOut:
     def sample(
         self,
         time: int,
-        past: Sequence[int],
+        times: Sequence[int],
         truth: MultiViewFrame,
         render: RenderConfig,
         min_hole_px: int,
-        rays: int = 0,
+        cameras: tuple[int, int] = (0, 0),
     ) -> Sample | None:
-        """The pair at `time` with context from `time` and the `past` times; None if fewer pixels are missing.
+        """The pair at `time` with context from these `times`, its own first; None if fewer pixels are missing.
 
         truth: the held camera at `time`, one view.
-        rays: how many cameras are `nearby`.
+        cameras: how many are context at least, and how many `nearby`.
         """
         view = render_view(self.frames[time], self.proxy(time), truth.cameras, render)
         if float(view.error.sum()) < min_hole_px:
             return None
+        wanted = view.around(max(len(view.chosen), cameras[0]))
         context = []
-        for tau in (time, *past):
-            names = [n for n in view.chosen if n in self.frames[tau].cameras.names]
+        for tau in times:
+            names = [n for n in wanted if n in self.frames[tau].cameras.names]
             frame = self.frames[tau].select(names)
             context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
         assert truth.mask is not None, "what trains has masks"
-        around = view.around(rays)
+        around = view.around(cameras[1])
         near = self.frames[time].select(around)
         nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)

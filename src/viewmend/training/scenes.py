@@ -76,11 +76,14 @@ def random_stage(plan: DataPlan, random: Random, seeds: range = range(FIRST_VALI
             mask_blobs=0.2 * strength,
             mask_hard=flawed and random.random() < 0.6,
             calibration_px=strength * random.random(),
+            calibration_m=0.003 * strength * random.random(),
+            jpeg_quality=random.randint(70, 95) if flawed and random.random() < 0.5 else None,
         ),
         device=plan.device,
     )
     if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:
-        config = replace(config, performers=plan.performers, motions=plan.motions)
+        variety = random.uniform(*plan.cloth_variety)
+        config = replace(config, performers=plan.performers, motions=plan.motions, cloth_variety=variety)
     return config
 
 
@@ -105,13 +108,14 @@ def rig_samples(
     for held in random.sample(names, min(plan.held_cameras, len(names))):
         rig = LeaveOneOut(frames, held, bounds, HullConfig(resolution=plan.hull_resolution))
         for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
-            reach = random.choice((0, 0, 0, 1, len(times)))
+            reach = random.choice(plan.past)
             render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
-            sample = None
+            sample, cameras = None, (plan.least_context, plan.rays)
             for time in range(end - plan.clip + 1, end + 1):
                 past = [t for t in reversed(times) if t < time][:reach]
+                context = (time, *past) if plan.context else ()
                 least_px = plan.min_hole_px if time == end else 0
-                new = rig.sample(time, past, truth(held, time), render, least_px, plan.rays)
+                new = rig.sample(time, context, truth(held, time), render, least_px, cameras)
                 sample = new and replace(new, previous=sample)
             if sample is not None:
                 samples.append(sample)

@@ -1,0 +1,72 @@
+"""`viewmend train` and `viewmend samples` from the command line."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from viewmend.capture.plain_writer import write_capture
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.cli import main
+from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
+from viewmend.inpainting.config import small as small_model
+from viewmend.inpainting.inpainter import Inpainter
+
+MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, rays=3)
+BRIEF = ("--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "mine"
+    write_capture(Studio(StudioConfig(seed=3, cameras=5, frames=2, size_px=192)), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models") / "tiny"
+    save_inpainter(Inpainter(MODEL), folder, "# tiny\n")
+    return folder
+
+
+def test_fine_tuning_on_a_capture_of_ones_own_goes_on_from_a_model(capture, model, tmp_path, capsys):
+    out = tmp_path / "mine"
+    command = ["train", "finetune", "--capture", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
+    assert main(command) == 0
+    assert load_inpainter(out).config == MODEL
+    steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
+    assert steps == [1, 2]
+    assert main(command) == 0
+    assert "nothing to do" in capsys.readouterr().err
+
+
+def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
+    shards = tmp_path / "shards"
+    command = ["samples", "--recipe", "finetune", "--capture", str(capture), "--out", str(shards)]
+    assert main([*command, "--count", "3", "--workers", "0"]) == 0
+    assert [path.name for path in shards.iterdir()] == ["shard-00000.tar"]
+    trained = ["train", "finetune", "--shards", str(shards), "--from", str(model), "--out", str(tmp_path / "out")]
+    assert main([*trained, *BRIEF]) == 0
+    assert load_inpainter(tmp_path / "out").config == MODEL
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "smal"], "expected a recipe among"),
+        (["train", "finetune"], "expected --capture DIR"),
+        (["train", "small", "--performers", "people"], "--performers and --motions together"),
+        (["train", "small", "--temporal", "0.1"], "set data.clip"),
+        (["train", "small_rays", "--adversarial", "0.01"], "no adversarial loss for rays"),
+        (["train", "small", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
+        (["train", "small", "--from", "nothing"], "one of the shipped models"),
+        (["samples", "--out", "x", "--count", "0"], "count of at least 1"),
+        (["ablation", "--out", "x", "--variants", "no-ropes"], "expected variants among"),
+    ],
+)
+def test_what_cannot_be_is_one_clear_error(arguments, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and said in lines[0], lines
