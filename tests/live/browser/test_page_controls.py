@@ -57,7 +57,7 @@ def test_side_by_side_has_a_divider_that_is_dragged(view):
     assert share(shown[:, :middle], scene.PINK) > 0.002
     assert share(shown[:, middle:], scene.PINK) == 0
     assert share(shown[:, middle:], tuple(scene.COLOURS[0])) + share(shown[:, middle:], blue) > 0.01
-    x, y = view.middle()
+    y = view.middle()[1]
     view.page.mouse.move(middle, y)
     view.page.mouse.down()
     view.page.mouse.move(middle - 150, y, steps=3)
@@ -190,9 +190,10 @@ def test_help_opens_and_closes(view):
     view.page.get_by_role("button", name="Help").click()
     help_ = view.page.get_by_role("dialog")
     assert help_.is_visible()
-    assert "to the live edge" in help_.inner_text()
+    assert "turn around the subject" in help_.inner_text()
     view.page.get_by_role("button", name="Close the help").click()
     assert help_.is_hidden()
+    view.page.locator("#picture").focus()
     view.page.keyboard.press("?")
     assert help_.is_visible()
 

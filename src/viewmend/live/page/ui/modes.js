@@ -81,7 +81,8 @@ export function placeDivider(settings, free) {
   const x = free.left + at * free.width;
   divider.hidden = settings.get("mode") !== "split";
   divider.style.transform = `translateX(${x}px)`;
-  divider.style.setProperty("--grip", `${free.top + 0.5 * free.height}px`);
+  divider.style.top = `${free.top}px`;
+  divider.style.height = `${free.height}px`;
   divider.setAttribute("aria-valuenow", String(Math.round(100 * at)));
   byId("left-name").style.left = `${free.left + 12}px`;
   byId("right-name").style.right = `${window.innerWidth - free.left - free.width + 12}px`;

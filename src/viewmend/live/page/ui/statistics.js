@@ -94,15 +94,17 @@ export class Statistics {
   }
 
   #show() {
-    if (!this.header || !byId("section-stats").offsetParent) return;
+    if (!this.header) return;
+    const median = quantile(this.latencies, 0.5);
+    byId("readout").textContent = `${this.pictures.perSecond.toFixed(0)} fps${median > 0 ? ` · ${median.toFixed(0)} ms` : ""}`;
+    if (!byId("section-stats").offsetParent) return;
     const { figures, header, server } = this;
     const put = (/** @type {string} */ name, /** @type {string} */ value, unit = "") => {
       figures[name].replaceChildren(value, element("small", { textContent: unit }));
     };
     put("fps", this.pictures.perSecond.toFixed(1));
     put("repaints", this.repaints.perSecond.toFixed(0));
-    const latency = quantile(this.latencies, 0.5);
-    put("latency", Number.isNaN(latency) ? "–" : latency.toFixed(0), " ms");
+    put("latency", Number.isNaN(median) ? "–" : median.toFixed(0), " ms");
     put("holes", (100 * header.holes).toFixed(1), " %");
     put("size", `${header.width}×${header.height}`);
     put("kb", (this.bytes / 1000).toFixed(0), " kB");
@@ -112,7 +114,7 @@ export class Statistics {
     const recent = this.history.slice(-20);
     for (const name of Object.keys(this.stages)) {
       const mean = recent.reduce((sum, stages) => sum + (stages[name] ?? 0), 0) / recent.length;
-      this.stages[name].textContent = `${mean.toFixed(1)} ms`;
+      this.stages[name].textContent = `${mean.toFixed(mean < 9.95 ? 1 : 0)} ms`;
     }
     this.#plot();
   }
@@ -144,7 +146,7 @@ export class Statistics {
       pen.fillStyle = "#ffffff26";
       pen.fillRect(0, y, width, 1);
       pen.fillStyle = "#c3cad2";
-      pen.fillText(`${ms} ms`, 5 * ratio, y - 3 * ratio);
+      if (y > 14 * ratio) pen.fillText(`${ms} ms`, 5 * ratio, y - 3 * ratio);
     }
   }
 }

@@ -81,7 +81,7 @@ export class Transport {
     const recording = state.kind === "recording";
     const seek = byId("seek");
     seek.min = state.first;
-    seek.max = Math.max(state.first, state.end - 1);
+    seek.max = Math.max(state.first, (state.total ?? state.end) - 1);
     seek.disabled = state.end - state.first < 2;
     const play = byId("play");
     play.setAttribute("aria-label", state.playing ? "Pause" : "Play");
@@ -103,7 +103,7 @@ export class Transport {
     if (!this.state || time < 0) return;
     if (!this.seeking) setSlider(byId("seek"), time);
     else setSlider(byId("seek"), Number(byId("seek").value));
-    const { end, first, kind } = this.state;
-    byId("time").textContent = kind === "live" ? `${time}` : `${time - first + 1} / ${end - first}`;
+    const { end, first, kind, total } = this.state;
+    byId("time").textContent = kind === "live" ? `${time}` : `${time - first + 1} / ${total ?? end - first}`;
   }
 }

@@ -1,0 +1,132 @@
+"""What the page says and does when something is slow, missing or broken."""
+
+import numpy as np
+import pytest
+from live.browser.conftest import opened
+
+pytestmark = pytest.mark.slow
+
+
+def cover(view) -> str:
+    return view.page.locator("#cover").inner_text() if view.page.locator("#cover").is_visible() else ""
+
+
+def test_loading_is_said_until_the_first_picture(browser, server):
+    server.hold, server.source = True, "loading"
+    for view in opened(browser, server, "phone"):
+        view.until(lambda view=view: "Loading" in cover(view))
+        server.source = "ready"
+        view.until(lambda view=view: "Rendering" in cover(view))
+        server.hold = False
+        view.until(lambda view=view: cover(view) == "")
+
+
+def test_a_lost_connection_comes_back_with_view_and_time(desktop):
+    desktop.page.locator("#seek").fill("9")
+    desktop.drag(90, 0)
+    desktop.settle()
+    before, camera = desktop.picture(), desktop.server.looks[-1]["camera"]
+    count = len(desktop.server.hellos)
+    desktop.server.drop()
+    desktop.until(lambda: len(desktop.server.hellos) > count)
+    desktop.settle()
+    assert desktop.server.looks[-1]["camera"] == camera
+    assert desktop.data("time") == "9"
+    assert np.abs(desktop.picture() - before).mean() < 1
+    assert cover(desktop) == ""
+
+
+def test_while_it_is_lost_there_is_a_button(desktop):
+    desktop.server.refuse = 4503
+    desktop.server.drop()
+    desktop.until(lambda: "All places are taken" in cover(desktop))
+    assert "Trying again in" in cover(desktop)
+    desktop.server.refuse = None
+    desktop.until(lambda: not cover(desktop) or (desktop.page.locator("#cover-retry").click() or False), 20)
+
+
+@pytest.mark.parametrize(("code", "words"), [(4401, "asks for a token"), (4426, "Reload the page")])
+def test_a_final_refusal_says_what_to_do(browser, server, code, words):
+    server.refuse = code
+    for view in opened(browser, server, "phone"):
+        view.until(lambda view=view: words in cover(view))
+        view.page.wait_for_timeout(700)
+        assert not server.viewers
+
+
+def test_the_token_of_the_address_is_passed_on(browser, server):
+    asked = []
+    for view in opened(browser, server, "desktop", "?token=a%20b"):
+        view.settle()
+        view.page.on("request", lambda request: asked.append(request.url))
+        for _ in range(2):
+            view.page.get_by_role("button", name="Add view").click()
+        with view.page.expect_download(timeout=60_000):
+            view.page.get_by_role("button", name="Export MP4").click()
+        assert any(url.endswith("/path.mp4?token=a+b") for url in asked)
+
+
+def test_a_failing_source_and_model_are_said_beside_the_picture(desktop):
+    pill = desktop.page.locator("#pill")
+    desktop.server.source, desktop.server.error = "failing", "camera cam01 is gone"
+    desktop.until(lambda: pill.is_visible() and "The source fails" in pill.inner_text())
+    assert pill.get_attribute("title") == "camera cam01 is gone"
+    desktop.server.source, desktop.server.model_error = "ready", "out of memory"
+    desktop.until(lambda: "Shown without mending" in pill.inner_text())
+    desktop.server.model_error = None
+    desktop.until(pill.is_hidden)
+
+
+def test_a_stall_is_said(desktop):
+    desktop.server.hold = True
+    desktop.drag(60, 0)
+    desktop.until(lambda: desktop.page.locator("#pill").is_visible(), 8)
+    assert "Waiting for the server" in desktop.page.locator("#pill").inner_text()
+    desktop.server.hold = False
+    desktop.until(desktop.page.locator("#pill").is_hidden)
+
+
+def test_broken_pictures_do_not_stop_the_page(desktop):
+    desktop.server.broken = True
+    desktop.drag(60, 0)
+    desktop.until(lambda: "A picture is broken" in desktop.page.locator("#toasts").inner_text())
+    desktop.server.broken = False
+    desktop.drag(60, 0)
+    desktop.settle()
+
+
+def test_broken_video_falls_back_to_jpeg(desktop):
+    pytest.importorskip("av")
+    if "vp9" not in desktop.server.hellos[0]["codecs"]:
+        pytest.skip("this Chromium has no VP9")
+    desktop.server.broken = True
+    desktop.page.locator("#codec").select_option("vp9")
+    desktop.until(lambda: desktop.server.looks[-1]["codec"] == "jpeg")
+    desktop.server.broken = False
+    desktop.drag(60, 0)
+    desktop.settle()
+
+
+def test_who_wants_no_motion_gets_none(browser, server):
+    for view in opened(browser, server, "desktop", reduced_motion="reduce"):
+        view.settle()
+        count = len(server.looks)
+        view.page.locator("#cameras").get_by_role("button", name="cam03").click()
+        view.settle()
+        poses = {tuple(look["camera"]["R"]) for look in server.looks[count:]}
+        assert len(poses) == 1
+
+
+def test_a_lost_gpu_comes_back(desktop):
+    before = desktop.picture()
+    desktop.page.evaluate(
+        "(async () => { const gl = document.querySelector('#picture').getContext('webgl2');"
+        " const e = gl.getExtension('WEBGL_lose_context'); e.loseContext();"
+        " await new Promise(r => setTimeout(r, 200)); e.restoreContext(); })()"
+    )
+    desktop.page.wait_for_timeout(500)
+    desktop.drag(40, 0)
+    desktop.page.get_by_role("button", name="Reset the view").click()
+    desktop.settle()
+    assert np.abs(desktop.picture() - before).mean() < 2
+    desktop.errors.clear()
