@@ -80,14 +80,13 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evalua
 
     if options.weights is not None:
         _look_first_in(options.weights)
+    scenes = [scene for name in sets for scene in scenes_of(name, options)]
     names = method_names(methods)
     available, missing = split_missing(names, options.device)
     networks, missing_networks = available_networks()
     settings = _settings(options, networks)
-    missing |= missing_networks
-    if missing:
-        say(f"n/a, as the report explains: {', '.join(missing)}")
-    scenes = [scene for name in sets for scene in scenes_of(name, options)]
+    if missing or missing_networks:
+        say(f"n/a, as the report explains: {', '.join(missing | missing_networks)}")
     store, cells = CellStore(options.out / "cells"), []
     steps = run_evaluation(scenes, available, store, settings, options.jobs, options.ray)
     total = len(scenes) * len(available)
@@ -97,7 +96,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evalua
             say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
     order = {key: n for n, key in enumerate((s.name, m) for s in scenes for m in names)}
     cells.sort(key=lambda cell: order[cell.key.scene, cell.key.method])
-    return Evaluated(make_report(cells, names, settings, missing), cells, store)
+    return Evaluated(make_report(cells, names, settings, missing, missing_networks), cells, store)
 
 
 def write_report(options: RunOptions, found: Evaluated) -> None:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from viewmend.baselines.published import is_baseline, make_baseline
+from viewmend.baselines.rgvi import Rgvi
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
 from viewmend.inpainting.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.inpainting.protocol import ViewInpainter
@@ -22,6 +23,9 @@ from viewmend.metrics.weights import MissingWeightsError
 
 REFERENCE = "telea"
 """Tables show how much better than this one every other is."""
+
+PRIVILEGED = ("rgvi",)
+"""See more than others may: their rows say so."""
 
 
 class MethodMissing(ValueError):  # noqa: N818
@@ -44,6 +48,7 @@ METHODS: tuple[Method, ...] = (
     Method("smooth", lambda device: SmoothFill()),
     Method("reprojection", lambda device: ReprojectionFill()),
     Method("unfilled", lambda device: Unfilled()),
+    Method("rgvi", lambda device: Rgvi()),
 )
 BASELINES = tuple(
     f"{network}-o-{framing}{weights}"

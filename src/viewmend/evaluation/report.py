@@ -25,6 +25,8 @@ RULES = (
     'training mode ("train"). Networks without their weights are n/a.',
     f"Frames with fewer than {ENOUGH_HOLE_PX} pixels of the kind are left out of scores in the holes, and counted.",
     "Means are over the frames of a scene, then over the scenes of a set, then over sets.",
+    "Methods see the cameras' past and their own results, never the left-out camera; rgvi alone sees its truth of past "
+    "frames, as in the paper, and is no fair rival.",
     f"The gain over {REFERENCE} is the mean over the scenes in which both have a score.",
     '"Flicker" is how much the error, completed view minus truth, differs from that of the frame before, warped by the '
     "true motion of the surface: mean absolute difference over E, in 255ths; the truth has 0.",
@@ -55,12 +57,18 @@ class Report:
     """All of them, also those that failed."""
     missing: dict[str, str]
     """Methods without what they need here, which have no cells, and the reason: their rows are n/a."""
+    missing_networks: dict[str, str]
+    """Networks of metrics without their weights, and the reason: their scores are n/a."""
     origins: tuple[Provenance, ...]
     """Where the cells were computed: several if runs were resumed."""
 
 
 def make_report(
-    cells: Sequence[Cell], methods: tuple[str, ...], settings: RunSettings, missing: dict[str, str] | None = None
+    cells: Sequence[Cell],
+    methods: tuple[str, ...],
+    settings: RunSettings,
+    missing: dict[str, str] | None = None,
+    missing_networks: dict[str, str] | None = None,
 ) -> Report:
     """Average the cells, in the order of scenes and methods in which they come."""
     identities = {cell.key.method: cell.identity for cell in cells}
@@ -74,5 +82,6 @@ def make_report(
         kinds=tuple(tables_by_kind(cells, methods)),
         cells=tuple(average_cell(cell) for cell in cells),
         missing=missing or {},
+        missing_networks=missing_networks or {},
         origins=origins,
     )

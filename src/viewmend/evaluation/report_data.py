@@ -18,6 +18,7 @@ def report_json(report: Report) -> str:
         "methods": report.methods,
         "identities": report.identities,
         "missing": report.missing,
+        "missing_networks": report.missing_networks,
         "origins": [asdict(origin) for origin in report.origins],
         "tables": [asdict(table) for table in report.tables],
         "kinds": [asdict(table) for table in report.kinds],

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from viewmend.evaluation.averages import Row, Scores, Table
-from viewmend.evaluation.methods import REFERENCE
+from viewmend.evaluation.methods import PRIVILEGED, REFERENCE
 from viewmend.evaluation.report import Report
 
 COLUMNS = (
@@ -109,6 +109,13 @@ def scenes_grid(report: Report) -> Grid:
     return Grid(("scene", "holes, % of the hull", *report.methods), tuple(rows))
 
 
+def not_available(report: Report) -> list[str]:
+    """What is missing, with its reason, in one line for all that share it."""
+    missing = report.missing | report.missing_networks
+    of = {reason: [name for name in missing if missing[name] == reason] for reason in missing.values()}
+    return [f"{', '.join(names)}: {reason}" for reason, names in of.items()]
+
+
 def number(value: float | None, factor: int, digits: int, none: str = "-") -> str:
     """A number with so many decimals, `none` for none."""
     return none if value is None else f"{factor * value:.{digits}f}"
@@ -117,8 +124,9 @@ def number(value: float | None, factor: int, digits: int, none: str = "-") -> st
 def _method_row(row: Row, width: int) -> tuple[str, ...]:
     if not row.scenes:
         return (row.method, *["n/a"] * (width - 1))
+    name = f"{row.method} (sees past truth)" if row.method in PRIVILEGED else row.method
     return (
-        row.method,
+        name,
         _signed(row.over_reference),
         *(number(getattr(row.scores, field), factor, digits) for _, field, factor, digits in COLUMNS),
         *(number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),

@@ -8,6 +8,7 @@ from viewmend.evaluation.report_grids import (
     holes_line,
     kinds_grid,
     main_grid,
+    not_available,
     readings_grid,
     scenes_grid,
     setting_lines,
@@ -19,8 +20,8 @@ def markdown(report: Report) -> str:
     parts = ["# Evaluation", "\n".join(setting_lines(report))]
     for table in report.tables:
         parts += [_main(table), written(readings_grid(table))]
-    if report.missing:
-        parts += ["## Not available", "\n".join(f"* {name}: {reason}" for name, reason in report.missing.items())]
+    if missing := not_available(report):
+        parts += ["## Not available", "\n".join(f"* {line}" for line in missing)]
     if report.kinds:
         by_kind = written(kinds_grid(report))
         parts += ["## By rig and style", f"PSNR in the holes, dB; gain over {REFERENCE}.", by_kind]

@@ -10,7 +10,15 @@ from viewmend.evaluation.averages import Table
 from viewmend.evaluation.cells import Cell, CellStore
 from viewmend.evaluation.film import Picture
 from viewmend.evaluation.report import RULES, Report
-from viewmend.evaluation.report_grids import Grid, holes_line, kinds_grid, main_grid, readings_grid, setting_lines
+from viewmend.evaluation.report_grids import (
+    Grid,
+    holes_line,
+    kinds_grid,
+    main_grid,
+    not_available,
+    readings_grid,
+    setting_lines,
+)
 from viewmend.evaluation.report_plot import Point, trade_off
 from viewmend.evaluation.report_sheets import columns, largest_hole
 from viewmend.evaluation.report_style import STYLE
@@ -27,8 +35,8 @@ def page(report: Report, cells: Sequence[Cell], store: CellStore, video: bool = 
     title = f"Evaluation: {', '.join(dict.fromkeys(cell.set for cell in cells)) or 'nothing'}"
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(line)}</p>" for line in setting_lines(report))]
     parts += [_table(table) for table in report.tables]
-    if report.missing:
-        parts += ["<h2>Not available</h2>", _list(f"{name}: {reason}" for name, reason in report.missing.items())]
+    if missing := not_available(report):
+        parts += ["<h2>Not available</h2>", _list(missing)]
     failed = [f"{c.key.scene}, {c.key.method}: {c.error}" for c in cells if c.error is not None]
     if failed:
         parts += ["<h2>Failed</h2>", _list(failed)]

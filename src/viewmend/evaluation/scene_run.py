@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.baselines.rgvi import SeesTruth
 from viewmend.contact_sheet import picture
 from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
 from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
@@ -185,6 +186,10 @@ class _Stream:
         if len(self._frames) < FILM_FRAMES:
             self._frames.append(picture(rgb))
         self._state, self._last = mended.state, rgb
+        if isinstance(self._inpainter, SeesTruth):
+            self._state = replace(
+                mended.state, inpainter=self._inpainter.shown(mended.state.inpainter, moment.truth.rgb)
+            )
         if moment.largest:
             self._picture = picture(rgb)
 

@@ -1,0 +1,122 @@
+"""RGVI (Cho et al. 2025), reference-guided video inpainting, as the offline reference of the paper: it sees the truth.
+
+The stages are the published ones, each with a network that can be put in: optical flow, its completion in holes,
+one-shot pulling along accumulated flow, a reference frame, completion of what is left. Without weights, flow is
+OpenCV's, and the others are the best fill that nothing was trained for. As in the paper, past frames are the truth and
+only the newest one has holes; so there is one direction to pull from, and the frame with most to fill is the newest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from viewmend.baselines.rgvi_flow import FlowMap, Image, dis_flow, pull
+from viewmend.inpainting.decoder import blend
+from viewmend.inpainting.prefill import fill
+from viewmend.inpainting.protocol import Source, State
+from viewmend.views import CompletedView, IncompleteView
+
+PAST_FRAMES = 10
+"""How far back it pulls from."""
+FLOW_MARGIN_PX = 4
+"""Flow this near to a hole was made from what fills it, and is completed, too."""
+
+Flow = Callable[[Image, Image], FlowMap]
+"""flow(image, other), of images in [0, 1]."""
+Completion = Callable[
+    [Float[Tensor, "channel height width"], Bool[Tensor, "height width"], Bool[Tensor, "height width"]],
+    Float[Tensor, "channel height width"],
+]
+"""completion(image, missing, subject): the image with its missing pixels filled, the others as they are."""
+
+
+@dataclass(frozen=True)
+class RgviParts:
+    """What stands for each of the published networks."""
+
+    flow: Flow = dis_flow
+    """RAFT."""
+    complete_flow: Completion = fill
+    """The recurrent flow completion network."""
+    reference: Completion = fill
+    """Stable Diffusion 2 inpainting, of a frame that nothing can be pulled into."""
+    rest: Completion = fill
+    """The per-frame completion network."""
+
+
+@dataclass(frozen=True)
+class RgviState(State):
+    """The past that a stream was shown."""
+
+    past: tuple[Image, ...] = ()
+    """Latest first."""
+    flows: tuple[FlowMap, ...] = ()
+    """From each of these to the next older one; there is one less of them."""
+
+
+@runtime_checkable
+class SeesTruth(Protocol):
+    """An inpainter that is privileged: after each of its frames it is shown how that should have been."""
+
+    def shown(self, state: State, truth: Image) -> State:
+        """The state after `step`, once the true image of that time is known."""
+        ...
+
+
+class Rgvi:
+    """RGVI on a stream of views. Without `shown`, its own results are its past."""
+
+    def __init__(self, parts: RgviParts | None = None) -> None:
+        self.parts = parts or RgviParts()
+
+    def initial_state(self) -> State:
+        """Nothing seen yet."""
+        return RgviState()
+
+    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
+        """Fills from the past along flow, the rest from the view alone; `source` is never asked."""
+        assert isinstance(state, RgviState), "the state of another inpainter"
+        past = state.past if not state.past or state.past[0].shape == view.rgb.shape else ()
+        missing, subject = view.error > 0, view.mask > 0
+        image, left = view.rgb, missing
+        if bool(missing.any()) and past:
+            image, left = self._pull(view, past, state.flows)
+        if bool(left.any()):
+            image = (self.parts.rest if past else self.parts.reference)(image, left, subject)
+        mended = blend(view.rgb, view.error, image, torch.ones_like(view.error))
+        return CompletedView(view, mended), self._remember(mended, past, state.flows if past else ())
+
+    def shown(self, state: State, truth: Image) -> State:
+        """The newest past frame becomes the truth."""
+        assert isinstance(state, RgviState), "the state of another inpainter"
+        return self._remember(truth, state.past[1:], state.flows[1:])
+
+    def _pull(
+        self, view: IncompleteView, past: tuple[Image, ...], flows: tuple[FlowMap, ...]
+    ) -> tuple[Image, Bool[Tensor, "height width"]]:
+        """The view with pixels of E from the latest past frame that has them, and the pixels that none has."""
+        missing, subject = view.error > 0, view.mask > 0
+        # Flow wants something to look at in the holes; what it says there, and close by, does not count.
+        guess = fill(view.rgb, missing, subject)
+        size = 2 * FLOW_MARGIN_PX + 1
+        unknown = max_pool2d(missing[None, None].float(), size, 1, FLOW_MARGIN_PX)[0, 0] > 0
+        flow = self.parts.complete_flow(self.parts.flow(guess, past[0]), unknown, subject)
+        image, left, seen = view.rgb, missing, torch.ones_like(missing)
+        for age, frame in enumerate(past):
+            if age:
+                older, inside = pull(flows[age - 1], flow)
+                flow, seen = flow + older, seen & inside
+            pulled, inside = pull(frame, flow)
+            found = left & seen & inside
+            image, left = torch.where(found, pulled, image), left & ~found
+        return image, left
+
+    def _remember(self, image: Image, past: tuple[Image, ...], flows: tuple[FlowMap, ...]) -> RgviState:
+        older = past[: PAST_FRAMES - 1]
+        newest = (self.parts.flow(image, older[0]),) if older else ()
+        return replace(RgviState(), past=(image, *older), flows=(*newest, *flows)[: len(older)])

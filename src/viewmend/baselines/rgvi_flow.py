@@ -1,0 +1,38 @@
+"""Optical flow for RGVI without any weights, and images pulled along flow."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+Image = Float[Tensor, "3 height width"]
+FlowMap = Float[Tensor, "2 height width"]
+"""Where each pixel's point is in another image, relative to the pixel: x right, y down, pixels."""
+
+
+def dis_flow(image: Image, other: Image) -> FlowMap:
+    """Dense inverse search (Kroeger et al. 2016), OpenCV's, from images in [0, 1]."""
+    import cv2
+
+    grey = [
+        cv2.cvtColor((x.clamp(0, 1) * 255).round().byte().cpu().movedim(0, -1).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+        for x in (image, other)
+    ]
+    found = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(grey[0], grey[1], np.zeros((0, 0)))
+    return torch.from_numpy(np.ascontiguousarray(found)).movedim(-1, 0).to(image)
+
+
+def pull(
+    image: Float[Tensor, "channel height width"], flow: FlowMap
+) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
+    """The other image seen through the flow, bilinearly, and where all that was sampled lies in it."""
+    height, width = flow.shape[1:]
+    y, x = torch.meshgrid(
+        torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
+    )
+    at = torch.stack([x, y], -1) + flow.movedim(0, -1)
+    last = flow.new_tensor([width - 1, height - 1])
+    inside = ((at >= 0) & (at <= last)).all(-1)
+    unit = 2 * at / last.clamp_min(1) - 1
+    return grid_sample(image[None], unit[None], padding_mode="border", align_corners=True)[0], inside

@@ -1,0 +1,124 @@
+"""RGVI: what the past saw is pulled into the holes along flow; the rest is filled; nothing else changes."""
+
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d
+
+from viewmend.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, SeesTruth
+from viewmend.baselines.rgvi_flow import dis_flow, pull
+from viewmend.geometry.cameras import Cameras
+from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.views import IncompleteView
+
+SIZE = 96
+MOTION = (3, 2)
+"""Of the picture from one time to the next, pixels right and down."""
+
+
+@pytest.fixture
+def texture(rng):
+    """A smooth picture, larger than the views of it."""
+    return avg_pool2d(torch.rand(1, 3, SIZE + 109, SIZE + 109, generator=rng), 9, 1)[0] * 4 % 1
+
+
+def at(texture, time):
+    """The moving picture at a time."""
+    x, y = 60 - MOTION[0] * time, 60 - MOTION[1] * time
+    return texture[:, y : y + SIZE, x : x + SIZE]
+
+
+def view(truth, time, hole=(slice(30, 50), slice(40, 60))):
+    error = torch.zeros(SIZE, SIZE)
+    error[hole] = 1
+    camera = Cameras(("c",), torch.eye(3)[None], torch.eye(4)[None], torch.tensor([[SIZE, SIZE]]))
+    ones = torch.ones(SIZE, SIZE)
+    return IncompleteView(camera, truth * (error == 0), ones, error, ones, (), torch.zeros(0, SIZE, SIZE), time)
+
+
+def known_flow(image, other):
+    """From any time to the one before."""
+    return torch.tensor([-float(v) for v in MOTION])[:, None, None].expand(2, SIZE, SIZE)
+
+
+def no_source(time, names):
+    raise AssertionError("RGVI knows no cameras")
+
+
+def stream(inpainter, texture, times, hole=(slice(30, 50), slice(40, 60)), shown=True):
+    state = inpainter.initial_state()
+    for time in range(times):
+        completed, state = inpainter.step(view(at(texture, time), time, hole), no_source, state)
+        if shown:
+            state = inpainter.shown(state, at(texture, time))
+    return completed, state
+
+
+def in_hole(completed, truth):
+    return float((completed.rgb - truth)[:, completed.view.error > 0].abs().mean())
+
+
+def test_it_is_an_inpainter_that_sees_the_truth():
+    assert isinstance(Rgvi(), ViewInpainter) and isinstance(Rgvi(), SeesTruth)
+
+
+def test_dis_flow_points_to_where_the_pixel_was(texture):
+    flow = dis_flow(at(texture, 1), at(texture, 0))[:, 20:-20, 20:-20]
+    assert (flow.flatten(1).median(1).values + torch.tensor(MOTION).float()).abs().max() < 0.5
+
+
+def test_pulling_moves_and_knows_its_borders(texture):
+    pulled, inside = pull(at(texture, 0), known_flow(None, None))
+    torch.testing.assert_close(pulled[:, inside], at(texture, 1)[:, inside], rtol=0, atol=1e-5)
+    assert not inside[: MOTION[1]].any() and not inside[:, : MOTION[0]].any()
+    assert inside[MOTION[1] :, MOTION[0] :].all()
+
+
+def test_a_hole_takes_what_was_there_before(texture):
+    exact, _ = stream(Rgvi(RgviParts(flow=known_flow)), texture, 3)
+    assert in_hole(exact, at(texture, 2)) < 1e-5
+    first, _ = stream(Rgvi(), texture, 1)
+    later, _ = stream(Rgvi(), texture, 3)
+    assert in_hole(later, at(texture, 2)) < 0.4 * in_hole(first, at(texture, 0))
+    kept = later.view.error == 0
+    assert torch.equal(later.rgb[:, kept], later.view.rgb[:, kept])
+
+
+def test_flow_adds_up_over_several_frames(texture):
+    """A hole at the border, through which the picture comes in: only what was in sight before can be pulled."""
+    parts = RgviParts(flow=known_flow, rest=lambda image, missing, subject: torch.where(missing, 0.0, image))
+    completed, _ = stream(Rgvi(parts), texture, 3, (slice(0, 20), slice(0, 20)))
+    truth = at(texture, 2)
+    seen = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    seen[MOTION[1] : 20, MOTION[0] : 20] = True
+    torch.testing.assert_close(completed.rgb[:, seen], truth[:, seen], rtol=0, atol=1e-5)
+    corner = completed.view.error.bool() & ~seen
+    assert not completed.rgb[:, corner].any()
+
+    def skip_latest(image, other):  # the latest past frame is of no use: it is looked for far outside
+        return torch.full((2, SIZE, SIZE), 999.0)
+
+    lost, _ = stream(Rgvi(RgviParts(flow=skip_latest, rest=parts.rest)), texture, 3)
+    assert not lost.rgb[:, lost.view.error > 0].any()
+
+
+def test_the_past_is_bounded_and_its_own_where_nobody_shows_the_truth(texture):
+    _, state = stream(Rgvi(RgviParts(flow=known_flow)), texture, PAST_FRAMES + 4)
+    assert isinstance(state, RgviState)
+    assert (len(state.past), len(state.flows)) == (PAST_FRAMES, PAST_FRAMES - 1)
+    assert torch.equal(state.past[0], at(texture, PAST_FRAMES + 3))
+    completed, state = stream(Rgvi(), texture, 2, shown=False)
+    assert isinstance(state, RgviState) and torch.equal(state.past[0], completed.rgb)
+
+
+def test_a_view_of_another_size_starts_anew(texture):
+    _, state = stream(Rgvi(), texture, 2)
+    small = view(at(texture, 2), 2)
+    rgb, weights = small.rgb[:, :64], small.weights[:, :64]
+    part = IncompleteView(small.camera, rgb, small.mask[:64], small.error[:64], small.depth[:64], (), weights, 2)
+    completed, state = Rgvi().step(part, no_source, state)
+    assert isinstance(state, RgviState) and len(state.past) == 1 and completed.rgb.shape == (3, 64, SIZE)
+
+
+def test_without_holes_it_leaves_the_view_alone(texture):
+    completed, _ = stream(Rgvi(), texture, 2, (slice(0, 0), slice(0, 0)))
+    assert torch.equal(completed.rgb, at(texture, 1))
