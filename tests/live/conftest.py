@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
-from reference.ball import BallCapture, ring
+import torch
+from reference.ball import BallCapture, camera_at, photograph, ring
 
 from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.classical import SmoothFill
@@ -17,6 +18,7 @@ from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
 from viewmend.pipeline import PipelineConfig
+from viewmend.views import CompletedView, IncompleteView
 
 CAMERAS = ring(12)[[0, 1, 2, 4, 7, 9]]
 PIPELINE = PipelineConfig(hull=HullConfig(resolution=32))
@@ -69,3 +71,20 @@ def ball() -> Iterator[Running]:
     """One server for a file's tests; leave it as it was."""
     with running() as server:
         yield server
+
+
+@pytest.fixture
+def ball_view() -> CompletedView:
+    """The ball with a square missing, mended."""
+    camera = camera_at(10, "t")
+    frame = photograph(camera)
+    mask = (frame.mask[0] > 0).float()
+    error = torch.zeros_like(mask)
+    error[20:26, 20:26] = 1
+    weights = torch.zeros(2, 48, 48)
+    weights[0, :, :24], weights[1, :, 24:] = 1, 1
+    rgb = frame.rgb[0] / 255
+    view = IncompleteView(
+        camera, rgb * (1 - error), mask, error, frame.depth[0], ("a", "b"), weights * mask * (1 - error), 0
+    )
+    return CompletedView(view, rgb)

@@ -2,31 +2,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from reference.ball import camera_at, photograph
 
 from viewmend.live.pictures import COLOURS, pack_depth, picture, to_jpeg, unpack_depth
-from viewmend.views import CompletedView, IncompleteView
 
 
-@pytest.fixture
-def completed() -> CompletedView:
-    """The ball's left half is coloured by one camera, the right half by another; a square is missing."""
-    camera = camera_at(10, "t")
-    frame = photograph(camera)
-    mask = (frame.mask[0] > 0).float()
-    error = torch.zeros_like(mask)
-    error[20:26, 20:26] = 1
-    weights = torch.zeros(2, 48, 48)
-    weights[0, :, :24], weights[1, :, 24:] = 1, 1
-    rgb = frame.rgb[0] / 255
-    shown = rgb * (1 - error)
-    view = IncompleteView(camera, shown, mask, error, frame.depth[0], ("a", "b"), weights * mask * (1 - error), 0)
-    return CompletedView(view, rgb)
-
-
-def test_every_mode_shows_what_it_says(completed):
-    rgb = (completed.rgb.movedim(0, -1) * 255).numpy()
-    images = {mode: picture(completed, mode) for mode in ("rendered", "holes", "mended", "depth", "coverage")}
+def test_every_mode_shows_what_it_says(ball_view):
+    rgb = (ball_view.rgb.movedim(0, -1) * 255).numpy()
+    images = {mode: picture(ball_view, mode) for mode in ("rendered", "holes", "mended", "depth", "coverage")}
     assert all(image.shape == (48, 48, 3) and image.dtype == np.uint8 for image in images.values())
     assert np.abs(images["mended"] - rgb).max() <= 1
     assert images["rendered"][22, 22].tolist() == [0, 0, 0]
@@ -40,8 +22,8 @@ def test_every_mode_shows_what_it_says(completed):
 
 
 @pytest.mark.parametrize("quality", [85, 95])
-def test_jpeg_comes_back(completed, quality):
-    image = picture(completed, "mended")
+def test_jpeg_comes_back(ball_view, quality):
+    image = picture(ball_view, "mended")
     back = cv2.imdecode(np.frombuffer(to_jpeg(image, quality), np.uint8), cv2.IMREAD_COLOR_RGB)
     assert np.abs(back.astype(int) - image).mean() < 5
 

@@ -1,5 +1,6 @@
 """A viewer in Python: ask for views over the network, get images and depth as arrays (needs `viewmend[live]`)."""
 
+import contextlib
 import json
 import time
 from dataclasses import dataclass, field
@@ -46,14 +47,18 @@ class Client:
 
     def __enter__(self) -> "Client":
         query = f"?token={self.token}" if self.token else ""
-        self._socket = connect(f"{self.url}/ws{query}", max_size=None, compression=None, open_timeout=self.timeout_s)
+        url = f"{self.url}/ws{query}"
+        self._open = contextlib.ExitStack()
+        self._socket = self._open.enter_context(
+            connect(url, max_size=None, compression=None, open_timeout=self.timeout_s)
+        )
         self._looks = 0
         self.send("hello", version=VERSION, codecs=["jpeg"])
         self.wait_for("welcome")
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._socket.close()
+        self._open.close()
 
     def send(self, kind: str, **values: object) -> None:
         """Send a message of the protocol."""

@@ -28,9 +28,9 @@ class Span:
         """A recording of which nothing more is to come."""
         return not self.live and self.end == self.total
 
-    def clamp(self, position: float) -> float:
+    def clamp(self, position: float | int) -> float:
         """The nearest position within."""
-        return max(float(self.first), min(float(max(self.first, self.newest)), position))
+        return float(max(self.first, min(max(self.first, self.newest), position)))
 
 
 class Clock:

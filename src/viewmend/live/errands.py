@@ -155,8 +155,7 @@ class _Mp4:
         import av
 
         self._file = io.BytesIO()
-        # Faststart needs the whole file anyway: pages play it while it is still a blob.
-        self._container = av.open(self._file, "w", format="mp4", options={"movflags": "faststart"})
+        self._container = av.open(self._file, "w", format="mp4")
         self._stream = self._container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = {"crf": "18", "preset": "veryfast"}

@@ -80,18 +80,18 @@ class Fields:
             raise ProtocolError(f"expected '{key}' as a text of at most {most} letters, got {str(value)[:40]!r}")
         return value
 
-    def items(self, key: str, most: int) -> list[Any]:
-        """A list of at least one and at most so many."""
+    def items(self, key: str, most: int, least: int = 1) -> list[Any]:
+        """A list of so many."""
         value = self.get(key, None)
-        if not isinstance(value, list) or not 1 <= len(value) <= most:
-            raise ProtocolError(f"expected '{key}' as a list of 1 to {most}, got {str(value)[:40]!r}")
+        if not isinstance(value, list) or not least <= len(value) <= most:
+            raise ProtocolError(f"expected '{key}' as a list of {least} to {most}, got {str(value)[:40]!r}")
         return value
 
-    def texts(self, key: str, default: tuple[str, ...], most: int) -> tuple[str, ...]:
+    def texts(self, key: str, default: tuple[str, ...], most: int, least: int = 1) -> tuple[str, ...]:
         """Some different short texts."""
         if not self.has(key):
             return default
-        value = self.items(key, most)
+        value = self.items(key, most, least)
         if any(not isinstance(v, str) or len(v) > 40 for v in value):
             raise ProtocolError(f"expected '{key}' as short texts, got {str(value)[:40]!r}")
         return tuple(dict.fromkeys(value))

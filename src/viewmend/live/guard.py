@@ -63,7 +63,7 @@ def _name(host: str) -> str:
 class Rate:
     """So many events a second on average, twice as many at once."""
 
-    def __init__(self, per_s: float) -> None:
+    def __init__(self, per_s: float | int) -> None:
         self._per_s = per_s
         self._left, self._at = 2 * per_s, time.monotonic()
 

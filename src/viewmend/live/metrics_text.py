@@ -28,6 +28,6 @@ def metrics_text(lobby: Lobby) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _metric(name: str, kind: str, text: str, values: dict[str, float]) -> list[str]:
+def _metric(name: str, kind: str, text: str, values: dict[str, float | int]) -> list[str]:
     rows = [f"{name}{labels} {value:g}" for labels, value in values.items()]
     return [f"# HELP {name} {text}", f"# TYPE {name} {kind}", *rows]

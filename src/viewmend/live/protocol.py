@@ -111,7 +111,7 @@ def parse(text: str, limits: Limits) -> Message:
     if kind == "ack":
         return Ack(given.whole("frame", 0, _LARGEST))
     if kind == "hello":
-        codecs = given.texts("codecs", ("jpeg",), most=8)
+        codecs = given.texts("codecs", ("jpeg",), most=8, least=0)
         return Hello(given.whole("version", 0, _LARGEST), tuple(c for c in CODECS if c in codecs))
     if kind == "ping":
         return Ping(given.number("sent_ms", -1e15, 1e15, 0.0))

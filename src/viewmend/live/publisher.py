@@ -1,5 +1,6 @@
 """Pushing a rig's frames to `viewmend serve live` (needs `viewmend[live]`)."""
 
+import contextlib
 import json
 from typing import Any
 
@@ -33,7 +34,8 @@ class Publisher:
         bounds: Bounds | None = None,
     ) -> None:
         query = f"?token={token}" if token else ""
-        self._socket = connect(f"{url}/push{query}", max_size=None, compression=None)
+        self._open = contextlib.ExitStack()
+        self._socket = self._open.enter_context(connect(f"{url}/push{query}", max_size=None, compression=None))
         rig = {
             "type": "rig",
             "version": VERSION,
@@ -54,7 +56,7 @@ class Publisher:
 
     def close(self) -> None:
         """Say goodbye."""
-        self._socket.close()
+        self._open.close()
 
     def push(self, frame: MultiViewFrame, quality: int = 92) -> int:
         """Send what the cameras see now; the number that it gets. Waits until the server has it.

@@ -119,8 +119,8 @@ class RenderService:
             for seat in list(self._seats):
                 try:
                     ask = seat.due(now, scene)
-                except ValueError as error:
-                    seat.fail(str(error))
+                except Exception as error:  # whatever one viewer asks for, the others are served
+                    seat.fail(str(error)[:400])
                     continue
                 if ask is not None:
                     self._seats.remove(seat)
