@@ -8,7 +8,7 @@ import threading
 import time
 
 import pytest
-from conftest import running, wait_until
+from live_servers import running, wait_until
 from test_server import get
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect

@@ -9,7 +9,7 @@ import urllib.request
 import cv2
 import numpy as np
 import pytest
-from conftest import CAMERAS, running, wait_until
+from live_servers import CAMERAS, running, wait_until
 from reference.ball import BallCapture, photograph
 
 from viewmend.live.client import Client

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 from torch import Tensor
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
@@ -45,8 +46,7 @@ class Publisher:
             "bounds": None if bounds is None else bounds_json(bounds),
             "cameras": cameras_json(cameras),
         }
-        self._socket.send(json.dumps(rig))
-        self._answer()
+        self._ask(json.dumps(rig))
 
     def __enter__(self) -> "Publisher":
         return self
@@ -76,11 +76,15 @@ class Publisher:
             for kind, data in (("rgb", _encoded(".jpg", bgr, quality)), ("mask", _encoded(".png", mask, quality))):
                 images.append({"camera": name, "kind": kind, "bytes": len(data)})
                 parts.append(data)
-        self._socket.send(pack({"images": images}, parts))
-        return self._answer()["frame"]
+        return self._ask(pack({"images": images}, parts))["frame"]
 
-    def _answer(self) -> dict[str, Any]:
-        answer = json.loads(self._socket.recv(timeout=30))
+    def _ask(self, message: str | bytes) -> dict[str, Any]:
+        try:
+            with contextlib.suppress(ConnectionClosed):  # closed already: the reason is waiting to be read
+                self._socket.send(message)
+            answer = json.loads(self._socket.recv(timeout=30))
+        except ConnectionClosed as error:
+            raise ConnectionError(f"the server has closed the connection: {error}") from None
         if answer["type"] == "error":
             raise ConnectionError(answer["message"])
         return answer

@@ -1,0 +1,110 @@
+"""Frames at hand: read ahead, made ahead, bounded, smaller."""
+
+import threading
+from dataclasses import replace
+
+import pytest
+import torch
+from live_servers import CAMERAS, wait_until
+from reference.ball import BallCapture, photograph
+
+from viewmend.live.frames import ReadAhead, shrunk
+
+
+class Slow(BallCapture):
+    """Reads a frame when it is allowed to."""
+
+    def __init__(self, frames=20):
+        super().__init__(CAMERAS, frames)
+        self.turns, self.order = threading.Semaphore(0), []
+
+    def read(self, time):
+        self.turns.acquire()
+        self.order.append(time)
+        return super().read(time % 9)
+
+
+@pytest.fixture
+def reading():
+    supplies = []
+
+    def start(source, **options):
+        supply = ReadAhead(lambda: source, **options)
+        supplies.append((supply, source))
+        supply.start()
+        return supply
+
+    yield start
+    for supply, source in supplies:
+        source.turns.release(1000)
+        supply.stop()
+
+
+def read(source, supply, count):
+    done = len(source.order) + count
+    source.turns.release(count)
+    wait_until(lambda: len(source.order) >= done)
+
+
+def test_what_is_wanted_is_read_first_with_what_follows(reading):
+    source = Slow()
+    supply = reading(source)
+    wait_until(lambda: supply.span.end == 20)
+    read(source, supply, 2)
+    assert supply.read(11) is None
+    read(source, supply, 5)
+    wait_until(lambda: supply.read(11) is not None)
+    assert source.order[:2] == [0, 1] and {11, 12, 13} <= set(source.order[2:])
+
+
+def test_what_is_made_can_be_asked_for_as_far_as_it_is(reading):
+    source = Slow(5)
+    supply = reading(source, made=True, fps=7.0)
+    wait_until(lambda: supply.rig is not None)
+    assert supply.span.end == 0 and supply.status.state == "loading"
+    read(source, supply, 3)
+    wait_until(lambda: supply.span.end == 3)
+    assert supply.span.total == 5 and supply.span.fps == 7 and not supply.span.whole
+    read(source, supply, 2)
+    wait_until(lambda: supply.span.whole)
+    assert source.order == [0, 1, 2, 3, 4] and supply.status.state == "ready"
+
+
+def test_memory_is_bounded_and_what_was_dropped_is_read_again(reading):
+    source = Slow(9)
+    supply = reading(source, memory_mb=0.3)
+    source.turns.release(1000)
+    for time in (*range(9), 0, 5):
+        wait_until(lambda time=time: supply.read(time) is not None)
+        assert supply.read(time).time == time
+    assert source.order.count(0) >= 2
+
+
+def test_failures_are_said_and_tried_again():
+    tries = []
+
+    def opens():
+        tries.append(1)
+        if len(tries) < 2:
+            raise ValueError("no such rig")
+        return BallCapture(CAMERAS, 1)
+
+    supply = ReadAhead(opens)
+    supply.start()
+    wait_until(lambda: supply.status.state == "failing")
+    assert supply.status.error == "ValueError: no such rig"
+    wait_until(lambda: supply.status.state == "ready")
+    assert supply.status.error is None and supply.span.fps == 0
+    supply.stop()
+
+
+def test_large_images_are_made_smaller_with_their_cameras():
+    sizes = torch.tensor([[48, 48], [40, 48], [48, 30], [48, 48], [48, 48], [48, 48]])
+    frame = replace(photograph(CAMERAS), cameras=replace(CAMERAS, size_px=sizes))
+    small = shrunk(frame, 24)
+    assert small.cameras.size_px.tolist()[:3] == [[24, 24], [20, 24], [24, 15]] and small.rgb.shape == (6, 3, 24, 24)
+    assert int(small.rgb[1, :, :, 20:].max()) == 0 and int(small.mask[2, 15:].max()) == 0
+    like = photograph(small.cameras[0])
+    assert float((like.rgb[0].float() - small.rgb[0].float()).abs().mean()) < 5
+    assert shrunk(frame, None) is frame and shrunk(frame, 48) is frame
+    assert shrunk(replace(frame, mask=None), 24).mask is None
