@@ -1,0 +1,178 @@
+"""How fast ours and the published networks fill a view, side by side in one run.
+
+    python benchmarks/baselines.py [--device cuda] [--precision bfloat16] [--quick] [--write]
+
+All have random weights: speed does not depend on them. Every method completes the same rendered view of a stream whose
+past is full: three frames just before it and three further back, which are remembered as in production. Geometry and
+rendering are not in the times.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+import torch
+from measure import summarise, synchronise, write
+
+from viewmend.baselines.clips import Sampling
+from viewmend.baselines.framing import window_canvas, windows_over
+from viewmend.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
+from viewmend.baselines.published import NETWORKS
+from viewmend.capture.studio.rigs import orbit
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.inpainting.config import base, small
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.protocol import Source, State, ViewInpainter
+from viewmend.pipeline import Observation, PipelineConfig, observe, view_of
+from viewmend.views import IncompleteView
+
+SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13
+"""Frames further back are `STEP` apart, not 10: as many, sooner there."""
+SIZES = ((320, 320), (512, 612), (1024, 1224))
+OURS = {"small": small, "base": base}
+FRAMINGS = ("def", "win", "mul")
+
+
+def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Source]:
+    """The views of a stream up to `NOW`, and the cameras around."""
+    config = PipelineConfig()
+    studio = Studio(StudioConfig(seed=SEED, cameras=CAMERAS, frames=NOW + 1, size_px=size))
+    assert studio.bounds is not None
+    target = orbit([0.4], size, elevation_rad=0.25).to(device)
+    seen: list[Observation] = [
+        observe(studio.read(t).to(device), studio.bounds.to(device), config) for t in range(NOW + 1)
+    ]
+    views = [view_of(observation, target, config)[0] for observation in seen]
+    for observation in seen:  # depths are the geometry's work
+        observation.depth(observation.frame.cameras.names)
+    return views, lambda at, names: seen[at].context(names)
+
+
+def ours(name: str, views: list[IncompleteView], source: Source, device: str, precision: str):
+    torch.manual_seed(0)
+    inpainter = Inpainter(replace(OURS[name](), k_w=STEP)).to(device).eval()
+    inpainter.compute_dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
+    state: State = inpainter.initial_state()
+    for view in views[:NOW]:
+        _, state = inpainter.step(view, source, state)
+    return inpainter, state
+
+
+def baseline(network: torch.nn.Module, memory: bool, framing: str, views: list[IncompleteView], source: Source):
+    """The past of a baseline is one time's, as often as it is looked at: its values do not matter to its speed."""
+    config = OnlineConfig(framing=framing, memory=memory, sampling=Sampling(step=STEP))  # pyright: ignore
+    inpainter = OnlineInpainter(network, config)  # pyright: ignore[reportArgumentType]
+    _, first = inpainter.step(replace(views[NOW], time=NOW - 1), source, inpainter.initial_state())
+    times = config.sampling.times(NOW)
+    assert len(times) == 6
+    frames = {t: frame for t in times for frame in first.frames.values()}
+    slots = {(window, t): slot for t in times for (window, _), slot in first.slots.items()}
+    return inpainter, OnlineState(frames=frames, slots=slots, canvas_px=first.canvas_px)
+
+
+def timed_steps(
+    inpainter: ViewInpainter, state: State, view: IncompleteView, source: Source, device: str, seconds: float
+) -> dict[str, float]:
+    """Steps until the seconds are over; the first does not count, unless it took all of them."""
+    taken: list[float] = []
+    while (sum(taken) < 1e3 * seconds and len(taken) < 30) or not taken:
+        synchronise(device)
+        start = time.perf_counter()
+        inpainter.step(view, source, state)
+        synchronise(device)
+        taken.append(1e3 * (time.perf_counter() - start))
+    taken = taken[1:] or taken
+    summary = summarise(taken)
+    return {"fps": round(1e3 * len(taken) / sum(taken), 4), **summary, "runs": len(taken)}
+
+
+def ratios(figures: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """FPS of ours over the fastest baseline, and over each network's mul variants."""
+    others = {name: f["fps"] for name, f in figures.items() if name not in OURS}
+    found = {}
+    for name in OURS.keys() & figures.keys():
+        own = figures[name]["fps"]
+        fastest = max(others, key=lambda n: others[n])
+        against = {f"fastest ({fastest})": own / others[fastest]}
+        against |= {n: own / fps for n, fps in others.items() if n.endswith("mul")}
+        found[name] = {n: round(value, 2) for n, value in against.items()}
+    return found
+
+
+def setting(view: IncompleteView) -> dict[str, object]:
+    holes = view.error > 0
+    config = OnlineConfig()
+    canvas = window_canvas(view.rgb, holes, config.size_px, config.dilation_px)
+    return {
+        "size_px": [view.error.shape[1], view.error.shape[0]],
+        "hole_px": int(holes.sum()),
+        "holes_of_hull": round(float(holes.sum() / (view.mask > 0).sum()), 4),
+        "windows": len(windows_over(canvas.holes, config.size_px, config.overlap_px)),
+    }
+
+
+def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
+    views, source = stage(size, options.device)
+    figures: dict[str, dict[str, float]] = {}
+    result: dict[str, object] = {**setting(views[NOW]), "methods": figures}
+
+    def add(name: str, inpainter: ViewInpainter, state: State) -> None:
+        figures[name] = timed_steps(inpainter, state, views[NOW], source, options.device, options.seconds)
+        print(f"{size[0]}x{size[1]} {name}: {figures[name]}", flush=True)
+        done(result)
+
+    with torch.inference_mode():
+        for name in OURS:
+            add(name, *ours(name, views, source, options.device, options.precision))
+        for name in options.networks:
+            torch.manual_seed(0)
+            network = NETWORKS[name]().to(options.device).eval()
+            for memory, framing in product((False, True), options.framings):
+                made = baseline(network, memory, framing, views, source)
+                add(f"{name}-{'om' if memory else 'o'}-{framing}", *made)
+    result["fps_of_ours_over"] = ratios(figures)
+    done(result)
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="of ours")
+    parser.add_argument("--networks", nargs="+", default=list(NETWORKS), choices=list(NETWORKS))
+    parser.add_argument("--framings", nargs="+", default=list(FRAMINGS), choices=FRAMINGS)
+    parser.add_argument("--seconds", type=float, default=20.0, help="for each method and size; one step at least")
+    parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
+    parser.add_argument(
+        "--quick", action="store_true", help="the smallest size, DSTT on whole views alone, one step each"
+    )
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results, after each method")
+    options = parser.parse_args()
+    if options.quick:
+        options.networks, options.framings, options.seconds = ["dstt"], ["def"], 0.0
+        options.sizes = options.sizes[:1]
+    config = {
+        "seed": SEED,
+        "weights": "random",
+        "precision": {"ours": options.precision, "baselines": "float32"},
+        "past": "3 frames before, 3 further back",
+        "window_px": OnlineConfig().size_px,
+    }
+    results: dict[str, object] = {}
+
+    for text in options.sizes:
+        width, height = (int(side) for side in text.split("x"))
+
+        def done(result: dict, text: str = text) -> None:
+            results[text] = result
+            if options.write:
+                write("baselines", options.device, config, results)
+
+        print(json.dumps(measure((width, height), options, done)["fps_of_ours_over"], indent=1), flush=True)
+
+
+if __name__ == "__main__":
+    main()
