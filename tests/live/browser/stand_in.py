@@ -37,6 +37,7 @@ class Seen:
     playing: bool = False
     live: bool = True
     speed: float = 1.0
+    greeted: bool = False
     acknowledged: int = 0
     sent: int = 0
     answered: tuple = ()
@@ -129,6 +130,7 @@ class StandIn:
             more = {"export": True, "budget_ms": None, "limits": LIMITS, "token_needed": False}
             await viewer.socket.send_json({"type": "welcome", **about, **more})
             await viewer.socket.send_json(scene.rig())
+            viewer.greeted = True
         elif kind == "look":
             self.looks.append(message)
             viewer.look = message
@@ -151,7 +153,7 @@ class StandIn:
             if viewer.playing:
                 viewer.time = (viewer.time + 10 * viewer.speed * (now - last)) % scene.FRAMES
             last = now
-            if now - told > 0.1:
+            if viewer.greeted and now - told > 0.1:
                 told = now
                 await viewer.socket.send_json(self._state(viewer))
             if viewer.look and not self.hold and viewer.acknowledged == viewer.sent:

@@ -21,9 +21,14 @@ def wrong(shown: np.ndarray, expected: np.ndarray) -> float:
     return float(off.sum() / (expected.max(-1) > 0).sum())
 
 
+def at_rest(view) -> float:
+    """How wrong a picture is that was not turned: it has fewer pixels than the page."""
+    shown = view.picture()
+    return wrong(shown, truth(view.server.looks[-1], *shown.shape[:2]))
+
+
 def held(view, dx: int, dy: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Move while the server sends nothing: the picture before, the one that is shown now, and the truth."""
-    view.settle()
     before = view.picture()
     view.server.hold = True
     view.drag(dx, dy)
@@ -33,14 +38,16 @@ def held(view, dx: int, dy: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def test_the_last_picture_is_seen_from_the_new_pose(view):
+    least = at_rest(view)
     before, shown, expected = held(view, 40, 15)
     assert wrong(before, expected) > 0.25
-    assert wrong(shown, expected) < 0.12
+    assert wrong(shown, expected) < least + 0.05
 
 
 def test_with_the_switch_off_it_stays_until_the_next_one(view):
     view.tab("view")
     view.page.locator("#reproject").set_checked(False)
+    view.settle()
     before, shown, _ = held(view, 40)
     assert np.abs(before - shown).mean() < 0.5
     view.server.hold = False
@@ -50,14 +57,14 @@ def test_with_the_switch_off_it_stays_until_the_next_one(view):
 
 
 def test_zoom_and_pan_are_followed_too(desktop):
-    desktop.settle()
+    least = at_rest(desktop)
     desktop.server.hold = True
     desktop.page.mouse.move(*desktop.middle())
     desktop.page.mouse.wheel(0, -150)
     desktop.drag(60, 30, button="right")
     desktop.page.wait_for_timeout(600)
     shown = desktop.picture()
-    assert wrong(shown, truth(desktop.server.looks[-1], *shown.shape[:2])) < 0.1
+    assert wrong(shown, truth(desktop.server.looks[-1], *shown.shape[:2])) < least + 0.05
 
 
 def test_what_was_hidden_is_dim_and_not_torn(desktop):
@@ -95,7 +102,8 @@ HEADSET = """
     requestAnimationFrame(paint) { this.timer = setTimeout(() => paint(0, {getViewerPose: () => ({views})}), 30); }
     end() { clearTimeout(this.timer); this.dispatchEvent(new Event('end')); }
   };
-  Object.defineProperty(navigator, 'xr', {value: {isSessionSupported: async () => true, requestSession: async () => session}});
+  const xr = {isSessionSupported: async () => true, requestSession: async () => session};
+  Object.defineProperty(navigator, 'xr', {value: xr});
   window.endSession = () => session.end();
   WebGL2RenderingContext.prototype.makeXRCompatible = async () => {};
   window.XRWebGLLayer = class {

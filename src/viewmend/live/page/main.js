@@ -205,7 +205,8 @@ class Page {
     const size = fixedWidth > 0 ? { width: fixedWidth, height: fixedHeight } : sizeFor(box, this.settings.get("side"), this.limits);
     this.controls.size(size);
     const { fx, fy, cx, cy } = resize(lens, size.width, size.height);
-    this.link.look({ camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving: this.motion.moving });
+    const look = { camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving: this.motion.moving };
+    if (this.link.look(look)) this.notices.asked();
   }
 
   /** @param {number} divider its place as a share of the viewport's width @returns {import("./draw/stage.js").Wish} */

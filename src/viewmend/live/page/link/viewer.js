@@ -40,16 +40,18 @@ export class ViewerLink extends EventTarget {
   /**
    * Ask for a view unless it is what was asked for last, or it comes too soon after that: call it again a frame later.
    * @param {object} look without `type`, `id` and `sent_ms`
+   * @returns {boolean} whether it was sent
    */
   look(look) {
     const asked = JSON.stringify(look);
     const now = performance.now();
     this.late = asked !== this.lastLook && now - this.lastSent < this.leastGapMs;
-    if (asked === this.lastLook || this.late) return;
-    if (!this.connection.send({ type: "look", id: this.looks + 1, sent_ms: now, ...look })) return;
+    if (asked === this.lastLook || this.late) return false;
+    if (!this.connection.send({ type: "look", id: this.looks + 1, sent_ms: now, ...look })) return false;
     this.looks += 1;
     this.lastLook = asked;
     this.lastSent = now;
+    return true;
   }
 
   /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} clock */
