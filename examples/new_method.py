@@ -25,7 +25,7 @@ class Memory(State):
 
 
 class Afterimage:
-    """Made from the device. All that its output depends on is an attribute: results are remembered by class and these."""
+    """Made from the device. All that its output depends on is an attribute: by these, results are remembered."""
 
     def __init__(self, device: str, fading: float = 0.9) -> None:
         self.fading = fading
