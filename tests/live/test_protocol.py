@@ -2,7 +2,7 @@ import json
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from viewmend.live.fields import Fields, ProtocolError
@@ -111,7 +111,7 @@ LEAVES = (
 VALUES = st.recursive(LEAVES, lambda v: st.lists(v, max_size=9) | st.dictionaries(KEYS, v, max_size=4), max_leaves=12)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.dictionaries(KEYS, VALUES, max_size=8), st.sampled_from(["look", "clock", "ack", "hello", "ping", None]))
 def test_anything_is_understood_or_refused(message, kind):
     message = message if kind is None else message | {"type": kind}

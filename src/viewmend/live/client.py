@@ -8,31 +8,29 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from viewmend.live.pictures import PackedDepth, unpack_depth
+from viewmend.live.pictures import PackedDepth, from_jpeg, unpack_depth
 from viewmend.live.protocol import VERSION, unpack
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame that was sent."""
+    """One frame: its header (docs/live-protocol.md), RGB images by eye and mode, depth in metres by eye."""
 
     header: dict[str, Any]
-    """As in docs/live-protocol.md."""
     images: dict[tuple[int, str], UInt8[np.ndarray, "height width 3"]]
-    """RGB by eye and mode."""
     depth: dict[int, Float[np.ndarray, "h w"]]
-    """By eye, metres, every `stride`-th pixel; 0 where there is no surface."""
     latency_ms: float
-    """From the look that it answers (the last one sent with that id) to now."""
+    """From the look that it answers to its arrival."""
     size: int
     """Bytes."""
 
 
 @dataclass
 class Client:
-    """A viewer's connection; a context manager.
+    """A viewer's connection; a context manager. `messages` holds the last message of each type.
 
     Raises:
         ConnectionError: the server refuses, or ends the connection; says why.
@@ -43,15 +41,11 @@ class Client:
     token: str | None = None
     timeout_s: float = 30.0
     messages: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """The last message of each type: welcome, rig, state, stats, error, pong."""
 
     def __enter__(self) -> "Client":
-        query = f"?token={self.token}" if self.token else ""
-        url = f"{self.url}/ws{query}"
+        url = f"{self.url}/ws" + (f"?token={self.token}" if self.token else "")
         self._open = contextlib.ExitStack()
-        self._socket = self._open.enter_context(
-            connect(url, max_size=None, compression=None, open_timeout=self.timeout_s)
-        )
+        self._socket = self._open.enter_context(connect(url, max_size=None, compression=None))
         self._looks = 0
         self.send("hello", version=VERSION, codecs=["jpeg"])
         self.wait_for("welcome")
@@ -62,7 +56,8 @@ class Client:
 
     def send(self, kind: str, **values: object) -> None:
         """Send a message of the protocol."""
-        self._socket.send(json.dumps({"type": kind, **values}))
+        with contextlib.suppress(ConnectionClosed):  # the reason is waiting to be read
+            self._socket.send(json.dumps({"type": kind, **values}))
 
     def look(self, **values: object) -> int:
         """Ask for views from now on, e.g. camera={"azimuth": 30}, width=320, height=320; the look's id."""
@@ -74,7 +69,7 @@ class Client:
         """The next message of this type; frames on the way are acknowledged and dropped."""
         self.messages.pop(kind, None)
         end = time.monotonic() + self.timeout_s
-        while kind not in self.messages and time.monotonic() < end:
+        while kind not in self.messages:
             self._receive(end)
         return self.messages[kind]
 
@@ -87,7 +82,10 @@ class Client:
                 return frame
 
     def _receive(self, end: float) -> Frame | None:
-        message = self._socket.recv(timeout=max(0.0, end - time.monotonic()))
+        try:
+            message = self._socket.recv(timeout=max(0.0, end - time.monotonic()))
+        except ConnectionClosed as closed:
+            raise ConnectionError(f"the server has closed the connection: {closed}") from None
         if isinstance(message, str):
             note = json.loads(message)
             self.messages[note["type"]] = note
@@ -98,12 +96,9 @@ class Client:
         self.send("ack", frame=header["frame"])
         frame = Frame(header, {}, {}, 1000 * time.perf_counter() - header["sent_ms"], len(message))
         for part, data in zip(header["parts"], parts, strict=True):
-            if part["kind"] == "depth":
-                shape = (part["width"], part["height"], part["near_m"], part["far_m"])
-                frame.depth[part["eye"]] = unpack_depth(PackedDepth(data, *shape))
-            elif part["codec"] == "jpeg":
-                import cv2
-
-                image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
-                frame.images[part["eye"], part["mode"]] = np.asarray(image)
+            if part["kind"] == "image":
+                frame.images[part["eye"], part["mode"]] = from_jpeg(data)
+            else:
+                sizes = (part[key] for key in ("width", "height", "near_m", "far_m"))
+                frame.depth[part["eye"]] = unpack_depth(PackedDepth(data, *sizes))
         return frame

@@ -67,6 +67,13 @@ def to_jpeg(image: Picture, quality: int) -> bytes:
     return data.tobytes()
 
 
+def from_jpeg(data: bytes) -> Picture:
+    """Inverse of `to_jpeg`, nearly."""
+    import cv2
+
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
+
+
 @dataclass(frozen=True)
 class PackedDepth:
     """Depth as the protocol sends it."""
