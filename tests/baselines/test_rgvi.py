@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from viewmend.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, SeesTruth
-from viewmend.baselines.rgvi_flow import dis_flow, pull
+from viewmend.baselines.rgvi_flow import dis_flow, disagreeing, pull
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.views import IncompleteView
@@ -35,9 +35,14 @@ def view(truth, time, hole=(slice(30, 50), slice(40, 60))):
     return IncompleteView(camera, truth * (error == 0), ones, error, ones, (), torch.zeros(0, SIZE, SIZE), time)
 
 
+def constant(x, y):
+    return torch.tensor([float(x), float(y)])[:, None, None].expand(2, SIZE, SIZE)
+
+
 def known_flow(image, other):
-    """From any time to the one before."""
-    return torch.tensor([-float(v) for v in MOTION])[:, None, None].expand(2, SIZE, SIZE)
+    """To the time before, or the one after: whichever explains the picture."""
+    ways = [constant(-MOTION[0], -MOTION[1]), constant(*MOTION)]
+    return min(ways, key=lambda way: float((pull(other, way)[0] - image)[:, 60:-20, 20:-20].abs().mean()))
 
 
 def no_source(time, names):
@@ -67,10 +72,20 @@ def test_dis_flow_points_to_where_the_pixel_was(texture):
 
 
 def test_pulling_moves_and_knows_its_borders(texture):
-    pulled, inside = pull(at(texture, 0), known_flow(None, None))
+    pulled, inside = pull(at(texture, 0), constant(-MOTION[0], -MOTION[1]))
     torch.testing.assert_close(pulled[:, inside], at(texture, 1)[:, inside], rtol=0, atol=1e-5)
     assert not inside[: MOTION[1]].any() and not inside[:, : MOTION[0]].any()
     assert inside[MOTION[1] :, MOTION[0] :].all()
+
+
+def test_flow_that_does_not_lead_home_disagrees():
+    right = constant(3, 2)
+    assert not disagreeing(right, -right)[:-2, :-3].any()
+    assert disagreeing(right, -right)[-2:].all() and disagreeing(right, -right)[:, -3:].all()  # out of the picture
+    assert disagreeing(right, right).all() and not disagreeing(right, -right + 0.4)[:-2, :-3].any()
+    wrong = right.clone()
+    wrong[:, 10, 20] = 9
+    assert (disagreeing(wrong, -right) & ~disagreeing(right, -right)).nonzero().tolist() == [[10, 20]]
 
 
 def test_a_hole_takes_what_was_there_before(texture):
@@ -94,10 +109,8 @@ def test_flow_adds_up_over_several_frames(texture):
     corner = completed.view.error.bool() & ~seen
     assert not completed.rgb[:, corner].any()
 
-    def skip_latest(image, other):  # the latest past frame is of no use: it is looked for far outside
-        return torch.full((2, SIZE, SIZE), 999.0)
-
-    lost, _ = stream(Rgvi(RgviParts(flow=skip_latest, rest=parts.rest)), texture, 3)
+    away = RgviParts(flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow, rest=parts.rest)
+    lost, _ = stream(Rgvi(away), texture, 3)
     assert not lost.rgb[:, lost.view.error > 0].any()
 
 

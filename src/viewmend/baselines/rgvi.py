@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from viewmend.baselines.rgvi_flow import FlowMap, Image, dis_flow, pull
+from viewmend.baselines.rgvi_flow import FlowMap, Image, dis_flow, disagreeing, pull
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
@@ -105,7 +105,9 @@ class Rgvi:
         guess = fill(view.rgb, missing, subject)
         size = 2 * FLOW_MARGIN_PX + 1
         unknown = max_pool2d(missing[None, None].float(), size, 1, FLOW_MARGIN_PX)[0, 0] > 0
-        flow = self.parts.complete_flow(self.parts.flow(guess, past[0]), unknown, subject)
+        flow = self.parts.flow(guess, past[0])
+        unknown = unknown | disagreeing(flow, self.parts.flow(past[0], guess))
+        flow = self.parts.complete_flow(flow, unknown, subject)
         image, left, seen = view.rgb, missing, torch.ones_like(missing)
         for age, frame in enumerate(past):
             if age:

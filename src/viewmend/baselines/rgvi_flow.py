@@ -11,6 +11,10 @@ FlowMap = Float[Tensor, "2 height width"]
 """Where each pixel's point is in another image, relative to the pixel: x right, y down, pixels."""
 
 
+DISAGREEMENT = (0.01, 0.5)
+"""Flow and the flow back may differ, squared, by this share of their squares, and by so many square pixels."""
+
+
 def dis_flow(image: Image, other: Image) -> FlowMap:
     """Dense inverse search (Kroeger et al. 2016), OpenCV's, from images in [0, 1]."""
     import cv2
@@ -36,3 +40,11 @@ def pull(
     inside = ((at >= 0) & (at <= last)).all(-1)
     unit = 2 * at / last.clamp_min(1) - 1
     return grid_sample(image[None], unit[None], padding_mode="border", align_corners=True)[0], inside
+
+
+def disagreeing(flow: FlowMap, back: FlowMap) -> Bool[Tensor, "height width"]:
+    """Where flow and the flow back from there do not lead home (Sundaram et al. 2010), or there is outside."""
+    returned, inside = pull(back, flow)
+    share, square_px = DISAGREEMENT
+    allowed = share * (flow.square().sum(0) + returned.square().sum(0)) + square_px
+    return ~inside | ((flow + returned).square().sum(0) > allowed)
