@@ -17,30 +17,24 @@ from viewmend.live.protocol import VERSION, unpack
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: its header (docs/live-protocol.md), RGB images by eye and mode, depth in metres by eye."""
+    """One frame: its header (docs/live-protocol.md), RGB by eye and mode, depth in metres by eye, latency, bytes."""
 
     header: dict[str, Any]
     images: dict[tuple[int, str], UInt8[np.ndarray, "height width 3"]]
     depth: dict[int, Float[np.ndarray, "h w"]]
     latency_ms: float
-    """From the look that it answers to its arrival."""
     size: int
-    """Bytes."""
 
 
 @dataclass
 class Client:
-    """A viewer's connection; a context manager. `messages` holds the last message of each type.
-
-    Raises:
-        ConnectionError: the server refuses, or ends the connection; says why.
-        TimeoutError: nothing came in time.
-    """
+    """A viewer's connection; a context manager. ConnectionError says why a server refuses, or ends it."""
 
     url: str = "ws://127.0.0.1:8008"
     token: str | None = None
     timeout_s: float = 30.0
     messages: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """The last message of each type."""
 
     def __enter__(self) -> "Client":
         url = f"{self.url}/ws" + (f"?token={self.token}" if self.token else "")

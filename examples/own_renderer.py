@@ -1,0 +1,111 @@
+"""Mend the views of a renderer that is not ours: `python examples/own_renderer.py [OUT.png]`.
+
+A renderer of your own needs to say, of each view: its colours, which pixels show the subject, which of these it could
+not colour, and their depth. The inpainter asks for nothing else but the camera images, and your geometry's depth in
+them. Here the renderer splats points: all six depth sensors of a rig say where the surface is, but only the nearest
+camera gives it colour. What that one does not see is missing.
+"""
+
+import math
+import sys
+from pathlib import Path
+
+import torch
+
+from viewmend import Stream
+from viewmend.capture.images import write_image
+from viewmend.capture.studio.rigs import orbit
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
+from viewmend.inpainting.checkpoint import load_inpainter
+from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.rendering.selection import select_closest
+from viewmend.views import IncompleteView, MultiViewFrame
+
+
+class DepthSensors:
+    """Our own geometry: what each camera's depth sensor measured. `depth(cameras)` is all that a stream wants of it."""
+
+    def __init__(self, frame: MultiViewFrame) -> None:
+        self.frame = frame
+
+    def depth(self, cameras: Cameras) -> torch.Tensor:
+        """z-depth in metres, (view, height, width); 0 where there is no surface."""
+        measured = self.frame.select(cameras.names).depth
+        assert measured is not None
+        return measured
+
+
+def splat(frame: MultiViewFrame, target: Cameras, coloured: tuple[str, ...]) -> tuple[torch.Tensor, torch.Tensor]:
+    """The nearest point in each pixel of the target: its colour (3, h, w) and depth (h, w); 0 where there is none.
+
+    The points are all pixels of the cameras named, each drawn as a square of 3 x 3 pixels.
+    """
+    seen = frame.select(coloured)
+    assert seen.depth is not None
+    views, _, height, width = seen.rgb.shape
+    pixels = pixel_centers(width, height).reshape(1, -1, 2).expand(views, -1, -1)
+    points = unproject(pixels, seen.depth.flatten(1), seen.cameras)[seen.depth.flatten(1) > 0]
+    colours = (seen.rgb / 255).movedim(1, -1).reshape(views, -1, 3)[seen.depth.flatten(1) > 0]
+
+    uv, z = (part[0] for part in project(points, target))
+    width, height = target.max_size_px
+    depth, rgb = torch.full((height * width,), math.inf), torch.zeros(height * width, 3)
+    for dx, dy in [(0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1)]:
+        column, row = (uv.floor().long() + torch.tensor([dx, dy])).unbind(-1)
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        place = (row * width + column)[inside]
+        nearest = depth.scatter_reduce(0, place, z[inside], "amin")
+        first = z[inside] <= nearest[place]
+        rgb[place[first]] = colours[inside][first]
+        depth = nearest
+    depth = torch.where(depth.isfinite(), depth, 0.0)
+    return rgb.T.reshape(3, height, width), depth.reshape(height, width)
+
+
+def render(frame: MultiViewFrame, target: Cameras, center: torch.Tensor) -> IncompleteView:
+    """A view as our renderer makes it: the surface of all sensors, the colours of the nearest camera."""
+    nearest = select_closest(target, frame.cameras, center, len(frame.cameras))
+    chosen = nearest[:1]
+    _, surface = splat(frame, target, nearest)
+    rgb, depth = splat(frame, target, chosen)
+    mask = (surface > 0).float()
+    # Coloured where that camera's points are the front-most surface, missing elsewhere on the subject.
+    right = (depth > 0) & (depth <= surface + 0.03) & (surface > 0)
+    error = mask * (~right).float()
+    weights = right.float()[None]
+    return IncompleteView(target, rgb * right, mask, error, surface, chosen, weights, frame.time, nearest)
+
+
+def run(inpainter: ViewInpainter, frames: int = 4, size: int = 256, cameras: int = 6):
+    """Mend a view of each time; the last one, rendered and mended, and what a camera there would see."""
+    studio = Studio(StudioConfig(seed=10003, cameras=cameras, frames=frames, size_px=size))
+    target = orbit([0.5], (size, size), elevation_rad=0.3)
+    center = torch.tensor([0.0, 0.95, 0.0])
+    stream = Stream(inpainter)
+    viewer, mended = None, None
+    for time in range(frames):
+        frame = studio.read(time)
+        stream.push(frame, DepthSensors(frame))
+        mended = stream.mend(render(frame, target, center), viewer)
+        viewer = mended.viewer
+    assert mended is not None
+    return mended.completed, studio.truth(target, frames - 1)
+
+
+def main() -> None:
+    out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own_renderer.png")
+    completed, truth = run(load_inpainter("small"))
+    assert truth.mask is not None
+    black = truth.rgb[0] / 255 * (truth.mask[0] / 255)
+    pictures = torch.cat([completed.view.rgb, completed.rgb, black], 2)
+    write_image(out, (pictures.clamp(0, 1) * 255).byte().movedim(0, -1).contiguous().numpy())
+    holes = completed.view.error > 0
+    for name, rgb in (("left black", completed.view.rgb), ("mended", completed.rgb)):
+        error = (rgb - black)[:, holes].square().mean()
+        print(f"{name}: {-10 * math.log10(float(error)):.1f} dB in {int(holes.sum())} missing pixels")
+    print(f"wrote {out}: rendered, mended, truth")
+
+
+if __name__ == "__main__":
+    main()
