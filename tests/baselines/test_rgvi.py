@@ -1,13 +1,22 @@
 """RGVI: what the past saw is pulled into the holes along flow; the rest is filled; nothing else changes."""
 
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from viewmend.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, SeesTruth
+from viewmend.baselines.diffusion_fill import find_diffusion
+from viewmend.baselines.raft import Raft
+from viewmend.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, SeesTruth, make_rgvi
 from viewmend.baselines.rgvi_flow import dis_flow, disagreeing, pull
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.metrics import weights
+from viewmend.metrics.weights import KnownWeights, WeightsError
 from viewmend.views import IncompleteView
 
 SIZE = 96
@@ -135,3 +144,59 @@ def test_a_view_of_another_size_starts_anew(texture):
 def test_without_holes_it_leaves_the_view_alone(texture):
     completed, _ = stream(Rgvi(), texture, 2, (slice(0, 0), slice(0, 0)))
     assert torch.equal(completed.rgb, at(texture, 1))
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    for name in ("VIEWMEND_WEIGHTS", "XDG_CACHE_HOME", "TORCH_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    return tmp_path
+
+
+def test_parts_are_what_is_there(places, monkeypatch):
+    assert make_rgvi().parts == RgviParts()
+    (places / "raft.pth").write_bytes(b"none")
+    with pytest.raises(WeightsError, match="damaged or another"):
+        make_rgvi()
+    network, loaded = Raft(), KnownWeights("raft", ("raft.pth",), "RAFT", "s", "l")
+    torch.save(network.state_dict(), places / "raft.pth")
+    monkeypatch.setattr(weights, "KNOWN", (loaded,))
+    parts = make_rgvi().parts
+    assert isinstance(parts.flow, Raft) and torch.equal(
+        parts.flow.state_dict()["mask_predictor.conv.bias"], network.mask_predictor.conv.bias
+    )
+
+
+def test_diffusion_makes_the_reference_where_it_is_installed(places, monkeypatch, texture):
+    """Called through a stand-in: what `diffusers` is given, and that nothing but the hole is taken from it."""
+    given = {}
+
+    class Pipeline:
+        @classmethod
+        def from_pretrained(cls, folder, **how):
+            given.update(folder=folder, **how)
+            return cls()
+
+        def to(self, device):
+            return self
+
+        def __call__(self, **how):
+            given.update(how)
+            return SimpleNamespace(images=[np.full((how["height"], how["width"], 3), 0.25, np.float32)])
+
+    module = ModuleType("diffusers")
+    module.StableDiffusionInpaintPipeline = Pipeline
+    module.__spec__ = ModuleSpec("diffusers", None)
+    monkeypatch.setitem(sys.modules, "diffusers", module)
+    assert find_diffusion() is None
+    folder = places / "stable-diffusion-2-inpainting"
+    folder.mkdir()
+    (folder / "model_index.json").touch()
+    completed, _ = stream(Rgvi(RgviParts(reference=find_diffusion())), texture, 1)
+    hole = completed.view.error > 0
+    assert (completed.rgb[:, hole] - 0.25).abs().max() < 1e-6
+    assert torch.equal(completed.rgb[:, ~hole], completed.view.rgb[:, ~hole])
+    assert given["folder"] == folder and given["local_files_only"] and given["use_safetensors"]
+    assert given["image"].shape == (1, 3, SIZE, SIZE) and given["mask_image"].sum() == 400
+    later, _ = stream(Rgvi(RgviParts(flow=known_flow, reference=find_diffusion())), texture, 2)
+    assert in_hole(later, at(texture, 1)) < 1e-5

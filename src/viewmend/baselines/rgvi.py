@@ -15,10 +15,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from viewmend.baselines.diffusion_fill import find_diffusion
+from viewmend.baselines.raft import load_raft
 from viewmend.baselines.rgvi_flow import FlowMap, Image, dis_flow, disagreeing, pull
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
+from viewmend.metrics.weights import find_weights, known_weights
 from viewmend.views import CompletedView, IncompleteView
 
 PAST_FRAMES = 10
@@ -122,3 +125,14 @@ class Rgvi:
         older = past[: PAST_FRAMES - 1]
         newest = (self.parts.flow(image, older[0]),) if older else ()
         return replace(RgviState(), past=(image, *older), flows=(*newest, *flows)[: len(older)])
+
+
+def make_rgvi(device: torch.device | str = "cpu") -> Rgvi:
+    """RGVI with RAFT and Stable Diffusion 2 where their weights are, and with what needs none elsewhere.
+
+    Raises:
+        WeightsError: a file of RAFT's name is damaged or another.
+    """
+    raft = find_weights(known_weights("raft"))
+    flow = dis_flow if raft is None else load_raft(device)
+    return Rgvi(RgviParts(flow=flow, reference=find_diffusion(device) or fill))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from viewmend.baselines.published import is_baseline, make_baseline
-from viewmend.baselines.rgvi import Rgvi
+from viewmend.baselines.rgvi import make_rgvi
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
 from viewmend.inpainting.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.inpainting.protocol import ViewInpainter
@@ -48,7 +48,7 @@ METHODS: tuple[Method, ...] = (
     Method("smooth", lambda device: SmoothFill()),
     Method("reprojection", lambda device: ReprojectionFill()),
     Method("unfilled", lambda device: Unfilled()),
-    Method("rgvi", lambda device: Rgvi()),
+    Method("rgvi", make_rgvi),
 )
 BASELINES = tuple(
     f"{network}-o-{framing}{weights}"

@@ -80,6 +80,14 @@ KNOWN: tuple[KnownWeights, ...] = (
         "Apache 2.0",
         git_sha1="73a4fd1d87eb3dbd97f33a9779fa1caa3d28111a",
     ),
+    KnownWeights(
+        "raft",
+        ("raft_large_C_T_SKHT_V2-ff5fadd5.pth", "raft.pth"),
+        "RAFT, the flow of rgvi",
+        "torchvision.models.optical_flow.raft_large(weights='C_T_SKHT_V2')",
+        "BSD 3-Clause",
+        sha256="ff5fadd5",
+    ),
     KnownWeights("dstt", ("dstt.pth", "DSTT.pth"), "DSTT's generator", "ruiliu-ai/DSTT", "none stated"),
     KnownWeights(
         "fuseformer",
