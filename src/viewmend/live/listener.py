@@ -53,6 +53,7 @@ class Server(uvicorn.Server):
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 listener.bind((config.host, config.port))
+                listener.listen(64)  # who is told the address may come at once, and waits
             except OSError as error:
                 what = error.strerror or str(error)
                 raise OSError(f"port {config.port} of {config.host}: {what}; choose another --port") from None
