@@ -98,6 +98,7 @@ class BaselineRun(Run):
         weights = {key: value.detach().cpu().contiguous() for key, value in self.averaged.state_dict().items()}
         partial = self.out / f".{TRAINED}"
         save_file(weights, partial, {"format": "pt", "network": self.recipe.name})
+        partial.chmod(0o644)
         partial.replace(self.out / TRAINED)
         begun = "a checkpoint, whose licence goes on" if self.recipe.started else "random weights"
         card = (
