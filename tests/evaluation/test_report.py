@@ -68,6 +68,7 @@ def test_the_page_asks_nobody_for_anything_and_has_all_pictures(evaluated):
     assert shown.count("whole view") - 1 == 2 * (3 + 2 + 3 + 1) + 0 * len(sources)
     assert shown.count(", difference from the truth") == 2 * (2 + 2 + 2 + 1)
     assert shown.count("<video") == 2 and page(report, cells, store, video=False).count("<video") == 0
+    assert page(report, cells * 2, store, shown=1).count("<section>") == 2  # one of each set
     assert shown.count("<svg") == 3 and "quality against milliseconds" in shown
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from viewmend.evaluation.scene_run import RunSettings
     from viewmend.evaluation.scenes import EvaluationScene
 
-POSITIVE = ("frames", "scenes", "size", "jobs", "closest")
+POSITIVE = ("frames", "scenes", "size", "jobs", "closest", "shown")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +46,8 @@ class RunOptions:
     """Where to compute: cpu, or cuda."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Of our networks."""
+    shown: int = 12
+    """How many scenes of each set the report's page shows in pictures; sheets/ has them all."""
     video: bool = True
     """Put short videos into the report's page (needs viewmend[video]; pictures side by side without)."""
 
@@ -109,7 +111,7 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
 
     report, cells, store = found.report, found.cells, found.store
     forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
-    forms["html"] = page(report, cells, store, options.video)
+    forms["html"] = page(report, cells, store, options.shown, options.video)
     for name, text in forms.items():
         (options.out / f"report.{name}").write_text(text, encoding="utf-8")
     write_sheets(cells, store, options.out / "sheets")

@@ -30,8 +30,8 @@ WHOLE_PX = 360
 """Longer side of whole views."""
 
 
-def page(report: Report, cells: Sequence[Cell], store: CellStore, video: bool = True) -> str:
-    """The whole page; pictures and videos are in it."""
+def page(report: Report, cells: Sequence[Cell], store: CellStore, shown: int = 12, video: bool = True) -> str:
+    """The whole page; pictures and videos of the first scenes `shown` of each set are in it."""
     title = f"Evaluation: {', '.join(dict.fromkeys(cell.set for cell in cells)) or 'nothing'}"
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(line)}</p>" for line in setting_lines(report))]
     parts += [_table(table) for table in report.tables]
@@ -43,13 +43,20 @@ def page(report: Report, cells: Sequence[Cell], store: CellStore, video: bool = 
     if report.kinds:
         parts += ["<h2>By rig and style</h2><p>PSNR in the holes, dB, and the gain.</p>", _grid(kinds_grid(report))]
     parts += ["<h2>What the figures mean</h2>", _list(RULES), "<h2>Scenes</h2>", _legend()]
-    for scene in dict.fromkeys(cell.key.scene for cell in cells):
+    for scene in _first_scenes(cells, shown):
         parts.append(_scene(scene, [cell for cell in cells if cell.key.scene == scene], store, video))
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(title)}</title><style>{STYLE}</style>"
     )
     return f'<!doctype html><html lang="en"><head>{head}</head><body><main>{"".join(parts)}</main></body></html>\n'
+
+
+def _first_scenes(cells: Sequence[Cell], count: int) -> list[str]:
+    of: dict[str, dict[str, None]] = {}
+    for cell in cells:
+        of.setdefault(cell.set, {})[cell.key.scene] = None
+    return [scene for scenes in of.values() for scene in list(scenes)[:count]]
 
 
 def _table(table: Table) -> str:
@@ -69,7 +76,8 @@ def _table(table: Table) -> str:
 def _legend() -> str:
     return (
         "<p>At the time of each scene's largest hole: the whole view; its largest hole up close; there, the difference "
-        f"from the truth in every pixel, {DIFFERENCE_GAIN} times as bright. Then the first frames as a video.</p>"
+        f"from the truth in every pixel, {DIFFERENCE_GAIN} times as bright. Then the first frames as a video. "
+        "Scenes that are not here are in sheets/.</p>"
     )
 
 
