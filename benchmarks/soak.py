@@ -1,0 +1,194 @@
+"""A long stay: python benchmarks/soak.py --minutes 30 [--write].
+
+A server in a process of its own, `viewmend serve live`; a rig that pushes the studio's frames and is killed now and
+then; viewers that come and go, each of whom checks that every frame is its own (the camera it asked for, an answer to
+its own look); and one who sends malformed messages. Every ten seconds the server's memory is read. Ends with 1 when the
+server died, a viewer saw a frame that was not its own, or memory grew by more than 5 % after the first fifth.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections import Counter
+from pathlib import Path
+
+from measure import write
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from viewmend.capture.studio.stage import Studio, StudioConfig
+from viewmend.live.client import Client
+from viewmend.live.publisher import Publisher
+
+SIZE, CAMERAS, FRAMES = 160, 6, 24
+ALLOWED_GROWTH = 0.05
+
+
+class Soak:
+    """What runs, until `ends`."""
+
+    def __init__(self, url: str, minutes: float) -> None:
+        self.url = url
+        self.ends = time.monotonic() + 60 * minutes
+        self.counts: Counter[str] = Counter()
+        self.faults: list[str] = []
+
+    @property
+    def over(self) -> bool:
+        return time.monotonic() > self.ends
+
+    def push(self) -> None:
+        """A rig: a few seconds to half a minute at a time, then it is gone without a word."""
+        studio = Studio(StudioConfig(seed=10008, cameras=CAMERAS, frames=FRAMES, size_px=SIZE))
+        frames = [studio.read(t) for t in range(FRAMES)]
+        chance = random.Random(1)
+        while not self.over:
+            with contextlib.suppress(ConnectionError, OSError, TimeoutError):
+                rig = Publisher(studio.cameras, self.url, up=studio.up, bounds=studio.bounds)
+                until = time.monotonic() + chance.uniform(3, 30)
+                number = 0
+                while time.monotonic() < until and not self.over:
+                    rig.push(frames[number % FRAMES])
+                    number += 1
+                    self.counts["pushed"] += 1
+                    time.sleep(1 / 10)
+                rig._socket.socket.close()
+                self.counts["rigs"] += 1
+            time.sleep(chance.uniform(0.5, 3))
+
+    def watch(self, seat: int) -> None:
+        """A viewer: comes, looks around, goes, some without goodbye."""
+        chance = random.Random(100 + seat)
+        while not self.over:
+            with contextlib.suppress(ConnectionError, OSError, TimeoutError):
+                viewer = Client(self.url, timeout_s=8.0).__enter__()
+                until = time.monotonic() + chance.uniform(2, 40)
+                while time.monotonic() < until and not self.over:
+                    self._look(viewer, seat, chance)
+                if chance.random() < 0.5:
+                    viewer._socket.socket.close()
+                else:
+                    viewer.__exit__()
+                self.counts["viewers"] += 1
+            time.sleep(chance.uniform(0, 2))
+
+    def _look(self, viewer: Client, seat: int, chance: random.Random) -> None:
+        """Each seat has a height of its own above the ground: a frame of another one is seen by its camera."""
+        if chance.random() < 0.1:
+            wish = [{"playing": False}, {"live": True}, {"seek": chance.randrange(500)}, {"speed": 2.0}]
+            viewer.send("clock", **chance.choice(wish))
+        height_m = 0.1 * seat
+        camera = {"azimuth": chance.uniform(0, 360), "target": [0.0, 0.9 + height_m, 0.0], "distance": 3.0}
+        asked = time.monotonic()
+        look = viewer.look(camera=camera, width=96 + 16 * seat, height=96, adaptive=False, depth=True)
+        while time.monotonic() - asked < 6:
+            frame = viewer.frame()
+            self.counts["frames"] += 1
+            R, T = frame.header["cameras"][0]["R"], frame.header["cameras"][0]["T"]
+            eye_height = -sum(R[3 * n + 1] * T[n] for n in range(3))
+            if abs(eye_height - 0.9 - height_m) > 1e-3 or frame.header["look"] > look:
+                self.faults.append(f"viewer {seat} saw a frame from {eye_height:.3f} m")
+            if frame.header["look"] == look:
+                return
+
+    def vex(self) -> None:
+        """Malformed messages, in connections that end when the server has had enough."""
+        chance = random.Random(7)
+        whole = json.dumps({"type": "look", "id": 1, "camera": {"azimuth": 3}, "modes": ["mended"]})
+        while not self.over:
+            with contextlib.suppress(ConnectionClosed, OSError, TimeoutError):
+                with connect(f"{self.url}/ws", compression=None) as socket:
+                    socket.send(json.dumps({"type": "hello", "version": 1, "codecs": []}))
+                    for _ in range(40):
+                        garbage = [
+                            chance.randbytes(40),
+                            whole[: chance.randrange(len(whole))],
+                            '{"type": "look", "width": -1}',
+                        ]
+                        socket.send(chance.choice(garbage))
+                        self.counts["malformed"] += 1
+            time.sleep(0.5)
+
+
+def memory_mb(process: int) -> float:
+    """Resident, by /proc."""
+    status = Path(f"/proc/{process}/status").read_text()
+    found = re.search(r"VmRSS:\s+(\d+)", status)
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--viewers", type=int, default=4)
+    parser.add_argument("--memory-mb", type=float, default=400.0, help="of the server's stores")
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    options = parser.parse_args()
+    command = [
+        sys.executable,
+        "-m",
+        "viewmend.cli",
+        "serve",
+        "live",
+        "--port",
+        "0",
+        "--memory-mb",
+        str(options.memory_mb),
+    ]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as server:
+        assert server.stderr is not None
+        address = re.search(r"http://[\d.:]+", server.stderr.readline())
+        assert address is not None, "the server does not start"
+        said: list[str] = []
+        threading.Thread(target=lambda: said.extend(server.stderr or []), daemon=True).start()
+        soak = Soak(address[0].replace("http", "ws"), options.minutes)
+        works = [soak.push, soak.vex, *(lambda n=n: soak.watch(n) for n in range(options.viewers))]
+        threads = [threading.Thread(target=work, daemon=True) for work in works]
+        for thread in threads:
+            thread.start()
+        memory: list[float] = []
+        while not soak.over and server.poll() is None:
+            time.sleep(10)
+            memory.append(round(memory_mb(server.pid), 1))
+            print(round(soak.ends - time.monotonic()), "s left:", memory[-1], "MB", dict(soak.counts), flush=True)
+        alive = server.poll() is None
+        for thread in threads:
+            thread.join(20)
+        with contextlib.suppress(OSError):
+            health = json.loads(
+                urllib.request.urlopen(f"{address[0]}/metrics").read().decode().count("viewmend_up") * "1"
+            )
+            alive = alive and bool(health)
+        server.send_signal(signal.SIGINT)
+        server.wait(30)
+    early, late = (statistics.median(part or [0.0]) for part in (memory[len(memory) // 5 :][:6], memory[-6:]))
+    growth = late / early - 1 if early else 0.0
+    results = {
+        "minutes": options.minutes,
+        "viewers": options.viewers,
+        **soak.counts,
+        "wrong_frames": len(soak.faults),
+        "memory_mb": memory[:: max(1, len(memory) // 30)],
+        "growth": round(growth, 4),
+        "alive": alive,
+        "warnings": len(said),
+    }
+    print(json.dumps(results), *soak.faults[:5], *said[:5], sep="\n")
+    if options.write:
+        config = {"size": SIZE, "cameras": CAMERAS, "memory_mb": options.memory_mb, "model": "small"}
+        print(write("soak", "cpu", config, results))
+    return 0 if alive and not soak.faults and growth <= ALLOWED_GROWTH else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
