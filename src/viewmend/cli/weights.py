@@ -36,8 +36,9 @@ def run(options: Options) -> int:
         print_json(found)
     else:
         for line in found:
-            where = line["path"] or f"not found; get it from {line['source']}"
-            print(f"{line['name']}: {line['status']}: {where}\n    {line['what']}; licence: {line['licence']}")
+            where = line["path"] or f"wanted as {line['files']}, from {line['source']}"
+            print(f"{line['name']}: {line['status']}: {where}")
+            print(f"    {line['what']}; licence: {line['licence']}; {line['hash']}")
             if line["said"]:
                 print(f"    {line['said']}")
         if not options.files:
@@ -69,7 +70,7 @@ def _checked(path: Path, name: str | None) -> dict[str, str]:
 
 
 def _line(name: str, path: Path | None) -> dict[str, str]:
-    from viewmend.metrics.weights import WeightsError, known_weights, verify_weights
+    from viewmend.metrics.weights import WeightsError, known_weights, stated_hashes, verify_weights
 
     known, status, said = known_weights(name), "missing", ""
     if path is not None:
@@ -84,10 +85,10 @@ def _line(name: str, path: Path | None) -> dict[str, str]:
         "name": name,
         "status": status,
         "path": "" if path is None else str(path),
+        "files": " or ".join(known.files),
         "what": known.what,
         "source": known.source,
         "licence": known.licence,
-        "sha256": known.sha256,
-        "git_sha1": known.git_sha1,
+        "hash": stated_hashes(known),
         "said": said,
     }

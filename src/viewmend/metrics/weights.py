@@ -139,8 +139,8 @@ def checked_weights(known: KnownWeights) -> Path:
     if path is None:
         where = ", ".join(str(place) for place in places())
         raise MissingWeightsError(
-            f"expected {known.what} as {' or '.join(known.files)} ({_hashes(known)}) in one of {where}, found none; "
-            f"get it from {known.source} and put it there, or name its folder in {PLACES_VARIABLE}"
+            f"expected {known.what} as {' or '.join(known.files)} ({stated_hashes(known)}) in one of {where}, found "
+            f"none; get it from {known.source} and put it there, or name its folder in {PLACES_VARIABLE}"
         )
     verify_weights(path, known)
     return path
@@ -151,8 +151,8 @@ def verify_weights(path: Path, known: KnownWeights) -> None:
     if not verified(path, known):
         sha256, git_sha1 = hashes(path)
         raise WeightsError(
-            f"{path}: expected {known.what} ({_hashes(known)}), got a file of {path.stat().st_size} bytes with SHA-256 "
-            f"{sha256}, git name {git_sha1}; it is damaged or another version, get it from {known.source}"
+            f"{path}: expected {known.what} ({stated_hashes(known)}), got a file of {path.stat().st_size} bytes with "
+            f"SHA-256 {sha256}, git name {git_sha1}; it is damaged or another version, get it from {known.source}"
         )
 
 
@@ -207,6 +207,8 @@ def fill_network(network: nn.Module, path: Path, spare: Sequence[str] = ()) -> N
     network.requires_grad_(False).eval()
 
 
-def _hashes(known: KnownWeights) -> str:
-    said = [("SHA-256", known.sha256), ("git name", known.git_sha1)]
-    return ", ".join(f"{kind} {value}" for kind, value in said if value) or "no hash was published"
+def stated_hashes(known: KnownWeights) -> str:
+    """The hashes that were published, in words."""
+    said = [("SHA-256", known.sha256, 64), ("git name", known.git_sha1, 40)]
+    shown = [f"{kind} {value}{'...' * (len(value) < whole)}" for kind, value, whole in said if value]
+    return ", ".join(shown) or "no hash was published"
