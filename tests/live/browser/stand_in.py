@@ -195,7 +195,13 @@ class StandIn:
         header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
         header |= {"height": height, "full": part == 1.0, "cameras": cameras, "chosen": scene.CHOSEN, "holes": share}
         header |= {"top_k": look.get("top_k"), "context_times": 3, "dropped": 0, "colours": scene.COLOURS}
-        stages = {"read": 1.0, "geometry": 8.0, "rendering": 6.0, "inpainting": 30.0 + 10 * np.sin(now), "encode": 2.0}
+        stages = {
+            "geometry": 8.0,
+            "context": 4.0,
+            "rendering": 6.0,
+            "inpainting": 30.0 + 10 * np.sin(now),
+            "encode": 2.0,
+        }
         header["stage_ms"] = {**stages, "wait": 1.0, "total": sum(stages.values()) + 1}
         header["parts"] = [about | {"bytes": len(content)} for about, content in zip(parts, data, strict=True)]
         text = json.dumps(header).encode()

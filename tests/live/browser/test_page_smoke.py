@@ -116,10 +116,12 @@ def test_a_surface_is_cut_at_jumps_in_depth_and_whole_elsewhere(page):
     body = """const s = m.surfaceOf({...x, z: Float32Array.from(x.z)}, 16, 12);
               return [[...s.vertices], [...s.solid], [...s.stretched]]"""
     vertices, solid, stretched = call(page, "draw/surface.js", body, depth)
-    triangles = np.reshape(vertices, (-1, 3))[np.reshape(solid, (-1, 3))]
+    vertices = np.reshape(vertices, (-1, 5))
+    triangles = vertices[np.reshape(solid, (-1, 3))]
     assert (triangles[..., 2] > 0).all()
     assert (triangles[..., 2].max(1) / triangles[..., 2].min(1) < 1.03).all()
     assert len(stretched) == 6 * 4  # the jump, one cell wide
+    assert (vertices[stretched, 3] >= 9).all()  # in the farther surface's colours
     sides = triangles[:, 1:, :2] - triangles[:, :1, :2]
     area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum() / 2
     two_layers = 12 * 2.0  # cells across the jump are covered by both surfaces

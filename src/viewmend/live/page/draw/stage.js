@@ -24,11 +24,12 @@ import { planeOf } from "./surface.js";
 
 const VERTEX = `#version 300 es
 layout(location = 0) in vec3 place;
+layout(location = 1) in vec2 shade;
 uniform mat4 clip;
 out vec3 pixel;
 void main() {
-  pixel = vec3(place.xy * place.z, place.z);
-  gl_Position = clip * vec4(pixel, 1.0);
+  pixel = vec3(shade * place.z, place.z);
+  gl_Position = clip * vec4(place.xy * place.z, place.z, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
@@ -43,8 +44,8 @@ void main() {
   float something = smoothstep(0.015, 0.055, max(seen.r, max(seen.g, seen.b)));
   colour = vec4(seen * something * tone, 1.0);
 }`;
-/** What was hidden when the picture was taken shows its neighbours' colours, dimmed. */
-const STRETCHED_TONE = 0.4;
+/** What was hidden when the picture was taken shows the colours beside it, dimmed. */
+const STRETCHED_TONE = 0.6;
 
 export class Stage {
   /** @param {HTMLCanvasElement} canvas */
@@ -142,9 +143,12 @@ export class Stage {
     const mesh = kept.mesh ?? kept.quad;
     gl.uniformMatrix4fv(at.clip, false, this.#clip(source, viewer, kept));
     gl.bindVertexArray(mesh.array);
-    gl.drawElements(gl.TRIANGLES, mesh.solid, gl.UNSIGNED_INT, 0);
+    gl.depthMask(false); // whatever was seen is drawn over it
     gl.uniform1f(at.tone, STRETCHED_TONE);
     gl.drawElements(gl.TRIANGLES, mesh.stretched, gl.UNSIGNED_INT, 4 * mesh.solid);
+    gl.depthMask(true);
+    gl.uniform1f(at.tone, 1);
+    gl.drawElements(gl.TRIANGLES, mesh.solid, gl.UNSIGNED_INT, 0);
     gl.colorMask(true, true, true, true);
   }
 
@@ -179,7 +183,9 @@ function upload(gl, kept, surface) {
   gl.bindBuffer(gl.ARRAY_BUFFER, mesh.vertices);
   gl.bufferData(gl.ARRAY_BUFFER, surface.vertices, gl.DYNAMIC_DRAW);
   gl.enableVertexAttribArray(0);
-  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+  gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 20, 0);
+  gl.enableVertexAttribArray(1);
+  gl.vertexAttribPointer(1, 2, gl.FLOAT, false, 20, 12);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, mesh.indices);
   const [solid, stretched] = [surface.solid.length, surface.stretched.length];
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, 4 * (solid + stretched), gl.DYNAMIC_DRAW);

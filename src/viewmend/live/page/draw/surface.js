@@ -1,13 +1,13 @@
-// A picture's depth as triangles in the picture's own pixels: (u, v, z), z in metres.
+// A picture's depth as triangles in the picture's own pixels: where they are (u, v, z), z in metres, and what colours them (s, t).
 
 /** Neighbours whose depths differ by more than this share lie on two surfaces. */
 const JUMP = 0.03;
 
 /**
  * @typedef {object} Surface
- * @property {Float32Array} vertices u, v, z
+ * @property {Float32Array} vertices u, v, z, s, t
  * @property {Uint32Array} solid triangles of what was seen
- * @property {Uint32Array} stretched triangles across jumps in depth: all that is known of what lies between
+ * @property {Uint32Array} stretched triangles across jumps in depth, in the farther one's colours: a guess at what was hidden
  */
 
 /** Grows as it is written to. */
@@ -34,6 +34,8 @@ class Numbers {
   }
 }
 
+const FLOATS = 5;
+
 /** Where the depth's columns (or rows) lie in the picture; the outermost on its edge. */
 function places(/** @type {number} */ count, /** @type {number} */ stride, /** @type {number} */ size) {
   const half = Math.floor(stride / 2);
@@ -45,7 +47,7 @@ function places(/** @type {number} */ count, /** @type {number} */ stride, /** @
 
 /**
  * Cells of one surface share the grid's vertices. In a cell across a jump each of the two surfaces goes on to the
- * cell's edge with vertices of its own, so that nothing is missing until the view moves; cells at the silhouette alike.
+ * cell's edge with vertices of its own, the farther one in its own colours; cells at the silhouette alike.
  * @param {import("../link/frames.js").Depth} depth @param {number} width of the picture @param {number} height
  * @returns {Surface}
  */
@@ -53,9 +55,11 @@ export function surfaceOf(depth, width, height) {
   const { width: columns, height: rows, z } = depth;
   const us = places(columns, depth.stride, width);
   const vs = places(rows, depth.stride, height);
-  const vertices = new Numbers(Float32Array, 3 * columns * rows + 12 * (columns + rows));
+  const vertices = new Numbers(Float32Array, FLOATS * (columns * rows + 16 * (columns + rows)));
   for (let row = 0; row < rows; row++) {
-    for (let column = 0; column < columns; column++) vertices.push(us[column], vs[row], z[row * columns + column]);
+    for (let column = 0; column < columns; column++) {
+      vertices.push(us[column], vs[row], z[row * columns + column], us[column], vs[row]);
+    }
   }
   const solid = new Numbers(Uint32Array, 6 * columns * rows);
   const stretched = new Numbers(Uint32Array, 1024);
@@ -75,9 +79,11 @@ export function surfaceOf(depth, width, height) {
       const low = Math.min(...seen.map((index) => z[index]));
       const jump = high > low * (1 + JUMP);
       const near = seen.filter((index) => z[index] <= low * (1 + JUMP));
-      extend(vertices, solid, z, corners, near);
-      if (jump) extend(vertices, solid, z, corners, seen.filter((index) => !near.includes(index)));
-      if (jump && whole) twoTriangles(stretched, corners);
+      extend(vertices, solid, z, corners, near, false);
+      if (!jump) continue;
+      const far = corners.filter((index) => z[index] > low * (1 + JUMP));
+      extend(vertices, solid, z, corners, far, true);
+      if (whole) stretch(vertices, stretched, z, corners, far);
     }
   }
   return {
@@ -95,22 +101,44 @@ function twoTriangles(indices, [a, b, c, d]) {
 /**
  * A whole cell at the depth of those corners that are `members`.
  * @param {Numbers} vertices @param {Numbers} solid @param {Float32Array} z @param {number[]} corners @param {number[]} members
+ * @param {boolean} own whether it is in the members' colours everywhere
  */
-function extend(vertices, solid, z, corners, members) {
+function extend(vertices, solid, z, corners, members, own) {
   let mean = 0;
   for (const index of members) mean += z[index] / members.length;
-  const start = vertices.length / 3;
-  for (const index of corners) {
-    const [u, v] = vertices.values.subarray(3 * index, 3 * index + 2);
-    vertices.push(u, v, members.includes(index) ? z[index] : mean);
-  }
-  twoTriangles(solid, [start, start + 1, start + 2, start + 3]);
+  const depths = corners.map((index) => (members.includes(index) ? z[index] : mean));
+  cell(vertices, solid, corners, depths, own ? members : corners);
+}
+
+/**
+ * A cell from the near corners to the far ones.
+ * @param {Numbers} vertices @param {Numbers} stretched @param {Float32Array} z @param {number[]} corners @param {number[]} far
+ */
+function stretch(vertices, stretched, z, corners, far) {
+  cell(vertices, stretched, corners, corners.map((index) => z[index]), far);
+}
+
+/**
+ * Four vertices and two triangles; a corner that does not colour itself takes its neighbour's colour.
+ * @param {Numbers} vertices @param {Numbers} indices @param {number[]} corners @param {number[]} depths @param {number[]} colouring
+ */
+function cell(vertices, indices, corners, depths, colouring) {
+  const start = vertices.length / FLOATS;
+  corners.forEach((index, place) => {
+    const [u, v] = vertices.values.subarray(FLOATS * index, FLOATS * index + 2);
+    const from = [place, place ^ 1, place ^ 2, place ^ 3].find((other) => colouring.includes(corners[other])) ?? place;
+    const [s, t] = vertices.values.subarray(FLOATS * corners[from], FLOATS * corners[from] + 2);
+    vertices.push(u, v, depths[place], s, t);
+  });
+  twoTriangles(indices, [start, start + 1, start + 2, start + 3]);
 }
 
 /** A picture without depth: a plane at `z`. @param {number} width @param {number} height @param {number} z @returns {Surface} */
 export function planeOf(width, height, z) {
   return {
-    vertices: new Float32Array([0, 0, z, width, 0, z, 0, height, z, width, height, z]),
+    vertices: new Float32Array([
+      ...[0, 0, z, 0, 0], ...[width, 0, z, width, 0], ...[0, height, z, 0, height], ...[width, height, z, width, height],
+    ]),
     solid: new Uint32Array([0, 2, 1, 1, 2, 3]),
     stretched: new Uint32Array(0),
   };

@@ -7,7 +7,7 @@ const FINAL = {
   4401: "This server asks for a token. Open the address that it printed when it started.",
   4426: "This page and the server are of different versions. Reload the page.",
 };
-const REASONS = { 4429: "Too many messages.", 4503: "All places are taken.", 1001: "The server has stopped." };
+const REASONS = { 4429: "Too many messages.", 4503: "All places are taken.", 1012: "The server has stopped." };
 
 /** @param {string} path @param {string | null} token */
 export function address(path, token) {

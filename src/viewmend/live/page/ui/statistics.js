@@ -3,8 +3,8 @@
 import { byId, element } from "./dom.js";
 
 const STAGES = {
-  read: ["Reading", "#6ea8fe"],
   geometry: ["Geometry", "#4fc3b1"],
+  context: ["Context", "#6ea8fe"],
   rendering: ["Rendering", "#f0c04c"],
   inpainting: ["Mending", "#ef7fa7"],
   encode: ["Encoding", "#a58bf0"],

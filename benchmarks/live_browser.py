@@ -1,0 +1,119 @@
+"""How immediate the live page is, in Chromium: python benchmarks/live_browser.py [--write].
+
+`viewmend serve` and a headless Chromium (its WebGL in software) share this machine. A key is held, so that the view
+orbits all the time, back and forth. Pose to pixel: from the moment a pose is sent to the draw call of the picture that
+answers it. Needs the extras `live` and `browser`, and `video` for other codecs than JPEG.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from urllib.parse import urlencode
+
+from measure import summarise, write
+from playwright.sync_api import Page, sync_playwright
+
+SIZES = ("320x320", "512x612")
+CODECS = ("jpeg", "vp9", "h264")
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+SWING_MS = 1500
+COLLECT = """
+() => {
+  const canvas = document.querySelector('#picture');
+  canvas.seen = [];
+  canvas.addEventListener('framepainted', ({detail: {header, bytes, latency_ms}}) => canvas.seen.push(
+    {now: performance.now(), latency: latency_ms, bytes, width: header.width, height: header.height,
+     holes: header.holes, stages: header.stage_ms}));
+}
+"""
+
+
+@contextmanager
+def served(options: list[str]) -> Iterator[str]:
+    """`viewmend serve` in a process of its own; its address."""
+    command = [sys.executable, "-m", "viewmend.cli", "serve", "--port", "0", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            assert process.stdout is not None
+            found = (re.search(r"http://\S+", line) for line in process.stdout)
+            yield next(address.group() for address in found if address)
+        finally:
+            process.terminate()
+
+
+def swing(page: Page, seconds: float) -> tuple[list[dict], list[float]]:
+    """Orbit back and forth; the frames that came, and the repaints a second."""
+    page.locator("#picture").focus()
+    repaints = []
+    for n in range(max(1, round(1000 * seconds / SWING_MS))):
+        key = ("ArrowRight", "ArrowLeft")[n % 2]
+        page.keyboard.down(key)
+        page.wait_for_timeout(SWING_MS)
+        page.keyboard.up(key)
+        repaints.append(float(page.locator("#figure-repaints").inner_text()))
+    return page.evaluate("document.querySelector('#picture').seen"), repaints[1:] or repaints
+
+
+def figures(seen: list[dict], repaints: list[float]) -> dict[str, object]:
+    latencies = [frame["latency"] for frame in seen if frame["latency"] is not None]
+    seconds = (seen[-1]["now"] - seen[0]["now"]) / 1000
+    stages = seen[0]["stages"]
+    mean = lambda values: round(sum(values) / len(values), 2)  # noqa: E731
+    return {
+        "frames": len(seen),
+        "pose_to_pixel": summarise(latencies),
+        "fps": round((len(seen) - 1) / seconds, 1),
+        "repaints_per_s": mean(repaints),
+        "kb_per_frame": mean([frame["bytes"] / 1000 for frame in seen]),
+        "width_mean": mean([frame["width"] for frame in seen]),
+        "holes_mean": round(sum(frame["holes"] for frame in seen) / len(seen), 4),
+        "stage_ms": {name: mean([frame["stages"][name] for frame in seen]) for name in stages},
+    }
+
+
+def measure(page: Page, address: str, query: dict[str, object], seconds: float) -> dict[str, object]:
+    page.goto(f"{address}?{urlencode(query)}")
+    page.wait_for_selector("#picture[data-frame]", timeout=120_000)
+    offered = page.locator("#codec option").evaluate_all("all => all.map(e => e.value)")
+    if query["codec"] not in offered:
+        return {"skipped": f"not both sides can {query['codec']}"}
+    page.wait_for_timeout(2000)
+    swing(page, 2 * SWING_MS / 1000)  # warms up
+    page.evaluate(COLLECT)
+    seen, repaints = swing(page, seconds)
+    return figures(seen, repaints)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=20, help="of orbiting, each size and codec")
+    parser.add_argument("--sizes", nargs="+", default=SIZES)
+    parser.add_argument("--codecs", nargs="+", default=CODECS)
+    parser.add_argument("--mode", default="mended")
+    parser.add_argument("--budget-ms", type=float, default=100, help="of the server; 0 for full quality always")
+    parser.add_argument("--full-size", action="store_true", help="the full resolution while moving, too")
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    options = parser.parse_args()
+    chromium = os.environ.get("VIEWMEND_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)))
+    results: dict[str, object] = {}
+    with served(["--budget-ms", str(options.budget_ms)]) as address, sync_playwright() as control:
+        browser = control.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        for size in options.sizes:
+            for codec in options.codecs:
+                query = {"size": size, "codec": codec, "mode": options.mode, "adaptive": int(not options.full_size)}
+                results[f"{size} {codec}"] = measure(page, address, query, options.seconds)
+                print(size, codec, json.dumps(results[f"{size} {codec}"]))
+        browser.close()
+    if options.write:
+        print(write("live_browser", "cpu", vars(options), results))
+
+
+if __name__ == "__main__":
+    main()
