@@ -28,7 +28,7 @@ const DEFAULTS = {
   adaptive: true,
   reproject: true,
   rig: false,
-  panel: true,
+  panel: window.innerHeight > 460,
 };
 
 export class Settings extends EventTarget {

@@ -4,7 +4,7 @@ import { byId } from "./dom.js";
 
 /** @typedef {import("../view/lens.js").Box} Box */
 
-const NARROW = window.matchMedia("(max-width: 760px), (max-height: 460px)");
+const NARROW = window.matchMedia("(max-width: 760px)");
 
 /** Keeps `free` up to date and calls back when it changes. */
 export class Layout {
