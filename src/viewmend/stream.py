@@ -38,7 +38,8 @@ class Effort:
     """Context tokens that survive pruning; None takes the model's own."""
     context_times: int | None = None
     """How many of the window's times are context, the latest first (1: the view's own alone); None takes all. With 0
-    holes are still read from the cameras along rays, if the model does that, but no camera image is encoded."""
+    no camera image is encoded: a model with a first fill shows that alone (read along rays, if it does so), and others
+    have but the view's own patches."""
 
 
 @dataclass(frozen=True)
@@ -267,5 +268,7 @@ class _WithEffort:
             return CompletedView(view, view.rgb)
         around = view.around(inpainter.config.rays)
         nearby = source(view.time, around) if around else None
+        if inpainter.config.prefill:
+            return inpainter.first_fill(view, nearby)
         prediction = inpainter.predict([view], [()], self._effort.top_k, [nearby])[0]
         return CompletedView(view, prediction.completed)

@@ -132,3 +132,14 @@ def test_many_pixels_at_once_equal_few(monkeypatch):
         monkeypatch.setattr("viewmend.inpainting.ray_reader.PIXELS_AT_ONCE", 7)
         parts = net.prefill([incomplete], [context(5)])[0]
     assert torch.allclose(whole, parts, atol=1e-6)
+
+
+def test_the_first_fill_alone_completes_a_view():
+    net, incomplete = tiny(), view(5)
+    completed = net.first_fill(incomplete, context(5))
+    (filled,) = net.prefill([incomplete], [context(5)])
+    whole, kept = incomplete.error == 1, incomplete.error == 0
+    assert torch.equal(completed.rgb[:, kept], incomplete.rgb[:, kept])
+    assert torch.allclose(completed.rgb[:, whole], filled.detach()[:, whole])
+    with pytest.raises(ValueError, match="expected a model with prefill"):
+        tiny(prefill=False, rays=0).first_fill(incomplete, None)

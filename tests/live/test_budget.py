@@ -16,9 +16,9 @@ class Device:
         self.noise, self.chance = noise, random.Random(seed)
 
     def frame(self, level: Level) -> FrameMs:
-        """Filling has a part that no picture size shrinks below a third."""
+        """Filling has a part that no picture size shrinks below a third; without context it is the first fill's."""
         size = 0.3 + 0.7 * level.scale**2
-        context = 1 - self.context_share * (1 - level.context_times / 7)
+        context = 1 - self.context_share * (1 - level.context_times / 7) if level.context_times else 0.25
         by = 1 + self.noise * self.chance.uniform(-1, 1)
         encoding = 0.2 * self.filling * by if level.context_times else None
         filling = 0.8 * self.filling * size * context * by

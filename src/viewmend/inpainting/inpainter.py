@@ -135,6 +135,18 @@ class Inpainter(nn.Module):
             return [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
         return [view.rgb for view in views]
 
+    @torch.no_grad()
+    def first_fill(self, view: IncompleteView, nearby: ContextViews | None) -> CompletedView:
+        """The view completed by the first fill alone, without the transformer: for whoever has no time for more.
+
+        Raises:
+            ValueError: the model has no such fill.
+        """
+        if not self.config.prefill:
+            raise ValueError("expected a model with prefill, got one without; complete the view by `step`")
+        filled = self.prefill([view], [nearby])[0].float()
+        return CompletedView(view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask)))
+
     def _encode_targets(self, views: Sequence[IncompleteView], nearby: Sequence[ContextViews | None]) -> list[Target]:
         """Tokens of every kept patch of each view; those with any pixel of E > 0 are the input set P."""
         filled = self.prefill(views, nearby)

@@ -23,6 +23,8 @@ MEMORY = 5
 AIM = 0.85
 PATIENCE = 4
 MOST_PATIENCE = 256
+FIRST_FILL = 0.15
+"""Work of a fill without the transformer, relative to all."""
 PROBATION = 12
 
 
@@ -41,6 +43,8 @@ class Level:
     def filling(self) -> float:
         """Work of filling, relative to the full level's."""
         tokens = min(self.top_k or 2048, 2048) / 2048
+        if self.context_times == 0:
+            return self.scale**2 * FIRST_FILL
         return self.scale**2 * (0.4 + 0.4 * self.context_times / 7 + 0.2 * tokens)
 
 
