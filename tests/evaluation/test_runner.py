@@ -9,10 +9,11 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from viewmend.evaluation import scene_run
+from viewmend.evaluation import ray_cluster, scene_run
 from viewmend.evaluation.cells import CellStore
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
@@ -168,3 +169,10 @@ def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
     subprocess.run(command, check=True, capture_output=True)
     assert len(list((tmp_path / "cells").glob("*.json"))) == len(METHODS) * len(small_scenes)
     assert figures(run(small_scenes, tmp_path / "cells")) == figures(whole[1])
+
+
+def test_a_cluster_that_is_not_there_is_one_clear_error(small_scenes, tmp_path, monkeypatch):
+    ray = SimpleNamespace(is_initialized=lambda: False)
+    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
+    with pytest.raises(ValueError, match=r"expected a Ray cluster at '127.0.0.1:1', got none .* --ray local"):
+        run(small_scenes[:1], tmp_path, ray="127.0.0.1:1")

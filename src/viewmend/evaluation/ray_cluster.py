@@ -1,5 +1,6 @@
 """Scenes on a Ray cluster: the same function of the same arguments as here, so the same numbers."""
 
+import socket
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -7,6 +8,8 @@ from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, eval
 from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.tasks import Task
 
+ANSWER_S = 5.0
+"""A cluster answers within this time."""
 LOCAL = "local"
 """Instead of an address: a cluster of this machine alone, for as long as the run lasts."""
 
@@ -57,6 +60,13 @@ def _on_one_core(scene: EvaluationScene, methods: tuple[str, ...], settings: Run
     return evaluate_scene(scene, methods, settings)
 
 
+def _knock(address: str) -> None:
+    """OSError where nobody listens at HOST:PORT; Ray itself would wait for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
+
+
 def _ray() -> Any:
     try:
         import ray  # pyright: ignore[reportMissingImports]
@@ -69,8 +79,9 @@ def _ray() -> Any:
 
 def _connect(ray: Any, address: str) -> None:
     try:
+        _knock(address)
         ray.init(None if address == LOCAL else address, include_dashboard=False, log_to_driver=False)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"expected a Ray cluster at '{address}', got none ({' '.join(str(error).split())[:200]}); check --ray, or "
             f"use --ray {LOCAL}"
