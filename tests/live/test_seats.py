@@ -54,6 +54,14 @@ def test_the_newest_look_wins():
     assert desk.seat.dropped == 4
 
 
+def test_the_same_look_again_is_answered_again():
+    desk = Desk()
+    desk.pause()
+    for _ in range(3):
+        desk.look(id=1)
+        assert desk.due() is not None and desk.due() is None
+
+
 def test_one_frame_is_in_flight_until_it_is_acknowledged():
     desk = Desk()
     desk.look(id=1)

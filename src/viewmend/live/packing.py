@@ -4,10 +4,11 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from viewmend.live.pictures import COLOURS, DEPTH_STRIDE, pack_depth, picture, to_jpeg
+from viewmend.live.pictures import COLOURS, DEPTH_STRIDE, Picture, pack_depth, picture, to_jpeg
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import Look, pack
 from viewmend.live.renderer import Ask, Rendered
+from viewmend.live.video import STRINGS, VideoStream
 from viewmend.views import CompletedView
 
 
@@ -19,16 +20,39 @@ class FrameInfo:
     full: bool
     wait_ms: float
     dropped: int
+    key: bool
+    """Video streams begin anew."""
 
 
-def frame_message(look: Look, ask: Ask, rendered: Rendered, info: FrameInfo) -> tuple[bytes, dict[str, float]]:
+class Encoders:
+    """How one viewer's pictures are encoded; video streams remember what came before."""
+
+    def __init__(self) -> None:
+        self._streams: dict[tuple[int, str], VideoStream] = {}
+
+    def encode(self, image: Picture, eye: int, mode: str, look: Look, key: bool) -> tuple[dict[str, Any], bytes]:
+        """The part's description, and its data."""
+        part: dict[str, Any] = {"kind": "image", "eye": eye, "mode": mode, "codec": look.codec}
+        if look.codec == "jpeg":
+            data = to_jpeg(image, look.quality)
+        else:
+            stream = self._streams.setdefault((eye, mode), VideoStream())
+            data, part["key"] = stream.encode(image, look.codec, key)
+            part["codec_string"] = STRINGS[look.codec]
+        return part | {"bytes": len(data)}, data
+
+
+def frame_message(
+    look: Look, ask: Ask, rendered: Rendered, info: FrameInfo, encoders: Encoders
+) -> tuple[bytes, dict[str, float]]:
     """The message, and the milliseconds of every stage."""
     start = time.perf_counter()
     parts, data = [], []
     for eye, completed in enumerate(rendered.completed):
         for mode in look.modes:
-            data.append(to_jpeg(picture(completed, mode), look.quality))
-            parts.append({"kind": "image", "eye": eye, "mode": mode, "codec": "jpeg", "bytes": len(data[-1])})
+            part, encoded = encoders.encode(picture(completed, mode), eye, mode, look, info.key)
+            parts.append(part)
+            data.append(encoded)
         if look.depth:
             part, packed = _depth_part(eye, completed)
             parts.append(part)

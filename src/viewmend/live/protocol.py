@@ -58,6 +58,8 @@ class Look:
     adaptive: bool = True
     depth: bool = False
     codec: str = "jpeg"
+    key: bool = False
+    """Begin video streams anew: the decoder has lost them."""
     quality: int = 85
 
 
@@ -143,6 +145,7 @@ def parse_look(given: Fields, limits: Limits) -> Look:
         adaptive=given.flag("adaptive", True),
         depth=given.flag("depth", False),
         codec=given.choice("codec", CODECS, "jpeg"),
+        key=given.flag("key", False),
         quality=given.whole("quality", 30, 95, 85),
     )
 

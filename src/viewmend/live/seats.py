@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from viewmend.live.budget import FULL, Budget, FrameMs, Level
 from viewmend.live.clock import Clock, Span
-from viewmend.live.packing import FrameInfo, frame_message
+from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
 from viewmend.live.protocol import ClockChange, Look
 from viewmend.live.renderer import Ask, Rendered
@@ -98,12 +98,14 @@ class ViewerSeat:
         self._shown: tuple[Look | None, int] = (None, -1)
         self._full = False
         self._level, self._wait_ms = FULL, 0.0
+        self._encoders, self._wants_key = Encoders(), False
 
     def look(self, look: Look) -> None:
         """What to show from now on; one that was not shown yet is dropped."""
         if self._look is not self._shown[0]:
             self.dropped += 1
         self._look, self._look_at = look, time.monotonic()
+        self._wants_key = self._wants_key or look.key
 
     def change(self, change: ClockChange, span: Span) -> None:
         """Play, pause, seek, speed, edge."""
@@ -122,7 +124,7 @@ class ViewerSeat:
         self.buffering = False
         if look is None or at < 0 or self.in_flight is not None:
             return None
-        fresh = (look, at) != self._shown
+        fresh = look is not self._shown[0] or at != self._shown[1]  # asked again in the same words is asked again
         rests = not look.moving and not (self.clock.playing and scene.span.fps > 0)
         if not fresh and (self._full or not rests or now - self._look_at < REFINE_S):
             return None
@@ -158,8 +160,10 @@ class ViewerSeat:
         look = self._shown[0]
         assert look is not None, "views are rendered for those who look"
         self.viewer = rendered.viewer
-        info = FrameInfo(next(self._numbers), self._full, max(0.0, self._wait_ms), self.dropped)
-        message, stage_ms = frame_message(look, ask, rendered, info)
+        # Once for each look that asks; a look that is dropped leaves its wish to the next.
+        key, self._wants_key = self._wants_key, False
+        info = FrameInfo(next(self._numbers), self._full, max(0.0, self._wait_ms), self.dropped, key)
+        message, stage_ms = frame_message(look, ask, rendered, info, self._encoders)
         now = time.monotonic()
         self.recent.append(Shown(now, stage_ms, len(message), rendered.geometry_ms == 0))
         if self.budget is not None:

@@ -25,6 +25,7 @@ from viewmend.live.protocol import Limits
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import Pushed
 from viewmend.live.service import RenderService
+from viewmend.live.video import video_codecs
 
 PICTURE_S = 60.0
 EXPORT_S = 3600.0
@@ -60,7 +61,7 @@ class LiveServer:
         about = {
             "server": f"viewmend {self._version}",
             "model": config.model,
-            "codecs": ["jpeg"],
+            "codecs": ["jpeg", *video_codecs()],
             "export": can_export(),
             "token_needed": bool(config.token),
         }
