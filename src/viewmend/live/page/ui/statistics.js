@@ -96,7 +96,8 @@ export class Statistics {
   #show() {
     if (!this.header) return;
     const median = quantile(this.latencies, 0.5);
-    byId("readout").textContent = `${this.pictures.perSecond.toFixed(0)} fps${median > 0 ? ` · ${median.toFixed(0)} ms` : ""}`;
+    const fps = Math.round(this.pictures.perSecond);
+    byId("readout").textContent = [...(fps ? [`${fps} fps`] : []), ...(median > 0 ? [`${median.toFixed(0)} ms`] : [])].join(" · ");
     if (!byId("section-stats").offsetParent) return;
     const { figures, header, server } = this;
     const put = (/** @type {string} */ name, /** @type {string} */ value, unit = "") => {
