@@ -64,6 +64,9 @@ def run(options: Options) -> int:
         import uvicorn  # noqa: F401
     except ImportError:
         raise ValueError("viewmend serve needs its extra; run: pip install 'viewmend[live]'") from None
+    import os
+
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
     from viewmend.cli.console import say
     from viewmend.cli.mending import load_named
     from viewmend.live.listener import Server

@@ -1,0 +1,106 @@
+"""Turns: everybody is served, whatever the others do."""
+
+from collections import Counter
+
+import pytest
+import torch
+from reference.ball import ring
+
+from viewmend.inpainting.protocol import State
+from viewmend.live.clock import Span
+from viewmend.live.frames import Rig, SourceStatus
+from viewmend.live.poses import rig_frame, view_camera
+from viewmend.live.protocol import Camera
+from viewmend.live.renderer import Ask, Rendered, Renderer
+from viewmend.live.service import RenderService
+from viewmend.stream import Effort, Viewer
+
+FRAME = rig_frame(ring(4), torch.zeros(3), None)
+CAMERA = view_camera(Camera(), FRAME, (16, 16))
+
+
+class Supply:
+    """Ten frames that are all there."""
+
+    changed = staticmethod(lambda: None)
+    status, rig, span = SourceStatus("ready"), Rig("x", None, None), Span(0, 10, 10, 10.0)
+
+    def read(self, time):
+        return object()
+
+    def start(self):
+        pass
+
+    stop = start
+
+
+class Drawing(Renderer):
+    """A renderer that renders nothing, and fails for one wish."""
+
+    def __init__(self):
+        self.frame = FRAME
+
+    def is_of(self, rig):
+        return True
+
+    def render(self, ask, viewer):
+        if ask.effort.top_k == 13:
+            raise RuntimeError("bad luck")
+        return Rendered(ask.time, (), Viewer(State()), 0.0, 0.0, 0.0, 0.0)
+
+
+class Eager:
+    """Always wants a view."""
+
+    viewer = None
+
+    def __init__(self, name, log, top_k=None, bad=False):
+        self.name, self.log, self.top_k, self.bad = name, log, top_k, bad
+        self.failures = []
+
+    def due(self, now, scene):
+        if self.bad:
+            raise KeyError("mine")
+        return Ask(0, (CAMERA,), Effort(top_k=self.top_k))
+
+    def show(self, ask, rendered):
+        self.log.append(self.name)
+
+    def fail(self, message):
+        self.failures.append(message)
+
+
+@pytest.fixture
+def service():
+    return RenderService(Drawing(), Supply())
+
+
+def test_all_take_turns(service):
+    log = []
+    for name in "abc":
+        service.join(Eager(name, log))
+    for turn in range(9):
+        if turn == 4:
+            service.join(Eager("d", log))
+        assert service._turn()
+    assert max(Counter(log).values()) - min(Counter(log[4:]).values()) <= 2 and log[:3] == ["a", "b", "c"]
+
+
+def test_who_fails_is_told_and_stops_nobody(service):
+    log = []
+    unlucky, odd = Eager("unlucky", log, top_k=13), Eager("odd", log, bad=True)
+    for seat in (odd, unlucky, Eager("a", log)):
+        service.join(seat)
+    for _ in range(6):
+        service._turn()
+    assert log == ["a"] * 3 and unlucky.failures == ["RuntimeError: bad luck"] * 3 and len(odd.failures) >= 3
+    assert service.counts["errors"] == 3 and service.counts["frames"] == 3
+
+
+def test_who_left_is_served_no_more(service):
+    log = []
+    seat = Eager("a", log)
+    service.join(seat)
+    service.leave(seat)
+    service.leave(seat)
+    assert not service._turn() and log == []
