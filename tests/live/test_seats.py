@@ -10,7 +10,7 @@ from viewmend.live.clock import Span
 from viewmend.live.poses import rig_frame
 from viewmend.live.protocol import ClockChange, Look, unpack
 from viewmend.live.renderer import Rendered
-from viewmend.live.seats import MOVING, REFINE_S, Scene, ViewerSeat
+from viewmend.live.seats import MOVING, REFINEMENTS, Scene, ViewerSeat
 from viewmend.stream import Viewer
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
@@ -97,16 +97,20 @@ def test_a_moving_view_is_small_and_a_still_one_full():
     assert desk.size(desk.due()) == (200, 100)
 
 
-def test_a_still_view_is_refined_once():
+def test_a_still_view_is_refined_in_two_steps():
     desk = Desk(budget_ms=50.0)
     desk.pause()
     desk.look(id=1, scale=0.5, top_k=100)
     first = desk.due()
     assert desk.size(first)[0] < 160 and first.effort.top_k == 100
-    assert desk.due(REFINE_S / 2) is None
-    better = desk.due(REFINE_S)
-    assert desk.size(better) == (160, 160) and better.effort.context_times == FULL.context_times
-    assert better.effort.top_k == 100 and desk.due(1.0) is None
+    (soon, sharp), (later, _) = REFINEMENTS
+    assert desk.due(soon / 2) is None
+    better = desk.due(soon)
+    assert desk.size(better) == (160, 160) and better.effort.context_times == sharp.context_times == 0
+    assert not desk.seat._full and desk.due(0.1) is None
+    best = desk.due(later)
+    assert best.effort.context_times == FULL.context_times and desk.seat._full
+    assert best.effort.top_k == 100 and desk.due(1.0) is None
 
 
 def test_budgets_are_shared_among_a_crowd():

@@ -15,8 +15,9 @@ from viewmend.live.protocol import ClockChange, Look
 from viewmend.live.renderer import Ask, Rendered
 from viewmend.stream import Effort, Viewer
 
-REFINE_S = 0.25
-"""A view that has been still for so long is rendered with all that the model can do."""
+REFINEMENTS = ((0.25, Level(1.0, 0, None)), (0.8, FULL))
+"""What a view is rendered with once it has been still for so many seconds: sharp first, since who moves on waits for what
+is being rendered; then with all that the model can do."""
 MOVING = Level(0.5, 0, 256)
 """What a moving view is made with where no budget says."""
 
@@ -126,18 +127,25 @@ class ViewerSeat:
             return None
         fresh = look is not self._shown[0] or at != self._shown[1]  # asked again in the same words is asked again
         rests = not look.moving and not (self.clock.playing and scene.span.fps > 0)
-        if not fresh and (self._full or not rests or now - self._look_at < REFINE_S):
+        level = self._choose(look, scene.crowd) if fresh else self._better(now - self._look_at) if rests else None
+        if level is None:
             return None
         if not scene.present(at):
             self.buffering = True
             return None
         if fresh and look is self._shown[0]:
             self.dropped += max(0, at - self._shown[1] - 1) if self.clock.playing else 0
-        self._level = self._choose(look, scene.crowd) if fresh else FULL
-        self._full = self._level == FULL
+        self._level, self._full = level, level == FULL
         self._wait_ms = 1000 * (now - self._look_at) if look is not self._shown[0] else 0.0
         self._shown = (look, at)
         return self._ask(look, at, scene.frame)
+
+    def _better(self, still_s: float) -> Level | None:
+        """What to render a view again with that has been still for so long; None for what it was rendered with."""
+        if self._full:
+            return None
+        due = [level for after_s, level in REFINEMENTS if still_s >= after_s and level.filling > self._level.filling]
+        return due[-1] if due else None
 
     def _choose(self, look: Look, crowd: int) -> Level:
         if self.budget is not None and self._budget_ms is not None:
