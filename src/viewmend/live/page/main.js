@@ -55,6 +55,13 @@ class Page {
     this.paths = new PathPanel({ motion, transport, notices, settings, token, wake: () => this.wake() });
     buildModes(settings);
     this.controls = buildControls(settings, motion, () => this.wake());
+    this.tools = buildTools({
+      settings,
+      notices,
+      reset: () => this.reset(),
+      shot: () => screenshot(this.canvas, () => this.paint(), `viewmend-${String(transport.shown).padStart(4, "0")}.png`, notices),
+      headset: () => this.headset.enter(motion.rig, motion.pose),
+    });
     this.keys = new Keys(motion, this.actions(), () => this.wake());
     listenToGestures(this.canvas, motion, () => this.viewer().lens.fx, () => this.wake());
     settings.addEventListener("change", () => this.wake());
@@ -63,10 +70,9 @@ class Page {
 
   /** What keys and tools do. @returns {Record<string, () => void>} */
   actions() {
-    const { settings, transport } = this;
+    const { settings, transport, tools } = this;
     const flip = (/** @type {"rig" | "reproject" | "panel"} */ name) => () => settings.set(name, !settings.get(name));
     const modes = Object.keys(MODES).map((mode, index) => [`Digit${index + 1}`, () => settings.set("mode", mode)]);
-    const { tools } = this;
     return {
       ...Object.fromEntries(modes),
       KeyR: () => this.reset(), Home: () => this.reset(),
@@ -78,18 +84,6 @@ class Page {
       Comma: () => transport.step(-1), Period: () => transport.step(1),
       BracketLeft: () => transport.faster(-1), BracketRight: () => transport.faster(1),
     };
-  }
-
-  /** Built on first use: keys and buttons share them. */
-  get tools() {
-    this.builtTools ??= buildTools({
-      settings: this.settings,
-      reset: () => this.reset(),
-      shot: () => screenshot(this.canvas, () => this.paint(), `viewmend-${String(this.transport.shown).padStart(4, "0")}.png`, this.notices),
-      headset: () => this.headset.enter(this.motion.rig, this.motion.pose),
-      notices: this.notices,
-    });
-    return this.builtTools;
   }
 
   reset() {

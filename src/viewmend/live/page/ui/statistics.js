@@ -51,13 +51,15 @@ export class Statistics {
     this.header = null;
     this.answered = 0;
     this.bytes = 0;
+    /** @type {Record<string, HTMLElement>} */
+    this.figures = {};
+    /** @type {Record<string, HTMLElement>} */
+    this.stages = {};
     this.#build();
     setInterval(() => this.#show(), 500);
   }
 
   #build() {
-    /** @type {Record<string, HTMLElement>} */
-    this.figures = {};
     for (const [name, text] of [
       ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "pose to pixel"],
       ["holes", "holes"], ["size", "picture"], ["kb", "a frame"],
@@ -67,8 +69,6 @@ export class Statistics {
       this.figures[name] = value;
       byId("figures").append(element("div", {}, element("dt", { textContent: text }), value));
     }
-    /** @type {Record<string, HTMLElement>} */
-    this.stages = {};
     for (const [name, [text, colour]] of Object.entries({ ...STAGES, total: ["Total", ""] })) {
       const value = element("output", { textContent: "–" });
       const swatch = element("i");
