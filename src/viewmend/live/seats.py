@@ -16,8 +16,8 @@ from viewmend.live.renderer import Ask, Rendered
 from viewmend.stream import Effort, Viewer
 
 REFINEMENTS = ((0.25, Level(1.0, 0, None)), (0.8, FULL))
-"""What a view is rendered with once it has been still for so many seconds: sharp first, since who moves on waits for what
-is being rendered; then with all that the model can do."""
+"""What a view is rendered with once it has been still for so many seconds: sharp first, since whoever moves on waits
+for it; then with all that the model can do."""
 MOVING = Level(0.5, 0, 256)
 """What a moving view is made with where no budget says."""
 
