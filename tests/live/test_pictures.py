@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from viewmend.live.pictures import COLOURS, pack_depth, picture, to_jpeg, unpack_depth
+from viewmend.live.pictures import COLOURS, depth_stride, pack_depth, picture, to_jpeg, unpack_depth
 
 
 def test_every_mode_shows_what_it_says(ball_view):
@@ -28,21 +28,28 @@ def test_jpeg_comes_back(ball_view, quality):
     assert np.abs(back.astype(int) - image).mean() < 5
 
 
+def test_small_pictures_have_fine_depth():
+    assert [depth_stride(*size) for size in ((100, 160), (320, 200), (400, 401))] == [1, 2, 4]
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
 @pytest.mark.parametrize("size", [(48, 48), (47, 50), (3, 2)])
-def test_depth_comes_back_where_it_was_taken(size):
+def test_depth_comes_back_where_it_was_taken(size, stride):
     rows, columns = torch.meshgrid(torch.arange(size[0]), torch.arange(size[1]), indexing="ij")
     depth = 1.5 + rows / 100 + columns / 37
     depth[rows < columns / 2] = 0
-    packed = pack_depth(depth)
+    packed = pack_depth(depth, stride)
     back = unpack_depth(packed)
     expected = np.zeros((packed.height, packed.width))
     for i in range(packed.height):
         for j in range(packed.width):
-            expected[i, j] = depth[min(4 * i + 2, size[0] - 1), min(4 * j + 2, size[1] - 1)]
+            expected[i, j] = depth[
+                min(stride * i + stride // 2, size[0] - 1), min(stride * j + stride // 2, size[1] - 1)
+            ]
     assert back.shape == expected.shape and np.abs(back - expected).max() < 1e-4
 
 
 def test_depth_of_nothing_is_nothing():
-    assert (unpack_depth(pack_depth(torch.zeros(20, 20))) == 0).all()
-    flat = unpack_depth(pack_depth(torch.full((20, 20), 2.0)))
+    assert (unpack_depth(pack_depth(torch.zeros(20, 20), 4)) == 0).all()
+    flat = unpack_depth(pack_depth(torch.full((20, 20), 2.0), 4))
     assert np.allclose(flat, 2.0, atol=1e-4)

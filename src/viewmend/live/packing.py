@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from viewmend.live.pictures import COLOURS, DEPTH_STRIDE, Picture, pack_depth, picture, to_jpeg
+from viewmend.live.pictures import COLOURS, Picture, depth_stride, pack_depth, picture, to_jpeg
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import Look, pack
 from viewmend.live.renderer import Ask, Rendered
@@ -94,7 +94,8 @@ def hole_fraction(completed: CompletedView) -> float:
 
 
 def _depth_part(eye: int, completed: CompletedView) -> tuple[dict[str, Any], bytes]:
-    packed = pack_depth(completed.view.depth)
+    stride = depth_stride(*completed.view.depth.shape)
+    packed = pack_depth(completed.view.depth, stride)
     part = {
         "kind": "depth",
         "eye": eye,
@@ -102,7 +103,7 @@ def _depth_part(eye: int, completed: CompletedView) -> tuple[dict[str, Any], byt
         "encoding": "u16-delta-zlib",
         "width": packed.width,
         "height": packed.height,
-        "stride": DEPTH_STRIDE,
+        "stride": stride,
         "near_m": packed.near_m,
         "far_m": packed.far_m,
     }

@@ -15,7 +15,10 @@ HOLE = (1.0, 0.15, 0.55)
 """What marks missing pixels: no cloth nor skin is of that pink."""
 COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
 """Of the first, second, ... chosen camera in `coverage`."""
-DEPTH_STRIDE = 4
+DEPTH_STRIDES = ((160, 1), (400, 2))
+"""Image pixels a depth pixel, both ways, for pictures whose longer side is at most so long;"""
+COARSEST_STRIDE = 4
+"""and for all others."""
 
 
 def picture(completed: CompletedView, mode: str) -> Picture:
@@ -85,7 +88,12 @@ class PackedDepth:
     far_m: float
 
 
-def pack_depth(depth: Float[Tensor, "height width"], stride: int = DEPTH_STRIDE) -> PackedDepth:
+def depth_stride(height: int, width: int) -> int:
+    """Image pixels a depth pixel, both ways: small pictures need fine depth, or their outlines are ragged."""
+    return next((stride for longest, stride in DEPTH_STRIDES if max(height, width) <= longest), COARSEST_STRIDE)
+
+
+def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth:
     """Every so manieth pixel: inverse depth in 16 bit, differences along rows, zlib."""
     height, width = depth.shape
     rows = (torch.arange(-(-height // stride)) * stride + stride // 2).clamp(max=height - 1)
