@@ -70,3 +70,18 @@ def test_what_cannot_be_is_one_clear_error(arguments, said, tmp_path, monkeypatc
     assert main(arguments) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and said in lines[0], lines
+
+
+@pytest.mark.slow
+def test_an_ablation_trains_evaluates_and_goes_on(tmp_path, capsys):
+    command = ["ablation", "--out", str(tmp_path), "--variants", "no-rope", "--seeds", "1", "--samples", "4"]
+    command += ["--steps", "1", "--scenes", "1", "--frames", "1", "--size", "128", "--jobs", "1"]
+    assert main(command) == 0
+    first = capsys.readouterr().out
+    assert "| no-rope |" in first and "| 64 |" in first and "| all |" in first
+    assert {p.name for p in tmp_path.iterdir()} >= {"ablation.md", "ablation.json", "ablation.svg", "models", "samples"}
+    assert load_inpainter(tmp_path / "models/no-rope-s0").config.rope is False
+    assert load_inpainter(tmp_path / "models/full-s0-k64").config.top_k == 64
+    (tmp_path / "ablation.md").unlink()
+    assert main(command) == 0
+    assert capsys.readouterr().out == first
