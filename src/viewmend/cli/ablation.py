@@ -109,17 +109,15 @@ def _make_samples(options: Options, recipe: "Recipe") -> None:
 
 def _train(options: Options, recipes: "dict[str, Recipe]") -> "list[Trained]":
     """Train what is not trained yet; the full models come with one folder more for each top-k."""
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
     from viewmend.cli.console import track
     from viewmend.evaluation.ablation_report import Trained
+    from viewmend.evaluation.runner import process_pool
 
     jobs = [
         (replace(recipe, data=replace(recipe.data, shards=options.out / "samples")), options.out / "models" / name)
         for name, recipe in recipes.items()
     ]
-    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
+    with process_pool(options.jobs, threads=1) as pool:
         for _ in track(pool.map(_train_one, jobs), "training", len(jobs)):
             pass
     trained = [Trained(recipe.name, recipe.seed, folder) for recipe, folder in jobs]
@@ -132,11 +130,8 @@ def _train(options: Options, recipes: "dict[str, Recipe]") -> "list[Trained]":
 
 
 def _train_one(job: "tuple[Recipe, Path]") -> None:
-    import torch
-
     from viewmend.training.loop import train
 
-    torch.set_num_threads(1)
     train(*job)
 
 

@@ -83,7 +83,7 @@ def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) 
         return
     left = list(tasks)
     try:
-        with _pool(jobs, threads) as pool:
+        with process_pool(jobs, threads) as pool:
             futures = {pool.submit(evaluate_scene, t.scene, t.methods, settings): t for t in tasks}
             try:
                 for future in as_completed(futures):
@@ -98,7 +98,7 @@ def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) 
 
 
 def _alone(task: Task, settings: RunSettings, threads: int) -> SceneRun:
-    with _pool(1, threads) as pool:
+    with process_pool(1, threads) as pool:
         try:
             return _result(pool.submit(evaluate_scene, task.scene, task.methods, settings))
         except BrokenProcessPool as error:
@@ -110,7 +110,8 @@ def _result(future: Future[SceneRun]) -> SceneRun:
     return future.result()
 
 
-def _pool(jobs: int, threads: int) -> ProcessPoolExecutor:
+def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
+    """So many worker processes, each with so many threads, that end when this process does, however it does."""
     # Not forked: threads of torch and numba do not survive that.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(jobs, context, _begin, (threads,))
