@@ -24,16 +24,20 @@ def small(data: DataPlan) -> Recipe:
 
 
 def small_rays(data: DataPlan) -> Recipe:
-    """The small model's ray reader: it learns ten times as fast, alone."""
+    """The small model's ray reader: it learns ten times as fast, alone. Thin holes of dense rigs count, too."""
+    dense = replace(data, context=False, cameras=(6, 20), min_hole_px=15, imperfect_share=0.7)
     return replace(
         small(data),
         name="small_rays",
-        data=_for(small_model(), replace(data, context=False)),
+        data=_for(small_model(), dense, sizes_px=(224, 320, 416)),
         part="rays",
         loss=LossWeights(log_error=2.0),
         steps=6000,
+        minutes=60.0,
         batch=16,
-        learning_rate=3e-3,
+        fresh=4,
+        buffer=220,
+        learning_rate=2e-3,
         ema=0.998,
     )
 
