@@ -108,7 +108,7 @@ def plots(ablation: Ablation) -> str:
     known = [(ms, db, name) for ms, db, name in points if ms is not None and db is not None]
     if known:
         parts += _curve(known, 600, 50, 300, rows - 110)
-    size = f'width="960" height="{rows}" viewBox="0 0 960 {rows}"'
+    size = f'width="1100" height="{rows}" viewBox="0 0 1100 {rows}"'
     body = "\n".join(parts)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="14">\n'
@@ -174,7 +174,7 @@ def _curve(points: Sequence[tuple[float, float, str]], left: int, top: int, widt
     wide, tall = max(ms) - min(ms) or 1, max(db) - min(db) or 1
     at = [(left + width * (m - min(ms)) / wide, top + height * (max(db) - d) / tall) for m, d, _ in points]
     parts = [
-        _text(left, 24, f"full by top-k: dB ({min(db):.2f} to {max(db):.2f}) over ms ({min(ms):.0f} to {max(ms):.0f})")
+        _text(left, 24, f"dB of full by top-k ({min(db):.2f} to {max(db):.2f}), ms ({min(ms):.0f} to {max(ms):.0f})")
     ]
     parts.append(_path(at, "#36c"))
     for (x, y), (_, _, name) in zip(at, points, strict=True):
