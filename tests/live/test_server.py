@@ -93,7 +93,7 @@ def test_a_viewer_sees_what_it_asks_for_and_when(ball):
         right = truth(ball.service.renderer.frame, (64, 64), azimuth=200.0)
         errors = {mode: np.abs(image - right.astype(float)).mean() for (_, mode), image in shown.images.items()}
         assert errors["mended"] < 12 and errors["mended"] < errors["rendered"]
-        assert shown.depth[0].shape == (16, 16) and 1.4 < shown.depth[0][8, 8] < 1.6
+        assert shown.depth[0].shape == (64, 64) and 1.4 < shown.depth[0][32, 32] < 1.6
         assert 0 < shown.latency_ms < 20_000
         state = viewer.wait_for("state")
         assert state["playing"] is False and state["time"] == 0 and state["total"] == 3
