@@ -141,7 +141,30 @@ def _area(image: UInt8[Tensor, "channel height width"], width: int, height: int)
     return torch.from_numpy(small).reshape(height, width, -1).movedim(-1, 0)
 
 
-class ReadAhead:
+class Supply:
+    """What all supplies say of themselves."""
+
+    _status: SourceStatus
+    _rig: Rig | None
+    _span: Span
+
+    @property
+    def status(self) -> SourceStatus:
+        """How the source is."""
+        return self._status
+
+    @property
+    def rig(self) -> Rig | None:
+        """What is known of the cameras; None before the source is open."""
+        return self._rig
+
+    @property
+    def span(self) -> Span:
+        """The times that can be asked for."""
+        return self._span
+
+
+class ReadAhead(Supply):
     """A recording: what is asked for and the frames after it are read first, then the rest while there is room.
 
     `made` is for sources whose frames are made one after the other (the studio): only those can be asked for that are
@@ -165,21 +188,6 @@ class ReadAhead:
         self._rig: Rig | None = None
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
-
-    @property
-    def status(self) -> SourceStatus:
-        """How the source is."""
-        return self._status
-
-    @property
-    def rig(self) -> Rig | None:
-        """What is known of the cameras; None before the source is open."""
-        return self._rig
-
-    @property
-    def span(self) -> Span:
-        """The times that can be asked for."""
-        return self._span
 
     def start(self) -> None:
         """Open the source and read ahead."""

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.live.clock import Span
-from viewmend.live.frames import FrameStore, Rig, SourceStatus
+from viewmend.live.frames import FrameStore, Rig, SourceStatus, Supply
 from viewmend.views import MultiViewFrame
 
 
-class Pushed:
+class Pushed(Supply):
     """A live rig: frames as they are pushed, numbered as they come; the oldest are forgotten."""
 
     def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
@@ -24,21 +24,6 @@ class Pushed:
         self._status = SourceStatus(error="waiting for a rig to push frames")
         self._rig: Rig | None = None
         self._span = Span(live=True, fps=fps or 15.0)
-
-    @property
-    def status(self) -> SourceStatus:
-        """How the source is."""
-        return self._status
-
-    @property
-    def rig(self) -> Rig | None:
-        """What is known of the cameras; None before the source is open."""
-        return self._rig
-
-    @property
-    def span(self) -> Span:
-        """The times that can be asked for."""
-        return self._span
 
     def start(self) -> None:
         """Nothing to do: frames come by themselves."""

@@ -29,7 +29,7 @@ class Features(nn.Module):
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
         self.taps = TAPS[backbone]
-        self.features = _alexnet() if backbone == "alex" else _vgg16()
+        self.features = _alexnet() if backbone == "alex" else vgg16_layers()
 
     def forward(self, rgb: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _channel _rows _cols"]]:
         """Features of images in [0, 1], with channels of length 1."""
@@ -122,7 +122,8 @@ def _alexnet() -> nn.Sequential:
     )
 
 
-def _vgg16() -> nn.Sequential:
+def vgg16_layers() -> nn.Sequential:
+    """The convolutions of VGG16 (Simonyan & Zisserman 2015) with what is between them, as torchvision numbers them."""
     layers: list[nn.Module] = []
     before = 3
     for block, channels in enumerate(CHANNELS["vgg"]):

@@ -4,28 +4,24 @@ The network is torchvision's `vgg16`, its weights a file that the user has: none
 them there is no such term.
 """
 
-import pickle
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
 from viewmend.inpainting.patches import crop
+from viewmend.metrics.lpips import DEVIATION, MEAN, vgg16_layers
+from viewmend.metrics.weights import WeightsError, load_tensors
 
-BLOCKS = ((3, 64, 64), (64, 128, 128), (128, 256, 256, 256), (256, 512, 512, 512), (512, 512, 512, 512))
-"""Channels before and after each 3 x 3 convolution of VGG16's five blocks; a pooling follows each block."""
 SEEN_BLOCKS = 4
 """Features are taken after the last ReLU of the first blocks: relu1_2, relu2_2, relu3_3, relu4_3."""
+SEEN_LAYERS = 23
+"""Up to there."""
 CLASSIFIER = {0: (4096, 25088), 3: (4096, 4096), 6: (1000, 4096)}
 """Linear layers that a whole file has and nobody here needs."""
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's, of RGB in [0, 1]."""
 MARGIN_PX = 32
 """How much of a hole's surroundings the network is shown."""
 CELL_PX = 2 ** (SEEN_BLOCKS - 1)
@@ -47,12 +43,7 @@ class Vgg16(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        for channels in BLOCKS[:SEEN_BLOCKS]:
-            for before, after in pairwise(channels):
-                layers += [nn.Conv2d(before, after, 3, 1, 1), nn.ReLU()]
-            layers.append(nn.MaxPool2d(2))
-        self.features = nn.Sequential(*layers[:-1])
+        self.features = nn.Sequential(*list(vgg16_layers())[:SEEN_LAYERS])
 
     def forward(self, rgb: Float[Tensor, "3 height width"]) -> list[Float[Tensor, "_channel _rows _cols"]]:
         """Features of an image in [0, 1] at 1/1, 1/2, 1/4 and 1/8 of its size."""
@@ -138,13 +129,9 @@ def _around(E: Tensor) -> tuple[int, int, tuple[int, int]]:
 
 def _shapes() -> dict[str, tuple[int, ...]]:
     """The keys and shapes of a whole file of torchvision's."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    place = 0
-    for channels in BLOCKS:
-        for before, after in pairwise(channels):
-            shapes |= {f"features.{place}.weight": (after, before, 3, 3), f"features.{place}.bias": (after,)}
-            place += 2  # its ReLU
-        place += 1  # the pooling
+    with torch.device("meta"):
+        layers = vgg16_layers().state_dict()
+    shapes = {f"features.{key}": tuple(layer.shape) for key, layer in layers.items()}
     for number, shape in CLASSIFIER.items():
         shapes |= {f"classifier.{number}.weight": shape, f"classifier.{number}.bias": shape[:1]}
     return shapes
@@ -155,16 +142,6 @@ def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise PerceptualWeightsError(f"expected the weights of torchvision's vgg16 at {path}, got no such file; {NEXT}")
     try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, EOFError, RuntimeError, SafetensorError, pickle.UnpicklingError) as error:
-        raise PerceptualWeightsError(
-            f"{path}: expected a .safetensors file or a state dict that torch saved, got {path.stat().st_size} bytes "
-            f"that do not read ({type(error).__name__}); {NEXT}"
-        ) from error
-    if not isinstance(weights, dict) or not all(isinstance(w, Tensor) for w in weights.values()):
-        raise PerceptualWeightsError(
-            f"{path}: expected a state dict, tensors by name, got {type(weights).__name__} of other things; {NEXT}"
-        )
-    return weights
+        return load_tensors(path)
+    except WeightsError as error:
+        raise PerceptualWeightsError(f"{error}; {NEXT}") from error
