@@ -20,7 +20,7 @@ from viewmend.training.sample_files import (
     sample_to_bytes,
     write_shards,
 )
-from viewmend.training.samples import LeaveOneOut
+from viewmend.training.samples import LeaveOneOut, widened
 from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, StudioScenes, random_stage
 from viewmend.training.sources import scene_source
 
@@ -95,6 +95,31 @@ def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
     for one, other in zip(feed.batch(3, 2), again.batch(3, 2), strict=True):
         assert same(one, other)
     assert feed.position == again.position
+
+
+def test_widened_holes_reach_so_far_and_stay_on_the_subject(plan):
+    view = StudioScenes(plan, "0").scene(0)[0].view
+    wider = widened(view, 2)
+    missing = torch.nonzero(view.error > 0)
+    for row, column in torch.nonzero(view.mask >= 0).tolist():
+        reach = int((missing - torch.tensor([row, column])).abs().amax(1).min())
+        widens = 0 < reach <= 2 and bool(view.mask[row, column] > 0)
+        assert bool(wider.error[row, column] > 0) == (widens or reach == 0)
+        if widens:
+            assert not wider.rgb[:, row, column].any() and not wider.weights[:, row, column].any()
+        elif reach:
+            assert torch.equal(wider.rgb[:, row, column], view.rgb[:, row, column])
+    assert int((wider.error > 0).sum()) > len(missing)
+    assert torch.equal(widened(view, 0).error, view.error)
+
+
+def test_dropped_cameras_are_missing_from_what_a_sample_sees(plan):
+    plan = replace(plan, cameras=(8, 8), rays=8, targets_per_camera=2)
+    whole, dropped = (StudioScenes(replace(plan, dropped_share=share), "0").scene(0) for share in (0.0, 1.0))
+    assert whole and dropped
+    assert {len(s.view.silhouettes.cameras) for s in whole} == {7}
+    assert {len(s.view.silhouettes.cameras) for s in dropped} <= {5, 6, 7}
+    assert min(len(s.view.silhouettes.cameras) for s in dropped) < 7
 
 
 class Empty:

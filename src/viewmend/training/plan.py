@@ -37,6 +37,10 @@ class DataPlan:
     """How many cameras near a view an inpainter that reads rays is given."""
     imperfect_share: float = 0.6
     """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
+    dropped_share: float = 0.0
+    """Share of the times at which one or two cameras have no frame."""
+    widened_share: float = 0.0
+    """Share of the views in which more is missing than the cameras could not see: holes are a few pixels wider."""
     min_hole_px: int = 50
     """Views that miss less are passed over."""
     hull_resolution: int = 96

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import HullConfig
@@ -78,15 +79,18 @@ class LeaveOneOut:
         render: RenderConfig,
         min_hole_px: int,
         cameras: tuple[int, int] = (0, 0),
+        widened_px: int = 0,
     ) -> Sample | None:
         """The pair at `time` with context from these `times`, its own first; None if fewer pixels are missing.
 
         truth: the held camera at `time`, one view.
         cameras: how many are context at least, and how many `nearby`.
+        widened_px: by how much its holes are larger than what the chosen cameras do not see.
         """
         view = render_view(self.frames[time], self.proxy(time), truth.cameras, render)
         if float(view.error.sum()) < min_hole_px:
             return None
+        view = widened(view, widened_px)
         wanted = view.around(max(len(view.chosen), cameras[0]))
         context = []
         for tau in times:
@@ -99,3 +103,12 @@ class LeaveOneOut:
         nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
         return Sample(view, tuple(context), nearby, black.round().to(torch.uint8))
+
+
+def widened(view: IncompleteView, reach_px: int) -> IncompleteView:
+    """The view with everything on the subject missing that is at most so far, along rows and columns, from a hole."""
+    side = 2 * reach_px + 1
+    near = F.max_pool2d((view.error[None, None] > 0).float(), side, 1, reach_px)[0, 0] > 0
+    missing = near & (view.mask > 0) if reach_px else torch.zeros_like(near)
+    kept = ~missing
+    return replace(view, rgb=view.rgb * kept, error=view.error.masked_fill(missing, 1.0), weights=view.weights * kept)

@@ -19,6 +19,11 @@ FIRST_VALIDATION_SEED = 9000
 FIRST_TEST_SEED = 10000
 """and from here on for tests and evaluation."""
 
+WIDEST_PX = 10
+"""By so much a hole is widened at most."""
+FEWEST_CAMERAS = 5
+"""A rig of so many never misses one."""
+
 Truth = Callable[[str, int], MultiViewFrame]
 """truth(name, time): what that camera, alone, should see at that time, with its mask."""
 
@@ -75,8 +80,8 @@ def random_stage(plan: DataPlan, random: Random, seeds: range = range(FIRST_VALI
             mask_holes=0.2 * strength,
             mask_blobs=0.2 * strength,
             mask_hard=flawed and random.random() < 0.6,
-            calibration_px=strength * random.random(),
-            calibration_m=0.003 * strength * random.random(),
+            calibration_px=1.5 * strength * random.random(),
+            calibration_m=0.005 * strength * random.random(),
             jpeg_quality=random.randint(70, 95) if flawed and random.random() < 0.5 else None,
         ),
         device=plan.device,
@@ -99,6 +104,7 @@ def rig_samples(
         plan: how many cameras and times, and how views are rendered.
         random: which.
     """
+    frames = _with_dropouts(frames, plan.dropped_share, random)
     times = sorted(frames)
     ends = [t for t in times if all(t - back in frames for back in range(plan.clip))]
     if not ends:
@@ -111,12 +117,25 @@ def rig_samples(
             reach = random.choice(plan.past)
             render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
             sample, cameras = None, (plan.least_context, plan.rays)
+            wider_px = random.randint(1, WIDEST_PX) if random.random() < plan.widened_share else 0
             for time in range(end - plan.clip + 1, end + 1):
                 past = [t for t in reversed(times) if t < time][:reach]
                 context = (time, *past) if plan.context else ()
                 least_px = plan.min_hole_px if time == end else 0
-                new = rig.sample(time, context, truth(held, time), render, least_px, cameras)
+                new = rig.sample(time, context, truth(held, time), render, least_px, cameras, wider_px)
                 sample = new and replace(new, previous=sample)
             if sample is not None:
                 samples.append(sample)
     return samples
+
+
+def _with_dropouts(frames: Mapping[int, MultiViewFrame], share: float, random: Random) -> Mapping[int, MultiViewFrame]:
+    """The frames, a share of them without one or two of their cameras."""
+    if not share:
+        return frames
+    found = {}
+    for time, frame in frames.items():
+        names = frame.cameras.names
+        count = min(random.randint(1, 2), len(names) - FEWEST_CAMERAS) if random.random() < share else 0
+        found[time] = frame.without(random.sample(names, count)) if count > 0 else frame
+    return found
