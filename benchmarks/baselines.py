@@ -5,20 +5,28 @@
 All have random weights: speed does not depend on them. Every method completes the same rendered view of a stream whose
 past is full: three frames just before it and three further back, which are remembered as in production. Geometry and
 rendering are not in the times.
+
+Each size is a run of its own, with ours and the fastest baseline in it; ratios are of one run. With --write, the file
+keeps the day's runs of other sizes and networks: a slow machine can be measured piece by piece. With --windows N, only
+N windows of a view are run, and the network's share of the time is multiplied up to all of them.
 """
 
 import argparse
 import json
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import date
 from itertools import product
+from typing import Any
 
 import torch
-from measure import summarise, synchronise, write
+from measure import RESULTS, summarise, synchronise, write
+from torch import Tensor
 
-from viewmend.baselines.clips import Sampling
-from viewmend.baselines.framing import window_canvas, windows_over
+from viewmend.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
+from viewmend.baselines.framing import Canvas, Window, window_canvas, windows_over
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
 from viewmend.baselines.published import NETWORKS
 from viewmend.capture.studio.rigs import orbit
@@ -34,6 +42,55 @@ SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13
 SIZES = ((320, 320), (512, 612), (1024, 1224))
 OURS = {"small": small, "base": base}
 FRAMINGS = ("def", "win", "mul")
+RIVAL = ("dstt", True, "def")
+"""In every run: the fastest baseline, as runs of all of them say."""
+
+
+class FewWindows(OnlineInpainter):
+    """A baseline that completes the first windows of a view alone, and says how much time all would have taken more."""
+
+    def __init__(self, network: OnlineNetwork, config: OnlineConfig, most: int) -> None:
+        super().__init__(Clocked(network), config)
+        self.most = most
+        self.left_out = 0.0
+        """Windows that were left out, for each one that was run."""
+
+    def unmeasured_s(self) -> float:
+        """What the windows that the last step left out would have taken in the network."""
+        assert isinstance(self.network, Clocked)
+        return self.left_out * self.network.take_s()
+
+    def _windows_with_holes(self, view: IncompleteView, canvas: Canvas) -> list[Window]:
+        windows = super()._windows_with_holes(view, canvas)
+        few = windows[: self.most]
+        self.left_out = (len(windows) - len(few)) / max(len(few), 1)
+        return few
+
+
+class Clocked:
+    """A network that counts the seconds it works."""
+
+    def __init__(self, network: OnlineNetwork) -> None:
+        self.network, self.seconds, self.check_size = network, 0.0, network.check_size
+
+    def complete_clip(self, clip: Clip) -> Tensor:
+        return self._timed(lambda: self.network.complete_clip(clip), clip.now.device.type)
+
+    def complete_remembering(self, now: Frames, memory: tuple[Any, ...]) -> tuple[Tensor, Any]:
+        return self._timed(lambda: self.network.complete_remembering(now, memory), now.device.type)
+
+    def take_s(self) -> float:
+        """Seconds since the last call."""
+        taken, self.seconds = self.seconds, 0.0
+        return taken
+
+    def _timed(self, work: Callable[[], Any], device: str) -> Any:
+        synchronise(device)
+        start = time.perf_counter()
+        found = work()
+        synchronise(device)
+        self.seconds += time.perf_counter() - start
+        return found
 
 
 def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Source]:
@@ -61,10 +118,12 @@ def ours(name: str, views: list[IncompleteView], source: Source, device: str, pr
     return inpainter, state
 
 
-def baseline(network: torch.nn.Module, memory: bool, framing: str, views: list[IncompleteView], source: Source):
+def baseline(name: str, memory: bool, framing: str, views: list[IncompleteView], source: Source, options):
     """The past of a baseline is one time's, as often as it is looked at: its values do not matter to its speed."""
+    torch.manual_seed(0)
+    network = NETWORKS[name]().to(options.device).eval()
     config = OnlineConfig(framing=framing, memory=memory, sampling=Sampling(step=STEP))  # pyright: ignore
-    inpainter = OnlineInpainter(network, config)  # pyright: ignore[reportArgumentType]
+    inpainter = FewWindows(network, config, options.windows)
     _, first = inpainter.step(replace(views[NOW], time=NOW - 1), source, inpainter.initial_state())
     times = config.sampling.times(NOW)
     assert len(times) == 6
@@ -78,15 +137,19 @@ def timed_steps(
 ) -> dict[str, float]:
     """Steps until the seconds are over; the first does not count, unless it took all of them."""
     taken: list[float] = []
-    while (sum(taken) < 1e3 * seconds and len(taken) < 30) or not taken:
+    end, few = time.perf_counter() + seconds, inpainter if isinstance(inpainter, FewWindows) else None
+    if few is not None:
+        few.unmeasured_s()  # the past's
+    while (time.perf_counter() < end and len(taken) < 30) or not taken:
         synchronise(device)
         start = time.perf_counter()
         inpainter.step(view, source, state)
         synchronise(device)
-        taken.append(1e3 * (time.perf_counter() - start))
+        step_s = time.perf_counter() - start
+        taken.append(1e3 * (step_s + (few.unmeasured_s() if few is not None else 0.0)))
     taken = taken[1:] or taken
-    summary = summarise(taken)
-    return {"fps": round(1e3 * len(taken) / sum(taken), 4), **summary, "runs": len(taken)}
+    found = {"fps": round(1e3 * len(taken) / sum(taken), 4), **summarise(taken), "runs": len(taken)}
+    return found if few is None or not few.left_out else {**found, "windows_run": few.most}
 
 
 def ratios(figures: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
@@ -117,7 +180,9 @@ def setting(view: IncompleteView) -> dict[str, object]:
 def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
     views, source = stage(size, options.device)
     figures: dict[str, dict[str, float]] = {}
-    result: dict[str, object] = {**setting(views[NOW]), "methods": figures}
+    load = round(os.getloadavg()[0], 1)
+    result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
+    wanted = [*product(options.networks, (False, True), options.framings)]
 
     def add(name: str, inpainter: ViewInpainter, state: State) -> None:
         figures[name] = timed_steps(inpainter, state, views[NOW], source, options.device, options.seconds)
@@ -127,12 +192,9 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
     with torch.inference_mode():
         for name in OURS:
             add(name, *ours(name, views, source, options.device, options.precision))
-        for name in options.networks:
-            torch.manual_seed(0)
-            network = NETWORKS[name]().to(options.device).eval()
-            for memory, framing in product((False, True), options.framings):
-                made = baseline(network, memory, framing, views, source)
-                add(f"{name}-{'om' if memory else 'o'}-{framing}", *made)
+        for network, memory, framing in dict.fromkeys((RIVAL, *wanted)):
+            made = baseline(network, memory, framing, views, source, options)
+            add(f"{network}-{'om' if memory else 'o'}-{framing}", *made)
     result["fps_of_ours_over"] = ratios(figures)
     done(result)
     return result
@@ -144,6 +206,7 @@ def main() -> None:
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="of ours")
     parser.add_argument("--networks", nargs="+", default=list(NETWORKS), choices=list(NETWORKS))
     parser.add_argument("--framings", nargs="+", default=list(FRAMINGS), choices=FRAMINGS)
+    parser.add_argument("--windows", type=int, default=1000, help="most windows of a view that are run")
     parser.add_argument("--seconds", type=float, default=20.0, help="for each method and size; one step at least")
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
     parser.add_argument(
@@ -161,13 +224,14 @@ def main() -> None:
         "past": "3 frames before, 3 further back",
         "window_px": OnlineConfig().size_px,
     }
-    results: dict[str, object] = {}
+    earlier = RESULTS / f"baselines--{options.device.split(':')[0]}--{date.today().isoformat()}.json"
+    results: dict[str, object] = json.loads(earlier.read_text())["results"] if earlier.exists() else {}
 
     for text in options.sizes:
         width, height = (int(side) for side in text.split("x"))
 
         def done(result: dict, text: str = text) -> None:
-            results[text] = result
+            results[f"{text}, {' '.join(options.networks)}"] = result
             if options.write:
                 write("baselines", options.device, config, results)
 

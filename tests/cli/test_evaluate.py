@@ -6,6 +6,7 @@ import json
 import pytest
 
 from viewmend import cli
+from viewmend.cli.evaluating import RunOptions, scenes_of
 from viewmend.metrics.weights import PLACES_VARIABLE
 
 QUICK = ("--frames", "1", "--scenes", "1", "--size", "128", "--methods", "nearest,unfilled")
@@ -34,6 +35,7 @@ def test_a_report_is_written_in_every_form_and_a_second_run_says_the_same(tmp_pa
     ("arguments", "said"),
     [
         (["P", "--scenes", "0"], "positive numbers, got --scenes 0"),
+        (["P", "--every", "0"], "positive numbers, got --every 0"),
         (["P", "--closest", "0"], "positive numbers, got --closest 0"),
         ([], "got no set"),
         (["Q"], "expected --performers DIR"),
@@ -47,6 +49,12 @@ def test_what_cannot_be_is_one_clear_error(tmp_path, capsys, arguments, said):
     assert cli.main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1
+
+
+def test_every_so_many_th_scene_shows_all_kinds(tmp_path):
+    found = scenes_of("P", RunOptions(out=tmp_path, every=5, frames=1, size=64))
+    assert len({(scene.rig, scene.style) for scene in found}) == len(found) == 6
+    assert [s.name for s in scenes_of("P", RunOptions(out=tmp_path, every=5, scenes=2))] == ["P-10000", "P-10005"]
 
 
 def test_results_do_not_go_into_a_file(tmp_path, capsys):

@@ -11,6 +11,7 @@ from viewmend.cli import main
 from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
 from viewmend.inpainting.config import small as small_model
 from viewmend.inpainting.inpainter import Inpainter
+from viewmend.training.sample_files import read_shard
 
 MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, rays=3)
 BRIEF = ("--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0")
@@ -44,10 +45,11 @@ def test_fine_tuning_on_a_capture_of_ones_own_goes_on_from_a_model(capture, mode
 def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
     shards = tmp_path / "shards"
     command = ["samples", "--recipe", "finetune", "--capture", str(capture), "--out", str(shards)]
-    assert main([*command, "--count", "3", "--workers", "0"]) == 0
+    assert main([*command, "--clip", "2", "--count", "3", "--workers", "0"]) == 0
     assert [path.name for path in shards.iterdir()] == ["shard-00000.tar"]
+    assert [len(sample.clip) for sample in read_shard(shards / "shard-00000.tar")] == [2, 2, 2]
     trained = ["train", "finetune", "--shards", str(shards), "--from", str(model), "--out", str(tmp_path / "out")]
-    assert main([*trained, *BRIEF]) == 0
+    assert main([*trained, "--bfloat16", "False", *BRIEF]) == 0
     assert load_inpainter(tmp_path / "out").config == MODEL
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from viewmend.evaluation.scene_run import RunSettings
     from viewmend.evaluation.scenes import EvaluationScene
 
-POSITIVE = ("frames", "scenes", "size", "jobs", "closest", "shown")
+POSITIVE = ("frames", "every", "scenes", "size", "jobs", "closest", "shown")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,8 +32,10 @@ class RunOptions:
     """How many of these colour a view: the closest to it."""
     frames: int | None = None
     """Of each scene, from the first. 10 for P and Q by default, all of a capture."""
+    every: int = 1
+    """Only every so many-th scene of each set, for a quick look at all its kinds;"""
     scenes: int | None = None
-    """Only the first so many of each set, for a quick look."""
+    """and of these only the first so many."""
     size: int = 512
     """Width and height of the views of P and Q."""
     ssim: Literal["gaussian", "uniform7", "uniform65"] = "gaussian"
@@ -124,14 +126,15 @@ def scenes_of(name: str, options: RunOptions) -> "list[EvaluationScene]":
     from viewmend.evaluation.scenes import FRAMES, performer_set, procedural_set
 
     frames = options.frames or FRAMES
+    part = slice(None, options.scenes and options.every * options.scenes, options.every)
     if name == "P":
-        return list(procedural_set(frames, options.size)[: options.scenes])
+        return list(procedural_set(frames, options.size)[part])
     if name == "Q":
         if options.performers is None:
             raise ValueError("expected --performers DIR for set Q, got none; P needs nothing")
-        return list(performer_set(options.performers, options.motions, frames, options.size)[: options.scenes])
-    inputs = [part.strip() for part in options.inputs.split(",") if part.strip()]
-    return [s for number in inputs for s in capture_set(Path(name), number, options.frames)[: options.scenes]]
+        return list(performer_set(options.performers, options.motions, frames, options.size)[part])
+    inputs = [number.strip() for number in options.inputs.split(",") if number.strip()]
+    return [s for number in inputs for s in capture_set(Path(name), number, options.frames)[part]]
 
 
 def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":

@@ -17,6 +17,8 @@ class Options:
     """How many samples."""
     recipe: str = "small"
     """Whose kind of samples."""
+    clip: int | None = None
+    """Consecutive times in a sample, instead of the recipe's."""
     performers: Path | None = None
     """Folder of glTF characters for a share of the scenes; never one that is kept for tests."""
     motions: Path | None = None
@@ -43,7 +45,11 @@ def run(options: Options) -> int:
         raise ValueError(f"expected a count of at least 1, got {options.count}")
     recipe = chosen_recipe(
         TrainOptions(
-            recipe=options.recipe, performers=options.performers, motions=options.motions, capture=options.capture
+            recipe=options.recipe,
+            clip=options.clip,
+            performers=options.performers,
+            motions=options.motions,
+            capture=options.capture,
         ),
         None,
     )

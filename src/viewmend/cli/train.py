@@ -51,6 +51,8 @@ class Options:
     streams: int | None = None
     workers: int | None = None
     learning_rate: float | None = None
+    bfloat16: bool | None = None
+    """Mixed precision; the published networks' authors train in float32."""
     checkpoint_every: int | None = None
     validate_every: int | None = None
     part: Literal["rays", "patches", "all"] | None = None
@@ -135,7 +137,7 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     if options.recipe == "finetune" and isinstance(start, Inpainter):
         recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
-    own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "part", "checkpoint_every")
+    own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "bfloat16", "part", "checkpoint_every")
     values = {n: getattr(options, n) for n in (*own, "validate_every")}
     return replace(
         recipe,

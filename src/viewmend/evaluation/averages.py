@@ -8,37 +8,17 @@ import numpy as np
 import torch
 
 from viewmend.evaluation.cells import Cell
+from viewmend.evaluation.frame_scores import Scores
 from viewmend.evaluation.methods import REFERENCE
 from viewmend.evaluation.scorers import KINDS
 from viewmend.metrics.vfid import frechet_distance
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Means of the `FrameScores` of these names; None where there is nothing to average."""
+@dataclass(frozen=True, kw_only=True)
+class MeanScores(Scores):
+    """Means of frames' scores; None where there is nothing to average."""
 
-    psnr_holes: float | None
-    psnr_holes_fg: float | None
-    psnr_masked: float | None
-    psnr_whole: float | None
-    ssim_holes: float | None
-    ssim_holes_fg: float | None
-    ssim_masked: float | None
-    ssim_whole: float | None
-    lpips_alex_holes: float | None
-    lpips_alex_holes_fg: float | None
-    lpips_alex_masked: float | None
-    lpips_alex_whole: float | None
-    lpips_vgg_holes: float | None
-    lpips_vgg_holes_fg: float | None
-    lpips_vgg_masked: float | None
-    lpips_vgg_whole: float | None
-    flicker: float | None
-    warp_error: float | None
-    warp_error_truth: float | None
-    change: float | None
-    change_truth: float | None
     holes_of_hull: float | None
     """Pixels of E as a share of those that the proxy covers;"""
     holes_of_image: float | None
@@ -50,7 +30,7 @@ class CellScores:
     """One cell, averaged over its frames."""
 
     cell: Cell
-    scores: Scores
+    scores: MeanScores
     frames: int
     thin_frames: int
     """Of these, the frames left out of the scores in the holes: with fewer than `ENOUGH_HOLE_PX` pixels of E."""
@@ -63,7 +43,7 @@ class Row:
     """One method in a table."""
 
     method: str
-    scores: Scores
+    scores: MeanScores
     """Means over scenes."""
     over_reference: float | None
     """`psnr_holes` over that of `REFERENCE`, mean over the scenes where both have it."""
@@ -120,17 +100,15 @@ def average_cell(cell: Cell) -> CellScores:
     wide = [f for f in frames if f.hole_px >= ENOUGH_HOLE_PX]
     inside = [f for f in frames if f.hole_fg_px >= ENOUGH_HOLE_PX]
     of = {"holes": wide, "masked": wide, "fg": inside}  # by the last word of a score's name
-    means = {f.name: _mean(getattr(frame, f.name) for frame in of.get(f.name.split("_")[-1], frames)) for f in SCORED}
-    scores = Scores(
+    means = {
+        f.name: _mean(getattr(frame, f.name) for frame in of.get(f.name.split("_")[-1], frames)) for f in fields(Scores)
+    }
+    scores = MeanScores(
         **means,
         holes_of_hull=_mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in frames),
         holes_of_image=_mean(f.hole_px / f.image_px for f in frames),
     )
     return CellScores(cell, scores, len(frames), len(frames) - len(wide), sum(f.hole_px == 0 for f in frames))
-
-
-SCORED = fields(Scores)[:-2]
-"""Those that frames have."""
 
 
 def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
@@ -157,9 +135,9 @@ def tables_by_kind(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]
     return found
 
 
-def mean_scores(many: Sequence[Scores]) -> Scores:
+def mean_scores(many: Sequence[MeanScores]) -> MeanScores:
     """Field by field, over those that have one."""
-    return Scores(*(_mean(getattr(scores, f.name) for scores in many) for f in fields(Scores)))
+    return MeanScores(**{f.name: _mean(getattr(scores, f.name) for scores in many) for f in fields(MeanScores)})
 
 
 def _table(title: str, averaged: Sequence[CellScores], methods: Sequence[str]) -> Table:

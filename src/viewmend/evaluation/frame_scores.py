@@ -17,28 +17,19 @@ FOREGROUND = 128
 """A true mask from here on (of 255) is subject."""
 
 
-@dataclass(frozen=True)
-class FrameScores:
-    """One frame. PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score.
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score.
 
     Each of PSNR, SSIM and LPIPS comes as `whole`, over all pixels; `holes`, over the pixels of E alone (reading a);
     `holes_fg`, over those of them inside the true mask; and `masked`, of both images blackened outside E, over all
     pixels of the image (reading b). SSIM and LPIPS over pixels are means of their maps there, seen unmasked.
     """
 
-    time: int
-    width_px: int
-    height_px: int
-    hull_px: int
-    """Pixels that the geometry proxy covers."""
-    hole_px: int
-    """Pixels of E (E > 0)."""
-    hole_fg_px: int
-    """Of these, inside the true mask."""
     psnr_holes: float | None
     psnr_holes_fg: float | None
     psnr_masked: float | None
-    psnr_whole: float
+    psnr_whole: float | None
     ssim_holes: float | None
     ssim_holes_fg: float | None
     ssim_masked: float | None
@@ -61,6 +52,21 @@ class FrameScores:
     """From the frame before, in place, over the pixels of E now or then (`change`)."""
     change_truth: float | None
     """The truth's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameScores(Scores):
+    """One frame's."""
+
+    time: int
+    width_px: int
+    height_px: int
+    hull_px: int
+    """Pixels that the geometry proxy covers."""
+    hole_px: int
+    """Pixels of E (E > 0)."""
+    hole_fg_px: int
+    """Of these, inside the true mask."""
     step_ms: float
     """What the inpainter's step took."""
 
@@ -108,8 +114,6 @@ def score_frame(
     view, rgb = completed.view, completed.rgb
     holes = view.error > 0
     pixels = _Pixels(rgb, truth.rgb, holes, holes & truth.mask)
-    whole = psnr(rgb, truth.rgb)
-    assert whole is not None, "images have pixels"
     height, width = holes.shape
     return FrameScores(
         time=view.time,
@@ -121,7 +125,7 @@ def score_frame(
         psnr_holes=psnr(rgb, truth.rgb, holes),
         psnr_holes_fg=psnr(rgb, truth.rgb, pixels.holes_fg),
         psnr_masked=psnr(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None,
-        psnr_whole=whole,
+        psnr_whole=psnr(rgb, truth.rgb),
         **_by_map("ssim", partial(similarity, window=scorers.ssim), pixels),
         **_by_map("lpips_alex", scorers.lpips_alex, pixels),
         **_by_map("lpips_vgg", scorers.lpips_vgg, pixels),

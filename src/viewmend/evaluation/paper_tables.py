@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from viewmend.evaluation.averages import Row, Scores, mean_scores
+from viewmend.evaluation.averages import MeanScores, Row, mean_scores
 from viewmend.evaluation.report import Report
 from viewmend.evaluation.report_grids import Grid, number
 
@@ -224,7 +224,7 @@ def _ours(rows: Sequence[Row]) -> list[float | None]:
     scores = mean_scores([row.scores for row in rows])
     found: list[float | None] = []
     for _, field, _ in OUR_COLUMNS:
-        if field in {f.name for f in fields(Scores)}:
+        if field in {f.name for f in fields(MeanScores)}:
             found.append(getattr(scores, field))
         else:
             values = [getattr(row.vfid if hasattr(row.vfid, field) else row.speed, field, None) for row in rows]

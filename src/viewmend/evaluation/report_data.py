@@ -5,7 +5,7 @@ import io
 import json
 from dataclasses import asdict, fields
 
-from viewmend.evaluation.averages import CellScores, Scores, speed
+from viewmend.evaluation.averages import CellScores, MeanScores, speed
 from viewmend.evaluation.report import RULES, Report
 
 
@@ -47,7 +47,7 @@ def _cell(averaged: CellScores) -> dict[str, object]:
         "style": cell.style,
         "method": cell.key.method,
         "error": cell.error,
-        **{f.name: getattr(averaged.scores, f.name) for f in fields(Scores)},
+        **{f.name: getattr(averaged.scores, f.name) for f in fields(MeanScores)},
         **{name: getattr(taken, name, None) for name in ("fps", "ms_p50", "ms_p95")},
         "frames": averaged.frames,
         "thin_frames": averaged.thin_frames,

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from viewmend.evaluation.averages import Row, Scores, Table
+from viewmend.evaluation.averages import MeanScores, Row, Table
 from viewmend.evaluation.methods import PRIVILEGED, REFERENCE
 from viewmend.evaluation.report import Report
 
@@ -18,7 +18,7 @@ COLUMNS = (
     ("warp", "warp_error", 255, 2),
     ("change", "change", 255, 2),
 )
-"""Of the main table: heading, field of `Scores`, factor, decimals."""
+"""Of the main table: heading, field of `MeanScores`, factor, decimals."""
 TRUTHS = ("warp_error", "change")
 """Of these the truth has some, too."""
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
@@ -135,7 +135,7 @@ def _method_row(row: Row, width: int) -> tuple[str, ...]:
     )
 
 
-def _truth_row(scores: Sequence[Scores], width: int) -> tuple[str, ...]:
+def _truth_row(scores: Sequence[MeanScores], width: int) -> tuple[str, ...]:
     """The truth's own change, which a perfect method would show."""
     of = {name: next((v for s in scores if (v := getattr(s, f"{name}_truth")) is not None), None) for name in TRUTHS}
     shown = [number(of[field], factor, digits) if field in of else "" for _, field, factor, digits in COLUMNS]
