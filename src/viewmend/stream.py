@@ -135,6 +135,14 @@ class Stream:
         self._forget()
         return self._moments[frame.time].observation
 
+    def observation(self, time: int) -> Observation:
+        """What `push` gave for a time that is at hand.
+
+        Raises:
+            ValueError: it is not.
+        """
+        return self._moment(time).observation
+
     def viewer(self) -> Viewer:
         """Someone who has seen nothing yet."""
         return Viewer(self.inpainter.initial_state())

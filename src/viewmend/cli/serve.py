@@ -70,6 +70,7 @@ def run(options: Options) -> int:
     from viewmend.cli.console import say
     from viewmend.cli.mending import load_named
     from viewmend.live.listener import Server
+    from viewmend.live.memory import set_up
     from viewmend.live.protocol import Limits
     from viewmend.live.renderer import Renderer
     from viewmend.live.server import LiveServer, ServerConfig
@@ -77,6 +78,7 @@ def run(options: Options) -> int:
     from viewmend.pipeline import PipelineConfig
     from viewmend.rendering.view import RenderConfig
 
+    set_up()
     config = ServerConfig(
         host=options.host,
         port=options.port,

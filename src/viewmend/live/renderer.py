@@ -6,12 +6,14 @@ from typing import Any
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
+from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
+from viewmend.live.window import window_of
 from viewmend.pipeline import Observation, PipelineConfig
-from viewmend.stream import Effort, Stream, Viewer
+from viewmend.stream import Effort, Stream, StreamView, Viewer
 from viewmend.views import CompletedView
 
 WARM_PX = 64
@@ -133,16 +135,30 @@ class Renderer:
         observation = stream.push(frame.to(self._device))
         return observation, 0.0 if known else 1000 * (time.perf_counter() - start)
 
-    def _view(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: Effort):
+    def _view(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: Effort) -> StreamView:
         """The view; with its holes where the model fails."""
         try:
-            view = stream.view(camera, viewer, at, effort)
+            view = self._windowed(stream, camera, viewer, at, effort)
         except Exception as error:
             if not effort.mend:
                 raise
-            view = stream.view(camera, viewer, at, replace(effort, mend=False))
+            view = self._windowed(stream, camera, viewer, at, replace(effort, mend=False))
             self.model_error = f"{type(error).__name__}: {error}"[:400]
         else:
             if effort.mend:
                 self.model_error = None
         return view
+
+    def _windowed(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: Effort) -> StreamView:
+        """The view, of which only the subject's surroundings are worked on where that changes nothing.
+
+        With context it would: patches lie on a grid from the view's corner.
+        """
+        fills = isinstance(self._inpainter, Inpainter) and self._inpainter.config.prefill
+        proxy = stream.observation(at).proxy
+        local = not effort.mend or (fills and effort.context_times == 0)
+        window = window_of(proxy.mesh.vertices, camera) if local and isinstance(proxy, GeometryProxy) else None
+        if window is None:
+            return stream.view(camera, viewer, at, effort)
+        view = stream.view(window.of(camera), viewer, at, effort)
+        return replace(view, completed=window.widened(view.completed, camera))

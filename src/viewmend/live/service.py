@@ -7,6 +7,7 @@ from collections import Counter
 
 from viewmend.live.clock import Clock, edge_of
 from viewmend.live.frames import FrameSupply
+from viewmend.live.memory import Tidying
 from viewmend.live.renderer import NotThereError, Renderer
 from viewmend.live.seats import Scene, Seat, ViewerSeat
 
@@ -83,6 +84,7 @@ class RenderService:
         return self.renderer.frame is not None and self.renderer.is_of(self.supply.rig)
 
     def _run(self) -> None:
+        tidying = Tidying()
         while not self._stopped:
             try:
                 worked = self._prepare() or self._turn()
@@ -90,6 +92,7 @@ class RenderService:
                 log.warning("while preparing: %s", error)
                 self.error, worked = f"{type(error).__name__}: {error}"[:400], False
                 time.sleep(AFTER_ERROR_S)
+            tidying.when_due(idle=not worked)
             with self.lock:
                 if not worked and not self._stopped:
                     self.lock.wait(TICK_S if self._seats else IDLE_S)

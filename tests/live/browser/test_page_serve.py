@@ -92,10 +92,10 @@ def test_the_re_projected_picture_is_nearly_what_the_server_then_answers(view):
     """Its messages are held back for a while: the page shows the new pose from the old picture."""
     before = view.picture()
     view.page.evaluate(
-        "(() => { const send = WebSocket.prototype.send, kept = [];"
-        " WebSocket.prototype.send = function (data) { kept.push([this, data]); };"
-        " document.body.addEventListener('release', () => { WebSocket.prototype.send = send;"
-        "   for (const [socket, data] of kept) send.call(socket, data); }); })()"
+        "(() => { const post = Worker.prototype.postMessage, kept = [];"
+        " Worker.prototype.postMessage = function (order) { kept.push([this, order]); };"
+        " document.body.addEventListener('release', () => { Worker.prototype.postMessage = post;"
+        "   for (const [worker, order] of kept) post.call(worker, order); }); })()"
     )
     view.drag(50, 0)
     view.page.wait_for_timeout(600)

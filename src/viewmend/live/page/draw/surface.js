@@ -19,14 +19,16 @@ class Numbers {
     this.length = 0;
   }
 
-  /** @param {number[]} added */
-  push(...added) {
-    if (this.length + added.length > this.values.length) {
-      const larger = new this.kind(2 * (this.length + added.length));
+  /** @param {number} count of numbers that are to be written @returns {number} where the first of them goes */
+  add(count) {
+    const first = this.length;
+    this.length += count;
+    if (this.length > this.values.length) {
+      const larger = new this.kind(2 * this.length);
       larger.set(this.values);
       this.values = larger;
     }
-    for (const value of added) this.values[this.length++] = value;
+    return first;
   }
 
   get taken() {
@@ -58,7 +60,7 @@ export function surfaceOf(depth, width, height) {
   const vertices = new Numbers(Float32Array, FLOATS * (columns * rows + 16 * (columns + rows)));
   for (let row = 0; row < rows; row++) {
     for (let column = 0; column < columns; column++) {
-      vertices.push(us[column], vs[row], z[row * columns + column], us[column], vs[row]);
+      vertex(vertices, us[column], vs[row], z[row * columns + column], us[column], vs[row]);
     }
   }
   const solid = new Numbers(Uint32Array, 6 * columns * rows);
@@ -66,15 +68,16 @@ export function surfaceOf(depth, width, height) {
   for (let row = 0; row + 1 < rows; row++) {
     for (let column = 0; column + 1 < columns; column++) {
       const first = row * columns + column;
-      const [a, b, c, d] = [z[first], z[first + 1], z[first + columns], z[first + columns + 1]];
+      const below = first + columns;
+      const [a, b, c, d] = [z[first], z[first + 1], z[below], z[below + 1]];
       const high = Math.max(a, b, c, d);
       if (high === 0) continue;
-      const corners = [first, first + 1, first + columns, first + columns + 1];
       const whole = a > 0 && b > 0 && c > 0 && d > 0;
       if (whole && high <= Math.min(a, b, c, d) * (1 + JUMP)) {
-        twoTriangles(solid, corners);
+        twoTriangles(solid, first, first + 1, below, below + 1);
         continue;
       }
+      const corners = [first, first + 1, below, below + 1];
       const seen = corners.filter((index) => z[index] > 0);
       const low = Math.min(...seen.map((index) => z[index]));
       const jump = high > low * (1 + JUMP);
@@ -93,9 +96,25 @@ export function surfaceOf(depth, width, height) {
   };
 }
 
-/** @param {Numbers} indices @param {number[]} corners */
-function twoTriangles(indices, [a, b, c, d]) {
-  indices.push(a, c, b, b, c, d);
+/** @param {Numbers} vertices @param {number} u @param {number} v @param {number} z @param {number} s @param {number} t */
+function vertex(vertices, u, v, z, s, t) {
+  const at = vertices.add(FLOATS);
+  const { values } = vertices;
+  values[at] = u;
+  values[at + 1] = v;
+  values[at + 2] = z;
+  values[at + 3] = s;
+  values[at + 4] = t;
+}
+
+/** @param {Numbers} indices @param {number} a @param {number} b @param {number} c @param {number} d its corners, by rows */
+function twoTriangles(indices, a, b, c, d) {
+  const at = indices.add(6);
+  const { values } = indices;
+  values[at] = a;
+  values[at + 1] = values[at + 4] = c;
+  values[at + 2] = values[at + 3] = b;
+  values[at + 5] = d;
 }
 
 /**
@@ -128,9 +147,9 @@ function cell(vertices, indices, corners, depths, colouring) {
     const [u, v] = vertices.values.subarray(FLOATS * index, FLOATS * index + 2);
     const from = [place, place ^ 1, place ^ 2, place ^ 3].find((other) => colouring.includes(corners[other])) ?? place;
     const [s, t] = vertices.values.subarray(FLOATS * corners[from], FLOATS * corners[from] + 2);
-    vertices.push(u, v, depths[place], s, t);
+    vertex(vertices, u, v, depths[place], s, t);
   });
-  twoTriangles(indices, [start, start + 1, start + 2, start + 3]);
+  twoTriangles(indices, start, start + 1, start + 2, start + 3);
 }
 
 /** A picture without depth: a plane at `z`. @param {number} width @param {number} height @param {number} z @returns {Surface} */

@@ -1,4 +1,4 @@
-// The WebSocket to the server: hello, messages as events, and a new try when it breaks.
+// The link to the server: hello, messages as events, and a new try when it breaks.
 
 const VERSION = 1;
 const LONGEST_WAIT_MS = 15000;
@@ -17,8 +17,9 @@ export function address(path, token) {
 }
 
 /**
- * Events: "message" (detail: a JSON message), "frame" (detail: ArrayBuffer), and "status" (detail: {status, text, wait_s})
- * where status is "connecting", "open", "lost" (another try in wait_s) or "refused".
+ * Events: "message" (detail: a JSON message), "picture" (detail: a frame, decoded), "trouble" (detail: text, of one that cannot
+ * be), and "status" (detail: {status, text, wait_s}) where status is "connecting", "open", "lost" (another try in wait_s) or
+ * "refused". The socket is a worker's.
  */
 export class Connection extends EventTarget {
   /** @param {string | null} token @param {string[]} codecs */
@@ -27,10 +28,12 @@ export class Connection extends EventTarget {
     this.token = token;
     this.codecs = codecs;
     this.failures = 0;
-    /** @type {WebSocket | null} */
-    this.socket = null;
+    /** @type {"none" | "opening" | "open"} */
+    this.socket = "none";
     this.timer = 0;
     this.refused = false;
+    this.worker = new Worker(new URL("./worker.js", import.meta.url), { type: "module" });
+    this.worker.onmessage = ({ data }) => this.#hear(data);
     document.addEventListener("visibilitychange", () => this.#visibility());
   }
 
@@ -39,30 +42,36 @@ export class Connection extends EventTarget {
     this.#status("connecting", "Connecting");
     const url = address("/ws", this.token);
     url.protocol = url.protocol.replace("http", "ws");
-    const socket = new WebSocket(url);
-    socket.binaryType = "arraybuffer";
-    this.socket = socket;
-    socket.onopen = () => this.send({ type: "hello", version: VERSION, codecs: this.codecs });
-    socket.onmessage = ({ data }) => this.#receive(data);
-    socket.onclose = ({ code, reason }) => {
-      if (this.socket === socket) this.#closed(code, reason);
-    };
+    this.socket = "opening";
+    this.#order({ open: url.href });
   }
 
   /** @param {object} message @returns {boolean} whether it went out */
   send(message) {
-    if (this.socket?.readyState !== WebSocket.OPEN) return false;
-    this.socket.send(JSON.stringify(message));
+    if (this.socket !== "open") return false;
+    this.#order({ send: JSON.stringify(message) });
     return true;
   }
 
-  /** @param {string | ArrayBuffer} data */
-  #receive(data) {
-    if (typeof data !== "string") {
-      this.dispatchEvent(new CustomEvent("frame", { detail: data }));
-      return;
+  /** @param {import("./worker.js").Order} order */
+  #order(order) {
+    this.worker.postMessage(order);
+  }
+
+  /** @param {any} news what the worker tells */
+  #hear(news) {
+    if ("picture" in news) this.dispatchEvent(new CustomEvent("picture", { detail: news.picture }));
+    else if ("text" in news) this.#receive(JSON.parse(news.text));
+    else if ("trouble" in news) this.dispatchEvent(new CustomEvent("trouble", { detail: news.trouble }));
+    else if ("closed" in news) this.#closed(news.closed.code, news.closed.reason);
+    else {
+      this.socket = "open";
+      this.send({ type: "hello", version: VERSION, codecs: this.codecs });
     }
-    const message = JSON.parse(data);
+  }
+
+  /** @param {any} message */
+  #receive(message) {
     if (message.type === "welcome") {
       this.failures = 0;
       this.#status("open", "Connected");
@@ -72,7 +81,7 @@ export class Connection extends EventTarget {
 
   /** @param {number} code @param {string} reason */
   #closed(code, reason) {
-    this.socket = null;
+    this.socket = "none";
     const final = /** @type {any} */ (FINAL)[code];
     if (final) {
       this.refused = true;
@@ -89,10 +98,10 @@ export class Connection extends EventTarget {
   /** A hidden page costs the server nothing; it comes back when it is looked at. */
   #visibility() {
     if (document.hidden) {
-      this.timer = setTimeout(() => this.socket?.close(1000, "hidden"), 10000);
+      this.timer = setTimeout(() => this.#order({ close: "hidden" }), 10000);
     } else {
       clearTimeout(this.timer);
-      if (!this.socket && !this.refused) this.open();
+      if (this.socket === "none" && !this.refused) this.open();
     }
   }
 

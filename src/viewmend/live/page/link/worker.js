@@ -1,0 +1,79 @@
+// The socket, and what comes through it made ready to be drawn. In a thread of its own: on the page's, every step of a
+// decoder would wait for a repaint.
+
+import { decodeDepth, parseFrame } from "./frames.js";
+import { PictureDecoder } from "./pictures.js";
+import { surfaceOf } from "../draw/surface.js";
+
+/**
+ * @typedef {{open: string} | {send: string} | {close: string}} Order what the page wants: a socket to this address in place
+ *   of the last, a text to be sent, an end with this reason
+ * @typedef {import("../draw/stage.js").Shown & {bytes: number}} Picture
+ * @typedef {{opened: true} | {closed: {code: number, reason: string}} | {text: string} | {picture: Picture} | {trouble: string}} News
+ */
+
+/** @type {WebSocket | null} */
+let socket = null;
+let decoder = new PictureDecoder();
+let queue = Promise.resolve();
+
+/** @param {News} news @param {Transferable[]} [transfer] */
+const tell = (news, transfer = []) => postMessage(news, /** @type {any} */ (transfer));
+
+/** @param {string} url */
+function open(url) {
+  const own = new WebSocket(url);
+  own.binaryType = "arraybuffer";
+  socket = own;
+  decoder.close();
+  decoder = new PictureDecoder();
+  own.onopen = () => tell({ opened: true });
+  own.onmessage = ({ data }) => (typeof data === "string" ? tell({ text: data }) : take(own, data));
+  own.onclose = ({ code, reason }) => {
+    if (socket !== own) return;
+    socket = null;
+    tell({ closed: { code, reason } });
+  };
+}
+
+/** Pictures are decoded side by side and told in order. @param {WebSocket} from @param {ArrayBuffer} message */
+function take(from, message) {
+  const frame = parseFrame(message);
+  if (from.readyState === WebSocket.OPEN) from.send(JSON.stringify({ type: "ack", frame: frame.header.frame }));
+  const decoded = decode(frame);
+  decoded.catch(() => {});
+  queue = queue
+    .then(async () => {
+      const { eyes, transfer } = await decoded;
+      tell({ picture: { header: frame.header, eyes, bytes: frame.bytes } }, transfer);
+    })
+    .catch((error) => tell({ trouble: String(error.message ?? error) }));
+}
+
+/** @param {ReturnType<typeof parseFrame>} frame */
+async function decode({ header, parts }) {
+  const eyes = header.cameras.map(() => ({ modes: /** @type {any} */ ({}), surface: /** @type {any} */ (null) }));
+  /** @type {Transferable[]} */
+  const transfer = [];
+  await Promise.all(
+    parts.map(async (part) => {
+      const eye = eyes[part.about.eye ?? 0];
+      if (part.about.kind === "image") {
+        const picture = await decoder.decode(part, header.frame);
+        eye.modes[part.about.mode] = picture;
+        transfer.push(picture);
+      } else if (part.about.kind === "depth") {
+        const surface = surfaceOf(await decodeDepth(part), header.width, header.height);
+        eye.surface = surface;
+        transfer.push(surface.vertices.buffer, surface.solid.buffer, surface.stretched.buffer);
+      }
+    }),
+  );
+  return { eyes, transfer };
+}
+
+onmessage = ({ data: order }) => {
+  if ("open" in order) open(order.open);
+  else if ("send" in order) socket?.send(order.send);
+  else socket?.close(1000, order.close);
+};

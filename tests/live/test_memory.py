@@ -1,0 +1,39 @@
+"""Memory that lies free goes back to the system."""
+
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from viewmend.live import memory
+
+pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="needs glibc 2.33 or later")
+
+
+def resident_mb() -> float:
+    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def test_what_lies_between_things_that_live_long_is_handed_back(monkeypatch):
+    monkeypatch.setattr(memory, "IDLE_S", 0.0)
+    blocks = [bytearray(60_000) for _ in range(6000)]  # below glibc's limit for mapping
+    kept = blocks[::40]
+    before = resident_mb()
+    del blocks
+    assert memory.free_bytes() > 200e6
+    assert resident_mb() > before - 50
+    assert memory.Tidying().when_due(idle=True)
+    assert resident_mb() < before - 200
+    assert sum(map(len, kept)) == 150 * 60_000
+
+
+def test_a_little_is_kept_and_busy_times_are_left_alone(monkeypatch):
+    monkeypatch.setattr(memory, "SLACK_BYTES", sys.maxsize)
+    monkeypatch.setattr(memory, "IDLE_S", 0.0)
+    tidying = memory.Tidying()
+    assert not tidying.when_due(idle=True)
+    monkeypatch.setattr(memory, "SLACK_BYTES", 0)
+    assert not tidying.when_due(idle=False)
+    assert tidying.when_due(idle=True)
