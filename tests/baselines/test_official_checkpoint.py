@@ -61,13 +61,13 @@ def test_another_networks_weights_are_refused(weights, tmp_path):
         load_official(FuseFormer(), path)
     # HQ and plain E2FGVI differ in one bias alone.
     path = saved(tmp_path / "E2FGVI.pth", E2FGVI().state_dict())
-    with pytest.raises(OfficialCheckpointError, match=r"2 missing \['sc.bias_conv.bias'.*1 unknown \['sc.bias'\]"):
+    with pytest.raises(OfficialCheckpointError, match=r"2 missing \(sc.bias_conv.bias.*1 unknown \(sc.bias ...\)"):
         load_official(E2FGVIHQ(), path)
 
 
 def test_weights_of_another_size_are_refused(weights, tmp_path):
     wrong = weights | {"patch2vec.bias": torch.zeros(7)}
-    with pytest.raises(OfficialCheckpointError, match=r"1 of another shape \['patch2vec.bias \(7,\) for \(512,\)'\]"):
+    with pytest.raises(OfficialCheckpointError, match=r"1 of another shape \(patch2vec.bias \(7,\) for \(512,\) "):
         load_official(fresh(), saved(tmp_path / "x.pth", wrong))
 
 

@@ -4,8 +4,10 @@ import hashlib
 import json
 
 import pytest
+import torch
 
 from viewmend import cli
+from viewmend.baselines.dstt import DSTT
 from viewmend.cli.evaluating import RunOptions, scenes_of
 from viewmend.metrics.weights import PLACES_VARIABLE
 
@@ -97,3 +99,15 @@ def test_weights_checks_a_file(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)[0]["name"] == "vgg16"
     assert cli.main(["weights", str(tmp_path / "none.pth")]) == 2
     assert "expected a file of weights, found none" in capsys.readouterr().err
+
+
+def test_weights_loads_a_file_that_has_no_published_hash(tmp_path, capsys):
+    path = tmp_path / "dstt.pth"
+    torch.save({"netG": DSTT().state_dict()}, path)
+    assert cli.main(["weights", str(path)]) == 0
+    assert "dstt: right by all names and shapes" in capsys.readouterr().out
+    assert cli.main(["weights", str(path), "--name", "fuseformer"]) == 1
+    assert "expected the 160 tensors of FuseFormer" in capsys.readouterr().out
+    path.write_bytes(path.read_bytes()[:1000])
+    assert cli.main(["weights", str(path)]) == 1
+    assert "do not read" in capsys.readouterr().out

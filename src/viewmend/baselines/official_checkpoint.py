@@ -29,17 +29,21 @@ def load_official(network: Network, path: str | Path, device: torch.device | str
     path, name = Path(path), type(network).__name__
     weights = read_weights(path)
     expected = network.state_dict()
-    missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
     reshaped = [
         f"{key} {tuple(weights[key].shape)} for {tuple(expected[key].shape)}"
         for key in sorted(expected.keys() & weights.keys())
         if weights[key].shape != expected[key].shape
     ]
-    if missing or unknown or reshaped:
+    wrong = {
+        "missing": sorted(expected.keys() - weights.keys()),
+        "unknown": sorted(weights.keys() - expected.keys()),
+        "of another shape": reshaped,
+    }
+    if any(wrong.values()):
+        counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
         raise OfficialCheckpointError(
-            f"{path}: expected the {len(expected)} tensors of {name}, got {len(weights)}: "
-            f"{len(missing)} missing {missing[:3]}, {len(unknown)} unknown {unknown[:3]}, {len(reshaped)} of another "
-            f"shape {reshaped[:3]}; give the checkpoint of {name}'s generator"
+            f"{path}: expected the {len(expected)} tensors of {name}, got {len(weights)}: {counts}; give the "
+            f"checkpoint of {name}'s generator"
         )
     network.load_state_dict(weights)
     return network.to(device).eval()
@@ -55,7 +59,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         else:
             contents = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # damaged files raise almost anything
-        said = " ".join(str(error).split())[:120] or type(error).__name__
+        said = f"{type(error).__name__}: {' '.join(str(error).split()).split('. ')[0][:120]}"
         raise OfficialCheckpointError(
             f"{path}: expected a whole checkpoint of tensors alone, got {path.stat().st_size} bytes that do not read "
             f"({said}); download it again"

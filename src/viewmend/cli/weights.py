@@ -53,6 +53,7 @@ def _listed() -> list[dict[str, str]]:
 
 
 def _checked(path: Path, name: str | None) -> dict[str, str]:
+    from viewmend.baselines.published import NETWORKS
     from viewmend.metrics.weights import KNOWN, verified
 
     if not path.is_file():
@@ -66,7 +67,20 @@ def _checked(path: Path, name: str | None) -> dict[str, str]:
                 f"{path}: expected known weights, got a file of another name and hash; give --name {names}"
             )
         name = (by_hash + by_name)[0]
-    return _line(name, path)
+    line = _line(name, path)
+    return {**line, **_loaded(name, path)} if name in NETWORKS else line
+
+
+def _loaded(name: str, path: Path) -> dict[str, str]:
+    """What loading says of a published network's file, whose hash nobody published."""
+    from viewmend.baselines.official_checkpoint import OfficialCheckpointError, load_official
+    from viewmend.baselines.published import NETWORKS
+
+    try:
+        load_official(NETWORKS[name](), path)
+    except OfficialCheckpointError as error:
+        return {"status": "wrong", "said": str(error)}
+    return {"status": "right by all names and shapes"}
 
 
 def _line(name: str, path: Path | None) -> dict[str, str]:
