@@ -267,7 +267,7 @@ class _WithEffort:
         if not isinstance(self._inpainter, Inpainter):
             return self._inpainter.step(view, source, state)
         if self._effort.context_times == 0:
-            return self._without_context(self._inpainter, view, source), state
+            return self._inpainter.keep_steady(self._without_context(self._inpainter, view, source), state)
         return self._inpainter.step(view, source, state, self._effort.top_k)
 
     @torch.no_grad()

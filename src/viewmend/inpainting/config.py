@@ -46,6 +46,8 @@ class InpainterConfig:
     rays: int = 0
     """Read that first fill from this many cameras at the view's own time, pixel by pixel along its ray: the chosen
     ones, then the closest others. 0: fill from the surroundings alone. Ours."""
+    steady: float = 0.0
+    """How much of a stream's last fill, carried by the proxy, is kept where the new one hardly differs. Ours."""
     top_k: int | None = None
     """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
     attention_scale: Literal["model", "head"] = "model"
@@ -77,6 +79,8 @@ class InpainterConfig:
             )
         if len(self.widths) != len(ENCODER_GROUPS) or any(w % 8 for w in self.widths):
             raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
+        if not 0 <= self.steady < 1:
+            raise ValueError(f"expected steady from 0 to below 1, got {self.steady}")
         if self.rays and not self.prefill:
             raise ValueError(f"expected prefill with rays (they make the fill), got rays {self.rays} without")
         for name in ("top_k", "context_cameras"):
@@ -141,9 +145,10 @@ def small() -> InpainterConfig:
         colour_path=True,
         prefill=True,
         rays=8,
+        steady=0.7,
     )
 
 
 def base() -> InpainterConfig:
     """The paper's widths with all of our additions, 35 M parameters: for a data-centre GPU."""
-    return InpainterConfig(rope_unit="patch", rope_values=True, colour_path=True, prefill=True, rays=8)
+    return InpainterConfig(rope_unit="patch", rope_values=True, colour_path=True, prefill=True, rays=8, steady=0.7)

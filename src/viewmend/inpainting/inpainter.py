@@ -1,7 +1,7 @@
 """The inpainter: an incomplete view and its context to a complete view (sections 2 to 7 and 9)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -28,6 +28,7 @@ from viewmend.inpainting.patches import (
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
 from viewmend.inpainting.ray_reader import RayReader
+from viewmend.inpainting.steadying import LastView, steadied
 from viewmend.inpainting.transformer import Transformer
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
@@ -192,13 +193,20 @@ class Inpainter(nn.Module):
         not, and for those of `view.nearest` that `rays` reads now; a view without holes comes back at once, unasked.
         """
         if not bool((view.error > 0).any()):
-            return CompletedView(view, view.rgb), state
+            return self.keep_steady(CompletedView(view, view.rgb), state)
         fresh, nearby = self._look(view, source, state.cache)
         frames = [frame for group in self.encode_contexts(fresh) for frame in group]
         cache = state.cache.add(frames, view.time, self.config)
         context = cache.find(self._context_names(view), window_times(view.time, self.config))
         prediction = self.predict([view], [context], top_k, [nearby])[0]
-        return CompletedView(view, prediction.completed), State(cache)
+        return self.keep_steady(CompletedView(view, prediction.completed), State(cache, state.last))
+
+    def keep_steady(self, completed: CompletedView, state: State) -> tuple[CompletedView, State]:
+        """The view as its stream shows it, by `InpainterConfig.steady`, and the state after it."""
+        if not self.config.steady:
+            return completed, state
+        shown = steadied(completed, state.last, self.config.steady)
+        return shown, replace(state, last=LastView.of(shown))
 
     def _context_names(self, view: IncompleteView) -> tuple[str, ...]:
         """The cameras that are context."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from viewmend.inpainting.context import ContextCache
+from viewmend.inpainting.steadying import LastView
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 Source = Callable[[int, tuple[str, ...]], ContextViews | None]
@@ -17,6 +18,8 @@ class State:
     """What a stream carries from one step to the next; a fresh one starts a stream. Never changed in place."""
 
     cache: ContextCache = field(default_factory=ContextCache)
+    last: LastView | None = None
+    """The last view, where `steady` looks at it."""
 
 
 @runtime_checkable

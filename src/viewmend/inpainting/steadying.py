@@ -1,0 +1,65 @@
+"""Fills that hardly differ from the last view's, at the same point of the proxy, are averaged with them. Ours.
+
+A stream's holes flicker: each view is filled anew, from masks and images with noise. Where nothing changed, what the
+proxy carries over from the last view says the same again; where colours differ, the subject moved: the new fill stands.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.geometry.cameras import Cameras, project, unproject
+from viewmend.views import CompletedView
+
+STALE = 3
+"""Views of more than so many frames ago are not looked at."""
+SAME_COLOUR = 0.07
+"""Root mean square difference of colours, in [0, 1], at which a carried fill counts 1/e of what it could."""
+SAME_PLACE = 0.01
+"""Of its depth: a point so far from the last view's surface is not the same."""
+
+
+@dataclass(frozen=True)
+class LastView:
+    """What is kept of a completed view."""
+
+    camera: Cameras
+    rgb: Float[Tensor, "3 height width"]
+    depth: Float[Tensor, "height width"]
+    time: int
+
+    @classmethod
+    def of(cls, completed: CompletedView) -> "LastView":
+        """Of this view."""
+        view = completed.view
+        return cls(view.camera, completed.rgb, view.depth, view.time)
+
+
+def steadied(completed: CompletedView, last: LastView | None, share: float) -> CompletedView:
+    """The view, its fill averaged with what `last` showed at the same points; known pixels stay bit for bit.
+
+    Args:
+        completed: of any camera and size.
+        last: the stream's last view; None for its first.
+        share: of a carried fill that agrees, in [0, 1); 0 leaves the view as it is.
+    """
+    view = completed.view
+    if not share or last is None or not 0 <= view.time - last.time <= STALE:
+        return completed
+    pixels = torch.nonzero((view.error > 0) & (view.depth > 0))
+    index = tuple(pixels.unbind(1))
+    points = unproject((pixels.flip(1) + 0.5).to(view.depth)[None], view.depth[index][None], view.camera)[0]
+    at, z = (x[0] for x in project(points, last.camera))
+    height, width = last.depth.shape
+    at = (at * at.new_tensor([2 / width, 2 / height]) - 1)[None, None]
+    there = F.grid_sample(last.depth[None, None], at, "nearest", align_corners=False)[0, 0, 0]
+    before = F.grid_sample(last.rgb[None], at, padding_mode="border", align_corners=False)[0, :, 0].T
+    now = completed.rgb.movedim(0, -1)[index]
+    agree = (-(((before - now) / SAME_COLOUR) ** 2).mean(1)).exp()
+    same = (z > 0) & (there > 0) & ((there - z).abs() < SAME_PLACE * z)
+    carried = (share * agree * same * view.error[index])[:, None]
+    rgb = completed.rgb.movedim(0, -1).index_put(index, torch.lerp(now, before, carried)).movedim(-1, 0)
+    return CompletedView(view, rgb)
