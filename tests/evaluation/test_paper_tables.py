@@ -84,6 +84,7 @@ def test_the_command_writes_the_table_in_every_form(tmp_path, monkeypatch, capsy
     assert cli.main([*command, "--frames", "1", "--scenes", "1", "--size", "128"]) == 0
     text, lines = capsys.readouterr().out, json.loads((tmp_path / "table1.json").read_text())
     assert len(lines) == 24 and lines[19]["here"] == "nearest" and lines[1]["PSNR (here)"] == "n/a"
+    assert "Here: 1 scenes, 1 frames of 128 x 128; holes" in text
     assert float(lines[0]["PSNR (here)"]) > 10 and lines[0]["PSNR (paper)"] == "33.478"
     with (tmp_path / "table1.csv").open() as file:
         assert list(csv.DictReader(file)) == lines

@@ -3,11 +3,14 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from viewmend.cli.evaluating import RunOptions
+
+if TYPE_CHECKING:
+    from viewmend.evaluation.report import Report
 
 RIVALS = ("telea", "navier-stokes", "nearest", "reprojection")
 """Rows that the paper does not have."""
@@ -36,7 +39,6 @@ def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.evaluating import evaluate, write_report
     from viewmend.evaluation.paper_tables import NO_FIGURES, OURS, TABLES, PaperRow, ablation_models, paper_grid
-    from viewmend.evaluation.report_grids import not_available
     from viewmend.evaluation.report_markdown import written
 
     sets = options.sets or (("P", "Q") if options.performers else ("P",))
@@ -55,7 +57,7 @@ def run(options: Options) -> int:
     found = evaluate(options, sets, ",".join(dict.fromkeys(names)))
     write_report(options, found)
     grid = paper_grid(rows, found.report, methods)
-    text = _text(options.table, sets, written(grid), not_available(found.report))
+    text = _text(options.table, sets, written(grid), found.report)
     stem = options.out / f"table{options.table}"
     stem.with_suffix(".md").write_text(text, encoding="utf-8")
     stem.with_suffix(".json").write_text(
@@ -66,15 +68,20 @@ def run(options: Options) -> int:
     return 1 if found.failed else 0
 
 
-def _text(table: int, sets: tuple[str, ...], grid: str, missing: list[str]) -> str:
+def _text(table: int, sets: tuple[str, ...], grid: str, report: "Report") -> str:
+    from viewmend.evaluation.report_grids import holes_line, not_available, setting_lines
+
+    scenes = len({cell.cell.key.scene for cell in report.cells})
     lines = [
         f"# Table {table}, on {', '.join(sets)}",
         "Columns (here) were measured here, columns (paper) are printed in the paper: other data, another image size "
         "and another GPU. Compare within a column.",
         "The paper's PSNR of inpainted regions is (a) by its text; its values are in the range of (b).",
+        *(f"Here: {scenes} scenes, {holes_line(table)}" for table in report.tables[:1]),
+        "\n".join(setting_lines(report)),
         grid,
     ]
-    if missing:
+    if missing := not_available(report):
         lines.append("n/a:\n\n" + "\n".join(f"* {line}" for line in missing))
     return "\n\n".join(lines) + "\n"
 
