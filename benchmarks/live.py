@@ -7,8 +7,11 @@ frame decoded, at a moving pose, while time goes on. Then the cost of 1 to 8 vie
 import argparse
 import contextlib
 import json
+import os
 import threading
 import time
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as `viewmend serve` does, before torch is loaded
 
 from measure import summarise, write
 

@@ -2,7 +2,8 @@
 
 `viewmend serve` and a headless Chromium (its WebGL in software) share this machine. A key is held, so that the view
 orbits all the time, back and forth. Pose to pixel: from the moment a pose is sent to the draw call of the picture that
-answers it. Needs the extras `live` and `browser`, and `video` for other codecs than JPEG.
+answers it. Measured once while the studio still makes its frames, as somebody who comes first sees it, and then with
+all of them made. Needs the extras `live` and `browser`, and `video` for other codecs than JPEG.
 """
 
 import argparse
@@ -12,6 +13,8 @@ import re
 import shutil
 import subprocess
 import sys
+import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from urllib.parse import urlencode
@@ -45,6 +48,29 @@ def served(options: list[str]) -> Iterator[str]:
             yield next(address.group() for address in found if address)
         finally:
             process.terminate()
+
+
+def start(page: Page, address: str, since: float) -> dict[str, float]:
+    """Seconds from the command to the page, to the first picture, and to the first of another time."""
+    page.goto(address)
+    taken = {"page_s": time.monotonic() - since}
+    page.wait_for_selector("#picture[data-frame]", timeout=120_000)
+    taken["first_picture_s"] = time.monotonic() - since
+    first = page.locator("#picture").get_attribute("data-time")
+    page.wait_for_selector(f"#picture[data-time]:not([data-time='{first}'])", timeout=120_000)
+    taken["moving_s"] = time.monotonic() - since
+    return {name: round(seconds, 1) for name, seconds in taken.items()}
+
+
+def wait_until_made(page: Page, address: str) -> None:
+    """Until the studio has made all of its frames."""
+    count = page.evaluate("+document.querySelector('#seek').max + 1")
+    made = 0
+    while made < count:
+        page.wait_for_timeout(500)
+        with urllib.request.urlopen(f"{address.rstrip('/')}/metrics", timeout=10) as answer:
+            found = re.search(r"^viewmend_source_frames (\d+)", answer.read().decode(), re.MULTILINE)
+        made = int(found[1]) if found else 0
 
 
 def swing(page: Page, seconds: float) -> tuple[list[dict], list[float]]:
@@ -102,14 +128,19 @@ def main() -> None:
     options = parser.parse_args()
     chromium = os.environ.get("VIEWMEND_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)))
     results: dict[str, object] = {}
+    since = time.monotonic()
     with served(["--budget-ms", str(options.budget_ms)]) as address, sync_playwright() as control:
         browser = control.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 800})
-        for size in options.sizes:
-            for codec in options.codecs:
-                query = {"size": size, "codec": codec, "mode": options.mode, "adaptive": int(not options.full_size)}
-                results[f"{size} {codec}"] = measure(page, address, query, options.seconds)
-                print(size, codec, json.dumps(results[f"{size} {codec}"]))
+        results["start"] = start(page, address, since)
+        print("start", json.dumps(results["start"]), flush=True)
+        cases = [(f"{size} {codec}", size, codec) for size in options.sizes for codec in options.codecs]
+        first = (f"{cases[0][0]}, first seconds", *cases[0][1:])
+        for label, size, codec in (first, *cases):
+            query = {"size": size, "codec": codec, "mode": options.mode, "adaptive": int(not options.full_size)}
+            results[label] = measure(page, address, query, options.seconds)
+            print(label, json.dumps(results[label]), flush=True)
+            wait_until_made(page, address)
         browser.close()
     if options.write:
         print(write("live_browser", "cpu", vars(options), results))

@@ -66,6 +66,8 @@ def run(options: Options) -> int:
         raise ValueError("viewmend serve needs its extra; run: pip install 'viewmend[live]'") from None
     import os
 
+    # Before torch is loaded. Its threads would spin between two pieces of work, on cores that a browser may need.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
     from viewmend.cli.console import say
     from viewmend.cli.mending import load_named

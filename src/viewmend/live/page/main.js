@@ -23,7 +23,7 @@ import { contained, lensOf, resize, sizeFor } from "./view/lens.js";
 import { degrees } from "./view/matrix.js";
 import { Motion } from "./view/motion.js";
 import { extrinsicsOf } from "./view/pose.js";
-import { Resolution } from "./draw/resolution.js";
+import { Pace, Resolution } from "./draw/resolution.js";
 
 const query = new URLSearchParams(location.search);
 const token = query.get("token");
@@ -36,6 +36,7 @@ class Page {
     this.stage = new Stage(this.canvas);
     this.motion = new Motion(window.matchMedia("(prefers-reduced-motion: reduce)").matches);
     this.resolution = new Resolution();
+    this.pace = new Pace(this.stage.software);
     this.limits = LIMITS;
     this.painted = 0;
     this.scheduled = false;
@@ -241,6 +242,10 @@ class Page {
   /** @param {number} now */
   refresh(now) {
     this.scheduled = false;
+    if (!this.pace.due(now)) {
+      this.wake();
+      return;
+    }
     const elapsed = Math.min(100, Math.max(1, now - this.painted));
     this.painted = now;
     const held = this.keys.step(elapsed);

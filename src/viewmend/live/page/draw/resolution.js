@@ -1,6 +1,6 @@
-// How many canvas pixels a CSS pixel gets: fewer while a slow device cannot repaint smoothly.
+// How many canvas pixels a CSS pixel gets, and how often they are painted: less where a device cannot do it easily.
 
-const [SLOW_MS, FAST_MS] = [36, 20];
+const [SLOW_MS, FAST_MS] = [36, 28];
 const LEAST = 0.5;
 
 export class Resolution {
@@ -26,5 +26,24 @@ export class Resolution {
     if (this.count % 15) return;
     if (this.mean > SLOW_MS) this.factor = Math.max(LEAST, this.factor * 0.8);
     else if (this.mean < FAST_MS) this.factor = Math.min(1, this.factor * 1.1);
+  }
+}
+
+/** Mean time between repaints where there is no GPU: each takes the processor that pictures are decoded with, too. */
+const SOFTWARE_MS = 25;
+
+/** Leaves out some of the display's refreshes. */
+export class Pace {
+  /** @param {boolean} software whether the processor draws */
+  constructor(software) {
+    this.gap = software ? SOFTWARE_MS : 0;
+    this.next = -Infinity;
+  }
+
+  /** @param {number} now of a refresh, ms @returns {boolean} whether to paint at this one */
+  due(now) {
+    if (now < this.next - 1) return false;
+    this.next = Math.max(now, this.next + this.gap);
+    return true;
   }
 }

@@ -55,6 +55,7 @@ export class Stage {
     const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
     if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
     this.gl = gl;
+    this.software = drawnBySoftware(gl);
     /** @type {Header | null} */
     this.header = null;
     /** @type {any[]} */
@@ -158,6 +159,12 @@ export class Stage {
     if (!kept.mesh) for (let i = 0; i < 12; i++) clip[i] *= viewer.distance ?? 1;
     return clip;
   }
+}
+
+/** Whether the processor does what a GPU should. @param {WebGL2RenderingContext} gl */
+function drawnBySoftware(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "");
 }
 
 /** @param {WebGL2RenderingContext} gl */
