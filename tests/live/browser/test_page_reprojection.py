@@ -139,3 +139,13 @@ def test_a_headset_gets_two_eyes_of_one_state(browser, server):
 
 def test_without_a_headset_there_is_no_button(desktop):
     assert desktop.page.locator("#tool-headset").is_hidden()
+
+
+def test_where_the_processor_draws_some_refreshes_are_left_out(desktop):
+    counts = desktop.page.evaluate(
+        "import('/page/draw/resolution.js').then(({ Pace }) => [false, true].map((software) => {"
+        "  const pace = new Pace(software);"
+        "  return Array.from({ length: 60 }, (_, n) => pace.due((1000 / 60) * n)).filter(Boolean).length; }))"
+    )
+    assert counts[0] == 60
+    assert 38 <= counts[1] <= 41
