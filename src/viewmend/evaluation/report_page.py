@@ -106,7 +106,7 @@ def _column(label: str, image: Picture | None, truth: Picture, close: tuple[slic
     whole = _image(_smaller(image), f"{label}, whole view", ".jpg")
     near = _image(image[close], f"{label}, largest hole", ".png")
     differs = ""
-    if label != "E":
+    if label not in ("E", "truth"):
         difference = np.abs(image[close].astype(np.int16) - truth[close]) * DIFFERENCE_GAIN
         differs = _image(difference.clip(0, 255).astype(np.uint8), f"{label}, difference from the truth", ".png")
     return f"<figure><figcaption>{escape(label)}</figcaption>{whole}{near}{differs}</figure>"

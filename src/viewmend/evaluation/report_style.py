@@ -21,11 +21,14 @@ tbody tr:hover td { background: var(--soft); }
 details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); padding: .3rem 0; }
 section { border-top: 1px solid var(--line); }
 .views { display: flex; gap: .5rem; align-items: flex-start; padding-bottom: .6rem; }
-figure { margin: 0; flex: 0 0 auto; width: 210px; }
+figure { margin: 0; flex: 1 0 130px; max-width: 240px; }
+figure:last-child {
+  position: sticky; right: 0; align-self: stretch; background: var(--back); box-shadow: -.5rem 0 var(--back);
+}
 figcaption { font-size: .82rem; min-height: 2.5em; overflow-wrap: anywhere; }
 figure img { display: block; width: 100%; height: auto; margin-bottom: .3rem; background: #000; }
 img.png { image-rendering: pixelated; }
 .none { background: var(--soft); padding: 2rem .5rem; text-align: center; }
 video { display: block; max-width: 100%; height: auto; background: #202020; }
-@media (max-width: 600px) { main { padding: .7rem; } figure { width: 150px; } h1 { font-size: 1.3rem; } }
+@media (max-width: 600px) { main { padding: .7rem; } figure { flex-basis: 110px; } h1 { font-size: 1.3rem; } }
 """
