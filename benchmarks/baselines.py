@@ -135,12 +135,12 @@ def baseline(name: str, memory: bool, framing: str, views: list[IncompleteView],
 def timed_steps(
     inpainter: ViewInpainter, state: State, view: IncompleteView, source: Source, device: str, seconds: float
 ) -> dict[str, float]:
-    """Steps until the seconds are over; the first does not count, unless it took all of them."""
+    """Steps until the seconds are over; the first does not count, unless it took all of them. Ours: three or more."""
     taken: list[float] = []
     end, few = time.perf_counter() + seconds, inpainter if isinstance(inpainter, FewWindows) else None
     if few is not None:
         few.unmeasured_s()  # the past's
-    while (time.perf_counter() < end and len(taken) < 30) or not taken:
+    while (time.perf_counter() < end and len(taken) < 30) or len(taken) < (1 if few else 4):
         synchronise(device)
         start = time.perf_counter()
         inpainter.step(view, source, state)
@@ -182,7 +182,8 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
-    wanted = [*product(options.networks, (False, True), options.framings)]
+    memories = [variant == "om" for variant in options.variants]
+    wanted = [*product(options.networks, memories, options.framings)]
 
     def add(name: str, inpainter: ViewInpainter, state: State) -> None:
         figures[name] = timed_steps(inpainter, state, views[NOW], source, options.device, options.seconds)
@@ -205,6 +206,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--precision", default="float32", choices=("float32", "bfloat16"), help="of ours")
     parser.add_argument("--networks", nargs="+", default=list(NETWORKS), choices=list(NETWORKS))
+    parser.add_argument("--variants", nargs="+", default=["o", "om"], choices=("o", "om"))
     parser.add_argument("--framings", nargs="+", default=list(FRAMINGS), choices=FRAMINGS)
     parser.add_argument("--windows", type=int, default=1000, help="most windows of a view that are run")
     parser.add_argument("--seconds", type=float, default=20.0, help="for each method and size; one step at least")
@@ -231,7 +233,7 @@ def main() -> None:
         width, height = (int(side) for side in text.split("x"))
 
         def done(result: dict, text: str = text) -> None:
-            results[f"{text}, {' '.join(options.networks)}"] = result
+            results[f"{text}, {' '.join(options.networks)}, {' '.join(options.variants)}"] = result
             if options.write:
                 write("baselines", options.device, config, results)
 
