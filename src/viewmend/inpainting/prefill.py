@@ -22,8 +22,10 @@ def fill(
     background. Where holes are wide, only the `subject` counts. What is farther than `REACH_PX` from anything known is
     `pull_push`ed from the subject's pixels.
     """
-    wide = _opened(missing, THIN_PX)
-    return torch.where(wide, _fill(rgb, ~missing & subject, missing, subject), _fill(rgb, ~missing, missing, subject))
+    wide, filled = _opened(missing, THIN_PX), _fill(rgb, ~missing, missing, subject)
+    if not bool(wide.any()):
+        return filled
+    return torch.where(wide, _fill(rgb, ~missing & subject, missing, subject), filled)
 
 
 def _fill(rgb: Tensor, known: Tensor, missing: Tensor, subject: Tensor) -> Tensor:
