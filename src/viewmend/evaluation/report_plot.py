@@ -76,14 +76,15 @@ def _ticks(values: Sequence[float]) -> list[float]:
 
 
 def _apart(places: Sequence[tuple[float, float]]) -> list[float]:
-    """Heights of labels, moved down where one that is near would be written over."""
+    """Heights of labels, moved towards the middle where one that is near would be written over."""
     heights = [0.0] * len(places)
     written: list[tuple[float, float]] = []
-    for n in sorted(range(len(places)), key=lambda i: places[i][1]):
+    middle = HEIGHT / 2
+    for n in sorted(range(len(places)), key=lambda i: -abs(places[i][1] - middle)):
         across, at = places[n]
-        for other_across, other in written:
-            if abs(other_across - across) < RIGHT and abs(other - at) < LINE_PX:
-                at = other + LINE_PX
+        away = math.copysign(LINE_PX, middle - at)
+        while any(abs(x - across) < RIGHT and abs(y - at) < LINE_PX for x, y in written):
+            at += away
         written.append((across, at))
         heights[n] = at
     return heights

@@ -25,7 +25,7 @@ figure { margin: 0; flex: 1 0 130px; max-width: 240px; }
 figure:last-child {
   position: sticky; right: 0; align-self: stretch; background: var(--back); box-shadow: -.5rem 0 var(--back);
 }
-figcaption { font-size: .82rem; min-height: 2.5em; overflow-wrap: anywhere; }
+figcaption { font-size: .82rem; min-height: 3em; overflow-wrap: anywhere; }
 figure img { display: block; width: 100%; height: auto; margin-bottom: .3rem; background: #000; }
 img.png { image-rendering: pixelated; }
 .none { background: var(--soft); padding: 2rem .5rem; text-align: center; }
