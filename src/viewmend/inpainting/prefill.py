@@ -36,13 +36,23 @@ def _fill(rgb: Tensor, known: Tensor, missing: Tensor, subject: Tensor) -> Tenso
     reached = missing & (weight > 0)
     filled = torch.where(reached, colour / weight.clamp_min(1e-6), rgb)
     deep = missing & ~reached
+    if not bool(deep.any()):
+        return filled
     return torch.where(deep, pull_push(filled, ~deep & subject), filled)
 
 
 def _opened(pixels: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "height width"]:
-    """The pixels that a square of this side, inside of them, can cover."""
-    outside = F.max_pool2d(1 - pixels[None, None].float(), size, 1, size // 2)
-    return pixels & (F.max_pool2d(1 - outside, size, 1, size // 2)[0, 0] > 0)
+    """The pixels that a square of this side, inside of them, can cover; beyond the image all counts as inside."""
+    return pixels & _spread(~_spread(~pixels, size), size)
+
+
+def _spread(pixels: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "height width"]:
+    """Where a square of this odd side, around a pixel, holds any of them."""
+    reach = size // 2
+    for axis, pad in ((0, (0, 0, reach, reach)), (1, (reach, reach))):
+        around, length = F.pad(pixels, pad), pixels.shape[axis]
+        pixels = torch.stack([around.narrow(axis, i, length) for i in range(size)]).any(0)
+    return pixels
 
 
 def pull_push(
