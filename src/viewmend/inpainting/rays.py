@@ -143,11 +143,11 @@ def _mean_around(
     mask: UInt8[Tensor, "view height width"], at: Float[Tensor, "view point 2"]
 ) -> Float[Tensor, "view point"]:
     """Masks averaged over squares of `OUTLINE` subjects, sampled between the squares."""
-    share = mask.to(at) / 255
-    side = max(1, round(OUTLINE * float(share.sum((1, 2)).mean().sqrt())))
+    side = max(1, round(OUTLINE * float((mask.sum((1, 2)) / 255).mean().sqrt())))
     rows, cols = (-(-size // side) for size in mask.shape[1:])
     height, width = mask.shape[1:]
-    coarse = F.avg_pool2d(F.pad(share[:, None], (0, cols * side - width, 0, rows * side - height)), side)[:, 0]
+    squares = F.pad(mask, (0, cols * side - width, 0, rows * side - height)).view(-1, rows, side, cols, side)
+    coarse = squares.sum(2, dtype=torch.int32).sum(3).to(at) / (255 * side**2)  # whole numbers: pooling is slower
     view = torch.arange(len(mask), device=at.device)[:, None]
     corners = _corners(at / side, coarse.shape[1:])
     return sum((share * coarse[view, row, column] for row, column, share in corners), torch.zeros_like(at[..., 0]))
