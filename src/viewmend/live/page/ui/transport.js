@@ -3,6 +3,8 @@
 import { byId, setIcon, setSlider } from "./dom.js";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
+/** So long what was asked for counts, whatever the server said meanwhile: it may have spoken before it heard. */
+const HEARD_MS = 1000;
 
 export class Transport {
   /** @param {import("../link/viewer.js").ViewerLink} link */
@@ -10,6 +12,8 @@ export class Transport {
     this.link = link;
     /** @type {any} */
     this.state = null;
+    /** @type {Record<string, {value: any, at: number}>} */
+    this.told = {};
     this.seeking = false;
     this.shown = -1;
     this.sought = -1;
@@ -27,8 +31,7 @@ export class Transport {
   }
 
   toggle() {
-    const playing = !(this.state?.playing ?? true);
-    this.#tell({ playing });
+    this.#tell({ playing: !this.#current("playing", true) });
   }
 
   /** @param {number} time */
@@ -58,15 +61,23 @@ export class Transport {
 
   /** @param {number} steps along the list of speeds */
   faster(steps) {
-    const place = SPEEDS.indexOf(this.state?.speed ?? 1);
+    const place = SPEEDS.indexOf(this.#current("speed", 1));
     this.speed(SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, place + steps))]);
+  }
+
+  /** What was asked for last, or what the server says. @param {string} name @param {any} otherwise */
+  #current(name, otherwise) {
+    const told = this.told[name];
+    return told && performance.now() - told.at < HEARD_MS ? told.value : (this.state?.[name] ?? otherwise);
   }
 
   /** @param {any} clock */
   #tell(clock) {
     this.link.clock(clock);
     const parted = clock.seek !== undefined || (clock.speed ?? 1) !== 1 || clock.playing === false;
-    if (this.state) this.#state({ ...this.state, ...clock, ...(clock.live ? { playing: true } : parted ? { live: false } : {}) });
+    const meant = { ...clock, ...(clock.live ? { playing: true } : parted ? { live: false } : {}) };
+    for (const [name, value] of Object.entries(meant)) this.told[name] = { value, at: performance.now() };
+    if (this.state) this.#state({ ...this.state, ...meant });
   }
 
   /** After a lost connection the clock is put back to where it was. */
