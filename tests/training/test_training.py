@@ -136,7 +136,8 @@ def started(out, steps, shards, streams=1, launcher=()):
     here = str(Path(__file__).parent)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
     command = [sys.executable, *launcher, str(script), here, str(out), str(steps), str(streams), str(shards)]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with out.with_suffix(".log").open("w") as log:
+        return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
 
 def test_a_killed_run_goes_on_from_a_whole_checkpoint(shards, tmp_path):
@@ -156,9 +157,10 @@ def test_a_killed_run_goes_on_from_a_whole_checkpoint(shards, tmp_path):
 
 
 def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, tmp_path):
-    torchrun = ("-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=29517")
+    torchrun = ("-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone")  # on any free port
     assert started(tmp_path / "one", 4, shards, streams=2).wait() == 0
-    assert started(tmp_path / "two", 4, shards, launcher=torchrun).wait() == 0
+    two = started(tmp_path / "two", 4, shards, launcher=torchrun)
+    assert two.wait() == 0, (tmp_path / "two.log").read_text()[-3000:]
     one, two = (load_file(tmp_path / n / "model.safetensors") for n in ("one", "two"))
     for key in one:
         assert torch.allclose(one[key], two[key], atol=2e-5), key
