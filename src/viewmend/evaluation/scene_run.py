@@ -173,13 +173,12 @@ class _Stream:
 
     def _step(self, moment: _Moment) -> None:
         view, config = moment.view, self.settings.pipeline
-        first = self._inpainter is None or self._state is None
         if self._inpainter is None or self._state is None:
             self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
             self._state = StreamState(self._inpainter.initial_state())
         # Depths that other methods asked for would be free for this one, and times depend on the list of methods.
         mended = complete_view(view, moment.observation.apart(), self._state, self._inpainter, config)
-        if first and mended.stage_ms.inpainting < SLOW_MS:
+        if not self._scores and mended.stage_ms.inpainting < SLOW_MS:
             mended = complete_view(view, moment.observation.apart(), self._state, self._inpainter, config)
         rgb, before = mended.completed.rgb, None
         _check(rgb, view)

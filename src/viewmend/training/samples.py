@@ -107,8 +107,9 @@ class LeaveOneOut:
 
 def widened(view: IncompleteView, reach_px: int) -> IncompleteView:
     """The view with everything on the subject missing that is at most so far, along rows and columns, from a hole."""
-    side = 2 * reach_px + 1
-    near = F.max_pool2d((view.error[None, None] > 0).float(), side, 1, reach_px)[0, 0] > 0
-    missing = near & (view.mask > 0) if reach_px else torch.zeros_like(near)
+    if not reach_px:
+        return view
+    near = F.max_pool2d((view.error[None, None] > 0).float(), 2 * reach_px + 1, 1, reach_px)[0, 0] > 0
+    missing = near & (view.mask > 0)
     kept = ~missing
     return replace(view, rgb=view.rgb * kept, error=view.error.masked_fill(missing, 1.0), weights=view.weights * kept)
