@@ -64,13 +64,16 @@ def test_steadying_equals_its_twin(rng):
     assert torch.equal(steady.rgb[:, ~filled], now.rgb[:, ~filled])
 
 
-def test_what_differs_is_old_or_comes_later_stays_as_it_is(rng):
+def test_what_differs_is_old_coarse_or_comes_later_stays_as_it_is(rng):
     now = completed(rng)
     last = LastView.of(completed(rng, time=4))
     other = replace(last, rgb=1 - last.rgb.round())
     assert torch.allclose(steadied(now, other, 0.7).rgb, now.rgb, atol=1e-6), "another colour"
     away = replace(last, depth=1.1 * last.depth)
-    for ignored in (None, replace(last, time=5 - STALE - 1), replace(last, time=6), away):
+    height, width = last.depth.shape
+    half = last.camera.resized(width // 2, height // 2)
+    coarse = replace(last, camera=half, rgb=last.rgb[:, ::2, ::2], depth=last.depth[::2, ::2])
+    for ignored in (None, replace(last, time=5 - STALE - 1), replace(last, time=6), away, coarse):
         assert torch.equal(steadied(now, ignored, 0.7).rgb, now.rgb)
     assert torch.equal(steadied(now, last, 0.0).rgb, now.rgb)
 

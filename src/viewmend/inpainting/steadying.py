@@ -16,6 +16,8 @@ from viewmend.views import CompletedView
 
 STALE = 3
 """Views of more than so many frames ago are not looked at."""
+COARSE = 0.9
+"""Nor views whose focal length, in pixels, is below this share of the new one's: they would blur its fill."""
 SAME_COLOUR = 0.07
 """Root mean square difference of colours, in [0, 1], at which a carried fill counts 1/e of what it could."""
 SAME_PLACE = 0.01
@@ -48,6 +50,8 @@ def steadied(completed: CompletedView, last: LastView | None, share: float) -> C
     """
     view = completed.view
     if not share or last is None or not 0 <= view.time - last.time <= STALE:
+        return completed
+    if float(last.camera.K[0, 0, 0]) < COARSE * float(view.camera.K[0, 0, 0]):
         return completed
     pixels = torch.nonzero((view.error > 0) & (view.depth > 0))
     index = tuple(pixels.unbind(1))
