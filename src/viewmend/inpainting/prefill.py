@@ -5,10 +5,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-THIN_PX = 5
-"""A hole is thin where no square of this side fits in."""
 REACH_PX = 2
 """How far the edge of a hole is from what it is filled from."""
+THIN_PX = 2 * REACH_PX + 1
+"""A hole is thin where no square of this side fits in."""
 
 
 def fill(
@@ -22,23 +22,29 @@ def fill(
     background. Where holes are wide, only the `subject` counts. What is farther than `REACH_PX` from anything known is
     `pull_push`ed from the subject's pixels.
     """
-    wide, filled = _opened(missing, THIN_PX), _fill(rgb, ~missing, missing, subject)
+    near, _ = _from_near(rgb, ~missing, missing)
+    wide = _opened(missing, THIN_PX)
     if not bool(wide.any()):
-        return filled
-    return torch.where(wide, _fill(rgb, ~missing & subject, missing, subject), filled)
+        return near  # nor is anything out of reach: around what is, a square of THIN_PX is missing
+    filled, reached = _from_near(rgb, ~missing & subject, missing)
+    deep = missing & ~reached
+    if bool(deep.any()):
+        filled = torch.where(deep, pull_push(filled, ~deep & subject), filled)
+    return torch.where(wide, filled, near)
 
 
-def _fill(rgb: Tensor, known: Tensor, missing: Tensor, subject: Tensor) -> Tensor:
+def _from_near(
+    rgb: Float[Tensor, "channel height width"],
+    known: Bool[Tensor, "height width"],
+    missing: Bool[Tensor, "height width"],
+) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
+    """Missing pixels as the mean of the known ones within reach, by distance; and which have any."""
     offsets = torch.arange(-REACH_PX, REACH_PX + 1, device=rgb.device)
     near = (-0.5 * (offsets[:, None] ** 2 + offsets**2)).exp().to(rgb)[None, None]
     colour = F.conv2d((rgb * known)[:, None], near, padding=REACH_PX)[:, 0]
     weight = F.conv2d(known.to(rgb)[None, None], near, padding=REACH_PX)[0, 0]
     reached = missing & (weight > 0)
-    filled = torch.where(reached, colour / weight.clamp_min(1e-6), rgb)
-    deep = missing & ~reached
-    if not bool(deep.any()):
-        return filled
-    return torch.where(deep, pull_push(filled, ~deep & subject), filled)
+    return torch.where(reached, colour / weight.clamp_min(1e-6), rgb), reached
 
 
 def _opened(pixels: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "height width"]:
