@@ -46,7 +46,7 @@ def _march(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], I
             starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
             table = triangle_table().numpy()
             count = kernels.connect(grid, ISO, table, starts.numpy(), vertex_of_edge, faces.numpy())
-            return vertices, faces[:count]
+            return vertices, faces[:count].clone()  # half of it: the rest would stay as long as the mesh
     vertices, vertex_of_edge = _crossings(values)
     return vertices, _triangles(values > ISO, vertex_of_edge)
 

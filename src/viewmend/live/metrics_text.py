@@ -1,6 +1,7 @@
 """/metrics: counters and gauges as Prometheus reads them."""
 
 from viewmend.live.connection import Lobby
+from viewmend.live.memory import resident_bytes
 from viewmend.live.service import STAGES
 
 
@@ -25,6 +26,9 @@ def metrics_text(lobby: Lobby) -> str:
             {f'{{stage="{stage}"}}': counts[f"{stage}_us"] / 1e6 for stage in STAGES},
         ),
     ]
+    resident = resident_bytes()
+    if resident is not None:
+        lines += _metric("process_resident_memory_bytes", "gauge", "Resident memory size in bytes.", {"": resident})
     return "\n".join(lines) + "\n"
 
 
