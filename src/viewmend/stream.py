@@ -13,6 +13,7 @@ from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.context import ContextCache, ContextFrame, window_times
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.protocol import Source, State, ViewInpainter
+from viewmend.keeping import kept
 from viewmend.pipeline import (
     DepthGiver,
     Observation,
@@ -130,7 +131,7 @@ class Stream:
             frame = replace(frame, depth=None)  # the truth of synthetic captures: nobody looks at it here
             bounds = None if self.bounds is None else self.bounds.to(frame.rgb.device)
             given = None if geometry is None else Observation(frame, geometry, 0.0)
-            self._moments[frame.time] = _Moment(given or observe(frame, bounds, self.config))
+            self._moments[frame.time] = _Moment(given or _kept_proxy(observe(frame, bounds, self.config)))
         self._moments.move_to_end(frame.time)
         self._forget()
         return self._moments[frame.time].observation
@@ -234,7 +235,7 @@ class Stream:
         fresh = [(m, views) for m, views in missing if views is not None]
         encoded = self.inpainter.encode_contexts([views for _, views in fresh])
         for (moment, _), frames in zip(fresh, encoded, strict=True):
-            moment.encoded.update({frame.name: frame for frame in frames})
+            moment.encoded.update({frame.name: kept(frame) for frame in frames})
         return ms_since(start, view.rgb.device)
 
     def _past(self, time: int, effort: Effort) -> list[_Moment]:
@@ -251,6 +252,10 @@ class Stream:
         while sum(size.values()) > 1e6 * self.memory_mb and len(self._moments) > 1:
             time, _ = self._moments.popitem(last=False)
             del size[time]
+
+
+def _kept_proxy(observation: Observation) -> Observation:
+    return replace(observation, proxy=kept(observation.proxy))
 
 
 class _WithEffort:

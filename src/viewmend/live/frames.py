@@ -15,6 +15,7 @@ from torch import Tensor
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.keeping import kept
 from viewmend.live.clock import Span
 from viewmend.views import MultiViewFrame
 
@@ -94,7 +95,7 @@ class FrameStore:
 
     def put(self, time: int, frame: MultiViewFrame) -> None:
         """Keep a frame as that of this time."""
-        frame = replace(frame, depth=None, time=time)
+        frame = kept(replace(frame, depth=None, time=time))
         self._frames[time] = frame
         self._bytes += _size(frame)
         while self._bytes > self._limit and len(self._frames) > 1:

@@ -10,13 +10,13 @@ import time
 from functools import cache
 from pathlib import Path
 
-IDLE_S, BUSY_S = 10.0, 20.0
+IDLE_S, BUSY_S = 20.0, 120.0
 """So often at most it is given back while nobody waits for a view, and at least."""
 SLACK_BYTES = 128e6
 """What may lie free: it is used again at once, and giving it back takes time (11 ms for 130 MB, 40 for 300)."""
-ARENAS = 2
-"""Of glibc's heaps. By default there are eight a core, each with its own holes, for threads that allocate at once: here
-one renders."""
+ARENAS = 1
+"""Of glibc's heaps. By default there are eight a core, each with holes of its own that no other fills; here one thread
+renders."""
 LARGE_BYTES = 8_000_000
 """Larger buffers are mapped on their own, and unmapped after use: no view in motion needs such. glibc would raise the
 limit to 32 MB by itself."""
