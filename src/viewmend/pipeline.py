@@ -14,6 +14,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.inpainting.protocol import State, ViewInpainter
+from viewmend.keeping import kept
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame
 
@@ -61,8 +62,9 @@ class Observation:
         if new:
             rendered = self.proxy.depth(self.frame.cameras.select(new))
             right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
-            rendered = torch.nn.functional.pad(rendered, (0, right, 0, below))  # padded as the images are
-            self._depths.update(zip(new, rendered, strict=True))
+            if right or below:
+                rendered = torch.nn.functional.pad(rendered, (0, right, 0, below))  # padded as the images are
+            self._depths.update(zip(new, kept(rendered), strict=True))
         return torch.stack([self._depths[name] for name in names])
 
     def known_depths(self) -> tuple[Float[Tensor, "height width"], ...]:

@@ -10,6 +10,7 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.rays import OFFSETS, RAY_CHANNELS, RaySamples, follow, windows
@@ -23,8 +24,11 @@ POINT_FEATURES = 16
 """What is kept of each point of a ray."""
 CONTRAST = 10.0
 """Variances of colours are small numbers: shown times this."""
-PIXELS_AT_ONCE = 4096
-"""So many are read together, that memory is bounded, where nothing is learned."""
+PIXELS_AT_ONCE = 512
+"""So many are read together where nothing is learned: with more, buffers are so large that the system hands them out
+page by page, each time anew, which takes longer than to compute what is in them."""
+PIXELS_STEP = 64
+"""Convolutions work on a multiple of so many: they are compiled for each number they meet, which takes as long."""
 
 
 class RayReader(nn.Module):
@@ -82,9 +86,11 @@ class RayReader(nn.Module):
     def mix(self, samples: RaySamples, around: Float[Tensor, "pixel 8 11 11"]) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         colours, features = self._points(samples)
-        hidden = self.head(torch.cat([features.flatten(1), self.around(around).flatten(1)], 1))
+        whole = F.pad(around, (0, 0) * 3 + (0, -len(around) % PIXELS_STEP))
+        surroundings = self.around(whole)[: len(around)]
+        hidden = self.head(torch.cat([features.flatten(1), surroundings.flatten(1)], 1))
         in_view = samples.features[..., 8].amax(2) > 0
-        candidate = torch.nn.functional.pad(in_view, (0, 2), value=True)
+        candidate = F.pad(in_view, (0, 2), value=True)
         shares = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
         guess = around[:, None, 5:, RADIUS_PX, RADIUS_PX]
         return (shares[..., None] * torch.cat([colours, guess, 0 * guess], 1)).sum(1)
