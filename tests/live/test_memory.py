@@ -8,7 +8,7 @@ import pytest
 
 from viewmend.live import memory
 
-pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="needs glibc 2.33 or later")
+pytestmark = pytest.mark.skipif(memory._glibc() is None, reason="needs glibc")
 
 
 def resident_mb() -> float:
@@ -22,7 +22,6 @@ def test_what_lies_between_things_that_live_long_is_handed_back(monkeypatch):
     kept = blocks[::40]
     before = resident_mb()
     del blocks
-    assert memory.free_bytes() > 200e6
     assert resident_mb() > before - 50
     assert memory.Tidying().when_due(idle=True)
     assert resident_mb() < before - 200
@@ -34,6 +33,9 @@ def test_a_little_is_kept_and_busy_times_are_left_alone(monkeypatch):
     monkeypatch.setattr(memory, "IDLE_S", 0.0)
     tidying = memory.Tidying()
     assert not tidying.when_due(idle=True)
-    monkeypatch.setattr(memory, "SLACK_BYTES", 0)
+    monkeypatch.setattr(memory, "SLACK_BYTES", 50e6)
     assert not tidying.when_due(idle=False)
     assert tidying.when_due(idle=True)
+    assert not tidying.when_due(idle=True), "nothing has come since"
+    grown = bytearray(b"x") * 100_000_000
+    assert tidying.when_due(idle=True) and len(grown) == 100_000_000

@@ -54,13 +54,13 @@ def assemble(
         complete = uvs[~target.incomplete]
         carried.append((complete, torch.ones_like(complete[:, 0], dtype=torch.bool)))
         context.append((torch.cat([uvs for uvs, _ in carried]), torch.cat([valid for _, valid in carried])))
-        keys.append(torch.cat([*(frame.keys_values.to(own) for frame in frames), own], 2))
+        keys.append([*(frame.keys_values.to(own) for frame in frames), own])
     # One key at least, though it does not count: kernels dislike empty tensors.
-    most = max(1, *(key.shape[2] for key in keys))
+    most = max(1, *(sum(part.shape[2] for part in parts) for parts in keys))
     return Batch(
         torch.stack([_padded(q, max(len(q) for q in queries)) for q in queries]),
         _placed(asking, targets, max(len(q) for q in queries)),
-        torch.stack([F.pad(key, (0, 0, 0, most - key.shape[2])) for key in keys], 2),
+        _stacked([_joined(parts, most) for parts in keys]),
         _placed(context, targets, most),
     )
 
@@ -90,6 +90,17 @@ def _placed(
     uvs = torch.stack([_padded(uvs, length) for uvs, _ in parts])
     sizes = torch.stack([F.pad(t.view.camera.size_px[0] / STEP_PX, (0, 1), value=1.0) for t in targets])
     return Placed(uvs, uvs * sizes[:, None], torch.stack([_padded(present, length) for _, present in parts]))
+
+
+def _joined(parts: Sequence[Float[Tensor, "block 2 _ dim"]], length: int) -> Float[Tensor, "block 2 key dim"]:
+    """One after the other, and zeros up to this length: in one copy, for these are most of a step's memory."""
+    blocks, two, _, dim = parts[0].shape
+    missing = length - sum(part.shape[2] for part in parts)
+    return torch.cat([*parts, *([parts[0].new_zeros(blocks, two, missing, dim)] * (missing > 0))], 2)
+
+
+def _stacked(samples: Sequence[Float[Tensor, "block 2 key dim"]]) -> Float[Tensor, "block 2 sample key dim"]:
+    return torch.stack(list(samples), 2) if len(samples) > 1 else samples[0][:, :, None]
 
 
 def _padded(rows: Tensor, length: int) -> Tensor:

@@ -1,7 +1,7 @@
 """Giving memory back.
 
-Stores are bounded, but glibc keeps what lies free between things that live long: large buffers of views that are gone
-beside frames that stay. Left alone that comes to more than the frames themselves.
+Stores are bounded, and have pages of their own (`keeping.py`). But glibc keeps what lies free between small things that
+live long and buffers of views that are gone. Left alone that comes to more than the stores.
 """
 
 import ctypes
@@ -10,10 +10,11 @@ import time
 from functools import cache
 from pathlib import Path
 
-IDLE_S, BUSY_S = 20.0, 120.0
-"""So often at most it is given back while nobody waits for a view, and at least."""
-SLACK_BYTES = 128e6
-"""What may lie free: it is used again at once, and giving it back takes time (11 ms for 130 MB, 40 for 300)."""
+IDLE_S, BUSY_S = 5.0, 15.0
+"""So often at most it is given back while nobody waits for a view, and while somebody does."""
+SLACK_BYTES = 100e6
+"""What may lie free: it is used again at once, and giving it back takes time (10 ms for 100 MB, and more to get it again).
+"""
 ARENAS = 1
 """Of glibc's heaps. By default there are eight a core, each with holes of its own that no other fills; here one thread
 renders."""
@@ -23,21 +24,11 @@ limit to 32 MB by itself."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 
 
-class _Usage(ctypes.Structure):
-    """glibc's `struct mallinfo2`."""
-
-    _fields_ = tuple(
-        (name, ctypes.c_size_t)
-        for name in ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "used", "free", "top")
-    )
-
-
 @cache
 def _glibc() -> ctypes.CDLL | None:
-    """The C library, where it is glibc 2.33 or later."""
+    """The C library, where it is glibc."""
     try:
         library = ctypes.CDLL(None)
-        library.mallinfo2.restype = _Usage
         library.malloc_trim.argtypes = [ctypes.c_size_t]
         library.mallopt.argtypes = [ctypes.c_int, ctypes.c_int]
     except (OSError, AttributeError, TypeError):  # other systems have other allocators
@@ -50,12 +41,6 @@ def set_up() -> bool:
     library = _glibc()
     options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE_BYTES), (_M_TRIM_THRESHOLD, int(SLACK_BYTES / 2)))
     return library is not None and all(library.mallopt(*option) == 1 for option in options)
-
-
-def free_bytes() -> int:
-    """What the allocator holds and nobody uses; 0 where that is not known."""
-    library = _glibc()
-    return 0 if library is None else library.mallinfo2().free
 
 
 def resident_bytes() -> int | None:
@@ -72,15 +57,18 @@ class Tidying:
 
     def __init__(self) -> None:
         self._last = time.monotonic()
+        self._least = 0
+        """What was resident when it was last given back: mostly what is in use."""
 
     def when_due(self, idle: bool) -> bool:
-        """Call it between views; whether something was handed back, which takes up to a tenth of a second."""
+        """Call it between views; whether something was handed back, which takes some hundredths of a second."""
         now = time.monotonic()
         if now - self._last < (IDLE_S if idle else BUSY_S):
             return False
         self._last = now
-        library = _glibc()
-        if library is None or free_bytes() < SLACK_BYTES:
+        library, resident = _glibc(), resident_bytes()
+        if library is None or resident is None or resident - self._least < SLACK_BYTES:
             return False
         library.malloc_trim(0)
+        self._least = resident_bytes() or 0
         return True
