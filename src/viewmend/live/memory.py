@@ -13,7 +13,7 @@ from pathlib import Path
 IDLE_S, BUSY_S = 5.0, 15.0
 """So often at most it is given back while nobody waits for a view, and while somebody does."""
 SLACK_BYTES = 100e6
-"""What may lie free: it is used again at once, and giving it back takes time (10 ms for 100 MB), and so does more."""
+"""What may lie free, for it is used again at once: giving 100 MB back takes 10 ms, and getting them again more."""
 ARENAS = 1
 """Of glibc's heaps. By default there are eight a core, each with holes of its own that no other fills; here one thread
 renders."""
