@@ -1,0 +1,119 @@
+"""Where a model's attention goes, and what the past changes: python benchmarks/attention.py [--model NAME] [--write].
+
+The last of 31 frames of scenes of P, seen by the camera that is left out, mended once with all of the paper's window
+and once with the present alone. Attention is a mean over the missing patches, heads and blocks.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from measure import write
+from torch import Tensor
+from visibility import FURTHER, NOW, RECENT
+
+from viewmend.capture.studio.procedural import PerformerStyle, procedural_scene
+from viewmend.capture.studio.stage import Studio
+from viewmend.evaluation.scenes import StudioScene, procedural_set
+from viewmend.inpainting import inpainter as steps
+from viewmend.inpainting import transformer
+from viewmend.inpainting.checkpoint import load_inpainter
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.metrics.image_quality import psnr
+from viewmend.pipeline import PipelineConfig, observe, view_of
+from viewmend.views import ContextViews
+
+
+class Watched:
+    """A model whose attention is written down while it completes one view."""
+
+    def __init__(self, model: Inpainter) -> None:
+        self.model = model
+        self.received: list[Tensor] = []
+        self.kinds: dict[str, Tensor] = {}
+
+    def __enter__(self) -> "Watched":
+        attend, assemble = transformer.attend, steps.assemble
+
+        def watch(Q: Tensor, K: Tensor, V: Tensor, keep: Tensor, scale: float) -> Tensor:
+            weights = ((Q @ K.mT) * scale).masked_fill(~keep[:, None, None], -torch.inf).softmax(-1)
+            self.received.append(weights.mean((0, 1, 2)))
+            return attend(Q, K, V, keep, scale)
+
+        def sort(targets: Sequence[Any], *others: Any) -> Any:
+            batch = assemble(targets, *others)
+            frames_ago = batch.context_at.uvs[0, :, 2] * self.model.config.window
+            own = torch.zeros(len(frames_ago), dtype=torch.bool)
+            own[len(own) - int((~targets[0].incomplete).sum()) :] = True
+            present = ~own & (frames_ago < 0.5)
+            recent = (frames_ago > 0.5) & (frames_ago < self.model.config.n_c + 0.5)
+            further = frames_ago > self.model.config.n_c + 0.5
+            self.kinds = {"the view's own": own, "now": present, "recent": recent, "further": further}
+            return batch
+
+        self._patches = [patch.object(transformer, "attend", watch), patch.object(steps, "assemble", sort)]
+        for one in self._patches:
+            one.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for one in self._patches:
+            one.stop()
+
+    def shares(self) -> dict[str, float]:
+        """Share of the attention, and of the context's patches, by kind."""
+        mean = torch.stack(self.received).mean(0)
+        count = len(mean)
+        attention = {f"attention, {kind}": float(mean[keys].sum()) for kind, keys in self.kinds.items()}
+        return attention | {f"patches, {kind}": float(keys.sum()) / count for kind, keys in self.kinds.items()}
+
+
+@torch.no_grad()
+def looked_at(scene: StudioScene, model: Inpainter) -> dict[str, float] | None:
+    """Shares and scores of one scene; None where hardly anything is missing."""
+    assert scene.tempo is not None, "scenes of P state it"
+    performer = procedural_scene(scene.config.seed, style=PerformerStyle(tempo=scene.tempo))
+    studio, config = Studio(scene.config, performer), PipelineConfig()
+    frames = {time: studio.read(time) for time in (NOW, *RECENT, *FURTHER)}
+    seen = {time: observe(frame.without([scene.held]), None, config) for time, frame in frames.items()}
+    truth = frames[NOW].select([scene.held])
+    view, _ = view_of(seen[NOW], truth.cameras, config)
+    holes = view.error > 0
+    if int(holes.sum()) < 50:
+        return None
+
+    def source(time: int, names: Sequence[str]) -> ContextViews | None:
+        return seen[time].context(names) if time in seen else None
+
+    with Watched(model) as watched:
+        whole, _ = model.step(view, source, model.initial_state())
+        shares = watched.shares()
+    alone, _ = model.step(view, lambda t, names: source(t, names) if t == NOW else None, model.initial_state())
+    assert truth.mask is not None, "the studio knows its masks"
+    right = truth.rgb[0].float() / 255 * (truth.mask[0].float() / 255)
+    scores = {"with the past, dB": psnr(whole.rgb, right, holes), "without, dB": psnr(alone.rgb, right, holes)}
+    change = float((whole.rgb - alone.rgb).abs()[:, holes].mean() * 255)
+    return shares | {k: v for k, v in scores.items() if v is not None} | {"change by the past, 255ths": change}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="small", help="name or folder; one that prunes is not watched whole")
+    parser.add_argument("--scenes", type=int, default=12)
+    parser.add_argument("--size", type=int, default=320)
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    options = parser.parse_args()
+    model = load_inpainter(options.model).eval()
+    scenes = procedural_set(frames=NOW + 1, size_px=options.size)[: options.scenes]
+    rows = [row for scene in scenes if (row := looked_at(scene, model)) is not None]
+    results = {name: round(sum(row[name] for row in rows) / len(rows), 4) for name in rows[0]} | {"scenes": len(rows)}
+    print(json.dumps(results, indent=2))
+    if options.write:
+        print("wrote", write("attention", "cpu", vars(options), results))
+
+
+if __name__ == "__main__":
+    main()
