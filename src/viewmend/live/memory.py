@@ -10,7 +10,7 @@ import time
 from functools import cache
 from pathlib import Path
 
-IDLE_S, BUSY_S = 5.0, 15.0
+IDLE_S, BUSY_S = 5.0, 60.0
 """So often at most it is given back while nobody waits for a view, and while somebody does."""
 SLACK_BYTES = 100e6
 """What may lie free, for it is used again at once: giving 100 MB back takes 10 ms, and getting them again more."""
