@@ -15,8 +15,6 @@ from measure import write
 from torch import Tensor
 from visibility import FURTHER, NOW, RECENT
 
-from viewmend.capture.studio.procedural import PerformerStyle, procedural_scene
-from viewmend.capture.studio.stage import Studio
 from viewmend.evaluation.scenes import StudioScene, procedural_set
 from viewmend.inpainting import inpainter as steps
 from viewmend.inpainting import transformer
@@ -74,9 +72,7 @@ class Watched:
 @torch.no_grad()
 def looked_at(scene: StudioScene, model: Inpainter) -> dict[str, float] | None:
     """Shares and scores of one scene; None where hardly anything is missing."""
-    assert scene.tempo is not None, "scenes of P state it"
-    performer = procedural_scene(scene.config.seed, style=PerformerStyle(tempo=scene.tempo))
-    studio, config = Studio(scene.config, performer), PipelineConfig()
+    studio, config = scene.studio(), PipelineConfig()
     frames = {time: studio.read(time) for time in (NOW, *RECENT, *FURTHER)}
     seen = {time: observe(frame.without([scene.held]), None, config) for time, frame in frames.items()}
     truth = frames[NOW].select([scene.held])

@@ -15,8 +15,6 @@ from jaxtyping import Bool, Float
 from measure import write
 from torch import Tensor
 
-from viewmend.capture.studio.procedural import PerformerStyle, procedural_scene
-from viewmend.capture.studio.stage import Studio
 from viewmend.evaluation.scenes import StudioScene, procedural_set
 from viewmend.evaluation.temporal import VISIBLE_M
 from viewmend.geometry.cameras import Cameras, project
@@ -50,9 +48,7 @@ def then(mesh: Mesh, camera: Cameras, raster: Raster, before: Mesh, pixels: Bool
 
 def shares(scene: StudioScene) -> dict[str, float] | None:
     """Shares of the missing surface; None where hardly anything is missing."""
-    assert scene.tempo is not None, "scenes of P state it"
-    performer = procedural_scene(scene.config.seed, style=PerformerStyle(tempo=scene.tempo))
-    studio = Studio(scene.config, performer)
+    studio = scene.studio()
     frames = {time: studio.read(time) for time in (NOW, *RECENT, *FURTHER)}
     inputs, camera = frames[NOW].without([scene.held]), frames[NOW].cameras.select([scene.held])
     config = PipelineConfig()

@@ -126,7 +126,7 @@ def observe(frame: MultiViewFrame, bounds: Bounds | None, config: PipelineConfig
             "foreground and name the files as each camera's 'mask'"
         )
     start = now_s(frame.rgb.device)
-    proxy = reconstruct(frame.mask, frame.cameras, bounds, config.hull)
+    proxy = kept(reconstruct(frame.mask, frame.cameras, bounds, config.hull))
     return Observation(frame, proxy, ms_since(start, frame.rgb.device))
 
 

@@ -131,7 +131,7 @@ class Stream:
             frame = replace(frame, depth=None)  # the truth of synthetic captures: nobody looks at it here
             bounds = None if self.bounds is None else self.bounds.to(frame.rgb.device)
             given = None if geometry is None else Observation(frame, geometry, 0.0)
-            self._moments[frame.time] = _Moment(given or _kept_proxy(observe(frame, bounds, self.config)))
+            self._moments[frame.time] = _Moment(given or observe(frame, bounds, self.config))
         self._moments.move_to_end(frame.time)
         self._forget()
         return self._moments[frame.time].observation
@@ -252,10 +252,6 @@ class Stream:
         while sum(size.values()) > 1e6 * self.memory_mb and len(self._moments) > 1:
             time, _ = self._moments.popitem(last=False)
             del size[time]
-
-
-def _kept_proxy(observation: Observation) -> Observation:
-    return replace(observation, proxy=kept(observation.proxy))
 
 
 class _WithEffort:

@@ -5,6 +5,7 @@ import json
 import threading
 import urllib.error
 import urllib.request
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -47,7 +48,8 @@ def test_health_and_metrics(ball):
     lines = [line for line in body.decode().splitlines() if not line.startswith("#")]
     values = {line.rsplit(" ", 1)[0]: float(line.rsplit(" ", 1)[1]) for line in lines}
     assert values["viewmend_up"] == 1 and 'viewmend_stage_seconds_total{stage="rendering"}' in values
-    assert 50e6 < values.get("process_resident_memory_bytes", 1e9) < 100e9  # nobody says it without /proc
+    if Path("/proc/self/statm").exists():
+        assert 50e6 < values["process_resident_memory_bytes"] < 100e9
 
 
 def test_a_picture_shows_the_subject_from_where_it_was_asked(ball):

@@ -100,15 +100,18 @@ class StudioScene:
         config = replace(self.config, performers=None, motions=None, device="cpu")
         return repr((config, self.held, self.tempo, self.files_sha256))
 
+    def studio(self, device: str = "cpu") -> Studio:
+        """The studio with its people: frames of all cameras, the one that is left out among them."""
+        tempo, config = self.tempo, replace(self.config, device=device)
+        return Studio(
+            config, None if tempo is None else procedural_scene(config.seed, style=PerformerStyle(tempo=tempo))
+        )
+
     def frames(self, device: str) -> Iterator[SceneFrame]:
         """Renders them, one at a time."""
-        config = replace(self.config, device=device)
-        performer = (
-            None if self.tempo is None else procedural_scene(config.seed, style=PerformerStyle(tempo=self.tempo))
-        )
-        studio = Studio(config, performer)
+        studio = self.studio(device)
         before: MultiViewFrame | None = None
-        for time in range(config.frames):
+        for time in range(self.config.frames):
             frame = studio.read(time)
             truth = frame.select([self.held])
             source = None

@@ -96,10 +96,11 @@ def _joined(parts: Sequence[Float[Tensor, "block 2 _ dim"]], length: int) -> Flo
     """One after the other, and zeros up to this length: in one copy, for these are most of a step's memory."""
     blocks, two, _, dim = parts[0].shape
     missing = length - sum(part.shape[2] for part in parts)
-    return torch.cat([*parts, *([parts[0].new_zeros(blocks, two, missing, dim)] * (missing > 0))], 2)
+    return torch.cat([*parts, parts[0].new_zeros(blocks, two, missing, dim)], 2)
 
 
 def _stacked(samples: Sequence[Float[Tensor, "block 2 key dim"]]) -> Float[Tensor, "block 2 sample key dim"]:
+    """All of a batch; of one, no copy."""
     return torch.stack(list(samples), 2) if len(samples) > 1 else samples[0][:, :, None]
 
 
