@@ -105,6 +105,8 @@ def main() -> None:
     model = load_inpainter(options.model).eval()
     scenes = procedural_set(frames=NOW + 1, size_px=options.size)[: options.scenes]
     rows = [row for scene in scenes if (row := looked_at(scene, model)) is not None]
+    if not rows:
+        parser.error("expected a scene that misses 50 pixels or more, got none; take more --scenes or a larger --size")
     results = {name: round(sum(row[name] for row in rows) / len(rows), 4) for name in rows[0]} | {"scenes": len(rows)}
     print(json.dumps(results, indent=2))
     if options.write:
