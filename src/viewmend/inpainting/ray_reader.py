@@ -28,7 +28,8 @@ PIXELS_AT_ONCE = 512
 """So many are read together where nothing is learned: with more, buffers are so large that the system hands them out
 page by page, each time anew, which takes longer than to compute what is in them."""
 PIXELS_STEP = 64
-"""Convolutions work on a multiple of so many: they are compiled for each number they meet, which takes as long."""
+"""Layers work on a multiple of so many: convolutions and GELUs are compiled for each number they meet, which takes as
+long, and a server that keeps a thousand of them has a heap full of holes."""
 
 
 class RayReader(nn.Module):
@@ -85,15 +86,15 @@ class RayReader(nn.Module):
 
     def mix(self, samples: RaySamples, around: Float[Tensor, "pixel 8 11 11"]) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
+        pixels = len(around)
+        samples, around = RaySamples(_whole(samples.features), _whole(samples.occupancy)), _whole(around)
         colours, features = self._points(samples)
-        whole = F.pad(around, (0, 0) * 3 + (0, -len(around) % PIXELS_STEP))
-        surroundings = self.around(whole)[: len(around)]
-        hidden = self.head(torch.cat([features.flatten(1), surroundings.flatten(1)], 1))
+        hidden = self.head(torch.cat([features.flatten(1), self.around(around).flatten(1)], 1))
         in_view = samples.features[..., 8].amax(2) > 0
         candidate = F.pad(in_view, (0, 2), value=True)
         shares = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
         guess = around[:, None, 5:, RADIUS_PX, RADIUS_PX]
-        return (shares[..., None] * torch.cat([colours, guess, 0 * guess], 1)).sum(1)
+        return (shares[..., None] * torch.cat([colours, guess, 0 * guess], 1)).sum(1)[:pixels]
 
     def _points(
         self, samples: RaySamples
@@ -117,6 +118,11 @@ class RayReader(nn.Module):
         spread = CONTRAST * (trust * (rgb - colour[:, :, None]) ** 2).sum(2)
         features = [(trust * compared).sum(2), colour, spread, samples.occupancy, (trust**2).sum(2)]
         return colour, self.point(torch.cat(features, -1))
+
+
+def _whole(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
+    """With zeros for pixels behind, up to a multiple of `PIXELS_STEP`."""
+    return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
 
 
 def _follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews | None) -> RaySamples:
