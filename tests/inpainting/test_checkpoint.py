@@ -90,6 +90,16 @@ def test_a_config_of_another_version(saved):
             load_inpainter(saved)
 
 
+def test_a_config_from_before_a_switch_was_added(saved):
+    before = load_inpainter(saved)
+    values = json.loads((saved / "config.json").read_text())
+    assert values.pop("steady") == InpainterConfig().steady == 0
+    (saved / "config.json").write_text(json.dumps(values))
+    after = load_inpainter(saved)
+    assert after.config == before.config
+    assert all(torch.equal(a, b) for a, b in zip(after.parameters(), before.parameters(), strict=True))
+
+
 def test_nothing_half_written(saved, monkeypatch):
     before = (saved / "model.safetensors").read_bytes()
 

@@ -113,20 +113,18 @@ class InpainterConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "InpainterConfig":
-        """Inverse of `to_dict`.
+        """Inverse of `to_dict`; what a config does not name yet has its default, which is as it was before.
 
         Raises:
-            ValueError: a key is missing or unknown, or a value is impossible.
+            ValueError: a key is unknown, or a value is impossible.
         """
-        expected = {f.name for f in fields(cls)}
-        if set(values) != expected:
+        unknown = sorted(set(values) - {f.name for f in fields(cls)})
+        if unknown:
             raise ValueError(
-                f"expected the keys of InpainterConfig, missing {sorted(expected - set(values))}, "
-                f"unknown {sorted(set(values) - expected)}; was this written by another version?"
+                f"expected the keys of InpainterConfig, unknown {unknown}; was this written by a newer version?"
             )
-        values = dict(values)
-        values["widths"] = tuple(values["widths"])
-        return cls(**values)
+        listed = {"widths": tuple(values["widths"])} if "widths" in values else {}
+        return cls(**values | listed)
 
 
 def paper() -> InpainterConfig:
