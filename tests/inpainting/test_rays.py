@@ -9,6 +9,7 @@ from reference.rays_twin import follow_twin
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.prefill import fill
+from viewmend.inpainting.ray_reader import PIXELS_STEP
 from viewmend.inpainting.rays import FAR, NEAR, OFFSETS, OUTLINE, follow, windows
 from viewmend.views import Silhouettes
 
@@ -132,6 +133,20 @@ def test_many_pixels_at_once_equal_few(monkeypatch):
         monkeypatch.setattr("viewmend.inpainting.ray_reader.PIXELS_AT_ONCE", 7)
         parts = net.prefill([incomplete], [context(5)])[0]
     assert torch.allclose(whole, parts, atol=1e-6)
+
+
+def test_layers_see_few_sizes():
+    """Each size that they meet is compiled and kept: a server would be slow, and its heap full of holes."""
+    reader, incomplete, met = tiny().ray_reader, view(5), set()
+    assert reader is not None
+    for layer in reader.modules():
+        if not list(layer.children()):
+            layer.register_forward_hook(lambda _, given, __: met.add(len(given[0])))
+    missing = torch.nonzero(incomplete.error > 0)
+    with torch.no_grad():
+        for pixels in (1, 7, 65, len(missing)):
+            reader([incomplete], [context(5)], [missing[:pixels]])
+    assert len(missing) > 65 and met and all(size % PIXELS_STEP == 0 for size in met)
 
 
 def test_the_first_fill_alone_completes_a_view():
