@@ -123,8 +123,10 @@ class InpainterConfig:
             raise ValueError(
                 f"expected the keys of InpainterConfig, unknown {unknown}; was this written by a newer version?"
             )
-        listed = {"widths": tuple(values["widths"])} if "widths" in values else {}
-        return cls(**values | listed)
+        values = dict(values)
+        if "widths" in values:
+            values["widths"] = tuple(values["widths"])
+        return cls(**values)
 
 
 def paper() -> InpainterConfig:
