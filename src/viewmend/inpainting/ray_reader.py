@@ -87,7 +87,7 @@ class RayReader(nn.Module):
     def mix(self, samples: RaySamples, around: Float[Tensor, "pixel 8 11 11"]) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         pixels = len(around)
-        samples, around = RaySamples(_whole(samples.features), _whole(samples.occupancy)), _whole(around)
+        samples, around = RaySamples(_rounded_up(samples.features), _rounded_up(samples.occupancy)), _rounded_up(around)
         colours, features = self._points(samples)
         hidden = self.head(torch.cat([features.flatten(1), self.around(around).flatten(1)], 1))
         in_view = samples.features[..., 8].amax(2) > 0
@@ -120,7 +120,7 @@ class RayReader(nn.Module):
         return colour, self.point(torch.cat(features, -1))
 
 
-def _whole(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
+def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
     """With zeros for pixels behind, up to a multiple of `PIXELS_STEP`."""
     return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
 
