@@ -37,6 +37,15 @@ def test_every_rig_meets_every_tempo_equally_often():
     assert len(pairs) == 30 and {pairs.count(pair) for pair in pairs} == {5} and len(set(pairs)) == 6
 
 
+def test_a_stage_behind_p_changes_the_images_and_neither_people_nor_rig():
+    plain, staged = (procedural_set(1, 64, background)[0] for background in ("black", "stage"))
+    assert (staged.name, staged.set, staged.held) == ("P-stage-10000", "P-stage", plain.held)
+    black, behind = (next(scene.frames("cpu")).inputs for scene in (plain, staged))
+    assert torch.equal(black.mask, behind.mask)
+    outside = (black.mask == 0)[:, None].expand_as(black.rgb)
+    assert not black.rgb[outside].any() and float(behind.rgb[outside].float().mean()) > 20
+
+
 def test_definitions_tell_scenes_apart_and_know_no_paths(small_scenes, tmp_path):
     definitions = {s.definition for s in (*small_scenes, *procedural_set(frames=2), *procedural_set(frames=3))}
     assert len(definitions) == 63

@@ -81,6 +81,11 @@ def test_no_stage_takes_a_seed_that_is_kept_for_validation_or_tests(plan):
     assert source.seeds == range(FIRST_VALIDATION_SEED, FIRST_TEST_SEED)
 
 
+def test_a_staged_plan_has_a_stage_behind_everyone_and_differs_in_nothing_else(plan):
+    plain, staged = (random_stage(replace(plan, staged=staged), Random(2)) for staged in (False, True))
+    assert staged == replace(plain, background="stage") != plain
+
+
 def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
     source = StudioScenes(plan, "7")
     alone, helped = (samples_in_order(source, 0, workers) for workers in (0, 2))

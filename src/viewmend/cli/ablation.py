@@ -18,8 +18,8 @@ class Options:
     """The ablation: what each part of the method is worth.
 
     Samples are made once; every variant is trained on them from every seed by the same number of steps, and evaluated
-    on the first scenes of P. OUT gets samples/, models/, cells/, ablation.md, .json and .svg. The same command goes on
-    with what was stopped.
+    on the first scenes of P, a stage behind their people. OUT gets samples/, models/, cells/, ablation.md, .json and
+    .svg. The same command goes on with what was stopped.
     """
 
     out: Path
@@ -152,7 +152,7 @@ def _evaluate(options: Options, trained: "list[Trained]") -> "list[Cell]":
     from viewmend.evaluation.runner import run_evaluation
     from viewmend.evaluation.scenes import procedural_set
 
-    scenes = procedural_set(options.frames, options.size)[: options.scenes]
+    scenes = procedural_set(options.frames, options.size, "stage")[: options.scenes]
     methods = ("telea", *(str(one.folder) for one in trained))
     steps = run_evaluation(scenes, methods, CellStore(options.out / "cells"), jobs=options.jobs)
     cells = list(track((cell for found in steps for cell in found), "evaluating", len(scenes) * len(methods)))

@@ -38,6 +38,8 @@ class RunOptions:
     """and of these only the first so many."""
     size: int = 512
     """Width and height of the views of P and Q."""
+    background: Literal["black", "stage"] = "black"
+    """What stands behind the people of P: a stage for models that are not given masks."""
     ssim: Literal["gaussian", "uniform7", "uniform65"] = "gaussian"
     """Windows of SSIM: Gaussian of 11 x 11 pixels, or uniform ones of 7 x 7 or 65 x 65, as others use."""
     jobs: int = 1
@@ -128,7 +130,7 @@ def scenes_of(name: str, options: RunOptions) -> "list[EvaluationScene]":
     frames = options.frames or FRAMES
     part = slice(None, options.scenes and options.every * options.scenes, options.every)
     if name == "P":
-        return list(procedural_set(frames, options.size)[part])
+        return list(procedural_set(frames, options.size, options.background)[part])
     if name == "Q":
         if options.performers is None:
             raise ValueError("expected --performers DIR for set Q, got none; P needs nothing")

@@ -27,6 +27,7 @@ FIRST_PAIR_SEED = 20000
 """Of set Q: of lights, rig and the part of the motion that is shown."""
 FRAMES, SIZE_PX = 10, 512
 
+Background = Literal["black", "stage"]
 Tempo = Literal["calm", "dance", "fast"]
 
 
@@ -122,18 +123,24 @@ class StudioScene:
             before = truth
 
 
-def procedural_set(frames: int = FRAMES, size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
-    """P: 30 procedural scenes; both rigs and the three tempos take turns, so that each pair comes five times."""
+def procedural_set(
+    frames: int = FRAMES, size_px: int = SIZE_PX, background: Background = "black"
+) -> tuple[StudioScene, ...]:
+    """P: 30 procedural scenes; both rigs and the three tempos take turns, so that each pair comes five times.
+
+    With a stage as the background it is P-stage: the same people, for models that are not given masks.
+    """
+    name = "P" if background == "black" else f"P-{background}"
     scenes = []
     for n in range(PROCEDURAL_SCENES):
         seed, cameras, tempo = FIRST_SEED + n, RINGS[n % 2], TEMPOS[n % 3]
         scenes.append(
             StudioScene(
-                name=f"P-{seed}",
-                set="P",
+                name=f"{name}-{seed}",
+                set=name,
                 rig=f"ring of {cameras}",
                 style=tempo,
-                config=StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px),
+                config=StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background),
                 held=held_camera(seed, cameras),
                 tempo=tempo,
             )

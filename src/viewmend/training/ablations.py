@@ -33,14 +33,16 @@ def ablation(name: str, data: DataPlan) -> Recipe:
     """The paper's transformer at the small size, without fill, so that all that it knows it has from its context.
 
     Colours travel with the patches, and it starts as a copier, else no budget of two CPU cores would teach it anything.
-    Holes are large: rigs of few cameras, views that miss much. The window is t, t - 1 and t - 10.
+    Holes are large: rigs of few cameras, views that miss much. The window is t, t - 1 and t - 10. A stage stands behind
+    the people: before black, colours alone would tell the background, and masks be worth nothing.
     """
     model = replace(small_model(), prefill=False, rays=0, n_c=1, n_w=1)
     few = replace(data, cameras=(5, 9), sizes_px=(192,), min_hole_px=250, context_cameras=(3,), context_weights=(1,))
+    few = replace(few, imperfect_share=0.0, staged=True)
     return Recipe(
         name=name,
         model=replace(model, **DIFFERENCES[name]),
-        data=replace(few, least_context=MOST_CAMERAS, times=(0, 1, 10, 11), past=(99,), imperfect_share=0.0),
+        data=replace(few, least_context=MOST_CAMERAS, times=(0, 1, 10, 11), past=(99,)),
         loss=LossWeights(log_error=0.5),
         steps=300,
         batch=4,

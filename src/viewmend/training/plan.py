@@ -37,6 +37,9 @@ class DataPlan:
     """How many cameras near a view an inpainter that reads rays is given."""
     imperfect_share: float = 0.6
     """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
+    staged: bool = False
+    """Whether a stage stands behind the people of every scene; else behind half of those that are imperfect, and black
+    behind the others, which tells the background as well as a mask does."""
     dropped_share: float = 0.0
     """Share of the times at which one or two cameras have no frame."""
     widened_share: float = 0.0

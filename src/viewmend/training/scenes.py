@@ -86,6 +86,8 @@ def random_stage(plan: DataPlan, random: Random, seeds: range = range(FIRST_VALI
         ),
         device=plan.device,
     )
+    if plan.staged:
+        config = replace(config, background="stage")
     if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:
         variety = random.uniform(*plan.cloth_variety)
         config = replace(config, performers=plan.performers, motions=plan.motions, cloth_variety=variety)
