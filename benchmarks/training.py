@@ -15,14 +15,14 @@ from viewmend.training.plan import DataPlan, Recipe
 from viewmend.training.processes import Processes
 from viewmend.training.recipes import RECIPES
 from viewmend.training.sample_files import write_shards
-from viewmend.training.scenes import StudioScenes
+from viewmend.training.sources import training_source
 
 NAMES = ("small_rays", "small", "base")
 
 
 def generator(recipe: Recipe, scenes: int) -> dict[str, float]:
     """One process that makes samples, after one scene that does not count."""
-    source = StudioScenes(recipe.data, "benchmark")
+    source = training_source(recipe, "benchmark")
     source.scene(0)
     samples, start = 0, time.perf_counter()
     for number in range(1, scenes + 1):
@@ -35,7 +35,7 @@ def optimiser(recipe: Recipe, steps: int, device: str) -> dict[str, float]:
     """Steps on samples that are there, after two that do not count."""
     with TemporaryDirectory() as folder:
         shards = Path(folder) / "shards"
-        source, samples = StudioScenes(recipe.data, "benchmark"), []
+        source, samples = training_source(recipe, "benchmark"), []
         while len(samples) < recipe.batch:
             samples += source.scene(100 + len(samples))
         list(write_shards(samples[: recipe.batch], shards))

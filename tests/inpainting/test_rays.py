@@ -10,7 +10,7 @@ from reference.rays_twin import follow_twin
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.ray_reader import PIXELS_STEP
-from viewmend.inpainting.rays import FAR, NEAR, OFFSETS, OUTLINE, follow, windows
+from viewmend.inpainting.rays import FAR, NEAR, OFFSETS, OUTLINE, PATCH, follow, windows
 from viewmend.views import Silhouettes
 
 
@@ -34,7 +34,7 @@ def test_following_equals_its_twin(rng):
     pixels = torch.nonzero(incomplete.error > 0)
     pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
     samples = follow(incomplete, pixels, nearby)
-    features, occupancy = follow_twin(incomplete, pixels, nearby, OFFSETS, NEAR, FAR, OUTLINE)
+    features, occupancy = follow_twin(incomplete, pixels, nearby, OFFSETS, NEAR, FAR, OUTLINE, PATCH)
     assert 0 < samples.features[..., 8].mean() < 1, "some points are out of view"
     assert torch.allclose(samples.features.double(), torch.from_numpy(features), atol=2e-3)
     assert torch.allclose(samples.occupancy.double(), torch.from_numpy(occupancy), atol=2e-3)

@@ -4,38 +4,38 @@ import numpy as np
 from reference.blend_twin import unit
 
 
-def follow_twin(view, pixels, nearby, offsets, near, far, outline):
-    """Features [pixel point view 10] and occupancy [pixel point 2], in double precision."""
+def follow_twin(view, pixels, nearby, offsets, near, far, outline, patch):
+    """Features [pixel point view 14] and occupancy [pixel point 2], in double precision."""
     depth = view.depth.double().numpy()
     focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
     covered = np.sort(depth[depth > 0])
     size_m = np.sqrt((view.mask > 0).sum().item()) * covered[(len(covered) - 1) // 2] / focal
     pose = np.linalg.inv(view.camera.camera_from_world[0].double().numpy())
-    features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 10))
+    features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 14))
     occupancy = np.ones((*features.shape[:2], 2))
     for number, (row, column) in enumerate(pixels.tolist()):
         ray = np.linalg.inv(view.camera.K[0].double().numpy()) @ [column + 0.5, row + 0.5, 1]
         for point, offset in enumerate(offsets):
             at = pose[:3, :3] @ (ray * (depth[row, column] + offset * size_m)) + pose[:3, 3]
             for camera in range(features.shape[2]):
-                seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far, outline)
+                seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far, outline, patch)
                 features[number, point, camera] = seen
             masks = [see_mask(at, view.silhouettes, camera) for camera in range(len(view.silhouettes.cameras))]
             occupancy[number, point] = sorted([*masks, 1.0, 1.0])[:2]
     return features, occupancy
 
 
-def look(point, viewer, view, nearby, index, size_m, near, far, outline):
-    """The ten features of one point in one camera; zeros where it is out of view."""
+def look(point, viewer, view, nearby, index, size_m, near, far, outline, patch):
+    """The features of one point in one camera; zeros where it is out of view."""
     camera, frame = nearby.frame.cameras[index], nearby.frame
     pose = camera.camera_from_world[0].double().numpy()
     x, y, z = pose[:3, :3] @ point + pose[:3, 3]
     width, height = camera.size_px[0].tolist()
     if z <= 0:
-        return np.zeros(10)
+        return np.zeros(14)
     u, v, _ = camera.K[0].double().numpy() @ [x / z, y / z, 1]
     if not (0 <= u < width and 0 <= v < height):
-        return np.zeros(10)
+        return np.zeros(14)
     rgb, mask, coverage, surface = np.zeros(3), 0.0, 0.0, 0.0
     for row, column, share in four_beyond(u, v):
         if 0 <= row < frame.rgb.shape[2] and 0 <= column < frame.rgb.shape[3]:
@@ -49,8 +49,13 @@ def look(point, viewer, view, nearby, index, size_m, near, far, outline):
     centre = -pose[:3, :3].T @ pose[:3, 3]
     cosine = unit(centre - point) @ unit(viewer - point)
     chosen = camera.names[0] in view.chosen
-    around = mean_around(frame.mask.double().numpy() / 255, index, u, v, outline)
-    return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, around])
+    masks, proxy = frame.mask.double().numpy() / 255, (nearby.depth.numpy() > 0).astype(float)
+    size_px = float(np.sqrt(masks.sum((1, 2)).mean()))
+    side, half = max(1, round(outline * size_px)), max(1, round(patch / 2 * size_px))
+    black = frame.rgb[index].double().numpy() / 255 * masks[index]
+    colours = [mean_around(channel[::2, ::2], half, u / 2, v / 2) for channel in black]
+    around = [mean_around(masks[index], side, u, v), *colours, mean_around(proxy[index], side, u, v)]
+    return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, *around])
 
 
 def see_mask(point, silhouettes, index):
@@ -68,13 +73,12 @@ def see_mask(point, silhouettes, index):
     return sum(share * float(silhouettes.mask[index, r, c]) / 255 for r, c, share in around)
 
 
-def mean_around(masks, index, u, v, outline):
-    """The mask's mean over squares, between the four squares around (u, v)."""
-    side = max(1, round(outline * float(np.sqrt(masks.sum((1, 2)).mean()))))
+def mean_around(image, side, u, v):
+    """The image's mean over squares, between the four squares around (u, v)."""
     total = 0.0
     for row, column, share in four_beyond(u / side, v / side):
         if row >= 0 and column >= 0:
-            square = masks[index, row * side : (row + 1) * side, column * side : (column + 1) * side]
+            square = image[row * side : (row + 1) * side, column * side : (column + 1) * side]
             total += share * square.sum() / side**2
     return total
 

@@ -20,7 +20,7 @@ from viewmend.training.sample_files import (
     sample_to_bytes,
     write_shards,
 )
-from viewmend.training.samples import LeaveOneOut, widened
+from viewmend.training.samples import LeaveOneOut, Sample, widened
 from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, StudioScenes, random_stage
 from viewmend.training.sources import scene_source
 
@@ -86,6 +86,17 @@ def test_a_staged_plan_has_a_stage_behind_everyone_and_differs_in_nothing_else(p
     assert staged == replace(plain, background="stage") != plain
 
 
+def test_rough_stages_are_only_more_wrong_than_imperfect_ones(plan):
+    def stages(**changes):
+        random = Random(3)
+        return [random_stage(replace(plan, **changes), random).imperfections for _ in range(100)]
+
+    assert {it.calibration_px for it in stages(imperfect_share=0.0, rough_share=1.0)} == {0.0}
+    usual, rough = stages(imperfect_share=1.0), stages(imperfect_share=1.0, rough_share=1.0)
+    assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in rough) <= 2.5
+    assert max(it.mask_edge_px for it in usual) <= 1 < max(it.mask_edge_px for it in rough) <= 2
+
+
 def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
     source = StudioScenes(plan, "7")
     alone, helped = (samples_in_order(source, 0, workers) for workers in (0, 2))
@@ -142,7 +153,7 @@ def test_samples_come_back_from_disk_bit_for_bit_and_damage_is_noticed(plan, tmp
     assert all(same(sample_from_bytes(sample_to_bytes(s)), s) for s in samples)
     paths = list(write_shards(samples, tmp_path, per_shard=1))
     assert [path.name for path in paths] == [f"shard-{n:05d}.tar" for n in range(len(samples))]
-    scenes = ShardScenes(tmp_path, "0")
+    scenes = ShardScenes(tmp_path, "0", (Sample,))
     drawn = [scenes.scene(number)[0] for number in range(len(samples))]
     assert {sample_to_bytes(s) for s in drawn} == {sample_to_bytes(s) for s in samples}
     paths[0].write_bytes(paths[0].read_bytes()[:3000])
@@ -153,7 +164,7 @@ def test_samples_come_back_from_disk_bit_for_bit_and_damage_is_noticed(plan, tmp
     with pytest.raises(ShardError, match="expected a sample"):
         read_shard(tmp_path / "other.tar")
     with pytest.raises(ShardError, match="expected tar files, found none"):
-        ShardScenes(tmp_path / "nowhere", "0")
+        ShardScenes(tmp_path / "nowhere", "0", (Sample,))
 
 
 def test_captures_are_scenes_whose_truth_is_the_camera_left_out(studio, plan):

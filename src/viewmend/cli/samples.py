@@ -9,7 +9,10 @@ from viewmend.cli.train import Options as TrainOptions
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Write training samples as tar shards, for `viewmend train --shards`; a recipe's own, made once for many runs."""
+    """Write training samples as tar shards, for `viewmend train --shards`; a recipe's own, made once for many runs.
+
+    Of a recipe that trains rays alone, some pixels' rays are written, looked up: thousands of scenes fit in memory.
+    """
 
     out: Path
     """Folder for shard-00000.tar and on."""
@@ -39,7 +42,7 @@ def run(options: Options) -> int:
     from viewmend.cli.train import chosen_recipe
     from viewmend.training.feed import samples_in_order
     from viewmend.training.sample_files import write_shards
-    from viewmend.training.sources import scene_source
+    from viewmend.training.sources import training_source
 
     if options.count < 1:
         raise ValueError(f"expected a count of at least 1, got {options.count}")
@@ -53,7 +56,7 @@ def run(options: Options) -> int:
         ),
         None,
     )
-    source = scene_source(recipe.data, f"{options.seed}/0")
+    source = training_source(recipe, f"{options.seed}/0")
     began = time.monotonic()
     samples = islice((s for _, _, s in samples_in_order(source, 0, options.workers)), options.count)
     shards = list(write_shards(track(samples, "samples", options.count), options.out))

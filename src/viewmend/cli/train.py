@@ -71,6 +71,8 @@ class Options:
     """Weight of VGG16's features; needs --perceptual-weights."""
     perceptual_weights: Path | None = None
     """File of torchvision's vgg16."""
+    varied: bool | None = None
+    """Vary what small_rays looked up, anew each time it is seen: for few samples and many steps."""
     seed: int = 0
     """Of weights and scenes."""
 
@@ -138,7 +140,7 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
         recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
     own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "bfloat16", "part", "checkpoint_every")
-    values = {n: getattr(options, n) for n in (*own, "validate_every")}
+    values = {n: getattr(options, n) for n in (*own, "validate_every", "varied")}
     return replace(
         recipe,
         seed=options.seed,

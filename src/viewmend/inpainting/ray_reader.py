@@ -20,6 +20,8 @@ RADIUS_PX = 5
 """How far a pixel looks around in the view."""
 WINDOW_CHANNELS = 8
 """RGB, M, E of the view, and RGB of the smooth guess."""
+SHOWN_CHANNELS = 7
+"""What cameras that see a point agree about: RGB, and the means around."""
 POINT_FEATURES = 16
 """What is kept of each point of a ray."""
 CONTRAST = 10.0
@@ -40,10 +42,15 @@ class RayReader(nn.Module):
         points = len(OFFSETS)
         self.look = nn.Sequential(nn.Linear(RAY_CHANNELS, width), nn.GELU())
         self.compare = nn.Sequential(
-            nn.Linear(width + RAY_CHANNELS + 8, width), nn.GELU(), nn.Linear(width, width), nn.GELU()
+            nn.Linear(width + RAY_CHANNELS + 2 * SHOWN_CHANNELS + 2, width),
+            nn.GELU(),
+            nn.Linear(width, width),
+            nn.GELU(),
         )
         self.trust = nn.Linear(width, 1)
-        self.point = nn.Sequential(nn.Linear(width + 9, width), nn.GELU(), nn.Linear(width, POINT_FEATURES))
+        self.point = nn.Sequential(
+            nn.Linear(width + 2 * SHOWN_CHANNELS + 3, width), nn.GELU(), nn.Linear(width, POINT_FEATURES)
+        )
         widths = (WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), 2 * width)
         layers = [(nn.Conv2d(before, after, 3), nn.GELU()) for before, after in pairwise(widths)]
         self.around = nn.Sequential(*(part for layer in layers for part in layer))
@@ -73,8 +80,8 @@ class RayReader(nn.Module):
             pixels = [torch.nonzero((view.error > 0) & (view.depth > 0).any()) for view in views]
         most = max([1, *(len(n.frame.cameras) for n in nearby if n is not None)])
         with torch.autocast(guesses[0].device.type, enabled=False):  # coordinates stay float32
-            samples = [_follow(*own).padded(most) for own in zip(views, pixels, nearby, strict=True)]
-        around = torch.cat([_surroundings(*own) for own in zip(views, guesses, pixels, strict=True)])
+            seen = [look_around(*own) for own in zip(views, nearby, pixels, guesses, strict=True)]
+        samples, around = [s.padded(most) for s, _ in seen], torch.cat([a for _, a in seen])
         features, occupancy = torch.cat([s.features for s in samples]), torch.cat([s.occupancy for s in samples])
         size = max(1, len(features)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
         parts = zip(features.split(size), occupancy.split(size), around.split(size), strict=True)
@@ -101,23 +108,23 @@ class RayReader(nn.Module):
     ) -> tuple[Float[Tensor, "pixel point 3"], Float[Tensor, "pixel point feature"]]:
         """Each point's colour, by the cameras that seem to see it, and what speaks for it being there."""
         seen, inside = samples.features, samples.features[..., 8:9]
-        rgb, fine, cosine = seen[..., :3], seen[..., 4:5], seen[..., 6:7]
+        shown, fine, cosine = torch.cat([seen[..., :3], seen[..., 10:]], -1), seen[..., 4:5], seen[..., 6:7]
         # A first opinion on who sees the point: not far behind the proxy, and from about where the view is.
         prior = inside * (4 * cosine).exp() * (-4 * fine).sigmoid()
         prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
-        mean = (prior * rgb).sum(2, keepdim=True)
-        variance = CONTRAST * (prior * (rgb - mean) ** 2).sum(2, keepdim=True)
+        mean = (prior * shown).sum(2, keepdim=True)
+        variance = CONTRAST * (prior * (shown - mean) ** 2).sum(2, keepdim=True)
         looked = self.look(seen)
         together = looked + (prior * looked).sum(2, keepdim=True)
         occupied = samples.occupancy[..., None, :1].expand_as(prior)
-        shown = [seen, mean.expand_as(rgb), variance.expand_as(rgb), together, occupied]
-        compared = self.compare(torch.cat([*shown, prior], -1))
+        told = [seen, mean.expand_as(shown), variance.expand_as(shown), together, occupied, prior]
+        compared = self.compare(torch.cat(told, -1))
         scores = self.trust(compared).float() + (prior + 1e-4).log()
         trust = inside * scores.masked_fill(inside == 0, -1e4).softmax(2)
-        colour = (trust * rgb).sum(2)
-        spread = CONTRAST * (trust * (rgb - colour[:, :, None]) ** 2).sum(2)
-        features = [(trust * compared).sum(2), colour, spread, samples.occupancy, (trust**2).sum(2)]
-        return colour, self.point(torch.cat(features, -1))
+        agreed = (trust * shown).sum(2)
+        spread = CONTRAST * (trust * (shown - agreed[:, :, None]) ** 2).sum(2)
+        features = [(trust * compared).sum(2), agreed, spread, samples.occupancy, (trust**2).sum(2)]
+        return agreed[..., :3], self.point(torch.cat(features, -1))
 
 
 def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
@@ -125,14 +132,21 @@ def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_
     return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
 
 
-def _follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews | None) -> RaySamples:
+def look_around(
+    view: IncompleteView,
+    nearby: ContextViews | None,
+    pixels: Int[Tensor, "pixel 2"],
+    guess: Float[Tensor, "3 height width"] | None = None,
+) -> tuple[RaySamples, Float[Tensor, "pixel 8 11 11"]]:
+    """All that the reader is told of these pixels (row, column): along their rays, and around them in the view.
+
+    guess: the view filled smoothly (`prefill.fill`), made where it is not given.
+    """
+    guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
+    shown = torch.cat([view.rgb, view.mask[None], view.error[None], guess])
     if nearby is not None and len(pixels):
-        return follow(view, pixels, nearby)
-    shape = (len(pixels), len(OFFSETS))
-    return RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 2))
-
-
-def _surroundings(
-    view: IncompleteView, guess: Float[Tensor, "3 height width"], pixels: Int[Tensor, "pixel 2"]
-) -> Float[Tensor, "pixel 8 11 11"]:
-    return windows(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), pixels, RADIUS_PX)
+        samples = follow(view, pixels, nearby)
+    else:
+        shape = (len(pixels), len(OFFSETS))
+        samples = RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 2))
+    return samples, windows(shown, pixels, RADIUS_PX)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -20,23 +20,25 @@ from viewmend.views import ContextViews, IncompleteView, Silhouettes
 
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Where a ray is looked at: z-depth behind the proxy, in subject sizes."""
-RAY_CHANNELS = 10
+RAY_CHANNELS = 14
 """Features of one point in one camera."""
 NEAR, FAR = 0.03, 0.2
 """Subject sizes over which the fine and the coarse distance behind the proxy saturate."""
 OUTLINE = 0.06
-"""Side, in subject sizes, of the squares over which masks are averaged to tell how near their outline is."""
+"""Side, in subject sizes, of the squares over which masks are averaged to tell how near their outline is,"""
+PATCH = 0.08
+"""and of those over which colours are: single pixels agree by chance more easily."""
 
 
 @dataclass(frozen=True)
 class RaySamples:
     """Points along the rays of some pixels, as each camera shows them."""
 
-    features: Float[Tensor, "pixel point view 10"]
+    features: Float[Tensor, "pixel point view 14"]
     """RGB (background black), mask, how far behind the proxy as that camera sees it (fine and coarse, -1 to 1), cosine
     between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view,
-    and the mask's mean around: where the outlines of two cameras meet, a hull is fattest. All 0 for a point out of
-    view."""
+    and means around: of the mask (where the outlines of two cameras meet, a hull is fattest), of the colours, and of
+    what the proxy covers (more than the mask where it is fat). All 0 for a point out of view."""
     occupancy: Float[Tensor, "pixel point 2"]
     """Least and second least mask of all cameras of the rig that have the point in view: 0 where one sees background
     there, and where another does, too; 1 where there is no such camera."""
@@ -76,9 +78,9 @@ def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: Context
     cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1)
     chosen = z.new_tensor([name in view.chosen for name in cameras.names])[:, None].expand_as(z)
     mask = frame.mask if frame.mask is not None else 255 * (nearby.depth > 0).to(torch.uint8)
-    around = _mean_around(mask, at)
-    place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z), around], -1)
-    features = torch.cat([seen[..., :4], place * inside[..., None]], -1).movedim(0, 1)
+    place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z)], -1)
+    around = _around(frame.rgb, mask, nearby.depth > 0, at)
+    features = torch.cat([seen[..., :4], torch.cat([place, around], -1) * inside[..., None]], -1).movedim(0, 1)
     silhouettes = view.silhouettes or Silhouettes(mask, cameras)
     occupancy = _least_masks(points, silhouettes)
     shape = (len(pixels), len(OFFSETS))
@@ -139,15 +141,37 @@ def _least_masks(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> 
     return value.topk(2, dim=0, largest=False).values.T
 
 
-def _mean_around(
-    mask: UInt8[Tensor, "view height width"], at: Float[Tensor, "view point 2"]
-) -> Float[Tensor, "view point"]:
-    """Masks averaged over squares of `OUTLINE` subjects, sampled between the squares."""
-    side = max(1, round(OUTLINE * float((mask.sum((1, 2)) / 255).mean().sqrt())))
-    rows, cols = (-(-size // side) for size in mask.shape[1:])
-    height, width = mask.shape[1:]
-    squares = F.pad(mask, (0, cols * side - width, 0, rows * side - height)).view(-1, rows, side, cols, side)
-    coarse = squares.sum(2, dtype=torch.int32).sum(3).to(at) / (255 * side**2)  # whole numbers: pooling is slower
-    view = torch.arange(len(mask), device=at.device)[:, None]
-    corners = _corners(at / side, coarse.shape[1:])
-    return sum((share * coarse[view, row, column] for row, column, share in corners), torch.zeros_like(at[..., 0]))
+def _around(
+    rgb: UInt8[Tensor, "view 3 height width"],
+    mask: UInt8[Tensor, "view height width"],
+    covered: Bool[Tensor, "view height width"],
+    at: Float[Tensor, "view point 2"],
+) -> Float[Tensor, "view point 5"]:
+    """Means around each place: of the mask, of RGB before black, and of what the proxy covers."""
+    size_px = float((mask.sum((1, 2)) / 255).mean().sqrt())
+    side, half = max(1, round(OUTLINE * size_px)), max(1, round(PATCH / 2 * size_px))
+    shapes = _padded(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
+    squares = shapes.unflatten(3, (-1, side)).unflatten(2, (-1, side))
+    # Whole numbers: pooling is slower.
+    shapes = squares.sum(3, dtype=torch.int32).sum(4).to(at) / (255 * side**2)
+    # Of colours every other row and column will do.
+    colours = F.avg_pool2d(_padded(rgb[..., ::2, ::2].to(at) * mask[:, None, ::2, ::2], half), half) / 255**2
+    masked, proxy = _between(shapes, at / side).split(1, -1)
+    return torch.cat([masked, _between(colours, at / (2 * half)), proxy], -1)
+
+
+def _padded(
+    images: Shaped[Tensor, "view channel height width"], side: int
+) -> Shaped[Tensor, "view channel whole_height whole_width"]:
+    """With zeros right and below, so that squares of this side cover the images."""
+    return F.pad(images, (0, -images.shape[3] % side, 0, -images.shape[2] % side))
+
+
+def _between(
+    images: Float[Tensor, "view channel height width"], at: Float[Tensor, "view point 2"]
+) -> Float[Tensor, "view point channel"]:
+    """The images between pixel centres, zeros beyond."""
+    view = torch.arange(len(images), device=at.device)[:, None]
+    corners = _corners(at, images.shape[2:])
+    nothing = at.new_zeros(*at.shape[:2], images.shape[1])
+    return sum((share[..., None] * images[view, :, row, column] for row, column, share in corners), nothing)

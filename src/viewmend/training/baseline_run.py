@@ -1,6 +1,7 @@
 """Fine-tuning of the published networks: the same samples and the same loop as ours, their authors' parameters."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from safetensors.torch import save_file
@@ -15,7 +16,6 @@ from viewmend.training.loop import Run
 from viewmend.training.model_card import model_card
 from viewmend.training.objective import Outcome
 from viewmend.training.plan import DataPlan, LossWeights, Recipe
-from viewmend.training.samples import Sample
 
 CLIP = 5
 """Consecutive views in the authors' training clips."""
@@ -88,7 +88,7 @@ class BaselineRun(Run):
     def _rate_factor(self, step: int, progress: float) -> float:
         return 1.0 if progress < FULL_RATE else 0.1
 
-    def _judge(self, adversary: Adversary, batch: list[Sample], outcome: Outcome, share: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], outcome: Outcome, share: float):
         assert isinstance(outcome, BaselineOutcome)
         truth = [(clip.truth.transpose(0, 1) + 1) / 2 for clip in outcome.clips]
         made = [(images.transpose(0, 1) + 1) / 2 for images in outcome.composed]

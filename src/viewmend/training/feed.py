@@ -1,15 +1,15 @@
 """Batches that follow from the recipe, the seed and the step alone, so that a run can go on where it was."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
 from random import Random
+from typing import Generic, TypeVar
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from viewmend.training.samples import Sample
 from viewmend.training.scenes import SceneSource
 
 MOST_EMPTY_SCENES = 100
@@ -28,14 +28,23 @@ class FeedPosition:
     """Samples in the buffer."""
 
 
-class SampleFeed:
+Item = TypeVar("Item")
+
+
+class SampleFeed(Generic[Item]):
     """One stream of batches: new samples, and others from the buffer of the last ones.
 
     Scenes are made ahead by worker processes, and used in the order of their numbers whoever made them.
     """
 
     def __init__(
-        self, scenes: SceneSource, seed: str, fresh: int, buffer: int, workers: int, start: FeedPosition | None = None
+        self,
+        scenes: SceneSource[Item],
+        seed: str,
+        fresh: int,
+        buffer: int,
+        workers: int,
+        start: FeedPosition | None = None,
     ) -> None:
         """`start` takes up a stream: the samples of its buffer are made again."""
         start = start or FeedPosition(0, 0, 0)
@@ -44,11 +53,11 @@ class SampleFeed:
         self._new = samples_in_order(scenes, start.scene, workers)
         for _ in range(start.sample):
             next(self._new)
-        self._buffer: deque[tuple[int, int, Sample]] = deque(maxlen=max(1, buffer))
+        self._buffer: deque[tuple[int, int, Item]] = deque(maxlen=max(1, buffer))
         for _ in range(start.buffered):
             self._buffer.append(next(self._new))
 
-    def batch(self, step: int, size: int) -> list[Sample]:
+    def batch(self, step: int, size: int) -> list[Item]:
         """The batch of `step`; steps follow one another. Smaller than `size` until the buffer holds enough."""
         again = min(size - self.fresh, len(self._buffer))
         seen = Random(f"{self.seed}/{step}").sample([sample for _, _, sample in self._buffer], again)
@@ -63,15 +72,15 @@ class SampleFeed:
         return FeedPosition(scene, sample, len(self._buffer))
 
 
-class _Numbered(Dataset[tuple[int, list[Sample]]]):
-    def __init__(self, scenes: SceneSource) -> None:
+class _Numbered(Dataset[tuple[int, Sequence[Item]]]):
+    def __init__(self, scenes: SceneSource[Item]) -> None:
         self.scenes = scenes
 
-    def __getitem__(self, index: int) -> tuple[int, list[Sample]]:
+    def __getitem__(self, index: int) -> tuple[int, Sequence[Item]]:
         return index, self.scenes.scene(index)
 
 
-def samples_in_order(scenes: SceneSource, first: int, workers: int) -> Iterator[tuple[int, int, Sample]]:
+def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Iterator[tuple[int, int, Item]]:
     """(scene, number, sample) of all scenes from `first` on."""
     numbered = _Numbered(scenes)
     if workers:

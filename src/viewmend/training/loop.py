@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import astuple
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -19,11 +20,12 @@ from viewmend.training.model_card import model_card
 from viewmend.training.objective import Objective, Outcome
 from viewmend.training.plan import Recipe
 from viewmend.training.processes import Processes, processes
+from viewmend.training.ray_lookups import RayLookups, RaysObjective
 from viewmend.training.run_files import FILE, RunState, load_run, save_run
 from viewmend.training.sample_files import sample_to_bytes
 from viewmend.training.samples import Sample
 from viewmend.training.schedule import Schedule, learning_rate_factor
-from viewmend.training.sources import scene_source
+from viewmend.training.sources import training_source
 from viewmend.training.validation import Validation
 
 
@@ -128,7 +130,7 @@ class Run:
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
         """A module whose call on a batch of samples is an `Outcome`."""
         assert isinstance(self.model, Inpainter)
-        return Objective(self.model, self.recipe)
+        return (RaysObjective if self.recipe.part == "rays" else Objective)(self.model, self.recipe)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         recipe = self.recipe
@@ -140,7 +142,7 @@ class Run:
     def _rate_factor(self, step: int, progress: float) -> float:
         return learning_rate_factor(step, progress, self.recipe.warmup)
 
-    def _judge(self, adversary: Adversary, batch: list[Sample], outcome: Outcome, share: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], outcome: Outcome, share: float):
         """See `Adversary.judge`."""
         return adversary.judge(batch, outcome.completed, share)
 
@@ -148,7 +150,7 @@ class Run:
         assert isinstance(self.averaged, Inpainter)
         save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
 
-    def _step(self, step: int, batches: list[list[Sample]]) -> Costs:
+    def _step(self, step: int, batches: list[list[Sample | RayLookups]]) -> Costs:
         """One step of all weights, with the mean of the streams' gradients."""
         self.optimizer.zero_grad(set_to_none=True)
         costs = []
@@ -178,7 +180,7 @@ class Run:
         values = torch.tensor([astuple(cost) for cost in costs], device=self.own.device).mean(0)
         return Costs(*self.own.mean(values).tolist())
 
-    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample]) -> None:
+    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample | RayLookups]) -> None:
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -190,7 +192,7 @@ class Run:
             "lower the learning rate and begin with the last checkpoint"
         )
 
-    def _streams(self) -> list[SampleFeed]:
+    def _streams(self) -> list[SampleFeed[Sample | RayLookups]]:
         """This process's streams: numbers rank, rank + count and so on."""
         recipe, own = self.recipe, self.own
         count = max(recipe.streams, own.count)
@@ -207,7 +209,7 @@ class Run:
         for number in range(own.rank, count, own.count):
             seed = f"{recipe.seed}/{number}"
             at: FeedPosition | None = self.state.positions[number] if self.state.positions else None
-            source = scene_source(recipe.data, seed)
+            source = training_source(recipe, seed)
             streams.append(SampleFeed(source, seed, recipe.fresh, recipe.buffer, recipe.workers, at))
         return streams
 

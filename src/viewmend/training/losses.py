@@ -1,5 +1,6 @@
 """The objective of section 8: L1 inside and outside the holes, on the network's own image Ftilde; and PSNR, ours."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -45,10 +46,25 @@ def image_loss(
 
     L_out counts the pixels that decoded patches cover (section 8). An empty weight gives 0 with a zero gradient.
     """
-    inside, outside, log_error = [], [], []
+    losses = []
     for image, covered, E, target in zip(predicted, coverage, error, truth, strict=True):
-        inside.append(weighted_l1(image.float(), target, E))
-        outside.append(weighted_l1(image.float(), target, (1 - E) * (covered > 0)))
+        inside = weighted_l1(image.float(), target, E)
+        outside = weighted_l1(image.float(), target, (1 - E) * (covered > 0))
         squares = (E * (image.float() - target).square().mean(0)).sum() / E.sum().clamp_min(1e-6)
-        log_error.append((squares + LEAST_SQUARE).log10())
-    return ImageLoss(torch.stack(inside).mean(), torch.stack(outside).mean(), torch.stack(log_error).mean())
+        losses.append(ImageLoss(inside, outside, (squares + LEAST_SQUARE).log10()))
+    return mean_loss(losses)
+
+
+def pixel_loss(predicted: Float[Tensor, "pixel 3"], truth: Float[Tensor, "pixel 3"]) -> ImageLoss:
+    """The losses of an image of which only these pixels, all missing, are looked at; 0 where there are none."""
+    if not len(truth):
+        zero = predicted.sum()
+        return ImageLoss(zero, zero, zero)
+    squares = (predicted - truth).square().mean()
+    return ImageLoss((predicted - truth).abs().mean(), torch.zeros_like(squares), (squares + LEAST_SQUARE).log10())
+
+
+def mean_loss(losses: Sequence[ImageLoss]) -> ImageLoss:
+    """The mean of each term."""
+    terms = zip(*((loss.inside, loss.outside, loss.log_error) for loss in losses), strict=True)
+    return ImageLoss(*(torch.stack(term).mean() for term in terms))

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from itertools import pairwise
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -42,11 +41,6 @@ class Objective(nn.Module):
         """All terms of `batch`."""
         weights = self.recipe.loss
         views = [sample for last in batch for sample in last.clip]
-        if self.recipe.part == "rays":
-            image = rays_loss(self.model, views, self.recipe.pixels)
-            zero = torch.zeros_like(image.inside)
-            total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
-            return Outcome(image, zero, zero, total, ())
         predictions = self.model(
             [s.view for s in views], [list(s.context) for s in views], nearby=[s.nearby for s in views]
         )
@@ -86,18 +80,3 @@ def patches_loss(predictions: list[Prediction], samples: list[Sample]) -> ImageL
         [s.view.error for s in samples],
         [s.truth.float() / 255 for s in samples],
     )
-
-
-def rays_loss(model: Inpainter, samples: list[Sample], most_px: int) -> ImageLoss:
-    """The same inside the holes, of what the ray reader makes of at most `most_px` random pixels of each view."""
-    assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
-    pixels = [torch.nonzero(s.view.error > 0) for s in samples]
-    pixels = [p[torch.randperm(len(p), device=p.device)[:most_px]] for p in pixels]
-    with model.autocast():
-        filled = model.ray_reader([s.view for s in samples], [s.nearby for s in samples], pixels)
-    one = torch.ones((), device=filled[0].device)
-    counted = [
-        torch.zeros_like(s.view.error).index_put(tuple(p.unbind(1)), one) for s, p in zip(samples, pixels, strict=True)
-    ]
-    nowhere = [torch.zeros_like(s.view.error) for s in samples]
-    return image_loss(filled, nowhere, counted, [s.truth.float() / 255 for s in samples])

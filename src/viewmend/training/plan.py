@@ -37,6 +37,8 @@ class DataPlan:
     """How many cameras near a view an inpainter that reads rays is given."""
     imperfect_share: float = 0.6
     """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
+    rough_share: float = 0.0
+    """Share of the imperfect scenes whose calibration and outlines are worse still, as those of older stages are."""
     staged: bool = False
     """Whether a stage stands behind the people of every scene; else behind half of those that are imperfect, and black
     behind the others, which tells the background as well as a mask does."""
@@ -123,6 +125,8 @@ class Recipe:
     """What is trained: the ray reader alone, on the fill that it makes, all but it, or both."""
     pixels: int = 300
     """For the rays alone: missing pixels that are read of each view, at most."""
+    varied: bool = False
+    """For the rays alone: what is looked up is varied anew each time it is seen, so that few samples last longer."""
     bfloat16: bool = True
     """Run the networks under autocast."""
     checkpoint_every: int = 100

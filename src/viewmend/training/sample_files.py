@@ -7,18 +7,20 @@ from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from viewmend.geometry.cameras import Cameras
+from viewmend.training.ray_lookups import RayLookups
 from viewmend.training.samples import Sample
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
-KINDS = {kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras)}
-"""The dataclasses that a sample is made of."""
+PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, RayLookups)
+KINDS = {kind.__name__: kind for kind in PARTS}
+"""The dataclasses that a sample is made of, and what is looked up of one."""
 STRUCTURE = "structure"
 """Name of the tensor that holds the sample without its tensors, as JSON."""
 
@@ -27,7 +29,7 @@ class ShardError(ValueError):
     """Samples that cannot be read: which file, what was expected, what came, the next step."""
 
 
-def sample_to_bytes(sample: Sample) -> bytes:
+def sample_to_bytes(sample: Sample | RayLookups) -> bytes:
     """A safetensors file with the sample's tensors, and the rest of it as JSON in a tensor of bytes."""
     tensors: dict[str, torch.Tensor] = {}
     structure = json.dumps(_taken_apart(sample, tensors)).encode()
@@ -35,7 +37,7 @@ def sample_to_bytes(sample: Sample) -> bytes:
     return save(tensors)
 
 
-def sample_from_bytes(data: bytes) -> Sample:
+def sample_from_bytes(data: bytes) -> Sample | RayLookups:
     """Inverse of `sample_to_bytes`.
 
     Raises:
@@ -48,15 +50,15 @@ def sample_from_bytes(data: bytes) -> Sample:
         raise ShardError(
             f"expected a sample, got {len(data)} bytes that do not read ({error}); make it again"
         ) from error
-    if not isinstance(sample, Sample):
+    if not isinstance(sample, Sample | RayLookups):
         raise ShardError(f"expected a sample, got a {type(sample).__name__}; make it again")
     return sample
 
 
-def write_shards(samples: Iterable[Sample], folder: Path, per_shard: int = 48) -> Iterator[Path]:
+def write_shards(samples: Iterable[Sample | RayLookups], folder: Path, per_shard: int = 48) -> Iterator[Path]:
     """Tar files of so many samples each, shard-00000.tar and on, every one whole or not there; yields their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    pending: list[Sample] = []
+    pending: list[Sample | RayLookups] = []
     number = 0
     for sample in samples:
         pending.append(sample)
@@ -67,7 +69,7 @@ def write_shards(samples: Iterable[Sample], folder: Path, per_shard: int = 48) -
         yield _write_shard(pending, folder / f"shard-{number:05d}.tar")
 
 
-def read_shard(path: Path) -> list[Sample]:
+def read_shard(path: Path) -> list[Sample | RayLookups]:
     """All samples of a shard.
 
     Raises:
@@ -81,29 +83,40 @@ def read_shard(path: Path) -> list[Sample]:
         raise ShardError(f"{path}: expected a tar of samples ({error}); make this shard again") from error
 
 
-class ShardScenes:
+Kind = TypeVar("Kind", bound=Sample | RayLookups)
+
+
+class ShardScenes(Generic[Kind]):
     """Shards as scenes, in another order each time all were used, and their samples too."""
 
-    def __init__(self, folder: Path, seed: str) -> None:
-        """Find the shards.
+    def __init__(self, folder: Path, seed: str, kinds: tuple[type[Kind], ...]) -> None:
+        """Find the shards, which hold these kinds alone.
 
         Raises:
             ShardError: the folder has none.
         """
         self.paths = sorted(folder.glob("*.tar"))
         self.seed = seed
+        self.kinds = kinds
         if not self.paths:
             raise ShardError(f"{folder}: expected tar files, found none; make some with `viewmend samples --out`")
 
-    def scene(self, number: int) -> list[Sample]:
-        """One shard."""
+    def scene(self, number: int) -> list[Kind]:
+        """One shard.
+
+        Raises:
+            ShardError: it is damaged, or holds another kind.
+        """
         round_, position = divmod(number, len(self.paths))
         order = Random(f"{self.seed}/shards/{round_}").sample(self.paths, len(self.paths))
-        samples = read_shard(order[position])
+        samples = [s for s in read_shard(order[position]) if isinstance(s, self.kinds)]
+        if not samples:
+            wanted = " or ".join(kind.__name__ for kind in self.kinds)
+            raise ShardError(f"{order[position]}: expected {wanted}, got others; make samples for this recipe")
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
 
 
-def _write_shard(samples: list[Sample], path: Path) -> Path:
+def _write_shard(samples: list[Sample | RayLookups], path: Path) -> Path:
     partial = path.with_suffix(".partial")
     with tarfile.open(partial, "w") as tar:
         for number, sample in enumerate(samples):

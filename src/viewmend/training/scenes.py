@@ -1,9 +1,9 @@
 """Scenes, each a list of samples that follows from the plan, the seed and the scene's number alone."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from random import Random
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 from viewmend.capture.studio.imperfections import Imperfections
 from viewmend.capture.studio.stage import Studio, StudioConfig
@@ -19,6 +19,8 @@ FIRST_VALIDATION_SEED = 9000
 FIRST_TEST_SEED = 10000
 """and from here on for tests and evaluation."""
 
+ROUGHEST = 2.5
+"""Calibration of a rough stage is so many times as wrong at most."""
 WIDEST_PX = 10
 """By so much a hole is widened at most."""
 FEWEST_CAMERAS = 5
@@ -28,11 +30,14 @@ Truth = Callable[[str, int], MultiViewFrame]
 """truth(name, time): what that camera, alone, should see at that time, with its mask."""
 
 
+Item = TypeVar("Item", covariant=True)
+
+
 @runtime_checkable
-class SceneSource(Protocol):
+class SceneSource(Protocol[Item]):
     """Endless numbered scenes; a number always gives the same samples."""
 
-    def scene(self, number: int) -> list[Sample]:
+    def scene(self, number: int) -> Sequence[Item]:
         """The samples of scene `number`, in the order in which they are used; there may be none."""
         ...
 
@@ -86,12 +91,25 @@ def random_stage(plan: DataPlan, random: Random, seeds: range = range(FIRST_VALI
         ),
         device=plan.device,
     )
+    if plan.rough_share and random.random() < plan.rough_share:
+        config = replace(config, imperfections=_rougher(config.imperfections, random))
     if plan.staged:
         config = replace(config, background="stage")
     if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:
         variety = random.uniform(*plan.cloth_variety)
         config = replace(config, performers=plan.performers, motions=plan.motions, cloth_variety=variety)
     return config
+
+
+def _rougher(it: Imperfections, random: Random) -> Imperfections:
+    """Calibration up to `ROUGHEST` times as wrong, outlines up to twice."""
+    worse = random.uniform(1, ROUGHEST)
+    return replace(
+        it,
+        calibration_px=worse * it.calibration_px,
+        calibration_m=worse * it.calibration_m,
+        mask_edge_px=random.uniform(1, 2) * it.mask_edge_px,
+    )
 
 
 def rig_samples(

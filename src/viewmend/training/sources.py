@@ -1,12 +1,27 @@
 """Where a run's scenes come from, by its plan."""
 
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes, open_captures
-from viewmend.training.plan import DataPlan
+from viewmend.training.plan import DataPlan, Recipe
+from viewmend.training.ray_lookups import LookedUpScenes, RayLookups
 from viewmend.training.sample_files import ShardScenes
+from viewmend.training.samples import Sample
 from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, SceneSource, StudioScenes
 
 
-def scene_source(plan: DataPlan, seed: str, validation: bool = False) -> SceneSource:
+def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayLookups]:
+    """A stream's scenes, as the recipe's part needs them.
+
+    Raises:
+        CaptureError, ShardError: what its plan names cannot be used.
+    """
+    if recipe.part != "rays":
+        return scene_source(recipe.data, seed)
+    shards = recipe.data.shards
+    scenes = scene_source(recipe.data, seed) if shards is None else ShardScenes(shards, seed, (Sample, RayLookups))
+    return LookedUpScenes(scenes, seed, recipe.pixels)
+
+
+def scene_source(plan: DataPlan, seed: str, validation: bool = False) -> SceneSource[Sample]:
     """Shards where they are given; else captures and the studio, as the plan shares them out.
 
     validation: scenes of the seeds that are kept for it, whatever shards there are.
@@ -15,7 +30,7 @@ def scene_source(plan: DataPlan, seed: str, validation: bool = False) -> SceneSo
         CaptureError, ShardError: what the plan names cannot be used.
     """
     if plan.shards is not None and not validation:
-        return ShardScenes(plan.shards, seed)
+        return ShardScenes(plan.shards, seed, (Sample,))
     seeds = range(FIRST_VALIDATION_SEED, FIRST_TEST_SEED) if validation else range(FIRST_VALIDATION_SEED)
     studio = StudioScenes(plan, seed, seeds)
     if not plan.captures:

@@ -1,0 +1,123 @@
+"""Samples as the ray reader alone needs them: some missing pixels, looked up in the cameras once. Ours.
+
+A hundredth of a sample's size, and most of a step's work: a buffer, or a folder of shards, holds thousands of scenes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from random import Random
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.ray_reader import look_around
+from viewmend.inpainting.rays import RaySamples
+from viewmend.training.losses import ImageLoss, mean_loss, pixel_loss
+from viewmend.training.objective import Outcome
+from viewmend.training.plan import Recipe
+from viewmend.training.samples import Sample
+from viewmend.training.scenes import SceneSource
+
+DARKEST = 0.6
+"""Least of the gains of varied colours."""
+BLINDED_SHARE, MOST_BLIND = 0.3, 3
+"""Share of the varied samples that lose cameras, and how many at most."""
+
+
+@dataclass(frozen=True)
+class RayLookups:
+    """What the cameras show along the rays of some missing pixels of a sample."""
+
+    features: Float[Tensor, "pixel point view 14"]
+    """`RaySamples.features`, half precision."""
+    occupancy: Float[Tensor, "pixel point 2"]
+    around: UInt8[Tensor, "pixel 8 11 11"]
+    """The view about each pixel, in 255ths."""
+    truth: UInt8[Tensor, "pixel 3"]
+    """F* there."""
+
+    def to(self, device: torch.device | str) -> "RayLookups":
+        """The same on `device`."""
+        values = (self.features, self.occupancy, self.around, self.truth)
+        return RayLookups(*(value.to(device) for value in values))
+
+
+class LookedUpScenes:
+    """A source's scenes, of each sample at most so many random missing pixels; the same for the same number."""
+
+    def __init__(self, scenes: SceneSource[Sample | RayLookups], seed: str, most_px: int) -> None:
+        self.scenes = scenes
+        self.seed = seed
+        self.most_px = most_px
+
+    def scene(self, number: int) -> list[RayLookups]:
+        """Scene `number`; what was looked up before stays as it is."""
+        random = Random(f"{self.seed}/pixels/{number}")
+        return [
+            s if isinstance(s, RayLookups) else looked_up(s, self.most_px, random) for s in self.scenes.scene(number)
+        ]
+
+
+def looked_up(sample: Sample, most_px: int, random: Random) -> RayLookups:
+    """The sample at no more than `most_px` of its missing pixels."""
+    missing = torch.nonzero(sample.view.error > 0)
+    pixels = missing[random.sample(range(len(missing)), min(most_px, len(missing)))]
+    samples, around = look_around(sample.view, sample.nearby, pixels)
+    return RayLookups(
+        samples.features.half(),
+        samples.occupancy.half(),
+        (around * 255).round().to(torch.uint8),
+        sample.truth[:, *pixels.unbind(1)].T.contiguous(),
+    )
+
+
+def varied(lookups: RayLookups) -> RayLookups:
+    """The same pixels as they might have been, by torch's random numbers: other colours, turned, with fewer cameras.
+
+    Channels change places and everything gets darker, for cameras, surroundings and truth alike; the surroundings are
+    flipped and turned; of three tenths of the samples up to three cameras that did not colour the view see nothing.
+    """
+    channels, gain = torch.randperm(3), float(torch.empty(()).uniform_(DARKEST, 1))
+    features, around = lookups.features.clone(), lookups.around.clone()
+    for values, first in ((features, 0), (features, 10)):
+        values[..., first : first + 3] = gain * values[..., first + channels]
+    for first in (0, 5):
+        around[:, first : first + 3] = (gain * around[:, first + channels].float()).round().to(torch.uint8)
+    flipped = [axis for axis in (2, 3) if bool(torch.rand(()) < 0.5)]
+    around = around.flip(flipped) if flipped else around
+    around = around.transpose(2, 3) if bool(torch.rand(()) < 0.5) else around
+    if bool(torch.rand(()) < BLINDED_SHARE) and features.numel():
+        blind = torch.randperm(features.shape[2])[: int(torch.randint(1, MOST_BLIND + 1, ()))].to(features.device)
+        chosen = (features[:, :, blind, 7] > 0).flatten(0, 1).any(0)
+        features[:, :, blind[~chosen]] = 0
+    truth = (gain * lookups.truth[:, channels].float()).round().to(torch.uint8)
+    return RayLookups(features, lookups.occupancy, around, truth)
+
+
+class RaysObjective(nn.Module):
+    """L_in, and the logarithmic error, of what the ray reader makes of the pixels of a batch."""
+
+    def __init__(self, model: Inpainter, recipe: Recipe) -> None:
+        super().__init__()
+        self.model = model
+        self.recipe = recipe
+
+    def forward(self, batch: Sequence[RayLookups]) -> Outcome:
+        """Both terms, the means over the samples."""
+        loss = rays_loss(self.model, [varied(b) for b in batch] if self.recipe.varied else batch)
+        weights, zero = self.recipe.loss, torch.zeros_like(loss.inside)
+        return Outcome(loss, zero, zero, weights.image * loss.inside + weights.log_error * loss.log_error, ())
+
+
+def rays_loss(model: Inpainter, batch: Sequence[RayLookups]) -> ImageLoss:
+    """`image_loss` over the looked-up pixels alone: nothing is outside."""
+    assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
+    most = max([1, *(lookups.features.shape[2] for lookups in batch)])
+    samples = [RaySamples(b.features.float(), b.occupancy.float()).padded(most) for b in batch]
+    together = RaySamples(torch.cat([s.features for s in samples]), torch.cat([s.occupancy for s in samples]))
+    around = torch.cat([b.around.float() / 255 for b in batch])
+    with model.autocast():
+        colours = model.ray_reader.mix(together, around).float().split([len(b.truth) for b in batch])
+    return mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])
