@@ -171,7 +171,6 @@ def _between(
     images: Float[Tensor, "view channel height width"], at: Float[Tensor, "view point 2"]
 ) -> Float[Tensor, "view point channel"]:
     """The images between pixel centres, zeros beyond."""
-    view = torch.arange(len(images), device=at.device)[:, None]
-    corners = _corners(at, images.shape[2:])
-    nothing = at.new_zeros(*at.shape[:2], images.shape[1])
-    return sum((share[..., None] * images[view, :, row, column] for row, column, share in corners), nothing)
+    height, width = images.shape[2:]
+    grid = at.clamp(-4, 4 * max(height, width)) * 2 / at.new_tensor([width, height]) - 1
+    return F.grid_sample(images, grid[:, None], align_corners=False)[:, :, 0].movedim(1, -1)
