@@ -51,7 +51,7 @@ def test_they_are_kept_in_shards_and_train_rays_alone(tiny, tmp_path):
     assert {sample_to_bytes(x) for x in again} == {sample_to_bytes(x) for x in lookups}, "as they were looked up"
     recipe = replace(tiny, part="rays", data=replace(tiny.data, shards=shards), steps=2)
     assert (train(recipe, tmp_path / "rays") / "model.safetensors").exists()
-    with pytest.raises(ShardError, match=r"shard-00000\.tar: expected Sample, got others"):
+    with pytest.raises(ShardError, match=r"shard-00000\.tar: expected Sample, got RayLookups; make samples"):
         train(replace(recipe, part="patches"), tmp_path / "patches")
 
 

@@ -109,10 +109,17 @@ class ShardScenes(Generic[Kind]):
         """
         round_, position = divmod(number, len(self.paths))
         order = Random(f"{self.seed}/shards/{round_}").sample(self.paths, len(self.paths))
-        samples = [s for s in read_shard(order[position]) if isinstance(s, self.kinds)]
-        if not samples:
-            wanted = " or ".join(kind.__name__ for kind in self.kinds)
-            raise ShardError(f"{order[position]}: expected {wanted}, got others; make samples for this recipe")
+        found = read_shard(order[position])
+        samples = [s for s in found if isinstance(s, self.kinds)]
+        if len(samples) < len(found):
+            wanted, got = (
+                " and ".join(sorted(names))
+                for names in ({kind.__name__ for kind in self.kinds}, {type(s).__name__ for s in found})
+            )
+            raise ShardError(
+                f"{order[position]}: expected {wanted}, got {got}; make samples for this recipe "
+                "(viewmend samples --recipe)"
+            )
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
 
 
