@@ -91,7 +91,8 @@ def test_who_only_talks_nonsense_is_shown_out(ball):
         greet(huge)
         with contextlib.suppress(ConnectionClosed):
             huge.send("x" * 1_000_000)
-        assert closing(huge) == 1009
+        # None: unread bytes can make the system drop the connection before its last words are read.
+        assert closing(huge) in (1009, None)
     assert still_serves(ball)
 
 
