@@ -20,12 +20,7 @@ OURS: dict[str, dict[str, Any]] = {
     "current-geometry": {"past_geometry": "current"},
     "no-validity": {"use_validity": False},
     "no-depth": {"use_depth": False},
-    "no-masks-no-depth": {
-        "context_cameras": 1,
-        "use_mask": False,
-        "black_background": False,
-        "use_depth": False,
-    },
+    "no-masks-no-depth": {**TABLE_3["single-camera-no-masks"], "use_depth": False},
     "two-cameras": {"context_cameras": 2},
     "four-cameras": {"context_cameras": 4},
     "five-cameras": {"context_cameras": 5},
