@@ -11,7 +11,8 @@ from reference.blend_twin import blend_twin
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering._blend_numba import blend_numba
 from viewmend.rendering._blend_torch import blend_torch
-from viewmend.rendering.blending import BlendConfig, blend
+from viewmend.rendering.blend_rule import BlendConfig
+from viewmend.rendering.blending import blend
 from viewmend.views import ContextViews, MultiViewFrame
 
 BIAS_M = 0.01
@@ -53,7 +54,8 @@ def hard():
 @pytest.mark.parametrize("config", [BlendConfig(), BlendConfig(normal_power=1, view_power=4, slope_px=3.0)])
 def test_both_paths_equal_the_twin(hard, fast, config):
     expected = blend_twin(*hard, BIAS_M, config)
-    for got, want in zip(fast(*hard, BIAS_M, config), expected, strict=True):
+    result = fast(*hard, BIAS_M, config)
+    for got, want in zip((result.rgb, result.weights, result.disagreement), expected, strict=True):
         # A depth test that float32 decides the other way is a flip: rare, and all else is tight.
         off = np.abs(got.numpy() - want) > 2e-4
         assert off.mean() < 0.002
@@ -66,7 +68,7 @@ def test_both_paths_equal_the_twin_without_masks(hard):
     expected = blend_twin(target, depth, normals, sources, BIAS_M, BlendConfig())
     for fast in (blend_torch, blend_numba):
         got = fast(target, depth, normals, sources, BIAS_M, BlendConfig())
-        assert (np.abs(got[1].numpy() - expected[1]) > 2e-4).mean() < 0.002
+        assert (np.abs(got.weights.numpy() - expected[1]) > 2e-4).mean() < 0.002
 
 
 @pytest.mark.gpu

@@ -1,7 +1,7 @@
 """Image-based blending in numba, for the CPU; `_blend_torch` is its twin for any device."""
 
 from math import floor, sqrt
-from typing import TYPE_CHECKING, no_type_check
+from typing import no_type_check
 
 import numpy as np
 import torch
@@ -11,11 +11,8 @@ from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.threads import share
-from viewmend.rendering._blend_torch import GRAZING
+from viewmend.rendering.blend_rule import GRAZING, Blend, BlendConfig
 from viewmend.views import ContextViews
-
-if TYPE_CHECKING:
-    from viewmend.rendering.blending import BlendConfig
 
 ROWS = 16
 """Rows of the novel view that one thread takes at a time: the subject fills some and not others."""
@@ -29,9 +26,9 @@ def blend_numba(
     normals: Float[Tensor, "height width 3"],
     sources: ContextViews,
     bias_m: float,
-    config: "BlendConfig",
-) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "chosen height width"], Float[Tensor, "height width"]]:
-    """`blending.blend`: colour, raw weights and disagreement."""
+    config: BlendConfig,
+) -> Blend:
+    """`blending.blend`."""
     frame, rig = sources.frame, sources.frame.cameras
     height, width = depth.shape
     rgb = torch.zeros(3, height, width)
@@ -55,7 +52,7 @@ def blend_numba(
         _blend_rows(band * ROWS, min(height, (band + 1) * ROWS), *inputs, *outputs)
 
     share(work, -(-height // ROWS))
-    return rgb, weights, disagreement
+    return Blend(rgb, weights, disagreement)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

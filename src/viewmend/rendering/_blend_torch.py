@@ -1,20 +1,13 @@
 """Image-based blending in torch, for any device; `_blend_numba` is its twin for the CPU."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import Cameras, project, unproject
+from viewmend.rendering.blend_rule import GRAZING, Blend, BlendConfig
 from viewmend.views import ContextViews
-
-if TYPE_CHECKING:
-    from viewmend.rendering.blending import BlendConfig
-
-GRAZING = 0.1
-"""Cosine below which the slope of the depth test grows no more."""
 
 
 def blend_torch(
@@ -23,9 +16,9 @@ def blend_torch(
     normals: Float[Tensor, "height width 3"],
     sources: ContextViews,
     bias_m: float,
-    config: "BlendConfig",
-) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "chosen height width"], Float[Tensor, "height width"]]:
-    """`blending.blend`: colour, raw weights and disagreement."""
+    config: BlendConfig,
+) -> Blend:
+    """`blending.blend`."""
     row, column = (depth > 0).nonzero(as_tuple=True)
     pixels = torch.stack([column, row], -1) + 0.5
     points = unproject(pixels[None].to(depth), depth[row, column][None], camera)[0]
@@ -49,7 +42,7 @@ def blend_torch(
     rgb[:, row, column] = mean
     raw[:, row, column] = weight
     disagreement[row, column] = variance.sqrt()
-    return rgb, raw, disagreement
+    return Blend(rgb, raw, disagreement)
 
 
 def _sample(
@@ -59,7 +52,7 @@ def _sample(
     sources: ContextViews,
     view: int,
     bias_m: float,
-    config: "BlendConfig",
+    config: BlendConfig,
 ) -> tuple[Float[Tensor, "point"], Float[Tensor, "3 point"]]:
     """Weight and colour of one camera at each surface point."""
     frame, camera = sources.frame, sources.frame.cameras[view]
