@@ -5,12 +5,23 @@ from dataclasses import replace
 import pytest
 import torch
 from inpainting.plates import Rig, camera, context, look, tiny, view
-from reference.rays_twin import follow_twin
+from reference.rays_twin import far_twin, follow_twin
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.ray_reader import PIXELS_STEP
-from viewmend.inpainting.rays import FAR, NEAR, OFFSETS, OUTLINE, PATCH, follow, windows
+from viewmend.inpainting.rays import (
+    CELLS,
+    CELLS_AROUND,
+    FAR,
+    NEAR,
+    OFFSETS,
+    OUTLINE,
+    PATCH,
+    far_around,
+    follow,
+    windows,
+)
 from viewmend.views import Silhouettes
 
 
@@ -38,7 +49,23 @@ def test_following_equals_its_twin(rng):
     assert 0 < samples.features[..., 8].mean() < 1, "some points are out of view"
     assert torch.allclose(samples.features.double(), torch.from_numpy(features), atol=2e-3)
     assert torch.allclose(samples.occupancy.double(), torch.from_numpy(occupancy), atol=2e-3)
-    assert 0.05 < (samples.occupancy < 0.9).float().mean() < 0.95
+    assert 0.05 < (samples.occupancy[..., :2] < 0.9).float().mean() < 0.95
+
+
+def test_farther_surroundings_equal_their_twin(rng):
+    incomplete = view(5)
+    ripples = 0.3 * torch.rand(incomplete.depth.shape, generator=rng)
+    holed = (incomplete.depth + ripples) * (torch.rand(incomplete.depth.shape, generator=rng) > 0.1)
+    incomplete = replace(incomplete, depth=holed)
+    guess = torch.rand(incomplete.rgb.shape, generator=rng)
+    pixels = torch.cat(
+        [torch.nonzero(incomplete.error > 0)[::60], torch.tensor([[0, 0], [3, incomplete.rgb.shape[2] - 1]])]
+    )
+    expected = far_twin(incomplete, guess, pixels, CELLS, CELLS_AROUND)
+    far, place = far_around(incomplete, guess, pixels)
+    assert torch.allclose(far[place].double(), torch.from_numpy(expected), atol=1e-4)
+    again, where = far_around(incomplete, guess, pixels.repeat(2, 1))
+    assert torch.equal(again, far) and torch.equal(where, place.repeat(2)), "same cells are there once"
 
 
 def test_without_silhouettes_the_nearby_masks_count():

@@ -1,18 +1,18 @@
-"""Slow, obvious twin of viewmend.inpainting.rays.follow: one pixel, one point, one camera at a time."""
+"""Slow, obvious twins of viewmend.inpainting.rays: one pixel, one point, one camera at a time."""
 
 import numpy as np
 from reference.blend_twin import unit
 
 
 def follow_twin(view, pixels, nearby, offsets, near, far, outline, patch):
-    """Features [pixel point view 14] and occupancy [pixel point 2], in double precision."""
+    """Features [pixel point view 14] and occupancy [pixel point 4], in double precision."""
     depth = view.depth.double().numpy()
     focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
     covered = np.sort(depth[depth > 0])
     size_m = np.sqrt((view.mask > 0).sum().item()) * covered[(len(covered) - 1) // 2] / focal
     pose = np.linalg.inv(view.camera.camera_from_world[0].double().numpy())
     features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 14))
-    occupancy = np.ones((*features.shape[:2], 2))
+    occupancy = np.ones((*features.shape[:2], 4))
     for number, (row, column) in enumerate(pixels.tolist()):
         ray = np.linalg.inv(view.camera.K[0].double().numpy()) @ [column + 0.5, row + 0.5, 1]
         for point, offset in enumerate(offsets):
@@ -20,8 +20,9 @@ def follow_twin(view, pixels, nearby, offsets, near, far, outline, patch):
             for camera in range(features.shape[2]):
                 seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far, outline, patch)
                 features[number, point, camera] = seen
-            masks = [see_mask(at, view.silhouettes, camera) for camera in range(len(view.silhouettes.cameras))]
-            occupancy[number, point] = sorted([*masks, 1.0, 1.0])[:2]
+            seen = [see_mask(at, view.silhouettes, i, outline) for i in range(len(view.silhouettes.cameras))]
+            masks, around = zip(*seen, strict=True)
+            occupancy[number, point] = [*sorted([*masks, 1.0, 1.0])[:2], *sorted([*around, 1.0, 1.0])[:2]]
     return features, occupancy
 
 
@@ -58,19 +59,43 @@ def look(point, viewer, view, nearby, index, size_m, near, far, outline, patch):
     return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, *around])
 
 
-def see_mask(point, silhouettes, index):
-    """The mask of one camera at a point, 1 where it is out of view."""
+def far_twin(view, guess, pixels, sizes, reach):
+    """Means over cells of `sizes` around each pixel, [pixel 12 11 11]."""
+    depth, subject = view.depth.double().numpy(), view.mask.numpy() > 0
+    focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
+    covered = np.sort(depth[depth > 0])
+    median = covered[(len(covered) - 1) // 2]
+    size_m = np.sqrt(subject.sum()) * median / focal
+    beyond = np.where(depth > 0, 0.5 + 0.5 * np.tanh((depth - median) / size_m), 0)
+    shown = [*guess.double().numpy(), view.mask.double().numpy(), view.error.double().numpy(), beyond]
+    told = np.zeros((len(pixels), len(sizes), len(shown), 2 * reach + 1, 2 * reach + 1))
+    for which, size in enumerate(sizes):
+        side = max(1, round(size * np.sqrt(subject.sum())))
+        for number, (row, column) in enumerate(pixels.tolist()):
+            for down in range(-reach, reach + 1):
+                for across in range(-reach, reach + 1):
+                    top, left = (row // side + down) * side, (column // side + across) * side
+                    if top >= 0 and left >= 0:
+                        cell = [image[top : top + side, left : left + side].sum() / side**2 for image in shown]
+                        told[number, which, :, reach + down, reach + across] = cell
+    return told.reshape(len(pixels), -1, 2 * reach + 1, 2 * reach + 1)
+
+
+def see_mask(point, silhouettes, index, outline):
+    """The mask of one camera at a point, and its mean around; 1 where it is out of view."""
     camera = silhouettes.cameras[index]
     x, y, z = (camera.camera_from_world[0].double().numpy() @ [*point, 1])[:3]
     if z <= 0:
-        return 1.0
+        return 1.0, 1.0
     u, v, _ = camera.K[0].double().numpy() @ [x / z, y / z, 1]
     width, height = camera.size_px[0].tolist()
     if not (0 <= u < width and 0 <= v < height):
-        return 1.0
+        return 1.0, 1.0
     rows, columns = silhouettes.mask.shape[1:]
     around = [(r, c, share) for r, c, share in four_beyond(u, v) if 0 <= r < rows and 0 <= c < columns]
-    return sum(share * float(silhouettes.mask[index, r, c]) / 255 for r, c, share in around)
+    masks = silhouettes.mask.double().numpy() / 255
+    side = max(1, round(outline * np.sqrt(masks.sum((1, 2)).mean())))
+    return sum(share * masks[index, r, c] for r, c, share in around), mean_around(masks[index], side, u, v)
 
 
 def mean_around(image, side, u, v):

@@ -6,6 +6,7 @@ smooth fill from around it, and background. The network only weighs them.
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +14,16 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.inpainting.prefill import fill
-from viewmend.inpainting.rays import OFFSETS, RAY_CHANNELS, RaySamples, follow, windows
+from viewmend.inpainting.rays import (
+    CELL_CHANNELS,
+    CELLS,
+    OFFSETS,
+    RAY_CHANNELS,
+    RaySamples,
+    far_around,
+    follow,
+    windows,
+)
 from viewmend.views import ContextViews, IncompleteView
 
 RADIUS_PX = 5
@@ -34,6 +44,32 @@ PIXELS_STEP = 64
 long, and a server that keeps a thousand of them has a heap full of holes."""
 
 
+class RayInputs(NamedTuple):
+    """All that the reader is told of some missing pixels."""
+
+    features: Float[Tensor, "pixel point view 14"]
+    """As in `RaySamples`,"""
+    occupancy: Float[Tensor, "pixel point 4"]
+    """and so is this."""
+    around: Float[Tensor, "pixel 8 11 11"]
+    """The view about each pixel."""
+    far: Float[Tensor, "place 12 11 11"]
+    """What lies farther around, for each place that differs,"""
+    place: Int[Tensor, "pixel"]
+    """and at which of them each pixel is."""
+
+    @staticmethod
+    def cat(parts: Sequence["RayInputs"]) -> "RayInputs":
+        """One after the other; those of fewer cameras get more that see nothing."""
+        most = max([1, *(part.features.shape[2] for part in parts)])
+        first, whole = 0, []
+        for part in parts:
+            more = most - part.features.shape[2]
+            whole.append(part._replace(features=F.pad(part.features, (0, 0, 0, more)), place=part.place + first))
+            first += len(part.far)
+        return RayInputs(*(torch.cat(values) for values in zip(*whole, strict=True)))
+
+
 class RayReader(nn.Module):
     """Weighs the candidates of each missing pixel."""
 
@@ -42,25 +78,30 @@ class RayReader(nn.Module):
         points = len(OFFSETS)
         self.look = nn.Sequential(nn.Linear(RAY_CHANNELS, width), nn.GELU())
         self.compare = nn.Sequential(
-            nn.Linear(width + RAY_CHANNELS + 2 * SHOWN_CHANNELS + 2, width),
+            nn.Linear(width + RAY_CHANNELS + 2 * SHOWN_CHANNELS + 3, width),
             nn.GELU(),
             nn.Linear(width, width),
             nn.GELU(),
         )
         self.trust = nn.Linear(width, 1)
         self.point = nn.Sequential(
-            nn.Linear(width + 2 * SHOWN_CHANNELS + 3, width), nn.GELU(), nn.Linear(width, POINT_FEATURES)
+            nn.Linear(width + 2 * SHOWN_CHANNELS + 5, width), nn.GELU(), nn.Linear(width, POINT_FEATURES)
         )
         widths = (WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), 2 * width)
         layers = [(nn.Conv2d(before, after, 3), nn.GELU()) for before, after in pairwise(widths)]
         self.around = nn.Sequential(*(part for layer in layers for part in layer))
-        self.head = nn.Sequential(
-            nn.Linear(points * POINT_FEATURES + 2 * width, 4 * width),
-            nn.GELU(),
-            nn.Linear(4 * width, 2 * width),
-            nn.GELU(),
+        sizes, deep = len(CELLS), 2 * width
+        self.far = nn.Sequential(
+            *(nn.Conv2d(sizes * CELL_CHANNELS, sizes * 24, 3, groups=sizes), nn.GELU()),
+            *(nn.Conv2d(sizes * 24, sizes * width, 3, stride=2, groups=sizes), nn.GELU()),
+            *(nn.Conv2d(sizes * width, sizes * deep, 4, groups=sizes), nn.GELU()),
         )
-        self.choose = nn.Linear(2 * width, points + 2)
+        told = points * POINT_FEATURES + (1 + sizes) * deep
+        # Once a pixel, not once a point and camera: width is cheap here, and worth more than anywhere else.
+        self.head = nn.Sequential(
+            *(nn.Linear(told, 16 * width), nn.GELU()), *(nn.Linear(16 * width, 14 * width), nn.GELU())
+        )
+        self.choose = nn.Linear(14 * width, points + 2)
 
     def forward(
         self,
@@ -78,36 +119,43 @@ class RayReader(nn.Module):
         guesses = [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
         if pixels is None:
             pixels = [torch.nonzero((view.error > 0) & (view.depth > 0).any()) for view in views]
-        most = max([1, *(len(n.frame.cameras) for n in nearby if n is not None)])
         with torch.autocast(guesses[0].device.type, enabled=False):  # coordinates stay float32
             seen = [look_around(*own) for own in zip(views, nearby, pixels, guesses, strict=True)]
-        samples, around = [s.padded(most) for s, _ in seen], torch.cat([a for _, a in seen])
-        features, occupancy = torch.cat([s.features for s in samples]), torch.cat([s.occupancy for s in samples])
-        size = max(1, len(features)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
-        parts = zip(features.split(size), occupancy.split(size), around.split(size), strict=True)
-        read = torch.cat([self.mix(RaySamples(f, o), a) for f, o, a in parts]).split([len(p) for p in pixels])
+        told = RayInputs.cat(seen)
+        read = self.mix(told).split([len(p) for p in pixels])
         return [
             guess.movedim(0, -1).index_put(tuple(at.unbind(1)), rgb).movedim(-1, 0)
             for guess, at, rgb in zip(guesses, pixels, read, strict=True)
         ]
 
-    def mix(self, samples: RaySamples, around: Float[Tensor, "pixel 8 11 11"]) -> Float[Tensor, "pixel 3"]:
+    def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
-        pixels = len(around)
-        samples, around = RaySamples(_rounded_up(samples.features), _rounded_up(samples.occupancy)), _rounded_up(around)
-        colours, features = self._points(samples)
-        hidden = self.head(torch.cat([features.flatten(1), self.around(around).flatten(1)], 1))
-        in_view = samples.features[..., 8].amax(2) > 0
-        candidate = F.pad(in_view, (0, 2), value=True)
+        far = self.far(_rounded_up(told.far)).flatten(1)[told.place]
+        size = max(1, len(far)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
+        parts = (values.split(size) for values in (told.features, told.occupancy, told.around, far))
+        return torch.cat([self._mix(*part) for part in zip(*parts, strict=True)])
+
+    def _mix(
+        self,
+        seen: Float[Tensor, "pixel point view 14"],
+        occupancy: Float[Tensor, "pixel point 4"],
+        around: Float[Tensor, "pixel 8 11 11"],
+        far: Float[Tensor, "pixel feature"],
+    ) -> Float[Tensor, "pixel 3"]:
+        pixels = len(seen)
+        seen, occupancy, around, far = map(_rounded_up, (seen, occupancy, around, far))
+        colours, features = self._points(seen, occupancy)
+        hidden = self.head(torch.cat([features.flatten(1), self.around(around).flatten(1), far], 1))
+        candidate = F.pad(seen[..., 8].amax(2) > 0, (0, 2), value=True)
         shares = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
         guess = around[:, None, 5:, RADIUS_PX, RADIUS_PX]
         return (shares[..., None] * torch.cat([colours, guess, 0 * guess], 1)).sum(1)[:pixels]
 
     def _points(
-        self, samples: RaySamples
+        self, seen: Float[Tensor, "pixel point view 14"], occupancy: Float[Tensor, "pixel point 4"]
     ) -> tuple[Float[Tensor, "pixel point 3"], Float[Tensor, "pixel point feature"]]:
         """Each point's colour, by the cameras that seem to see it, and what speaks for it being there."""
-        seen, inside = samples.features, samples.features[..., 8:9]
+        inside = seen[..., 8:9]
         shown, fine, cosine = torch.cat([seen[..., :3], seen[..., 10:]], -1), seen[..., 4:5], seen[..., 6:7]
         # A first opinion on who sees the point: not far behind the proxy, and from about where the view is.
         prior = inside * (4 * cosine).exp() * (-4 * fine).sigmoid()
@@ -116,14 +164,14 @@ class RayReader(nn.Module):
         variance = CONTRAST * (prior * (shown - mean) ** 2).sum(2, keepdim=True)
         looked = self.look(seen)
         together = looked + (prior * looked).sum(2, keepdim=True)
-        occupied = samples.occupancy[..., None, :1].expand_as(prior)
+        occupied = occupancy[..., None, ::2].expand(*prior.shape[:-1], -1)
         told = [seen, mean.expand_as(shown), variance.expand_as(shown), together, occupied, prior]
         compared = self.compare(torch.cat(told, -1))
         scores = self.trust(compared).float() + (prior + 1e-4).log()
         trust = inside * scores.masked_fill(inside == 0, -1e4).softmax(2)
         agreed = (trust * shown).sum(2)
         spread = CONTRAST * (trust * (shown - agreed[:, :, None]) ** 2).sum(2)
-        features = [(trust * compared).sum(2), agreed, spread, samples.occupancy, (trust**2).sum(2)]
+        features = [(trust * compared).sum(2), agreed, spread, occupancy, (trust**2).sum(2)]
         return agreed[..., :3], self.point(torch.cat(features, -1))
 
 
@@ -137,7 +185,7 @@ def look_around(
     nearby: ContextViews | None,
     pixels: Int[Tensor, "pixel 2"],
     guess: Float[Tensor, "3 height width"] | None = None,
-) -> tuple[RaySamples, Float[Tensor, "pixel 8 11 11"]]:
+) -> RayInputs:
     """All that the reader is told of these pixels (row, column): along their rays, and around them in the view.
 
     guess: the view filled smoothly (`prefill.fill`), made where it is not given.
@@ -148,5 +196,7 @@ def look_around(
         samples = follow(view, pixels, nearby)
     else:
         shape = (len(pixels), len(OFFSETS))
-        samples = RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 2))
-    return samples, windows(shown, pixels, RADIUS_PX)
+        samples = RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 4))
+    return RayInputs(
+        samples.features, samples.occupancy, windows(shown, pixels, RADIUS_PX), *far_around(view, guess, pixels)
+    )

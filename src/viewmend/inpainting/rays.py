@@ -27,7 +27,13 @@ NEAR, FAR = 0.03, 0.2
 OUTLINE = 0.06
 """Side, in subject sizes, of the squares over which masks are averaged to tell how near their outline is,"""
 PATCH = 0.08
-"""and of those over which colours are: single pixels agree by chance more easily."""
+"""of those over which colours are: single pixels agree by chance more easily,"""
+CELLS = (0.03, 0.06)
+"""and of those in which a view's pixel is told of its farther surroundings."""
+CELL_CHANNELS = 6
+"""RGB of the smoothly filled view, M, E and depth."""
+CELLS_AROUND = 5
+"""So many cells to each side."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +45,9 @@ class RaySamples:
     between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view,
     and means around: of the mask (where the outlines of two cameras meet, a hull is fattest), of the colours, and of
     what the proxy covers (more than the mask where it is fat). All 0 for a point out of view."""
-    occupancy: Float[Tensor, "pixel point 2"]
+    occupancy: Float[Tensor, "pixel point 4"]
     """Least and second least mask of all cameras of the rig that have the point in view: 0 where one sees background
-    there, and where another does, too; 1 where there is no such camera."""
-
-    def padded(self, views: int) -> "RaySamples":
-        """The same with cameras behind that see nothing, `views` in all."""
-        return RaySamples(F.pad(self.features, (0, 0, 0, views - self.features.shape[2])), self.occupancy)
+    there, and where another does, too; 1 where there is no such camera. The same of the mask's means around."""
 
 
 def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
@@ -85,6 +87,29 @@ def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: Context
     occupancy = _least_masks(points, silhouettes)
     shape = (len(pixels), len(OFFSETS))
     return RaySamples(features.unflatten(0, shape), occupancy.unflatten(0, shape))
+
+
+def far_around(
+    view: IncompleteView, guess: Float[Tensor, "3 height width"], pixels: Int[Tensor, "pixel 2"]
+) -> tuple[Float[Tensor, "place 12 11 11"], Int[Tensor, "pixel"]]:
+    """What shape the subject has around each pixel (row, column): means over cells of both sizes, the finer first.
+
+    Pixels of the same cells share them: the second of the pair says which is whose. Channels: RGB of `guess`, the view
+    filled smoothly; M; E; and depth, 0.5 at the subject's median and growing with distance.
+    """
+    subject_px = float((view.mask > 0).sum().sqrt())
+    covered = view.depth > 0
+    beyond = torch.zeros_like(view.depth)
+    if bool(covered.any()):
+        beyond = 0.5 + 0.5 * ((view.depth - view.depth[covered].median()) / subject_size_m(view)).tanh()
+    shown = torch.cat([guess, view.mask[None], view.error[None], (beyond * covered)[None]])[None]
+    sides = [max(1, round(size * subject_px)) for size in CELLS]
+    cells, place = torch.unique(torch.cat([pixels // side for side in sides], 1), dim=0, return_inverse=True)
+    told = [
+        windows(F.avg_pool2d(_padded(shown, side), side)[0], at, CELLS_AROUND)
+        for side, at in zip(sides, cells.split(2, 1), strict=True)
+    ]
+    return torch.cat(told, 1), place
 
 
 def windows(
@@ -129,16 +154,19 @@ def _corners(
         yield row.clamp(0, height - 1), column.clamp(0, width - 1), share
 
 
-def _least_masks(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> Float[Tensor, "point 2"]:
-    """The two smallest mask values at each point; a camera that has it not in view says 1."""
+def _least_masks(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> Float[Tensor, "point 4"]:
+    """The two smallest mask values at each point, and means around; a camera that has it not in view says 1."""
     cameras, mask = silhouettes.cameras, silhouettes.mask
     at, z = project(points, cameras)
     inside = (z > 0) & (at >= 0).all(-1) & (at < cameras.size_px[:, None]).all(-1)
     view = torch.arange(len(cameras), device=mask.device)[:, None]
     corners = _corners(at, mask.shape[1:])
     value = sum((share * mask[view, row, column] for row, column, share in corners), torch.zeros_like(z)) / 255
-    value = F.pad(torch.where(inside, value, 1.0), (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
-    return value.topk(2, dim=0, largest=False).values.T
+    side = _outline_px(mask)
+    around = _between(_means(mask[:, None], side), at / side)[..., 0]
+    values = torch.where(inside, torch.stack([value, around]), 1.0)
+    values = F.pad(values, (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
+    return values.topk(2, dim=1, largest=False).values.flatten(0, 1).T
 
 
 def _around(
@@ -148,16 +176,27 @@ def _around(
     at: Float[Tensor, "view point 2"],
 ) -> Float[Tensor, "view point 5"]:
     """Means around each place: of the mask, of RGB before black, and of what the proxy covers."""
-    size_px = float((mask.sum((1, 2)) / 255).mean().sqrt())
-    side, half = max(1, round(OUTLINE * size_px)), max(1, round(PATCH / 2 * size_px))
-    shapes = _padded(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
-    squares = shapes.unflatten(3, (-1, side)).unflatten(2, (-1, side))
-    # Whole numbers: pooling is slower.
-    shapes = squares.sum(3, dtype=torch.int32).sum(4).to(at) / (255 * side**2)
+    side, half = _outline_px(mask), max(1, round(PATCH / 2 * _subject_px(mask)))
+    shapes = _means(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
     # Of colours every other row and column will do.
     colours = F.avg_pool2d(_padded(rgb[..., ::2, ::2].to(at) * mask[:, None, ::2, ::2], half), half) / 255**2
     masked, proxy = _between(shapes, at / side).split(1, -1)
     return torch.cat([masked, _between(colours, at / (2 * half)), proxy], -1)
+
+
+def _subject_px(mask: UInt8[Tensor, "view height width"]) -> float:
+    """Root of the subject's area, a mean over cameras."""
+    return float((mask.sum((1, 2)) / 255).mean().sqrt())
+
+
+def _outline_px(mask: UInt8[Tensor, "view height width"]) -> int:
+    return max(1, round(OUTLINE * _subject_px(mask)))
+
+
+def _means(shapes: UInt8[Tensor, "view shape height width"], side: int) -> Float[Tensor, "view shape rows columns"]:
+    """Of squares of this side, 255 as 1. Whole numbers: pooling is slower."""
+    squares = _padded(shapes, side).unflatten(3, (-1, side)).unflatten(2, (-1, side))
+    return squares.sum(3, dtype=torch.int32).sum(4).float() / (255 * side**2)
 
 
 def _padded(

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from random import Random
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from viewmend.inpainting.inpainter import Inpainter
-from viewmend.inpainting.ray_reader import look_around
-from viewmend.inpainting.rays import RaySamples
+from viewmend.inpainting.ray_reader import RayInputs, look_around
+from viewmend.inpainting.rays import CELL_CHANNELS
 from viewmend.training.losses import ImageLoss, mean_loss, pixel_loss
 from viewmend.training.objective import Outcome
 from viewmend.training.plan import Recipe
@@ -32,16 +32,25 @@ class RayLookups:
 
     features: Float[Tensor, "pixel point view 14"]
     """`RaySamples.features`, half precision."""
-    occupancy: Float[Tensor, "pixel point 2"]
+    occupancy: Float[Tensor, "pixel point 4"]
     around: UInt8[Tensor, "pixel 8 11 11"]
-    """The view about each pixel, in 255ths."""
+    """The view about each pixel, in 255ths,"""
+    far: UInt8[Tensor, "place 12 11 11"]
+    """and what is farther around at each place that differs."""
+    place: Int[Tensor, "pixel"]
+    """At which of these each pixel is."""
     truth: UInt8[Tensor, "pixel 3"]
     """F* there."""
 
     def to(self, device: torch.device | str) -> "RayLookups":
         """The same on `device`."""
-        values = (self.features, self.occupancy, self.around, self.truth)
+        values = (self.features, self.occupancy, self.around, self.far, self.place, self.truth)
         return RayLookups(*(value.to(device) for value in values))
+
+    def inputs(self) -> RayInputs:
+        """As the reader takes them."""
+        around, far = self.around.float() / 255, self.far.float() / 255
+        return RayInputs(self.features.float(), self.occupancy.float(), around, far, self.place)
 
 
 class LookedUpScenes:
@@ -64,11 +73,13 @@ def looked_up(sample: Sample, most_px: int, random: Random) -> RayLookups:
     """The sample at no more than `most_px` of its missing pixels."""
     missing = torch.nonzero(sample.view.error > 0)
     pixels = missing[random.sample(range(len(missing)), min(most_px, len(missing)))]
-    samples, around = look_around(sample.view, sample.nearby, pixels)
+    seen = look_around(sample.view, sample.nearby, pixels)
     return RayLookups(
-        samples.features.half(),
-        samples.occupancy.half(),
-        (around * 255).round().to(torch.uint8),
+        seen.features.half(),
+        seen.occupancy.half(),
+        (255 * seen.around).round().to(torch.uint8),
+        (255 * seen.far).round().to(torch.uint8),
+        seen.place,
         sample.truth[:, *pixels.unbind(1)].T.contiguous(),
     )
 
@@ -80,20 +91,21 @@ def varied(lookups: RayLookups) -> RayLookups:
     flipped and turned; of three tenths of the samples up to three cameras that did not colour the view see nothing.
     """
     channels, gain = torch.randperm(3), float(torch.empty(()).uniform_(DARKEST, 1))
-    features, around = lookups.features.clone(), lookups.around.clone()
+    features, around, far = (values.clone() for values in (lookups.features, lookups.around, lookups.far))
     for values, first in ((features, 0), (features, 10)):
         values[..., first : first + 3] = gain * values[..., first + channels]
-    for first in (0, 5):
-        around[:, first : first + 3] = (gain * around[:, first + channels].float()).round().to(torch.uint8)
+    for values, first in ((around, 0), (around, 5), (far, 0), (far, CELL_CHANNELS)):
+        values[:, first : first + 3] = (gain * values[:, first + channels].float()).round().to(torch.uint8)
     flipped = [axis for axis in (2, 3) if bool(torch.rand(()) < 0.5)]
-    around = around.flip(flipped) if flipped else around
-    around = around.transpose(2, 3) if bool(torch.rand(()) < 0.5) else around
+    around, far = around.flip(flipped), far.flip(flipped)
+    if bool(torch.rand(()) < 0.5):
+        around, far = around.transpose(2, 3), far.transpose(2, 3)
     if bool(torch.rand(()) < BLINDED_SHARE) and features.numel():
         blind = torch.randperm(features.shape[2])[: int(torch.randint(1, MOST_BLIND + 1, ()))].to(features.device)
         chosen = (features[:, :, blind, 7] > 0).flatten(0, 1).any(0)
         features[:, :, blind[~chosen]] = 0
     truth = (gain * lookups.truth[:, channels].float()).round().to(torch.uint8)
-    return RayLookups(features, lookups.occupancy, around, truth)
+    return RayLookups(features, lookups.occupancy, around, far, lookups.place, truth)
 
 
 class RaysObjective(nn.Module):
@@ -114,10 +126,7 @@ class RaysObjective(nn.Module):
 def rays_loss(model: Inpainter, batch: Sequence[RayLookups]) -> ImageLoss:
     """`image_loss` over the looked-up pixels alone: nothing is outside."""
     assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
-    most = max([1, *(lookups.features.shape[2] for lookups in batch)])
-    samples = [RaySamples(b.features.float(), b.occupancy.float()).padded(most) for b in batch]
-    together = RaySamples(torch.cat([s.features for s in samples]), torch.cat([s.occupancy for s in samples]))
-    around = torch.cat([b.around.float() / 255 for b in batch])
+    told = RayInputs.cat([lookups.inputs() for lookups in batch])
     with model.autocast():
-        colours = model.ray_reader.mix(together, around).float().split([len(b.truth) for b in batch])
+        colours = model.ray_reader.mix(told).float().split([len(b.truth) for b in batch])
     return mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])
