@@ -143,8 +143,10 @@ def test_a_renderer_without_depth_in_holes_is_served_too():
         (without,) = net.prefill([flat], [context(5)])
     assert torch.allclose(full, from_around, atol=1e-3), "the plate is flat"
     assert torch.equal(without, fill(incomplete.rgb, incomplete.error > 0, incomplete.mask > 0))
-    completed, _ = net.step(flat, Rig(), net.initial_state())
-    assert completed.rgb.isfinite().all()
+    maskless = replace(incomplete, mask=0 * incomplete.mask, depth=2.0 * (incomplete.depth > 0))
+    for odd in (flat, maskless):
+        completed, _ = net.step(odd, Rig(), net.initial_state())
+        assert completed.rgb.isfinite().all() and net.prefill([odd], [context(5)])[0].isfinite().all()
 
 
 def test_a_step_reads_the_chosen_cameras_and_then_the_nearest():

@@ -51,9 +51,12 @@ class RaySamples:
 
 
 def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
-    """Root of the subject's area at its median depth, metres: the unit along rays, so that any rig fits."""
+    """Root of the subject's area at its median depth, metres: the unit along rays, so that any rig fits.
+
+    A pixel, where M is empty.
+    """
     f = (view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]).sqrt()
-    return (view.mask > 0).sum().sqrt() * view.depth[view.depth > 0].median() / f
+    return (view.mask > 0).sum().clamp_min(1).sqrt() * view.depth[view.depth > 0].median() / f
 
 
 def follow(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews) -> RaySamples:
