@@ -71,13 +71,15 @@ def far_twin(view, guess, pixels, sizes, reach):
     told = np.zeros((len(pixels), len(sizes), len(shown), 2 * reach + 1, 2 * reach + 1))
     for which, size in enumerate(sizes):
         side = max(1, round(size * np.sqrt(subject.sum())))
+        middle_column, middle_row = (int(np.floor(float(c))) for c in view.camera.K[0, :2, 2])
         for number, (row, column) in enumerate(pixels.tolist()):
             for down in range(-reach, reach + 1):
                 for across in range(-reach, reach + 1):
-                    top, left = (row // side + down) * side, (column // side + across) * side
-                    if top >= 0 and left >= 0:
-                        cell = [image[top : top + side, left : left + side].sum() / side**2 for image in shown]
-                        told[number, which, :, reach + down, reach + across] = cell
+                    top = middle_row + ((row - middle_row) // side + down) * side
+                    left = middle_column + ((column - middle_column) // side + across) * side
+                    rows, columns = (slice(max(0, first), max(0, first + side)) for first in (top, left))
+                    cell = [image[rows, columns].sum() / side**2 for image in shown]
+                    told[number, which, :, reach + down, reach + across] = cell
     return told.reshape(len(pixels), -1, 2 * reach + 1, 2 * reach + 1)
 
 

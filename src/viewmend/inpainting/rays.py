@@ -98,7 +98,8 @@ def far_around(
     """What shape the subject has around each pixel (row, column): means over cells of both sizes, the finer first.
 
     Pixels of the same cells share them: the second of the pair says which is whose. Channels: RGB of `guess`, the view
-    filled smoothly; M; E; and depth, 0.5 at the subject's median and growing with distance.
+    filled smoothly; M; E; and depth, 0.5 at the subject's median and growing with distance. Cells meet at the principal
+    point, so that a window of a view has the same.
     """
     subject_px = float((view.mask > 0).sum().sqrt())
     covered = view.depth > 0
@@ -107,11 +108,14 @@ def far_around(
         beyond = 0.5 + 0.5 * ((view.depth - view.depth[covered].median()) / subject_size_m(view)).tanh()
     shown = torch.cat([guess, view.mask[None], view.error[None], (beyond * covered)[None]])[None]
     sides = [max(1, round(size * subject_px)) for size in CELLS]
-    cells, place = torch.unique(torch.cat([pixels // side for side in sides], 1), dim=0, return_inverse=True)
-    told = [
-        windows(F.avg_pool2d(_padded(shown, side), side)[0], at, CELLS_AROUND)
-        for side, at in zip(sides, cells.split(2, 1), strict=True)
-    ]
+    column, row = view.camera.K[0, :2, 2].floor().long().tolist()
+    before = [(-row % side, -column % side) for side in sides]
+    shifted = [(pixels + pixels.new_tensor(shift)) // side for side, shift in zip(sides, before, strict=True)]
+    cells, place = torch.unique(torch.cat(shifted, 1), dim=0, return_inverse=True)
+    told = []
+    for side, (above, left), at in zip(sides, before, cells.split(2, 1), strict=True):
+        means = F.avg_pool2d(_padded(F.pad(shown, (left, 0, above, 0)), side), side)[0]
+        told.append(windows(means, at, CELLS_AROUND))
     return torch.cat(told, 1), place
 
 
