@@ -121,8 +121,7 @@ class RayReader(nn.Module):
             pixels = [torch.nonzero((view.error > 0) & (view.depth > 0).any()) for view in views]
         with torch.autocast(guesses[0].device.type, enabled=False):  # coordinates stay float32
             seen = [look_around(*own) for own in zip(views, nearby, pixels, guesses, strict=True)]
-        told = RayInputs.cat(seen)
-        read = self.mix(told).split([len(p) for p in pixels])
+        read = self.mix(RayInputs.cat(seen)).split([len(p) for p in pixels])
         return [
             guess.movedim(0, -1).index_put(tuple(at.unbind(1)), rgb).movedim(-1, 0)
             for guess, at, rgb in zip(guesses, pixels, read, strict=True)
@@ -130,8 +129,10 @@ class RayReader(nn.Module):
 
     def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
-        far = self.far(_rounded_up(told.far)).flatten(1)[told.place]
-        size = max(1, len(far)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
+        size = max(1, len(told.place)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
+        far = torch.cat([self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.far.split(size)])[
+            told.place
+        ]
         parts = (values.split(size) for values in (told.features, told.occupancy, told.around, far))
         return torch.cat([self._mix(*part) for part in zip(*parts, strict=True)])
 

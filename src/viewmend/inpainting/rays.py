@@ -169,7 +169,7 @@ def _least_masks(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> 
     view = torch.arange(len(cameras), device=mask.device)[:, None]
     corners = _corners(at, mask.shape[1:])
     value = sum((share * mask[view, row, column] for row, column, share in corners), torch.zeros_like(z)) / 255
-    side = _outline_px(mask)
+    side = max(1, round(OUTLINE * _subject_px(mask)))
     around = _between(_means(mask[:, None], side), at / side)[..., 0]
     values = torch.where(inside, torch.stack([value, around]), 1.0)
     values = F.pad(values, (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
@@ -183,7 +183,8 @@ def _around(
     at: Float[Tensor, "view point 2"],
 ) -> Float[Tensor, "view point 5"]:
     """Means around each place: of the mask, of RGB before black, and of what the proxy covers."""
-    side, half = _outline_px(mask), max(1, round(PATCH / 2 * _subject_px(mask)))
+    subject_px = _subject_px(mask)
+    side, half = (max(1, round(share * subject_px)) for share in (OUTLINE, PATCH / 2))
     shapes = _means(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
     # Of colours every other row and column will do.
     colours = F.avg_pool2d(_padded(rgb[..., ::2, ::2].to(at) * mask[:, None, ::2, ::2], half), half) / 255**2
@@ -194,10 +195,6 @@ def _around(
 def _subject_px(mask: UInt8[Tensor, "view height width"]) -> float:
     """Root of the subject's area, a mean over cameras."""
     return float((mask.sum((1, 2)) / 255).mean().sqrt())
-
-
-def _outline_px(mask: UInt8[Tensor, "view height width"]) -> int:
-    return max(1, round(OUTLINE * _subject_px(mask)))
 
 
 def _means(shapes: UInt8[Tensor, "view shape height width"], side: int) -> Float[Tensor, "view shape rows columns"]:
