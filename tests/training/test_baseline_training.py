@@ -13,7 +13,8 @@ from safetensors.torch import load_file
 
 from viewmend import cli
 from viewmend.baselines.dstt import DSTT
-from viewmend.baselines.e2fgvi import E2FGVIHQ, LocalFlows
+from viewmend.baselines.e2fgvi import E2FGVI, E2FGVIHQ, LocalFlows
+from viewmend.baselines.fuseformer import TOKENS, FuseFormer
 from viewmend.baselines.published import load_baseline
 from viewmend.training.baseline_clips import training_clip
 from viewmend.training.baseline_objective import BaselineObjective, clip_terms, flow_term
@@ -134,6 +135,22 @@ def test_a_network_learns_goes_on_and_is_a_method(recipe, tmp_path):
         shutil.rmtree(tmp_path / name)
 
 
+@pytest.mark.parametrize(("kind", "size"), [(FuseFormer, (36, 48)), (E2FGVI, (60, 108))])
+def test_learned_maps_are_learned_in_parts(kind, size, clip_of_two):
+    """Frames smaller than the maps see a part of them, each time another; what is learned is for all of them."""
+    torch.manual_seed(0)
+    network = kind()
+    objective = BaselineObjective(network, size, False, None)
+    for _ in range(8):
+        objective([clip_of_two]).total.backward()
+    maps = [network.sc.bias.grad.abs().sum(0)]
+    if kind is FuseFormer:
+        maps.append(network.add_pos_emb.pos_emb.grad.abs().sum(-1).reshape(TOKENS))
+    for seen in maps:
+        share = float((seen > 0).float().mean())
+        assert 1.5 * size[0] * size[1] / (240 * 432) < share < 1
+
+
 @pytest.mark.slow
 def test_the_command_begins_with_a_checkpoint(shards, tmp_path, capsys):
     torch.manual_seed(5)
@@ -154,6 +171,8 @@ def test_the_command_begins_with_a_checkpoint(shards, tmp_path, capsys):
     [
         (["dstt", "--from", "absent.pth"], "absent.pth: expected a checkpoint file, found none"),
         (["sttn"], "expected a recipe among small, .*dstt, fuseformer, e2fgvi, e2fgvi-hq, got 'sttn'"),
+        (["small", "--size-px", "60", "108"], "expected --size-px with dstt, .* alone, got it with small"),
+        (["fuseformer", "--size-px", "64", "108"], "frames of 432x240.*got 108x64"),
         (["e2fgvi", "--validate-every", "5", "--steps", "1"], "expected --validate-every 0"),
     ],
 )

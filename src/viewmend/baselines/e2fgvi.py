@@ -76,7 +76,7 @@ class FocalBlock(nn.Module):
 
 
 class E2FGVI(nn.Module):
-    """41.8 M parameters; 243 tensors, named as in the official checkpoint. Takes 432x240 alone."""
+    """41.8 M parameters; 243 tensors, named as in the official checkpoint. Takes 432x240; in training, also less."""
 
     name = "E2FGVI"
 
@@ -122,8 +122,12 @@ class E2FGVI(nn.Module):
         return self.decode(completed), flows
 
     def check_size(self, height: int, width: int) -> None:
-        """ValueError unless the frame is 432x240: the bias map is learned for this size."""
-        if (height, width) != NATIVE_PX:
+        """ValueError unless the frame is 432x240: the bias map is learned for this size.
+
+        In training smaller frames of whole attention windows will do: each looks at a part of the map.
+        """
+        part = _is_covered(height, width) and height <= NATIVE_PX[0] and width <= NATIVE_PX[1]
+        if (height, width) != NATIVE_PX and not (self.training and part):
             raise ValueError(
                 f"E2FGVI: expected frames of {NATIVE_PX[1]}x{NATIVE_PX[0]}, the size of its learned bias map, got "
                 f"{width}x{height}; resize them, run windows of that size, or use E2FGVI-HQ"
@@ -210,8 +214,13 @@ class E2FGVIHQ(E2FGVI):
 
     def check_size(self, height: int, width: int) -> None:
         """ValueError unless attention windows of 60 x 108 pixels cover the frame."""
-        if min(height, width) <= 0 or height % MULTIPLE_PX[0] or width % MULTIPLE_PX[1]:
+        if not _is_covered(height, width):
             raise ValueError(
                 f"E2FGVI-HQ: expected frames whose height is a multiple of {MULTIPLE_PX[0]} and whose width is one of "
                 f"{MULTIPLE_PX[1]}, got {width}x{height}; pad or resize them, or run windows of such a size"
             )
+
+
+def _is_covered(height: int, width: int) -> bool:
+    """Whether attention windows cover a frame."""
+    return min(height, width) > 0 and not (height % MULTIPLE_PX[0] or width % MULTIPLE_PX[1])

@@ -7,7 +7,15 @@ from torch import Tensor, nn
 
 from viewmend.baselines.frame_decoder import FrameDecoder
 from viewmend.baselines.hierarchical_encoder import STRIDE_PX, HierarchicalEncoder
-from viewmend.baselines.soft_split import DIM, FusionFeedForward, SoftComposition, SoftSplit, token_grid
+from viewmend.baselines.soft_split import (
+    DIM,
+    STEP_CELLS,
+    FusionFeedForward,
+    SoftComposition,
+    SoftSplit,
+    part_of,
+    token_grid,
+)
 from viewmend.baselines.token_transformer import (
     BLOCKS,
     NATIVE_PX,
@@ -20,6 +28,8 @@ from viewmend.baselines.token_transformer import (
 CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
 """Rows and columns of the feature map, fixed by the learned bias map and positional embedding."""
 TOKENS = token_grid(*CELLS)
+STEP_PX = STRIDE_PX * STEP_CELLS
+"""Pixels from token to token."""
 
 
 class JointBlock(TokenBlock):
@@ -36,7 +46,8 @@ class JointBlock(TokenBlock):
         sources = own if memory is None else torch.cat([own, memory], 1)
         queries, keys = (rearrange(x, "b f r c d -> b (f r c) d") for x in (own, sources))
         x = tokens + self.attention(queries, keys).reshape(tokens.shape)
-        fused = self.ffn(self.norm2(x).flatten(0, 1), CELLS)
+        size = (STEP_CELLS * x.shape[2], STEP_CELLS * x.shape[3])
+        fused = self.ffn(self.norm2(x).flatten(0, 1), size)
         return x + fused.reshape(x.shape), own
 
 
@@ -51,11 +62,12 @@ class PositionalEmbedding(nn.Module):
 
     def forward(self, tokens: Float[Tensor, "frame rows cols 512"]) -> Float[Tensor, "frame rows cols 512"]:
         """Tokens that know their place."""
-        return tokens + self.pos_emb.reshape(*TOKENS, DIM)
+        everywhere = self.pos_emb.reshape(*TOKENS, DIM).movedim(-1, 0)
+        return tokens + part_of(everywhere, (tokens.shape[1], tokens.shape[2])).movedim(0, -1)
 
 
 class FuseFormer(TokenTransformer):
-    """36.6 M parameters; 160 tensors, named as in the official checkpoint. Takes 432x240 alone."""
+    """36.6 M parameters; 160 tensors, named as in the official checkpoint. Takes 432x240; in training, also less."""
 
     name = "FuseFormer"
 
@@ -70,8 +82,12 @@ class FuseFormer(TokenTransformer):
         initialise(self)
 
     def check_size(self, height: int, width: int) -> None:
-        """ValueError unless the frame is 432x240: positional embedding and bias map are learned for this size."""
-        if (height, width) != NATIVE_PX:
+        """ValueError unless the frame is 432x240: positional embedding and bias map are learned for this size.
+
+        In training smaller frames of multiples of 12 px will do: each looks at a part of these maps.
+        """
+        part = 0 < height <= NATIVE_PX[0] and 0 < width <= NATIVE_PX[1] and not (height % STEP_PX or width % STEP_PX)
+        if (height, width) != NATIVE_PX and not (self.training and part):
             raise ValueError(
                 f"FuseFormer: expected frames of {NATIVE_PX[1]}x{NATIVE_PX[0]}, the size of its learned positions, got "
                 f"{width}x{height}; resize them or run windows of that size"
@@ -89,4 +105,4 @@ class FuseFormer(TokenTransformer):
         self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
     ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
         """Frames in [-1, 1]."""
-        return self.decoder(features + self.sc(tokens, CELLS))
+        return self.decoder(features + self.sc(tokens, (features.shape[-2], features.shape[-1])))

@@ -25,6 +25,13 @@ def token_grid(height: int, width: int) -> tuple[int, int]:
     return rows, cols
 
 
+def part_of(learned: Float[Tensor, "channel rows cols"], size: tuple[int, int]) -> Float[Tensor, "channel _r _c"]:
+    """A map learned for frames of one size; in training on smaller frames, a part of it, each time another."""
+    spare = [whole - part for whole, part in zip(learned.shape[-2:], size, strict=True)]
+    top, left = (int(torch.randint(n + 1, ())) if n else 0 for n in spare)
+    return learned[:, top : top + size[0], left : left + size[1]]
+
+
 class SoftSplit(nn.Module):
     """A token for each patch, by a linear layer `embedding`."""
 
@@ -55,7 +62,7 @@ class SoftComposition(nn.Module):
         """The feature map of this (height, width)."""
         features = _add_up(self.embedding(rearrange(tokens, "f r c d -> f (r c) d")), size)
         if self.bias is not None:
-            features = features + self.bias
+            features = features + part_of(self.bias, size)
         return features if self.bias_conv is None else self.bias_conv(features)
 
 

@@ -53,6 +53,8 @@ class Options:
     learning_rate: float | None = None
     bfloat16: bool | None = None
     """Mixed precision; the published networks' authors train in float32."""
+    size_px: tuple[int, int] | None = None
+    """Height and width that a published network sees in training: 240 432 by default, parts of that for short runs."""
     checkpoint_every: int | None = None
     validate_every: int | None = None
     part: Literal["rays", "patches", "all"] | None = None
@@ -138,9 +140,13 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     recipe = recipes[options.recipe](data)
     if options.recipe == "finetune" and isinstance(start, Inpainter):
         recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
+    if options.size_px and options.recipe not in NETWORKS:
+        raise ValueError(
+            f"expected --size-px with {', '.join(NETWORKS)} alone, got it with {options.recipe}; leave it out"
+        )
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
     own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "bfloat16", "part", "checkpoint_every")
-    values = {n: getattr(options, n) for n in (*own, "validate_every", "varied")}
+    values = {n: getattr(options, n) for n in (*own, "validate_every", "varied", "size_px")}
     return replace(
         recipe,
         seed=options.seed,
