@@ -135,6 +135,14 @@ def test_a_network_learns_goes_on_and_is_a_method(recipe, tmp_path):
         shutil.rmtree(tmp_path / name)
 
 
+def test_a_network_that_fills_with_black_still_learns_in_bfloat16(clip_of_two):
+    network = DSTT()
+    with torch.no_grad():
+        network.decoder[-1].bias.fill_(-4)
+    BaselineObjective(network, SIZE, True, None)([clip_of_two]).image.inside.backward()
+    assert float(network.decoder[-1].bias.grad.abs().min()) > 1e-4
+
+
 @pytest.mark.parametrize(("kind", "size"), [(FuseFormer, (36, 48)), (E2FGVI, (60, 108))])
 def test_learned_maps_are_learned_in_parts(kind, size, clip_of_two):
     """Frames smaller than the maps see a part of them, each time another; what is learned is for all of them."""

@@ -34,4 +34,5 @@ class FrameDecoder(nn.Sequential):
 
     def forward(self, features: Float[Tensor, "frame 128 rows cols"]) -> Float[Tensor, "frame 3 height width"]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Frames of four times the size, in [-1, 1]."""
-        return super().forward(features).tanh()
+        # Not in bfloat16, where tanh near 1 is 1 and has no slope: who learned black would never leave it.
+        return super().forward(features).float().tanh()

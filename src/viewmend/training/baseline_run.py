@@ -8,6 +8,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from viewmend.baselines.e2fgvi import E2FGVI
+from viewmend.baselines.hierarchical_encoder import SLOPE
 from viewmend.baselines.published import NETWORKS, TRAINED
 from viewmend.baselines.token_transformer import NATIVE_PX, TokenTransformer
 from viewmend.training.adversary import BETAS, Adversary
@@ -73,6 +74,8 @@ class BaselineRun(Run):
         network.check_size(*self.recipe.size_px)
         if start is not None:
             network.load_state_dict(start.state_dict())
+        else:
+            _draw_as_he(network)
         return network.train()
 
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
@@ -105,3 +108,15 @@ class BaselineRun(Run):
             model_card(self.recipe, self.state) + f"\nBegan with {begun}. A method: {self.recipe.name}-o-def@FOLDER.\n"
         )
         (self.out / "README.md").write_text(card)
+
+
+def _draw_as_he(network: TokenTransformer | E2FGVI) -> None:
+    """Draws the convolutions before and after the tokens by their fan-in (He et al. 2015), all but the last.
+
+    The authors draw N(0, 0.02). From there, where most of a frame is black, a network becomes black within tens of
+    steps and stays so for hundreds: before its features say anything, tanh has no slope left.
+    """
+    parts = [child for name, child in network.named_children() if name in ("encoder", "hier_enc", "decoder")]
+    convolutions = [m for part in parts for m in part.modules() if isinstance(m, nn.Conv2d)]
+    for layer in convolutions[:-1]:
+        nn.init.kaiming_normal_(layer.weight, SLOPE)
