@@ -99,9 +99,9 @@ class RayReader(nn.Module):
         told = points * POINT_FEATURES + (1 + sizes) * deep
         # Once a pixel, not once a point and camera: width is cheap here, and worth more than anywhere else.
         self.head = nn.Sequential(
-            *(nn.Linear(told, 16 * width), nn.GELU()), *(nn.Linear(16 * width, 14 * width), nn.GELU())
+            *(nn.Linear(told, 22 * width), nn.GELU()), *(nn.Linear(22 * width, 20 * width), nn.GELU())
         )
-        self.choose = nn.Linear(14 * width, points + 2)
+        self.choose = nn.Linear(20 * width, points + 2)
 
     def forward(
         self,

@@ -28,8 +28,8 @@ def small_rays(data: DataPlan) -> Recipe:
 
     A moment of each scene: many scenes teach more than many views of few.
     """
-    dense = replace(data, context=False, cameras=(6, 20), min_hole_px=15, imperfect_share=0.7)
-    dense = replace(dense, rough_share=0.3, dropped_share=0.1, widened_share=0.15)
+    dense = replace(data, context=False, cameras=(6, 20), min_hole_px=15, imperfect_share=0.8)
+    dense = replace(dense, rough_share=0.5, dropped_share=0.1, widened_share=0.15)
     dense = replace(dense, times=(0,), held_cameras=5, targets_per_camera=1)
     return replace(
         small(data),
