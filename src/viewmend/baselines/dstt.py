@@ -6,14 +6,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.baselines.frame_decoder import FrameDecoder
-from viewmend.baselines.hierarchical_encoder import FEATURES, STRIDE_PX, DeepLayers, shallow_layers
-from viewmend.baselines.soft_split import DIM, MARGIN_CELLS, PATCH_CELLS, STEP_CELLS, SoftComposition
+from viewmend.baselines.hierarchical_encoder import FEATURES, DeepLayers, shallow_layers
+from viewmend.baselines.soft_split import DIM, MARGIN_CELLS, PATCH_CELLS, STEP_CELLS, STEP_PX, SoftComposition
 from viewmend.baselines.token_transformer import BLOCKS, TokenBlock, TokenClips, TokenTransformer, initialise
 
 ZONES = 2
 """Temporal attention stays within a zone; a frame has ZONES x ZONES."""
 HIDDEN = 2048
-SIZE_STEP_PX = STRIDE_PX * STEP_CELLS * ZONES
+SIZE_STEP_PX = STEP_PX * ZONES
 """Heights and widths are multiples of this, so that zones are equal."""
 
 

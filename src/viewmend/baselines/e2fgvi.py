@@ -14,13 +14,13 @@ from viewmend.baselines.e2fgvi_propagation import AlignedConvolution, Propagated
 from viewmend.baselines.focal_attention import WINDOW, FocalAttention, FocalTokens
 from viewmend.baselines.frame_decoder import FrameDecoder
 from viewmend.baselines.hierarchical_encoder import STRIDE_PX, HierarchicalEncoder
-from viewmend.baselines.soft_split import DIM, STEP_CELLS, FusionFeedForward, SoftComposition, SoftSplit
+from viewmend.baselines.soft_split import DIM, STEP_PX, FusionFeedForward, SoftComposition, SoftSplit
 from viewmend.baselines.spynet import SPyNet
 from viewmend.baselines.token_transformer import BLOCKS, HEADS, NATIVE_PX, initialise
 
 CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
 """Rows and columns of the feature map that E2FGVI's learned bias map fixes."""
-MULTIPLE_PX = (WINDOW[0] * STEP_CELLS * STRIDE_PX, WINDOW[1] * STEP_CELLS * STRIDE_PX)
+MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)
 """Height and width of one attention window: 60 x 108."""
 
 Clips = Float[Tensor, "sample frame 3 height width"]

@@ -10,6 +10,7 @@ from viewmend.baselines.hierarchical_encoder import STRIDE_PX, HierarchicalEncod
 from viewmend.baselines.soft_split import (
     DIM,
     STEP_CELLS,
+    STEP_PX,
     FusionFeedForward,
     SoftComposition,
     SoftSplit,
@@ -28,8 +29,6 @@ from viewmend.baselines.token_transformer import (
 CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
 """Rows and columns of the feature map, fixed by the learned bias map and positional embedding."""
 TOKENS = token_grid(*CELLS)
-STEP_PX = STRIDE_PX * STEP_CELLS
-"""Pixels from token to token."""
 
 
 class JointBlock(TokenBlock):

@@ -6,10 +6,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import fold, unfold
 
-from viewmend.baselines.hierarchical_encoder import FEATURES
+from viewmend.baselines.hierarchical_encoder import FEATURES, STRIDE_PX
 
 PATCH_CELLS, STEP_CELLS, MARGIN_CELLS = 7, 3, 3
 """Patches are 7 x 7 feature cells, one every 3, with 3 cells of zeros around the map."""
+STEP_PX = STRIDE_PX * STEP_CELLS
+"""Pixels from token to token."""
 DIM = 512
 """Channels of a token."""
 FUSION_CHANNELS = 40

@@ -127,6 +127,10 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
         raise ValueError(f"expected a recipe among {', '.join(recipes)}, got '{options.recipe}'; see --help")
     if options.recipe == "finetune" and not (options.capture or options.shards):
         raise ValueError("expected --capture DIR for finetune, got none; name the folder of your capture")
+    if options.size_px and options.recipe not in NETWORKS:
+        raise ValueError(
+            f"expected --size-px with {', '.join(NETWORKS)} alone, got it with {options.recipe}; leave it out"
+        )
     if (options.performers is None) != (options.motions is None):
         raise ValueError("expected --performers and --motions together, got one of them; give both folders")
     data = DataPlan(
@@ -140,10 +144,6 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     recipe = recipes[options.recipe](data)
     if options.recipe == "finetune" and isinstance(start, Inpainter):
         recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
-    if options.size_px and options.recipe not in NETWORKS:
-        raise ValueError(
-            f"expected --size-px with {', '.join(NETWORKS)} alone, got it with {options.recipe}; leave it out"
-        )
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
     own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "bfloat16", "part", "checkpoint_every")
     values = {n: getattr(options, n) for n in (*own, "validate_every", "varied", "size_px")}

@@ -130,10 +130,8 @@ class RayReader(nn.Module):
     def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         size = max(1, len(told.place)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
-        far = torch.cat([self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.far.split(size)])[
-            told.place
-        ]
-        parts = (values.split(size) for values in (told.features, told.occupancy, told.around, far))
+        far = torch.cat([self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.far.split(size)])
+        parts = (values.split(size) for values in (told.features, told.occupancy, told.around, far[told.place]))
         return torch.cat([self._mix(*part) for part in zip(*parts, strict=True)])
 
     def _mix(
