@@ -1,6 +1,7 @@
 """What strangers, broken networks and floods do to a server: nothing."""
 
 import contextlib
+import http.client
 import json
 import random
 import socket
@@ -151,6 +152,32 @@ def test_disconnects_in_the_middle_of_a_frame():
         wait_until(lambda: not server.service._seats)
 
 
+def test_requests_that_never_end_are_cut_off(monkeypatch):
+    monkeypatch.setattr(listener, "SILENT_S", 0.5)
+    with running(token="secret") as server:
+        port = int(server.url.rsplit(":", 1)[1])
+        whole = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        posted = b"POST /path.mp4 HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
+        for sent in (whole + b"GET / HTTP/1.1\r\nHost: loc", posted):
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as half:
+                half.sendall(sent)
+                while half.recv(65536):
+                    pass
+        asked = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        asked.connect()
+        kept_open = asked.sock
+        for _ in range(8):  # for longer than SILENT_S, on one connection
+            time.sleep(0.25)
+            asked.request("GET", "/health?token=secret")
+            assert asked.getresponse().read() and asked.sock is kept_open
+        asked.close()
+
+
+def test_a_token_may_have_any_sign():
+    with running(token="a+b&c#d/e f%") as server, Client(server.ws, token="a+b&c#d/e f%") as viewer:
+        assert viewer.messages["welcome"]
+
+
 def test_strangers_and_the_token():
     with running(token="sesame") as server:
         assert get(f"{server.url}/health")[0] == 401
@@ -168,6 +195,12 @@ def test_pages_of_others_are_refused(ball):
     for headers in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Host": "evil.example"}):
         assert get(f"{ball.url}/health", headers)[0] == 403 and get(f"{ball.url}/", headers)[0] == 403
     assert get(f"{ball.url}/health", own)[0] == 200
+    port = ball.url.rsplit(":", 1)[1]
+    rebound = {"Host": f"127.0.0.1.evil.example:{port}", "Origin": f"http://127.0.0.1.evil.example:{port}"}
+    for headers in (rebound, {"Origin": "http://["}, {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"}):
+        assert get(f"{ball.url}/frame.jpg?width=16&height=16", headers)[0] == 403
+    followed = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "document"}
+    assert get(ball.url, followed)[0] == get(ball.url, {"Sec-Fetch-Site": "same-origin"})[0] == 200
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"{ball.ws}/ws", origin="http://evil.example", **SOON).__enter__()
     with connect(f"{ball.ws}/ws", origin=ball.url, **SOON) as ours:

@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import replace
+from time import sleep
 
 import pytest
 import torch
@@ -78,6 +79,15 @@ def test_memory_is_bounded_and_what_was_dropped_is_read_again(reading):
         wait_until(lambda time=time: supply.read(time) is not None)
         assert supply.read(time).time == time
     assert source.order.count(0) >= 2
+
+
+def test_where_few_frames_have_room_reading_ahead_comes_to_rest(reading):
+    source = Slow(9)
+    supply = reading(source, memory_mb=0.12)  # two frames of six images
+    source.turns.release(1000)
+    wait_until(lambda: supply.read(0) is not None)
+    sleep(0.5)
+    assert source.order == [0, 1] and supply.read(0) is not None
 
 
 def test_failures_are_said_and_tried_again():

@@ -1,6 +1,8 @@
 """A rig that pushes its frames."""
 
 import json
+import struct
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -83,6 +85,9 @@ def rig_message(**changes):
         rig_message(cameras=cameras_json(CAMERAS[[0, 0]])),
         rig_message(cameras=[cameras_json(CAMERAS)[0] | {"width": 16000, "height": 16000}]),
         rig_message(up=[0, 0, 0]),
+        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"R": [-1, 0, 0, 0, 1, 0, 0, 0, 1]}]),
+        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"K": [-50, 0, 24, 0, 50, 24, 0, 0, 1]}]),
+        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"K": [0] * 9}]),
         rig_message(bounds={"low": [0, 0, 0], "high": [0, 1, 1]}),
     ],
 )
@@ -98,6 +103,10 @@ def frame_message(name="c0", kind="rgb", data=None, size=48):
     return pack({"images": [{"camera": name, "kind": kind, "bytes": len(image)}]}, [image])
 
 
+CHUNK = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
+HUGE_PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + CHUNK + struct.pack(">I", zlib.crc32(CHUNK))
+
+
 @pytest.mark.parametrize(
     "message",
     [
@@ -109,6 +118,7 @@ def frame_message(name="c0", kind="rgb", data=None, size=48):
         frame_message(size=47),
         frame_message(data=b"GIF89a"),
         frame_message(data=b"\x89PNG and nothing more"),
+        frame_message(data=HUGE_PNG),
         pack({"images": [3]}, [b""]),
     ],
 )

@@ -1,8 +1,10 @@
 """The server over real sockets: what is asked for comes, to whom asked."""
 
+import http.client
 import io
 import json
 import threading
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -183,6 +185,22 @@ def test_a_path_becomes_a_video(ball):
 def test_bad_paths_are_refused(ball, body):
     status, _, answer = get(f"{ball.url}/path.mp4", data=body)
     assert status in (400, 413) and "expected" in json.loads(answer)["error"]
+
+
+def test_one_path_at_a_time(ball):
+    pytest.importorskip("av")
+    body = json.dumps({"poses": [{"azimuth": 20.0 * n} for n in range(4)], "width": 32, "height": 32}).encode()
+    clients = [http.client.HTTPConnection("127.0.0.1", int(ball.url.rsplit(":", 1)[1]), timeout=20) for _ in range(3)]
+    for client in clients:
+        client.putrequest("POST", "/path.mp4")
+        client.putheader("Content-Length", str(len(body)))
+        client.endheaders()
+    time.sleep(0.3)
+    for client in clients:
+        client.send(body)
+    assert sorted(client.getresponse().status for client in clients) == [200, 409, 409]
+    for client in clients:
+        client.close()
 
 
 def test_the_page_is_served_from_a_table_and_nothing_else(ball):

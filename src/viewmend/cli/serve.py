@@ -71,6 +71,7 @@ def run(options: Options) -> int:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
     from viewmend.cli.console import say
     from viewmend.cli.mending import load_named
+    from viewmend.live.guard import token_query
     from viewmend.live.listener import Server
     from viewmend.live.memory import set_up
     from viewmend.live.protocol import Limits
@@ -95,8 +96,7 @@ def run(options: Options) -> int:
     renderer = Renderer(supply, inpainter, pipeline, options.device, memory_mb=options.memory_mb / 2)
     server = Server(LiveServer(RenderService(renderer, supply), config), config, pushes=options.source == "live")
     with server.bound() as address:
-        query = f"/?token={options.token}" if options.token else "/"
-        say(f"open {address}{query}   (Ctrl-C stops it)")
+        say(f"open {address}/{token_query(options.token)}   (Ctrl-C stops it)")
         server.run_bound()
     return 0
 

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from viewmend.live.guard import token_query
 from viewmend.live.pictures import PackedDepth, from_jpeg, unpack_depth
 from viewmend.live.protocol import VERSION, unpack
 
@@ -37,7 +38,7 @@ class Client:
     """The last message of each type."""
 
     def __enter__(self) -> "Client":
-        url = f"{self.url}/ws" + (f"?token={self.token}" if self.token else "")
+        url = f"{self.url}/ws{token_query(self.token)}"
         self._open = contextlib.ExitStack()
         self._socket = self._open.enter_context(connect(url, max_size=None, compression=None))
         self._looks = 0

@@ -63,7 +63,7 @@ class Clock:
         """Do what a viewer asks."""
         if change.seek is not None:
             self.position, self.live = span.clamp(float(change.seek)), False
-        if change.speed is not None:
+        if change.speed is not None and not span.live:
             self.speed = change.speed
             self.live = self.live and change.speed == 1
         if change.playing is not None:

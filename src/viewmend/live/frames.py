@@ -41,7 +41,7 @@ class SourceStatus:
     """How a source is."""
 
     state: str = "loading"
-    """loading, ready, failing or ended."""
+    """loading, ready or failing."""
     error: str | None = None
     """For people."""
 
@@ -106,6 +106,12 @@ class FrameStore:
         if self._by_use and time in self._frames:
             self._frames.move_to_end(time)
         return self._frames.get(time)
+
+    @property
+    def room(self) -> int:
+        """How many frames like the newest fit in."""
+        newest = next(reversed(self._frames.values()), None)
+        return 1 if newest is None else max(1, int(self._limit // _size(newest)))
 
     @property
     def oldest(self) -> int:
@@ -252,5 +258,5 @@ class ReadAhead(Supply):
         total = self._span.total or 0
         if self._made and self._span.end < total:
             return self._span.end
-        soon = [(self._wanted + n) % max(1, total) for n in range(min(AHEAD + 1, total))]
+        soon = [(self._wanted + n) % max(1, total) for n in range(min(AHEAD + 1, total, self._store.room))]
         return next((time for time in soon if time not in self._store), None)

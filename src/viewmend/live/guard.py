@@ -3,16 +3,23 @@
 import hmac
 import time
 from collections import deque
-from urllib.parse import urlsplit
+from ipaddress import ip_address
+from urllib.parse import quote
 
 from starlette.requests import HTTPConnection
-
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 def is_loopback(host: str) -> bool:
     """Whether an address is this machine's alone."""
-    return host in LOOPBACK or host.startswith("127.")
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:  # a name, and who knows what 127.0.0.1.example resolves to
+        return False
+
+
+def token_query(token: str | None) -> str:
+    """What follows a path where the token is wanted; empty without one."""
+    return f"?token={quote(token, safe='')}" if token else ""
 
 
 class Guard:
@@ -35,14 +42,19 @@ class Guard:
     def stranger(self, connection: HTTPConnection) -> str | None:
         """Why a request comes from a page that is not ours; None if it does not.
 
-        A page elsewhere has another `Origin`; one that made its own name resolve to this machine calls us by it.
+        A page elsewhere has another `Origin`, or shows our pictures as its own; one that made its own name resolve to
+        this machine calls us by it. A link to us may be anywhere.
         """
         host = connection.headers.get("host", "")
         if self._local and not is_loopback(_name(host)):
             return f"expected a request to localhost, got one to '{host[:60]}'; open the address that was printed"
         origin = connection.headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and not origin.endswith(f"://{host}"):
             return f"expected a request of our own page, got one of '{origin[:60]}'"
+        site = connection.headers.get("sec-fetch-site", "none")
+        followed = connection.headers.get("sec-fetch-dest") == "document"
+        if site not in ("none", "same-origin") and not followed:
+            return f"expected a request of our own page, got a {site[:20]} one"
         return None
 
     def lacks_token(self, connection: HTTPConnection) -> bool:

@@ -12,7 +12,7 @@ from viewmend.live.server import LiveServer, ServerConfig
 
 PUSH_BYTES = 64_000_000
 SILENT_S = 10.0
-"""A connection that asks for nothing is closed after so long."""
+"""A connection that asks for nothing, or never to the end, is closed after so long."""
 
 
 class Server(uvicorn.Server):
@@ -38,7 +38,8 @@ class Server(uvicorn.Server):
                 server_header=False,
             )
         )
-        self._since: WeakKeyDictionary[object, float] = WeakKeyDictionary()
+        self._since: WeakKeyDictionary[object, tuple[int, float]] = WeakKeyDictionary()
+        """Which request a connection has had answered (0 for none), and since when it asks for nothing more."""
 
     @contextlib.contextmanager
     def bound(self) -> Iterator[str]:
@@ -75,8 +76,14 @@ class Server(uvicorn.Server):
     def _close_silent(self) -> None:
         now = time.monotonic()
         for connection in list(self.server_state.connections):
-            # An HTTP connection without a request so far; sockets of viewers have other watchmen.
-            if getattr(connection, "cycle", connection) is not None:
+            # Of HTTP; sockets of viewers have other watchmen. A request that is half sent is none.
+            cycle = getattr(connection, "cycle", connection)
+            if cycle is not None and not getattr(cycle, "response_complete", False):
                 self._since.pop(connection, None)
-            elif now - self._since.setdefault(connection, now) > SILENT_S and connection.transport is not None:
+                continue
+            answered, since = self._since.get(connection, (id(cycle), now))
+            if answered != id(cycle):
+                since = now
+            self._since[connection] = id(cycle), since
+            if now - since > SILENT_S and connection.transport is not None:
                 connection.transport.close()

@@ -33,5 +33,5 @@ def metrics_text(lobby: Lobby) -> str:
 
 
 def _metric(name: str, kind: str, text: str, values: dict[str, float | int]) -> list[str]:
-    rows = [f"{name}{labels} {value:g}" for labels, value in values.items()]
+    rows = [f"{name}{labels} {value!r}" for labels, value in values.items()]
     return [f"# HELP {name} {text}", f"# TYPE {name} {kind}", *rows]

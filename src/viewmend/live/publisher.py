@@ -12,6 +12,7 @@ from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.live.guard import token_query
 from viewmend.live.poses import bounds_json, cameras_json
 from viewmend.live.protocol import VERSION, pack
 from viewmend.views import MultiViewFrame
@@ -34,9 +35,10 @@ class Publisher:
         up: Tensor | None = None,
         bounds: Bounds | None = None,
     ) -> None:
-        query = f"?token={token}" if token else ""
         self._open = contextlib.ExitStack()
-        self._socket = self._open.enter_context(connect(f"{url}/push{query}", max_size=None, compression=None))
+        self._socket = self._open.enter_context(
+            connect(f"{url}/push{token_query(token)}", max_size=None, compression=None)
+        )
         rig = {
             "type": "rig",
             "version": VERSION,

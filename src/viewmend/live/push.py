@@ -10,7 +10,7 @@ from starlette.websockets import WebSocket
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.rigid import rigid
+from viewmend.geometry.rigid import is_rotation, rigid
 from viewmend.live.fields import Fields, ProtocolError, read_json
 from viewmend.live.protocol import VERSION, unpack
 from viewmend.live.pushed import Pushed
@@ -82,7 +82,15 @@ def _cameras(given: list[Fields]) -> Cameras:
     if len(set(names)) < len(names):
         raise ProtocolError("expected cameras of different names")
     R = torch.tensor([camera.numbers("R", 9, 1.001) for camera in given]).view(-1, 3, 3)
+    if not bool(is_rotation(R).all()):
+        raise ProtocolError("expected 'R' to be a rotation, world to camera, row by row; got another matrix")
     K = torch.tensor([camera.numbers("K", 9, 1e6) for camera in given]).view(-1, 3, 3)
+    if not bool(
+        ((K[:, 0, 0] > 0) & (K[:, 1, 1] > 0) & (K[:, 1, 0] == 0) & (K[:, 2] == K.new_tensor([0, 0, 1])).all(1)).all()
+    ):
+        raise ProtocolError(
+            "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0; got another matrix"
+        )
     size = [(camera.whole("width", 8, 16384), camera.whole("height", 8, 16384)) for camera in given]
     if sum(width * height for width, height in size) > MOST_PIXELS:
         raise ProtocolError(f"expected at most {MOST_PIXELS} pixels in all; push smaller images")
@@ -123,7 +131,10 @@ def _decoded(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.nd
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
         raise ProtocolError(f"camera '{name}': expected JPEG or PNG as {kind}, got {data[:4]!r}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:  # it claims more pixels than OpenCV takes
+        image = None
     if image is None or image.shape[:2] != (height, width):
         got = "no image" if image is None else f"{image.shape[1]} x {image.shape[0]}"
         raise ProtocolError(f"camera '{name}': expected {kind} of {width} x {height} pixels, got {got}")

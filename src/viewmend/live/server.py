@@ -13,7 +13,7 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.live.connection import Lobby, ViewerConnection
 from viewmend.live.errands import PathErrand, PictureErrand, can_export, parse_path, parse_query
@@ -30,7 +30,7 @@ from viewmend.live.video import video_codecs
 PICTURE_S = 60.0
 EXPORT_S = 3600.0
 PICTURES_AT_ONCE = 4
-BODY_BYTES = 1_000_000
+BODY_BYTES, BODY_S = 1_000_000, 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +127,8 @@ class LiveServer:
     async def _health(self, request: Request) -> Response:
         source = self.lobby.source_json()
         error = source["error"] or source["model_error"]
-        failing = source["source"] == "failing" or (error is not None and source["source"] != "loading")
+        state = self._service.supply.status.state
+        failing = state == "failing" or (error is not None and state != "loading")
         status = "failing" if failing else "ok" if self._service.ready else "loading"
         rig = self._service.supply.rig
         health = {
@@ -166,14 +167,12 @@ class LiveServer:
             return _refusal(501, "videos need PyAV; run: pip install 'viewmend[video]'")
         if self._exporting:
             return _refusal(409, "another path is being rendered; ask again")
-        body = b""
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > BODY_BYTES:
-                return _refusal(413, f"expected at most {BODY_BYTES} bytes")
-        errand = PathErrand(parse_path(Fields(read_json(body)), self._config.limits))
         self._exporting = True
         try:
+            body = await _body(request)
+            if body is None:
+                return _refusal(413, f"expected at most {BODY_BYTES} bytes")
+            errand = PathErrand(parse_path(Fields(read_json(body)), self._config.limits))
             video = await self._wait(request, errand, errand.done, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
@@ -228,9 +227,29 @@ class LiveServer:
         self._pushing = True
         try:
             await receive_rig(socket, supply)
+        except (WebSocketDisconnect, RuntimeError):  # gone, maybe while its frame was decoded
+            pass
         finally:
             self._pushing = False
             supply.lost()
+
+
+async def _body(request: Request) -> bytes | None:
+    """The request's body; None where it is too large.
+
+    Raises:
+        ProtocolError: it takes too long.
+    """
+    body = b""
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > BODY_BYTES:
+                    return None
+    except TimeoutError:
+        raise ProtocolError(f"expected the whole body within {BODY_S:g} s") from None
+    return body
 
 
 def _refusal(status: int, message: str | None) -> Response:

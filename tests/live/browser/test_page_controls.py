@@ -130,6 +130,47 @@ def test_pause_seek_step_speed_and_live(view):
     view.until(lambda: server.clocks[-1] == {"type": "clock", "playing": False})
 
 
+def test_steps_and_clicks_start_from_what_is_shown(desktop):
+    page, server = desktop.page, desktop.server
+    line = page.locator("#seek")
+    box = line.bounding_box()
+    at = {"position": {"x": 0.4 * box["width"], "y": box["height"] / 2}}
+    line.click(**at)
+    desktop.until(lambda: "seek" in server.clocks[-1])
+    sought = server.clocks[-1]["seek"]
+    desktop.until(lambda: desktop.data("time") == str(sought))
+    page.keyboard.press("Space")  # the timeline has the focus, and no use for it
+    for _ in range(2):
+        desktop.until(lambda: desktop.data("time") not in (str(sought), str(sought + 1)))
+        line.click(**at)  # where it was clicked before
+        desktop.until(lambda: server.clocks[-1].get("seek") == sought)
+        server.clocks.append({})
+    desktop.until(lambda: desktop.data("time") not in (str(sought), str(sought + 1)))
+    page.keyboard.press("Space")
+    desktop.until(lambda: server.clocks[-1].get("playing") is False)
+    desktop.settle()
+    shown = int(desktop.data("time"))
+    page.keyboard.press(".")
+    desktop.until(lambda: server.clocks[-1].get("seek") is not None)
+    assert server.clocks[-1]["seek"] == min(shown + 1, scene.FRAMES - 1)
+
+
+def test_what_the_address_asks_for_must_make_sense(browser, server):
+    for view in opened(browser, server, "desktop", "?mode=foo&left=split&size=big"):
+        view.settle()
+        assert server.looks[-1]["modes"] == ["mended"]
+
+
+def test_a_phone_that_is_turned_upright_has_its_tabs(browser, server):
+    for view in opened(browser, server, "phone"):
+        view.page.set_viewport_size({"width": 844, "height": 390})
+        view.page.reload()
+        view.settle()
+        view.page.set_viewport_size({"width": 390, "height": 844})
+        view.tab("quality")
+        assert view.page.locator("#quality").is_visible()
+
+
 def test_the_rig_is_drawn_and_the_cameras_in_use_stand_out(view):
     before = view.picture()
     view.page.get_by_role("button", name="Show the cameras").click()

@@ -36,6 +36,21 @@ def test_a_lost_connection_comes_back_with_view_and_time(desktop):
     assert cover(desktop) == ""
 
 
+def test_who_comes_back_while_a_try_is_due_has_one_connection(desktop):
+    look_away = "Object.defineProperty(document, 'hidden', {{value: {}, configurable: true}});"
+    look_away += "document.dispatchEvent(new Event('visibilitychange'))"
+    desktop.server.refuse = 4503
+    desktop.server.drop()
+    desktop.until(lambda: "Trying again in 4" in cover(desktop), 20)
+    desktop.server.refuse = None
+    count = len(desktop.server.hellos)
+    for hidden in ("true", "false"):
+        desktop.page.evaluate(look_away.format(hidden))
+    desktop.until(lambda: len(desktop.server.hellos) > count)
+    desktop.page.wait_for_timeout(5000)
+    assert len(desktop.server.hellos) == count + 1
+
+
 def test_while_it_is_lost_there_is_a_button(desktop):
     desktop.server.refuse = 4503
     desktop.server.drop()

@@ -108,6 +108,13 @@ def test_a_track_passes_its_views_and_takes_the_short_way_round(page):
     assert time == (7 + 30) % 20
 
 
+def test_a_track_through_high_views_does_not_tip_over(page):
+    pose = {"target": [0, 1, 0], "azimuth": 0, "elevation": 0, "roll": 0, "distance": 3, "fov": 45}
+    poses = [pose, pose | {"elevation": 89}, pose | {"elevation": 89, "azimuth": 40}]
+    body = "const t = new m.Track(); for (const p of x) t.add(p, 7); return t.moments.map((s) => t.at(s).elevation)"
+    assert max(call(page, "view/track.js", body, poses)) <= 89
+
+
 def test_a_surface_is_cut_at_jumps_in_depth_and_whole_elsewhere(page):
     z = np.full((6, 8), 3.0)
     z[:, 4:] = 4.0

@@ -31,6 +31,15 @@ const DEFAULTS = {
   panel: window.innerHeight > 460,
 };
 
+const PICTURES = ["rendered", "holes", "mended", "depth", "coverage"];
+/** What a choice may be, where not everything is one. @type {Record<string, (value: string) => boolean>} */
+const SENSIBLE = {
+  mode: (value) => value === "split" || PICTURES.includes(value),
+  left: (value) => PICTURES.includes(value),
+  right: (value) => PICTURES.includes(value),
+  size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
+};
+
 export class Settings extends EventTarget {
   /** @param {URLSearchParams} query choices by name, e.g. `?mode=split&size=320x320&reproject=0` */
   constructor(query) {
@@ -39,7 +48,7 @@ export class Settings extends EventTarget {
     this.values = { ...DEFAULTS };
     for (const [name, standard] of Object.entries(DEFAULTS)) {
       const given = query.get(name);
-      if (given === null) continue;
+      if (given === null || SENSIBLE[name]?.(given) === false) continue;
       if (typeof standard === "boolean") this.values[name] = given !== "0";
       else if (typeof standard === "number" || name === "topK") this.values[name] = Number(given) || standard;
       else this.values[name] = given;

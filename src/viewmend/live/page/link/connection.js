@@ -39,6 +39,7 @@ export class Connection extends EventTarget {
 
   open() {
     clearTimeout(this.timer);
+    if (this.socket !== "none") return;
     this.#status("connecting", "Connecting");
     const url = address("/ws", this.token);
     url.protocol = url.protocol.replace("http", "ws");
@@ -97,12 +98,9 @@ export class Connection extends EventTarget {
 
   /** A hidden page costs the server nothing; it comes back when it is looked at. */
   #visibility() {
-    if (document.hidden) {
-      this.timer = setTimeout(() => this.#order({ close: "hidden" }), 10000);
-    } else {
-      clearTimeout(this.timer);
-      if (this.socket === "none" && !this.refused) this.open();
-    }
+    clearTimeout(this.timer);
+    if (document.hidden) this.timer = setTimeout(() => this.#order({ close: "hidden" }), 10000);
+    else if (!this.refused) this.open();
   }
 
   /** @param {string} status @param {string} text @param {number} [wait_s] */

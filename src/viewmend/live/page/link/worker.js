@@ -22,13 +22,18 @@ const tell = (news, transfer = []) => postMessage(news, /** @type {any} */ (tran
 
 /** @param {string} url */
 function open(url) {
+  socket?.close(1000, "another one");
   const own = new WebSocket(url);
   own.binaryType = "arraybuffer";
   socket = own;
   decoder.close();
   decoder = new PictureDecoder();
   own.onopen = () => tell({ opened: true });
-  own.onmessage = ({ data }) => (typeof data === "string" ? tell({ text: data }) : take(own, data));
+  own.onmessage = ({ data }) => {
+    if (socket !== own) return;
+    if (typeof data === "string") tell({ text: data });
+    else take(own, data);
+  };
   own.onclose = ({ code, reason }) => {
     if (socket !== own) return;
     socket = null;
@@ -47,7 +52,9 @@ function take(from, message) {
       const { eyes, transfer } = await decoded;
       tell({ picture: { header: frame.header, eyes, bytes: frame.bytes } }, transfer);
     })
-    .catch((error) => tell({ trouble: String(error.message ?? error) }));
+    .catch((error) => {
+      if (socket === from) tell({ trouble: String(error.message ?? error) });
+    });
 }
 
 /** @param {ReturnType<typeof parseFrame>} frame */

@@ -52,9 +52,6 @@ export class Layout {
     const bottom = Math.min(dock.top, covered && this.narrow ? panel.top : height);
     this.page = { left: 0, top: 0, width, height };
     this.free = { left: 0, top: bar.bottom, width: Math.max(60, right), height: Math.max(60, bottom - bar.bottom) };
-    const stage = byId("stage");
-    stage.dataset.freeLeft = String(this.free.left);
-    stage.dataset.freeWidth = String(this.free.width);
     document.body.style.setProperty("--middle", `${this.free.left + this.free.width / 2}px`);
     document.body.style.setProperty("--centre", `${this.free.top + this.free.height / 2}px`);
     this.changed();

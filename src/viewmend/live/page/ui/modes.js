@@ -46,8 +46,8 @@ export function buildModes(settings) {
 function buildDivider(settings) {
   const divider = byId("divider");
   const move = (/** @type {number} */ x) => {
-    const { left, width } = freeBox(divider);
-    settings.set("divider", clamp((x - left) / width, 0, 1));
+    const { left, width } = divider.dataset;
+    settings.set("divider", clamp((x - Number(left)) / Math.max(1, Number(width)), 0, 1));
   };
   divider.addEventListener("pointerdown", (/** @type {PointerEvent} */ event) => {
     divider.setPointerCapture(event.pointerId);
@@ -65,12 +65,6 @@ function buildDivider(settings) {
   });
 }
 
-/** Layout writes the free part of the page on the stage. @param {HTMLElement} divider */
-function freeBox(divider) {
-  const { freeLeft, freeWidth } = /** @type {HTMLElement} */ (divider.parentElement).dataset;
-  return { left: Number(freeLeft), width: Math.max(1, Number(freeWidth)) };
-}
-
 /**
  * Put the divider and the two names where they belong.
  * @param {Settings} settings @param {import("../view/lens.js").Box} free @returns {number} the divider's x, CSS pixels
@@ -79,6 +73,7 @@ export function placeDivider(settings, free) {
   const divider = byId("divider");
   const at = settings.get("divider");
   const x = free.left + at * free.width;
+  Object.assign(divider.dataset, { left: free.left, width: free.width });
   divider.hidden = settings.get("mode") !== "split";
   divider.style.transform = `translateX(${x}px)`;
   divider.style.top = `${free.top}px`;

@@ -93,7 +93,6 @@ export class Notices {
     if (!this.pictured) return { kind: "wait", title: "Rendering the first view", text: "This takes a moment." };
     const late = this.waitingSince && performance.now() - this.waitingSince > STALLED_MS;
     if (late || this.state.buffering) return { kind: "wait", title: "Waiting for the server", text: "" };
-    if (this.state.source === "ended") return { kind: "warning", title: "The source has ended", text: "" };
     return { kind: "fine", title: "", text: "" };
   }
 }

@@ -91,6 +91,8 @@ export class PathPanel {
     const record = byId("path-record");
     record.setAttribute("aria-pressed", String(this.recording));
     record.lastElementChild.textContent = this.recording ? "Stop" : "Record";
+    const room = recordingSince >= 0 || this.track.room;
+    byId("path-add").disabled = !room;
     byId("path-play").disabled = !ready;
     byId("path-play").textContent = this.playing ? "Stop" : "Preview";
     byId("path-clear").disabled = !points.length || this.recording;
@@ -99,8 +101,9 @@ export class PathPanel {
     button.classList.toggle("busy", this.exporting > 0);
     button.textContent = this.exporting ? "Rendering the film" : "Export MP4";
     let text = "Record your own movement, or add views: the film goes through them.";
-    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s`;
+    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s${room ? "" : ": as long as a film can be"}`;
     if (!this.canExport) text = "The server cannot write MP4. There, install viewmend[video].";
+    byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
   }
 

@@ -70,7 +70,7 @@ export class Statistics {
       byId("figures").append(element("div", {}, element("dt", { textContent: text }), value));
     }
     for (const [name, [text, colour]] of Object.entries({ ...STAGES, total: ["Total", ""] })) {
-      const value = element("output", { textContent: "–" });
+      const value = element("span", { textContent: "–" });
       const swatch = element("i");
       swatch.style.setProperty("--colour", colour || "transparent");
       byId("stages").append(element("li", { className: name }, swatch, text, value));

@@ -16,13 +16,17 @@ export class Transport {
     this.told = {};
     this.seeking = false;
     this.shown = -1;
+    /** What was asked for last and is not yet shown; -1 when nothing is. */
     this.sought = -1;
     const seek = byId("seek");
     seek.addEventListener("input", () => {
       this.seeking = true;
       this.seek(Number(seek.value));
     });
-    seek.addEventListener("change", () => (this.seeking = false));
+    seek.addEventListener("change", () => {
+      this.seeking = false;
+      this.sought = -1;
+    });
     byId("play").addEventListener("click", () => this.toggle());
     byId("live").addEventListener("click", () => this.live());
     byId("speed").addEventListener("change", () => this.speed(Number(byId("speed").value)));
@@ -31,6 +35,7 @@ export class Transport {
   }
 
   toggle() {
+    this.sought = -1;
     this.#tell({ playing: !this.#current("playing", true) });
   }
 
@@ -51,6 +56,7 @@ export class Transport {
   }
 
   live() {
+    this.sought = -1;
     this.#tell({ live: true, speed: 1 });
   }
 
@@ -61,6 +67,7 @@ export class Transport {
 
   /** @param {number} steps along the list of speeds */
   faster(steps) {
+    if (this.state?.kind !== "recording") return;
     const place = SPEEDS.indexOf(this.#current("speed", 1));
     this.speed(SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, place + steps))]);
   }
@@ -111,6 +118,7 @@ export class Transport {
   /** The time of the picture that is shown. @param {number} time */
   picture(time) {
     this.shown = time;
+    if (time === this.sought && !this.seeking) this.sought = -1;
     if (!this.state || time < 0) return;
     if (!this.seeking) setSlider(byId("seek"), time);
     else setSlider(byId("seek"), Number(byId("seek").value));

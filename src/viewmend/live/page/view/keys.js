@@ -7,8 +7,16 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], Arrow
 const WALK = { KeyA: [-1, 0, 0], KeyD: [1, 0, 0], KeyQ: [0, 1, 0], KeyE: [0, -1, 0], KeyW: [0, 0, 1], KeyS: [0, 0, -1] };
 const ZOOM = { Equal: -1, NumpadAdd: -1, Minus: 1, NumpadSubtract: 1 };
 
-/** @param {EventTarget | null} target whether keys belong to a field, a list or a slider there */
-const takesKeys = (target) => target instanceof Element && target.matches("input, select, textarea, [role=slider]");
+/** Keys that a control there has a use for: all in a field or a list, those that move a slider, those that press a switch. */
+const SLIDER_KEYS = [...Object.keys(ARROWS), "Home", "End", "PageUp", "PageDown"];
+
+/** @param {KeyboardEvent} event whether its key belongs to a control there */
+function takesKey({ target, code }) {
+  if (!(target instanceof Element)) return false;
+  if (target.matches("input[type=range], [role=slider]")) return SLIDER_KEYS.includes(code);
+  if (target.matches("input[type=checkbox]")) return code === "Space";
+  return target.matches("input, select, textarea");
+}
 
 export class Keys {
   /**
@@ -23,7 +31,7 @@ export class Keys {
     this.shift = false;
     window.addEventListener("keydown", (event) => {
       if (event.altKey || event.ctrlKey || event.metaKey || document.querySelector("dialog[open]")) return;
-      if (takesKeys(event.target)) return;
+      if (takesKey(event)) return;
       this.shift = event.shiftKey;
       const continuous = event.code in ARROWS || event.code in WALK || event.code in ZOOM;
       const button = event.target instanceof HTMLButtonElement && (event.code === "Space" || event.code === "Enter");

@@ -1,6 +1,7 @@
 // A camera path: places in time, and the smooth curve through them.
 
-import { wrap } from "./matrix.js";
+import { clamp, wrap } from "./matrix.js";
+import { MOST_ELEVATION } from "./pose.js";
 
 /** @typedef {import("./pose.js").Pose} Pose */
 /** @typedef {{pose: Pose, seconds: number, time: number}} Point `time`: the index of the frame that was shown */
@@ -13,9 +14,9 @@ export const MOST_POSES = 900;
 /** @param {Pose} pose */
 const numbers = (pose) => [...pose.target, pose.azimuth, pose.elevation, pose.roll, Math.log(pose.distance), pose.fov];
 
-/** @param {number[]} values @returns {Pose} */
+/** A curve through two high views would pass above the pole and tip over. @param {number[]} values @returns {Pose} */
 const poseFrom = ([x, y, z, azimuth, elevation, roll, logDistance, fov]) => ({
-  target: [x, y, z], azimuth, elevation, roll, distance: Math.exp(logDistance), fov,
+  target: [x, y, z], azimuth, elevation: clamp(elevation, -MOST_ELEVATION, MOST_ELEVATION), roll, distance: Math.exp(logDistance), fov,
 });
 
 export class Track {
@@ -34,10 +35,19 @@ export class Track {
     this.recordingSince = -1;
   }
 
+  /** When a view that is added now would be passed. */
+  get #next() {
+    return this.points.length ? this.seconds + SECONDS_BETWEEN : 0;
+  }
+
+  /** Whether one more view has room. */
+  get room() {
+    return this.#next * FPS < MOST_POSES;
+  }
+
   /** @param {Pose} pose @param {number} time */
   add(pose, time) {
-    const seconds = this.points.length ? this.seconds + SECONDS_BETWEEN : 0;
-    if (seconds * FPS < MOST_POSES) this.points.push({ pose: { ...pose }, seconds, time });
+    if (this.room) this.points.push({ pose: { ...pose }, seconds: this.#next, time });
   }
 
   /** @param {number} now ms */
