@@ -129,8 +129,11 @@ def test_cameras_of_different_sizes_travel_in_one_stack():
     observation = observe(
         photograph(SPARSE).__class__(cameras, photograph(SPARSE).rgb, photograph(SPARSE).mask, 0), None, CONFIG
     )
-    assert observation.depth(["c2"]).shape == (1, 48, 48)
-    assert observation.depth(["c2"])[0, 30:].max() == 0
+    assert observation.depth(["c0", "c2"]).shape == (2, 48, 48)
+    assert observation.depth(["c0", "c2"])[1, 30:].max() == 0
+    for names in (["c2"], ["c1"], ["c1", "c2"]):
+        seen = observation.context(names)
+        assert seen.depth.shape[1:] == seen.frame.rgb.shape[2:] == seen.frame.mask.shape[1:]
 
 
 def test_a_capture_without_masks_is_refused():

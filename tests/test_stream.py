@@ -13,9 +13,10 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.classical import Telea
 from viewmend.inpainting.config import small
 from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.reprojection_fill import ReprojectionFill
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
 from viewmend.stream import Effort, Stream
-from viewmend.views import IncompleteView
+from viewmend.views import IncompleteView, MultiViewFrame
 
 CONFIG = PipelineConfig(hull=HullConfig(resolution=32))
 SPARSE = ring(12)[[0, 1, 2, 4, 7, 9]]
@@ -88,6 +89,26 @@ def test_every_camera_image_is_encoded_once_whoever_looks():
     for time in (0, 2, 1):  # seeking back and forth finds everything there
         stream.view(A, None, time)
     assert len(model.encoded) == before
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_other_numbers_of_context_cameras_are_encoded_once_too(count):
+    torch.manual_seed(0)
+    config = replace(small(), widths=(8,) * 9, dim=64, k_w=2, n_w=1, n_c=2, context_cameras=count)
+    model = Counting(config).eval()
+    walk(Stream(model, CONFIG), range(3), A, A)
+    assert len(model.encoded) == len(set(model.encoded)) == 3 * count
+
+
+@pytest.mark.parametrize("inpainter", ["model", "reprojection"])
+def test_cameras_of_different_sizes_are_looked_at(model, inpainter):
+    sizes = torch.tensor([[48, 48], [40, 48], [48, 48], [48, 48], [48, 48], [52, 64]])
+    whole = photograph(SPARSE)
+    rgb, mask = (torch.nn.functional.pad(x, (0, 4, 0, 16)) for x in (whole.rgb, whole.mask))
+    stream = Stream(model if inpainter == "model" else ReprojectionFill(3), CONFIG)
+    stream.push(MultiViewFrame(replace(SPARSE, size_px=sizes), rgb, mask, 0))
+    seen = stream.view(A, None, exclude=("c9",))
+    assert seen.completed.view.chosen and (seen.completed.rgb - seen.completed.view.rgb).abs().max() > 0.05
 
 
 def test_a_time_is_carved_once_and_stays(model):

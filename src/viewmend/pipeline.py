@@ -27,8 +27,9 @@ class PipelineConfig:
     """How the geometry proxy is carved."""
     render: RenderConfig = field(default_factory=RenderConfig)
     """How views are rendered from the cameras."""
-    history: int = 30
-    """How many past frames a stream keeps for cameras that it chooses anew: k_w n_w, the inpainter's window."""
+    history: int = 33
+    """How many past frames a stream keeps for cameras that it chooses anew: k_w n_w + n_c, as far as the inpainters'
+    windows reach back on either grid."""
 
 
 @runtime_checkable
@@ -65,7 +66,8 @@ class Observation:
             if right or below:
                 rendered = torch.nn.functional.pad(rendered, (0, right, 0, below))  # padded as the images are
             self._depths.update(zip(new, kept(rendered), strict=True))
-        return torch.stack([self._depths[name] for name in names])
+        width, height = self.frame.cameras.select(names).max_size_px
+        return torch.stack([self._depths[name][:height, :width] for name in names])  # as `frame.select` cuts images
 
     def known_depths(self) -> tuple[Float[Tensor, "height width"], ...]:
         """Those that were rendered so far."""

@@ -231,7 +231,8 @@ class Stream:
         if not isinstance(self.inpainter, Inpainter) or not bool((view.error > 0).any()):
             return 0.0
         start = now_s(view.rgb.device)
-        missing = [(m, m.observation.context([n for n in view.chosen if n not in m.encoded])) for m in moments]
+        wanted = self.inpainter.context_names(view)
+        missing = [(m, m.observation.context([n for n in wanted if n not in m.encoded])) for m in moments]
         fresh = [(m, views) for m, views in missing if views is not None]
         encoded = self.inpainter.encode_contexts([views for _, views in fresh])
         for (moment, _), frames in zip(fresh, encoded, strict=True):

@@ -67,6 +67,12 @@ def test_one_frame_alone_and_all_frames_local_can_be_compared(tmp_path):
     assert not check(write(tmp_path / "e.npz", "E2FGVI", 2, 7, 1, run("E2FGVI", 2, 7, 2).numpy())).passed
 
 
+def test_n_local_is_of_networks_that_have_one(tmp_path):
+    blank = np.zeros((1, 3, 240, 432), np.float32)
+    path = write(tmp_path / "old.npz", output=blank, n_local=None, name=np.bytes_(b"DSTT"), frames=np.array([1]))
+    assert read_case(path).name == "DSTT" and read_case(path).frames == 1
+
+
 def test_outputs_that_differ_fail(tmp_path, capsys):
     output = run("DSTT", 1, 3).numpy()
     wrong = output.copy()
@@ -92,6 +98,7 @@ BLANK = np.zeros((1, 3, 240, 432), np.float32)
     [
         ({"name": "ProPainter"}, "expected a network among .*, got 'ProPainter'"),
         ({"name": "E2FGVI"}, "expected an n_local of 1 to the 1 frames, got 0"),
+        ({"name": "E2FGVI", "n_local": None}, "expected an n_local of 1 to the 1 frames, got 0"),
         ({"name": "E2FGVI_HQ", "n_local": 2}, "expected an n_local of 1 to the 1 frames, got 2"),
         ({"frames": 2}, "expected an output of"),
         ({"frames": 0}, "expected 1 or more frames"),

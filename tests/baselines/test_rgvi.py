@@ -1,6 +1,7 @@
 """RGVI: what the past saw is pulled into the holes along flow; the rest is filled; nothing else changes."""
 
 import sys
+from dataclasses import replace
 from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 
@@ -109,7 +110,7 @@ def test_a_hole_takes_what_was_there_before(texture):
 
 def test_flow_adds_up_over_several_frames(texture):
     """A hole at the border, through which the picture comes in: only what was in sight before can be pulled."""
-    parts = RgviParts(flow=known_flow, rest=lambda image, missing, subject: torch.where(missing, 0.0, image))
+    parts = RgviParts(flow=known_flow, reference=lambda image, missing, subject: torch.where(missing, 0.0, image))
     completed, _ = stream(Rgvi(parts), texture, 3, (slice(0, 20), slice(0, 20)))
     truth = at(texture, 2)
     seen = torch.zeros(SIZE, SIZE, dtype=torch.bool)
@@ -118,9 +119,28 @@ def test_flow_adds_up_over_several_frames(texture):
     corner = completed.view.error.bool() & ~seen
     assert not completed.rgb[:, corner].any()
 
-    away = RgviParts(flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow, rest=parts.rest)
+    away = replace(parts, flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow)
     lost, _ = stream(Rgvi(away), texture, 3)
     assert not lost.rgb[:, lost.view.error > 0].any()
+
+
+def test_the_reference_frame_is_the_newest_and_the_rest_is_what_it_leaves(texture):
+    away = RgviParts(flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow)
+    asked = []
+
+    def half(image, missing, subject):
+        asked.append(int(missing.sum()))
+        above = torch.arange(SIZE)[:, None] < SIZE // 2
+        return torch.where(missing & above, 0.25, torch.where(missing, torch.nan, image))
+
+    def rest(image, missing, subject):
+        assert not image.isnan().any()
+        return torch.where(missing, 0.75, image)
+
+    completed, _ = stream(Rgvi(replace(away, reference=half, rest=rest)), texture, 3)
+    hole = completed.view.error > 0
+    assert asked == [int(hole.sum())] * 3
+    assert set(completed.rgb[:, hole].unique().tolist()) <= {0.25, 0.75}
 
 
 def test_the_past_is_bounded_and_its_own_where_nobody_shows_the_truth(texture):

@@ -70,6 +70,7 @@ def test_the_left_out_camera_is_none_of_the_inputs_and_true_motion_explains_the_
     first, second = scene.frames("cpu")
     for frame in (first, second):
         assert frame.truth.cameras.names == (scene.held,) and scene.held not in frame.inputs.cameras.names
+        assert frame.inputs.depth is None, "methods may not see true geometry"
     assert first.came_from_px is None and second.came_from_px is not None
     mask = second.truth.mask[0] > 127
     seen = second.came_from_px.isfinite().all(-1)

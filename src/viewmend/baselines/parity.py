@@ -23,7 +23,8 @@ STRIDE_PX = 6
 """Files keep every sixth row and column of the output."""
 OWN_VALUES = ("valid_ind_rolled", "update_spynet.mean", "update_spynet.std")
 """Entries of a state dict that keep their values: constants, not weights."""
-FIELDS = ("name", "frames", "seed", "n_local", "output", "mean", "std")
+FIELDS = ("name", "frames", "seed", "output", "mean", "std")
+"""What every file has; `n_local` only those of networks that have one."""
 
 
 class ParityFileError(ValueError):
@@ -93,7 +94,7 @@ def read_case(path: str | Path) -> ParityCase:
             absent = [field for field in FIELDS if field not in file]
             if absent:
                 raise ParityFileError(f"{path}: expected the fields {list(FIELDS)}, {absent} missing; see the format")
-            values = {field: file[field] for field in FIELDS}
+            values = {field: file[field] for field in (*FIELDS, "n_local") if field in file}
     except FileNotFoundError as error:
         raise ParityFileError(f"{path}: expected a parity file (.npz), found none; check the path") from error
     except ParityFileError:
@@ -108,7 +109,9 @@ def read_case(path: str | Path) -> ParityCase:
 
 def _case(values: dict[str, np.ndarray]) -> ParityCase:
     """ValueError or TypeError where a field is not what it must be."""
-    name, (frames, seed, n_local) = str(values["name"]), (int(values[field]) for field in ("frames", "seed", "n_local"))
+    frames, seed, n_local = (int(values.get(field, np.array(0)).item()) for field in ("frames", "seed", "n_local"))
+    name = values["name"].item()
+    name = name.decode() if isinstance(name, bytes) else str(name)
     if name not in NETWORKS:
         raise ValueError(f"expected a network among {sorted(NETWORKS)}, got {name!r}")
     if frames < 1 or not 0 <= seed < 2**32:
@@ -133,7 +136,8 @@ def run(
     make, compute = NETWORKS[name]
     network = make()
     network.load_state_dict(recipe_weights(network, seed))
-    return compute(network.to(device).eval(), recipe_input(frames, seed).to(device), n_local)
+    with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):  # float32 means float32
+        return compute(network.to(device).eval(), recipe_input(frames, seed).to(device), n_local)
 
 
 def recipe_weights(network: nn.Module, seed: int) -> dict[str, Tensor]:

@@ -3,7 +3,8 @@
 The stages are the published ones, each with a network that can be put in: optical flow, its completion in holes,
 one-shot pulling along accumulated flow, a reference frame, completion of what is left. Without weights, flow is
 OpenCV's, and the others are the best fill that nothing was trained for. As in the paper, past frames are the truth and
-only the newest one has holes; so there is one direction to pull from, and the frame with most to fill is the newest.
+only the newest one has holes; so there is one direction to pull from, and the frame with most to fill, the reference
+frame, is the newest: all that cannot be pulled is its network's.
 """
 
 from collections.abc import Callable
@@ -47,9 +48,9 @@ class RgviParts:
     complete_flow: Completion = fill
     """The recurrent flow completion network."""
     reference: Completion = fill
-    """Stable Diffusion 2 inpainting, of a frame that nothing can be pulled into."""
+    """Stable Diffusion 2 inpainting, of what nothing can be pulled into; NaN where it leaves pixels to `rest`."""
     rest: Completion = fill
-    """The per-frame completion network."""
+    """The per-frame completion network: of what the reference leaves, which the published one never does here."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,10 @@ class Rgvi:
         if bool(missing.any()) and past:
             image, left = self._pull(view, past, state.flows)
         if bool(left.any()):
-            image = (self.parts.rest if past else self.parts.reference)(image, left, subject)
+            image = self.parts.reference(image, left, subject)
+            left = left & image.isnan().any(0)
+        if bool(left.any()):
+            image = self.parts.rest(torch.where(left, 0.0, image), left, subject)
         mended = blend(view.rgb, view.error, image, torch.ones_like(view.error))
         return CompletedView(view, mended), self._remember(mended, past, state.flows if past else ())
 

@@ -119,7 +119,8 @@ class StudioScene:
             if before is not None and before.depth is not None:
                 now, then = (studio.scene(t).mesh for t in (time, time - 1))
                 source = came_from(now, then, before.depth[0], truth.cameras)
-            yield SceneFrame(frame.without([self.held]), truth, None, source)
+            inputs = replace(frame.without([self.held]), depth=None)  # the truth: no method may look
+            yield SceneFrame(inputs, truth, None, source)
             before = truth
 
 

@@ -9,7 +9,7 @@ ENCODER_GROUPS = (1, 1, 1, 1, 1, 2, 4, 8, 1)
 
 @dataclass(frozen=True, kw_only=True)
 class InpainterConfig:
-    """One architecture; `paper()` and `small()` are two sizes of it. Defaults follow the paper where it speaks."""
+    """One architecture; `paper()` and `small()` are two of them. Defaults are the paper's sizes."""
 
     widths: tuple[int, ...] = (64, 64, 128, 256, 384, 512, 384, 256, 128)
     """Output channels of the encoder's nine convolutions; the last is C, the channels of a patch."""
@@ -130,8 +130,11 @@ class InpainterConfig:
 
 
 def paper() -> InpainterConfig:
-    """The paper's size: encoder of FuseFormer's widths, D = 512, 8 heads, 2 groups of 4 blocks."""
-    return InpainterConfig()
+    """The paper's model: encoder of FuseFormer's widths, D = 512, 8 heads, 2 groups of 4 blocks, nothing of ours.
+
+    Its k of pruning is not stated: `top_k` is left to who asks.
+    """
+    return InpainterConfig(use_validity=False, black_background=False, past_geometry="current")
 
 
 def small() -> InpainterConfig:

@@ -197,7 +197,7 @@ class Inpainter(nn.Module):
         fresh, nearby = self._look(view, source, state.cache)
         frames = [frame for group in self.encode_contexts(fresh) for frame in group]
         cache = state.cache.add(frames, view.time, self.config)
-        context = cache.find(self._context_names(view), window_times(view.time, self.config))
+        context = cache.find(self.context_names(view), window_times(view.time, self.config))
         prediction = self.predict([view], [context], top_k, [nearby])[0]
         return self.keep_steady(CompletedView(view, prediction.completed), State(cache, state.last))
 
@@ -208,7 +208,7 @@ class Inpainter(nn.Module):
         shown = steadied(completed, state.last, self.config.steady)
         return shown, replace(state, last=LastView.of(shown))
 
-    def _context_names(self, view: IncompleteView) -> tuple[str, ...]:
+    def context_names(self, view: IncompleteView) -> tuple[str, ...]:
         """The cameras that are context."""
         count = self.config.context_cameras
         return view.chosen if count is None else view.around(count)
@@ -217,7 +217,7 @@ class Inpainter(nn.Module):
         self, view: IncompleteView, context: Sequence[ContextFrame | ContextViews]
     ) -> list[ContextFrame | ContextViews]:
         """The context without images of times and cameras that are not the config's."""
-        names, times = self._context_names(view), window_times(view.time, self.config)
+        names, times = self.context_names(view), window_times(view.time, self.config)
         kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
         return [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]
 
@@ -228,7 +228,7 @@ class Inpainter(nn.Module):
         around = view.around(self.config.rays)
         fresh, nearby = [], None
         for time in window_times(view.time, self.config):
-            new = cache.missing(self._context_names(view), time)
+            new = cache.missing(self.context_names(view), time)
             names = tuple(dict.fromkeys((*new, *around))) if time == view.time else new
             seen = source(time, names) if names else None
             if seen is not None:
