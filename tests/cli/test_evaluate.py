@@ -45,6 +45,7 @@ def test_a_report_is_written_in_every_form_and_a_second_run_says_the_same(tmp_pa
         (["P", "--device", "tpu"], "expected a device that is there"),
         (["P", "--weights", "nowhere"], "expected a folder of weights"),
         (["no-such-capture"], "no-such-capture"),
+        (["no-such-capture", "--inputs", ","], "expected --inputs all or a number"),
     ],
 )
 def test_what_cannot_be_is_one_clear_error(tmp_path, capsys, arguments, said):

@@ -46,7 +46,8 @@ def test_what_a_user_can_get_wrong_is_one_line(monkeypatch, capsys, error, code)
 
     assert run_command(monkeypatch, run) == code
     out, message = capsys.readouterr()
-    assert out == "" and message == f"viewmend: error: {' '.join(str(error).split())}\n"
+    assert out == "" and message.startswith(f"viewmend: error: {' '.join(str(error).split())}")
+    assert message.count("\n") == 1 and ("may you write there?" in message) == (getattr(error, "filename", None) == "f")
 
 
 def test_our_own_mistakes_show_where(monkeypatch, capsys):

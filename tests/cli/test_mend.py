@@ -138,6 +138,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, capsys, argu
         (json.dumps([(2 * torch.eye(4)).tolist()]), "pose 0: expected a rotation"),
         (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 30}), "'height'"),
         (json.dumps([torch.eye(4).tolist()] * 3), "one for each of 2 frames, got 3"),
+        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "K": [[0] * 3] * 3}), "expected 'K' as"),
+        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 10**8, "height": 9}), "1 to 16384"),
+        ("[" * 100_000, "expected JSON"),
     ],
 )
 def test_a_bad_path_is_named(folder, tmp_path, capsys, content, message):
@@ -167,6 +170,27 @@ def test_an_unreadable_frame_leaves_nothing_half_written(folder, tmp_path, capsy
     code, _, err = mend(capsys, broken, tmp_path / "out", "--leave-out", "held")
     assert code == 2 and last.name in err
     assert [f.name for f in tmp_path.iterdir()] == ["broken"]
+
+
+def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, capsys):
+    notes = tmp_path / "holes/notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("precious")
+    code, _, err = mend(capsys, folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
+    assert code == 2 and "pictures of an earlier run, got 'notes.txt'" in err and notes.read_text() == "precious"
+    notes.unlink()
+    for _ in range(2):  # its own results are
+        assert mend(capsys, folder, tmp_path, "--leave-out", "held", "--frames", "0:1")[0] == 0
+    assert {f.name for f in tmp_path.iterdir()} == {"holes", "mended", "contact_sheet.png"}
+
+
+def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, capsys):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(folder, spoiled)
+    mask = spoiled / "mask" / "c5" / "000.png"
+    cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), 0)))
+    _, _, said = mend(capsys, spoiled, tmp_path / "out", "--leave-out", "held", "--frames", "0:1")
+    assert "principal points" not in said and "a mask or a camera is wrong" in said
 
 
 def test_a_shift_of_all_images_is_said_and_undone(folder, tmp_path, capsys):

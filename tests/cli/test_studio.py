@@ -24,7 +24,9 @@ def test_writes_captures_that_can_be_read(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--frames", "0"], "frames 0"),
+        (["--frames", "0"], "--frames of at least 1, got 0"),
+        (["--cameras", "3"], "--cameras of at least 4, got 3"),
+        (["--seed", "-1"], "--seed of at least 0, got -1"),
         (["--performers", "nowhere", "--motions", "nowhere"], "nowhere"),
         (["--performers", "nowhere"], "no motions"),
     ],

@@ -1,6 +1,7 @@
 """`viewmend train` and `viewmend samples` from the command line."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -48,7 +49,9 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
     assert main([*command, "--clip", "2", "--count", "3", "--workers", "0"]) == 0
     assert [path.name for path in shards.iterdir()] == ["shard-00000.tar"]
     assert [len(sample.clip) for sample in read_shard(shards / "shard-00000.tar")] == [2, 2, 2]
+    assert main([*command, "--count", "1", "--workers", "0"]) == 2, "shards are never replaced"
     trained = ["train", "finetune", "--shards", str(shards), "--from", str(model), "--out", str(tmp_path / "out")]
+    assert main([*trained, "--temporal", "0.1", "--clip", "3", *BRIEF]) == 2, "clips are too short"
     assert main([*trained, "--bfloat16", "False", *BRIEF]) == 0
     assert load_inpainter(tmp_path / "out").config == MODEL
 
@@ -63,6 +66,14 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
         (["train", "small_rays", "--adversarial", "0.01"], "no adversarial loss for rays"),
         (["train", "small", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
         (["train", "small", "--from", "nothing"], "one of the shipped models"),
+        (["train", "paper", "--from", "small", *BRIEF], "of which anything fits paper"),
+        (["train", "small", "--steps", "0"], "steps of 0"),
+        (["train", "small", "--checkpoint-every", "0"], "checkpoint_every of 0"),
+        (["train", "small", "--minutes", "nan"], "minutes of nan"),
+        (["train", "small", "--batch", "0"], "batch of 0"),
+        (["train", "small", "--clip", "-1"], "clip of -1"),
+        (["train", "small", "--data-device", "abacus"], "expected a device that is there"),
+        (["train", "small", "--performers", "nobody", "--motions", "nobody"], "nobody: expected people or motions"),
         (["samples", "--out", "x", "--count", "0"], "count of at least 1"),
         (["ablation", "--out", "x", "--variants", "no-ropes"], "expected variants among"),
     ],
@@ -72,6 +83,27 @@ def test_what_cannot_be_is_one_clear_error(arguments, said, tmp_path, monkeypatc
     assert main(arguments) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and said in lines[0], lines
+
+
+def test_a_model_that_lies_there_is_not_overwritten(capture, model, tmp_path, capsys):
+    out = tmp_path / "mine"
+    shutil.copytree(model, out)
+    before = (out / "model.safetensors").read_bytes()
+    command = ["train", "finetune", "--capture", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
+    assert main(command) == 2
+    assert "config.json, README.md of something else" in capsys.readouterr().err
+    assert (out / "model.safetensors").read_bytes() == before
+
+
+def test_a_sample_that_cannot_be_made_in_a_worker_is_one_line(capture, tmp_path, capfd):
+    broken = tmp_path / "broken"
+    shutil.copytree(capture, broken)
+    for image in broken.glob("image/*/*1.*"):
+        image.write_bytes(b"none")
+    command = ["samples", "--recipe", "finetune", "--capture", str(broken), "--out", str(tmp_path / "out")]
+    assert main([*command, "--count", "40", "--workers", "1"]) == 2
+    said = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
+    assert len(said) == 1 and "expected an image" in said[0] and "Traceback" not in said[0]
 
 
 @pytest.mark.slow

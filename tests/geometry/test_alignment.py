@@ -27,6 +27,13 @@ def test_a_wrong_convention_is_undone(frame, shift):
     assert found.iou_after > found.iou_before + WORTH_MOVING
 
 
+def test_one_empty_mask_asks_for_no_shift(frame):
+    spoiled = frame.mask.clone()
+    spoiled[3] = 0
+    found = shared_offset(spoiled, frame.cameras, None, HULL)
+    assert found.offset_px == (0.0, 0.0) and found.iou_after < 0.8
+
+
 def test_masks_that_agree_on_nothing_ask_for_no_shift(frame):
     scattered = torch.zeros_like(frame.mask)
     for view in range(len(scattered)):

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.inpainter import Inpainter
@@ -86,6 +87,33 @@ def test_a_run_goes_on_only_with_its_own_recipe_and_a_whole_file(tiny, tmp_path)
     (tmp_path / FILE).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(RunError, match=r"run\.safetensors: expected a run to go on with"):
         train(tiny, tmp_path)
+
+
+def test_a_run_whose_values_do_not_fit_is_one_clear_error(tiny, tmp_path):
+    train(replace(tiny, steps=1), tmp_path)
+    with safe_open(tmp_path / FILE, framework="pt") as file:
+        metadata = file.metadata()
+        whole = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    moment = next(key for key in whole if key.startswith("optimizer/"))
+    weight = next(key for key in whole if key.startswith("model/"))
+    state = json.dumps({"step": 1, "elapsed_s": 0.0})
+    for tensors, told in (
+        ({key: value for key, value in whole.items() if key != moment}, metadata),
+        ({key: value for key, value in whole.items() if key != weight}, metadata),
+        (whole | {weight: torch.zeros(3, 3, 3)}, metadata),
+        (whole, metadata | {"state": state}),
+    ):
+        save_file(tensors, tmp_path / FILE, told)
+        with pytest.raises(RunError, match="expected a run of this version"):
+            train(replace(tiny, steps=2), tmp_path)
+
+
+def test_a_finished_run_makes_its_model_again(tiny, tmp_path):
+    train(replace(tiny, steps=1), tmp_path)
+    before = (tmp_path / "model.safetensors").read_bytes()
+    (tmp_path / "model.safetensors").write_bytes(before[:100])
+    train(replace(tiny, steps=1), tmp_path)
+    assert (tmp_path / "model.safetensors").read_bytes() == before
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_its_batch(tiny, tmp_path, monkeypatch):

@@ -66,7 +66,9 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         ) from error
     if isinstance(contents, dict) and isinstance(contents.get(WRAPPER), dict):
         contents = contents[WRAPPER]
-    if not isinstance(contents, dict) or not all(isinstance(value, Tensor) for value in contents.values()):
+    if not isinstance(contents, dict) or not all(
+        isinstance(key, str) and isinstance(value, Tensor) for key, value in contents.items()
+    ):
         raise OfficialCheckpointError(
             f"{path}: expected a dictionary of tensors, plain or under {WRAPPER!r}, got {_kind(contents)}; give the "
             "generator's weights"

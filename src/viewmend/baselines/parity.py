@@ -23,6 +23,8 @@ STRIDE_PX = 6
 """Files keep every sixth row and column of the output."""
 OWN_VALUES = ("valid_ind_rolled", "update_spynet.mean", "update_spynet.std")
 """Entries of a state dict that keep their values: constants, not weights."""
+UNREADABLE = (OSError, ValueError, EOFError, AttributeError, TypeError, MemoryError, zipfile.BadZipFile, zlib.error)
+"""What damaged files raise."""
 FIELDS = ("name", "frames", "seed", "output", "mean", "std")
 """What every file has; `n_local` only those of networks that have one."""
 
@@ -99,8 +101,9 @@ def read_case(path: str | Path) -> ParityCase:
         raise ParityFileError(f"{path}: expected a parity file (.npz), found none; check the path") from error
     except ParityFileError:
         raise
-    except (OSError, ValueError, EOFError, AttributeError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ParityFileError(f"{path}: expected a whole .npz file, got one that does not read ({error})") from error
+    except UNREADABLE as error:
+        said = "pickled objects, or no .npz at all" if "allow_pickle" in str(error) else str(error)
+        raise ParityFileError(f"{path}: expected a whole .npz file, got one that does not read ({said})") from error
     try:
         return _case(values)
     except (ValueError, TypeError, OverflowError) as error:
@@ -109,7 +112,10 @@ def read_case(path: str | Path) -> ParityCase:
 
 def _case(values: dict[str, np.ndarray]) -> ParityCase:
     """ValueError or TypeError where a field is not what it must be."""
-    frames, seed, n_local = (int(values.get(field, np.array(0)).item()) for field in ("frames", "seed", "n_local"))
+    numbers = [values.get(field, np.array(0)).item() for field in ("frames", "seed", "n_local")]
+    if any(number != int(number) for number in numbers):
+        raise ValueError(f"expected whole numbers of frames, seed and n_local, got {numbers}")
+    frames, seed, n_local = map(int, numbers)
     name = values["name"].item()
     name = name.decode() if isinstance(name, bytes) else str(name)
     if name not in NETWORKS:

@@ -7,10 +7,13 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from viewmend.capture.errors import CaptureError
+from viewmend.whole_files import write_whole
 
 DEPTH_UNITS_PER_M = 1000
 """Depth is stored in whole millimetres, 16 bit."""
 MAX_DEPTH_M = 65.535
+FULL_16_BIT = 4096
+"""16-bit images whose values stay below this hold 8, 10 or 12 bits, and would be read as black."""
 
 
 def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
@@ -23,7 +26,12 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """
     import cv2
 
-    bgr = _decode(path, where, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    bgr = _decode(path, where, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if bgr.dtype == np.uint16 and not 0 < bgr.max() < FULL_16_BIT:
+        bgr = (bgr >> 8).astype(np.uint8)
+    if bgr.dtype != np.uint8:
+        got = f"{bgr.dtype} with values up to {bgr.max():g}"
+        raise CaptureError(f"{where}: expected 8 bit, or 16 bit that are used, got {got}; write it as 8-bit PNG")
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
@@ -78,7 +86,10 @@ def _decode(path: Path, where: str, flags: int) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _is_complete(data) else None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _is_complete(data) else None
+    except cv2.error:  # it claims more pixels than OpenCV takes
+        image = None
     if image is None:
         got = f"{len(data)} bytes that are none, or cut short"
         raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")
@@ -136,4 +147,4 @@ def _encode(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
             f"{path}: expected an image that the format can hold, got {image.shape} {image.dtype}; use .png"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data.tobytes())
+    write_whole(path, lambda beside: beside.write_bytes(data.tobytes()))

@@ -71,7 +71,7 @@ class Fields:
     def positive_integer(self, key: str) -> int:
         """A whole number above zero."""
         value = self._get(key, _REQUIRED, "a whole number")
-        if not isinstance(value, int) or isinstance(value, bool) or value <= 0:
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 < value < 2**31:
             raise self.wrong(key, "a whole number above 0", shown(value), "correct the value")
         return value
 
@@ -107,7 +107,7 @@ class Fields:
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**63)
 
 
 def _has_shape(value: object, shape: tuple[int, ...]) -> bool:

@@ -112,7 +112,7 @@ def _load(path: Path) -> object:
         raise CaptureError(f"expected a capture folder with {path}, but {there}; check the path")
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # of syntax, of bytes, of numbers with thousands of digits
         raise CaptureError(f"{path}: expected JSON, got something else: {error}; mend the file there") from None
 
 

@@ -77,7 +77,10 @@ def _run(command: Command, arguments: list[str]) -> int:
     except BrokenPipeError:  # the reader of our output left: nothing to say, and nobody to say it to
         sys.stderr.close()
         return 1
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        advice = "" if error.filename is None else "; is that the place you meant, and may you write there?"
+        return _fail(f"{error}{advice}")
+    except ValueError as error:
         return _fail(str(error))
     except Exception:
         traceback.print_exc()

@@ -66,6 +66,7 @@ def run(options: Options) -> int:
 
 def _recipes(options: Options) -> "dict[str, Recipe]":
     """Variant and seed -> recipe."""
+    from viewmend.cli.checks import check_people
     from viewmend.training.ablations import ABLATIONS
     from viewmend.training.plan import DataPlan
 
@@ -77,14 +78,14 @@ def _recipes(options: Options) -> "dict[str, Recipe]":
             f"expected variants among {', '.join(ABLATIONS)} and positive numbers, got {', '.join(unknown + wrong)}; "
             "see --help"
         )
-    if (options.performers is None) != (options.motions is None):
-        raise ValueError("expected --performers and --motions together, got one of them; give both folders")
+    check_people(options.performers, options.motions)
     data = DataPlan(performers=options.performers, motions=options.motions)
     found = {}
     for seed in range(options.seeds):
         for name in dict.fromkeys(["full", *names]):
             recipe = replace(ABLATIONS[name](data), seed=seed)
-            found[f"{name}-s{seed}"] = replace(recipe, steps=options.steps or recipe.steps)
+            steps = recipe.steps if options.steps is None else options.steps
+            found[f"{name}-s{seed}"] = replace(recipe, steps=steps)
     return found
 
 
@@ -98,13 +99,19 @@ def _make_samples(options: Options, recipe: "Recipe") -> None:
     from viewmend.training.sources import scene_source
 
     folder, done = options.out / "samples", options.out / "samples/done"
-    if done.exists() and int(done.read_text()) >= options.samples:
+    made_of = f"{options.samples} samples, {options.performers}, {options.motions}"
+    if done.exists():
+        if done.read_text() != made_of:
+            raise ValueError(
+                f"{folder}: expected {made_of}, got {done.read_text()[:200]!r}; give the options that they were made "
+                "with, or choose another --out"
+            )
         return
     made = samples_in_order(scene_source(recipe.data, "ablation"), 0, options.jobs)
     samples = (sample for _, _, sample in islice(made, options.samples))
     for _ in write_shards(track(samples, "samples", options.samples), folder):
         pass
-    done.write_text(str(options.samples))
+    done.write_text(made_of)
 
 
 def _train(options: Options, recipes: "dict[str, Recipe]") -> "list[Trained]":

@@ -1,8 +1,11 @@
 """What the commands that evaluate share: their options, the scenes that these mean, and the run."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
+
+from viewmend.cli.checks import check_device
 
 if TYPE_CHECKING:
     from viewmend.evaluation.cells import Cell, CellStore
@@ -112,12 +115,15 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
     from viewmend.evaluation.report_markdown import markdown
     from viewmend.evaluation.report_page import page
     from viewmend.evaluation.report_sheets import write_sheets
+    from viewmend.whole_files import write_whole
 
     report, cells, store = found.report, found.cells, found.store
+    if not cells and (options.out / "report.json").exists():
+        raise ValueError(f"{options.out}: expected results for the report there, got none; it stays as it was")
     forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
     forms["html"] = page(report, cells, store, options.shown, options.video)
     for name, text in forms.items():
-        (options.out / f"report.{name}").write_text(text, encoding="utf-8")
+        write_whole(options.out / f"report.{name}", partial(Path.write_text, data=text, encoding="utf-8"))
     write_sheets(cells, store, options.out / "sheets")
     say(f"wrote {options.out}")
 
@@ -135,7 +141,9 @@ def scenes_of(name: str, options: RunOptions) -> "list[EvaluationScene]":
         if options.performers is None:
             raise ValueError("expected --performers DIR for set Q, got none; P needs nothing")
         return list(performer_set(options.performers, options.motions, frames, options.size)[part])
-    inputs = [number.strip() for number in options.inputs.split(",") if number.strip()]
+    inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
+    if not inputs:
+        raise ValueError("expected --inputs all or a number of cameras, got none; leave it away for all")
     return [s for number in inputs for s in capture_set(Path(name), number, options.frames)[part]]
 
 
@@ -160,10 +168,7 @@ def _check(options: RunOptions, sets: tuple[str, ...]) -> None:
         raise ValueError(f"expected at least one set, and positive numbers, got {got}; P needs nothing")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
-    import torch
-
-    if options.device != "cpu" and not (options.device.startswith("cuda") and torch.cuda.is_available()):
-        raise ValueError(f"expected a device that is there, got '{options.device}'; use --device cpu")
+    check_device(options.device)
 
 
 def _look_first_in(folder: Path) -> None:

@@ -114,7 +114,7 @@ def _open(options: Options) -> "PlainCapture":
 def _offset(options: Options, capture: "PlainCapture", time: int) -> tuple[float, float]:
     """The shift of the calibration that the input cameras' masks ask for; it is said if there is one."""
     from viewmend.cli.console import say
-    from viewmend.geometry.alignment import shared_offset
+    from viewmend.geometry.alignment import LEAST_IOU, shared_offset
 
     frame = capture.read(time).without([options.leave_out] if options.leave_out else [])
     if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > 0).any()):
@@ -125,6 +125,11 @@ def _offset(options: Options, capture: "PlainCapture", time: int) -> tuple[float
         say(
             f"all principal points moved by ({x:+.2f}, {y:+.2f}) pixels: hull and masks then agree better, IoU "
             f"{found.iou_before:.3f} -> {found.iou_after:.3f}; check first_pixel_center, or use --no-align"
+        )
+    if found.iou_after < LEAST_IOU:
+        say(
+            f"the hull hardly agrees with the masks of frame {time}, IoU {found.iou_after:.3f}: a mask or a camera is "
+            "wrong; look at it with viewmend info --out"
         )
     return found.offset_px
 

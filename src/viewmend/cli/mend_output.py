@@ -1,5 +1,7 @@
 """The files of `viewmend mend`: mended views, holes, and a contact sheet. All of them, or none."""
 
+import contextlib
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -15,6 +17,7 @@ from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.views import IncompleteView
 
 SHEET_ROWS = 4
+PICTURE = re.compile(r"\d{6}\.png")
 HOLE_COLOUR = (1.0, 0.0, 1.0)
 DIFFERENCE_GAIN = 3.0
 
@@ -22,13 +25,22 @@ DIFFERENCE_GAIN = 3.0
 class MendOutput:
     """Takes one step after another; a context manager that puts the files into `out` when all went well.
 
-    Until then they lie in a hidden folder beside it, which an error removes.
+    Until then they lie in a hidden folder of it, which an error removes.
     """
 
     def __init__(self, out: Path, fps: float):
+        """Begin.
+
+        Raises:
+            ValueError: `out` has a folder `mended` or `holes` that no earlier run left.
+            OSError: `out` cannot be made.
+        """
         self._out, self._fps = out, fps
-        out.parent.mkdir(parents=True, exist_ok=True)
-        self._draft = Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}."))
+        self._new = not out.exists()
+        for name in ("mended", "holes"):
+            _demand_pictures(out / name)
+        out.mkdir(parents=True, exist_ok=True)
+        self._draft = Path(tempfile.mkdtemp(dir=out, prefix=".mend."))
         self._count = 0
         self._rows: list[list[Tile]] = []
         self._stride = 1
@@ -57,6 +69,9 @@ class MendOutput:
                 self._publish()
         finally:
             shutil.rmtree(self._draft, ignore_errors=True)
+            if self._new:
+                with contextlib.suppress(OSError):  # it holds what was made
+                    self._out.rmdir()
 
     def _to_video(self) -> None:
         """Replace the mended pictures by a video, where PyAV is installed."""
@@ -76,14 +91,20 @@ class MendOutput:
         shutil.rmtree(self._draft / "mended")
 
     def _publish(self) -> None:
-        self._out.mkdir(parents=True, exist_ok=True)
         for name in ("mended", "mended.mp4", "holes", "contact_sheet.png"):
             old, new = self._out / name, self._draft / name
-            if old.is_dir():
-                shutil.rmtree(old)
-            old.unlink(missing_ok=True)
+            if old.exists():
+                old.rename(self._draft / f"old-{name}")
             if new.exists():
                 new.rename(old)
+
+
+def _demand_pictures(folder: Path) -> None:
+    """ValueError if there is anything that is not a picture of an earlier run, which may be replaced."""
+    others = [file.name for file in folder.iterdir() if not PICTURE.fullmatch(file.name)] if folder.is_dir() else []
+    if others or (folder.exists() and not folder.is_dir()):
+        what = f"'{others[0]}' in it" if others else "a file"
+        raise ValueError(f"{folder}: expected none, or pictures of an earlier run, got {what}; choose another --out")
 
 
 def sheet_row(step: MendStep) -> list[Tile]:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -108,11 +107,11 @@ def load_named(name: str | None, top_k: int | None, device: str) -> ViewInpainte
     Raises:
         ValueError: there is none, it is damaged, or the device is not there.
     """
+    from viewmend.cli.checks import check_device
     from viewmend.cli.console import say
     from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
 
-    if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
-        raise ValueError(f"expected a device that is there, got '{device}'; use --device cpu")
+    check_device(device)
     if name is None:
         shipped = shipped_models()
         if not shipped:

@@ -17,6 +17,7 @@ from viewmend.geometry.upright import upright
 FULL_TURN_GAP_RAD = math.radians(130)
 """A rig with a larger gap between neighbours does not stand all around: the orbit swings over what it sees."""
 STATIC_VIEWS = 60
+MOST_SIDE_PX = 16384
 FRAMES_PER_TURN = 150
 
 
@@ -82,12 +83,13 @@ def read_path(file: Path, like: Cameras) -> Cameras:
 
     Raises:
         ValueError: the file does not hold that; says what and where.
-        OSError: it cannot be read.
     """
     try:
         content = json.loads(file.read_text())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: expected JSON with camera poses, got {error}; correct the file") from error
+    except OSError as error:
+        raise ValueError(f"{file}: expected a file with camera poses, got: {error.strerror}; check --path") from error
     given = content if isinstance(content, dict) else {"world_from_camera": content}
     poses = _matrices(file, given.get("world_from_camera"), "world_from_camera", (4, 4))
     good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
@@ -100,6 +102,11 @@ def read_path(file: Path, like: Cameras) -> Cameras:
     K, size = first.K[0].cpu(), first.size_px[0].cpu()
     if "K" in given:
         K = _matrices(file, [given["K"]], "K", (3, 3))[0]
+        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]):
+            raise ValueError(
+                f"{file}: expected 'K' as [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, got "
+                f"{given['K']}; correct it"
+            )
     if "width" in given or "height" in given:
         size = torch.tensor([_pixels(file, given, "width"), _pixels(file, given, "height")])
     count = len(poses)
@@ -136,6 +143,8 @@ def _matrices(file: Path, value: object, key: str, shape: tuple[int, int]) -> Fl
 
 def _pixels(file: Path, given: dict, key: str) -> int:
     value = given.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{file}: expected '{key}' as a positive number of pixels, got {value!r}; give both sides")
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= MOST_SIDE_PX:
+        raise ValueError(
+            f"{file}: expected '{key}' as a number of pixels from 1 to {MOST_SIDE_PX}, got {value!r}; give both sides"
+        )
     return value

@@ -38,6 +38,7 @@ class Options(RunOptions):
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.evaluating import evaluate, write_report
+    from viewmend.evaluation.methods import method_names
     from viewmend.evaluation.paper_tables import NO_FIGURES, OURS, TABLES, PaperRow, ablation_models, paper_grid
     from viewmend.evaluation.report_markdown import written
 
@@ -50,7 +51,10 @@ def run(options: Options) -> int:
     else:
         if options.table == 2 and not options.sets:
             raise ValueError("expected captures for Table 2, got none; name their folders behind the 2")
-        first, *others = (name.strip() for name in options.ours.split(",") if name.strip())
+        given = method_names(options.ours) if options.ours.strip() else ()
+        if not given:
+            raise ValueError("expected --ours with a model's name or folder, got none; leave it away for small")
+        first, *others = given
         methods = {OURS: (first,)}
         rows += [PaperRow("not in the paper", name, NO_FIGURES) for name in (*others, *RIVALS)]
     names = [name for row in rows for name in methods.get(row.method, (row.method,))]

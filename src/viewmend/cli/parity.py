@@ -28,10 +28,12 @@ def run(options: Options) -> int:
     from dataclasses import asdict
 
     from viewmend.baselines.parity import TOLERANCE, check
+    from viewmend.cli.checks import check_device
     from viewmend.cli.console import busy, print_json
 
     if not options.files:
         raise ValueError("expected one or more parity files, got none; see viewmend evaluate parity --help")
+    check_device(options.device)
     results = []
     for path in options.files:
         with busy(f"running the network of {path.name}"):

@@ -46,6 +46,8 @@ def run(options: Options) -> int:
 
     if options.count < 1:
         raise ValueError(f"expected a count of at least 1, got {options.count}")
+    if any(options.out.glob("shard-*.tar")):
+        raise ValueError(f"{options.out}: expected no samples yet, found shards; choose another --out, or remove them")
     recipe = chosen_recipe(
         TrainOptions(
             recipe=options.recipe,

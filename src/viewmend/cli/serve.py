@@ -106,6 +106,7 @@ def _check(options: Options) -> None:
     positive = ("width", "context", "viewers", "cameras", "frames", "size", "memory_mb")
     wrong = [name for name in positive if not getattr(options, name) > 0]
     wrong += [name for name in ("budget_ms", "port") if not getattr(options, name) >= 0]
+    wrong += ["cameras"] if options.source == "studio" and options.cameras < 4 else []
     if options.fps is not None and not 0 < options.fps <= 240:
         wrong.append("fps")
     if wrong or options.port > 65535:

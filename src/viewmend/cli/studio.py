@@ -41,9 +41,11 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; the exit code."""
-    wrong = [name for name in ("scenes", "cameras", "frames", "size") if getattr(options, name) < 1]
+    least = {"scenes": 1, "cameras": 4, "frames": 1, "size": 1, "seed": 0}
+    wrong = [name for name, low in least.items() if getattr(options, name) < low]
     if wrong:
-        raise ValueError(f"expected positive numbers, got {wrong[0]} {getattr(options, wrong[0])}; see --help")
+        name = wrong[0]
+        raise ValueError(f"expected --{name} of at least {least[name]}, got {getattr(options, name)}; see --help")
     from viewmend.capture.errors import CaptureError
     from viewmend.capture.plain_writer import write_capture
     from viewmend.capture.studio.imperfections import Imperfections

@@ -81,11 +81,20 @@ class Options:
 
 def run(options: Options) -> int:
     """Train, with a bar on a terminal, else a line every twenty steps."""
+    import torch
+
     from viewmend.cli.console import say
-    from viewmend.training.loop import train
+    from viewmend.inpainting.inpainter import Inpainter
+    from viewmend.training.loop import fitting_weights, train
 
     start, kind = _start(options)
     recipe = chosen_recipe(options, start)
+    if isinstance(start, Inpainter):
+        with torch.device("meta"):
+            wanted = Inpainter(recipe.model)
+        fitting, count = len(fitting_weights(wanted, start)), len(wanted.state_dict())
+        if 0 < fitting < count:
+            say(f"{fitting} of {count} tensors begin as {options.start or 'small'} has them, the others at random")
     with _Reporter(recipe.steps) as reporter:
         try:
             train(recipe, options.out, start, reporter.report, kind)
@@ -116,6 +125,7 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
         ValueError: no such recipe, or options that do not go together.
     """
     from viewmend.baselines.published import NETWORKS
+    from viewmend.cli.checks import check_device, check_people
     from viewmend.inpainting.inpainter import Inpainter
     from viewmend.training.baseline_run import baseline_recipe
     from viewmend.training.plan import DataPlan
@@ -131,15 +141,15 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
         raise ValueError(
             f"expected --size-px with {', '.join(NETWORKS)} alone, got it with {options.recipe}; leave it out"
         )
-    if (options.performers is None) != (options.motions is None):
-        raise ValueError("expected --performers and --motions together, got one of them; give both folders")
+    check_people(options.performers, options.motions)
+    check_device(options.data_device or "cpu")
     data = DataPlan(
         performers=options.performers,
         motions=options.motions,
         captures=options.capture,
         shards=options.shards,
         device=options.data_device or "cpu",
-        clip=options.clip or 1,
+        clip=1 if options.clip is None else options.clip,
     )
     recipe = recipes[options.recipe](data)
     if options.recipe == "finetune" and isinstance(start, Inpainter):
@@ -150,7 +160,7 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     return replace(
         recipe,
         seed=options.seed,
-        fresh=min(recipe.fresh, options.batch or recipe.batch),
+        fresh=recipe.fresh if options.batch is None else max(1, min(recipe.fresh, options.batch)),
         loss=replace(recipe.loss, **{n: v for n, v in loss.items() if v is not None}),
         **{n: v for n, v in values.items() if v is not None},
     )

@@ -10,6 +10,7 @@ import torch
 
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.plain import PlainCapture, open_capture
+from viewmend.capture.plain_format import read_calibration
 from viewmend.evaluation.scenes import SceneFrame
 from viewmend.geometry.alignment import shared_offset
 from viewmend.geometry.cameras import Cameras
@@ -119,10 +120,11 @@ def _open(folder: Path, names: Sequence[str] | None) -> PlainCapture:
 
 
 def _fingerprint(folder: Path) -> str:
-    """Changes when the calibration does, or name, size or time of any file: images are too many to read them all."""
+    """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
     folder = folder if folder.is_dir() else folder.parent
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    stats = [(str(path.relative_to(folder)), path.stat()) for path in files]
+    plain = read_calibration(folder)
+    named = {c.file(stream, frame) for c in plain.cameras for stream in c.streams for frame in plain.frames}
+    stats = [(name, (folder / name).stat()) for name in sorted(named) if (folder / name).is_file()]
     listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     calibration = (folder / "cameras.json").read_bytes()
     return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable
+import zlib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.scorers import KINDS, Features
+from viewmend.whole_files import write_whole
 
 PROTOCOL = 1
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
@@ -105,7 +106,7 @@ class CellStore:
             self._write_features(f"{cell.key.stem}.npz", run.features)
         values = asdict(replace(cell, features=None, true_features=None))
         text = json.dumps({name: values[name] for name in REMEMBERED}, indent=1, allow_nan=False) + "\n"
-        _replace(self.folder / f"{cell.key.stem}.json", lambda path: path.write_text(text))
+        write_whole(self.folder / f"{cell.key.stem}.json", lambda path: path.write_text(text))
 
     def save_scene(self, key: CellKey, run: SceneRun) -> None:
         """Remember what all methods of a scene share: rendered view, E, truth, and its videos' features."""
@@ -144,17 +145,25 @@ class CellStore:
             with path.open("wb") as file:
                 np.savez(file, **features)  # pyright: ignore[reportArgumentType]
 
-        _replace(self.folder / name, write)
+        write_whole(self.folder / name, write)
 
     def _read_features(self, name: str) -> Features | None:
         try:
             with (self.folder / name).open("rb") as file, np.load(file) as arrays:
                 return {kind: arrays[kind] for kind in KINDS}
-        except (OSError, ValueError, KeyError, BadZipFile):  # without them there is no VFID, all else stands
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            EOFError,
+            BadZipFile,
+            zlib.error,
+        ):  # without them there is no VFID, all else stands
             return None
 
     def _write_image(self, name: str, image: Picture) -> None:
-        _replace(self.folder / name, lambda path: write_image(path, image))
+        write_image(self.folder / name, image)
 
     def _read_image(self, name: str) -> Picture | None:
         path = self.folder / name
@@ -229,10 +238,3 @@ def _cell(values: dict[str, Any]) -> Cell:
     values["frames"] = tuple(FrameScores(**frame) for frame in values["frames"])
     values["provenance"] = Provenance(**values["provenance"])
     return Cell(**values)
-
-
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write beside the place, then rename: nobody ever sees half a file."""
-    beside = path.with_name(f".half-{path.name}")
-    write(beside)
-    beside.replace(path)

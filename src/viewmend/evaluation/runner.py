@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -43,9 +44,10 @@ def run_evaluation(
     """
     settings = settings or RunSettings()
     names = [scene.name for scene in scenes]
-    if len(set(names)) < len(names) or jobs < 1:
-        twice = sorted({name for name in names if names.count(name) > 1})
-        raise ValueError(f"expected scenes of different names and at least one job, got {twice} twice and {jobs} jobs")
+    if jobs < 1:
+        raise ValueError(f"expected at least one job, got {jobs}")
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder")
     identities = method_identities(methods, settings)
     keys = {scene.name: cell_keys(scene, identities, settings) for scene in scenes}
     tasks = []
@@ -89,6 +91,11 @@ def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) 
                 for future in as_completed(futures):
                     yield futures[future], _result(future)
                     left.remove(futures[future])
+            except BaseException:
+                # What the workers have begun nobody will hear of: an interrupted run ends now.
+                for worker in list((pool._processes or {}).values()):
+                    worker.terminate()
+                raise
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
     except BrokenProcessPool:
@@ -119,6 +126,7 @@ def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
 
 def _begin(threads: int) -> None:
     """What a worker does first."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent says what it means
     torch.set_num_threads(threads)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 

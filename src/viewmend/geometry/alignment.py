@@ -25,6 +25,9 @@ MARGIN = 0.05
 WORTH_MOVING = 0.003
 """A shift counts if hull and masks then agree better by this much (IoU): above the noise of exact calibrations."""
 
+LEAST_IOU = 0.8
+"""Hull and masks that agree less even then say nothing of pixels: a mask or a camera is wrong altogether."""
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -67,7 +70,7 @@ def shared_offset(
     before = iou(0.0, 0.0)
     x, after_x = _peak(lambda x: iou(x, 0.0), before)
     y, after = _peak(lambda y: iou(x, y), after_x)
-    if after - before < WORTH_MOVING:
+    if after - before < WORTH_MOVING or after < LEAST_IOU:
         return Alignment((0.0, 0.0), before, before)
     return Alignment((x, y), before, after)
 

@@ -1,17 +1,14 @@
 """Inpainters on disk: model.safetensors, config.json and a model card, in the layout of huggingface_hub's mixin."""
 
 import json
-import os
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.inpainter import Inpainter
+from viewmend.whole_files import write_tensors, write_whole
 
 FORMAT = 1
 """Grows when an older program could no longer read what is written."""
@@ -75,10 +72,9 @@ def save_inpainter(inpainter: Inpainter, folder: str | Path, card: str) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     config = {"viewmend_format": FORMAT} | inpainter.config.to_dict()
-    weights = {key: value.detach().cpu().contiguous() for key, value in inpainter.state_dict().items()}
-    _write_atomically(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
-    _write_atomically(folder / CARD, lambda path: path.write_text(card))
-    _write_atomically(folder / WEIGHTS, lambda path: save_file(weights, path, {"format": "pt"}))
+    write_whole(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
+    write_whole(folder / CARD, lambda path: path.write_text(card))
+    write_tensors(folder / WEIGHTS, inpainter.state_dict(), {"format": "pt"})
 
 
 def _folder(name_or_path: str | Path) -> Path:
@@ -122,16 +118,3 @@ def _read_weights(path: Path, device: str) -> dict[str, torch.Tensor]:
             f"{path}: expected a whole safetensors file, got {path.stat().st_size} bytes that do not read ({error}); "
             "copy or download it again"
         ) from error
-
-
-def _write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Writes beside the place, then renames: nobody ever sees half a file."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    beside = Path(name)
-    try:
-        write(beside)
-        beside.chmod(0o644)
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)

@@ -57,7 +57,7 @@ class Server(uvicorn.Server):
                 listener.listen(64)  # who is told the address may come at once, and waits
             except OSError as error:
                 what = error.strerror or str(error)
-                raise OSError(f"port {config.port} of {config.host}: {what}; choose another --port") from None
+                raise OSError(f"port {config.port} of {config.host}: {what}; choose another --port or --host") from None
             self._socket = listener
             name = f"[{config.host}]" if ":" in config.host else config.host
             yield f"http://{name}:{listener.getsockname()[1]}"

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from safetensors.torch import save_file
 from torch import nn
 
 from viewmend.baselines.e2fgvi import E2FGVI
@@ -17,6 +16,7 @@ from viewmend.training.loop import Run
 from viewmend.training.model_card import model_card
 from viewmend.training.objective import Outcome
 from viewmend.training.plan import DataPlan, LossWeights, Recipe
+from viewmend.whole_files import write_tensors
 
 CLIP = 5
 """Consecutive views in the authors' training clips."""
@@ -98,11 +98,7 @@ class BaselineRun(Run):
         return adversary.judge_images(truth, made, [clip.holes.float() for clip in outcome.clips], share)
 
     def _write_model(self) -> None:
-        weights = {key: value.detach().cpu().contiguous() for key, value in self.averaged.state_dict().items()}
-        partial = self.out / f".{TRAINED}"
-        save_file(weights, partial, {"format": "pt", "network": self.recipe.name})
-        partial.chmod(0o644)
-        partial.replace(self.out / TRAINED)
+        write_tensors(self.out / TRAINED, self.averaged.state_dict(), {"format": "pt", "network": self.recipe.name})
         begun = "a checkpoint, whose licence goes on" if self.recipe.started else "random weights"
         card = (
             model_card(self.recipe, self.state) + f"\nBegan with {begun}. A method: {self.recipe.name}-o-def@FOLDER.\n"

@@ -72,12 +72,17 @@ class SampleFeed(Generic[Item]):
         return FeedPosition(scene, sample, len(self._buffer))
 
 
-class _Numbered(Dataset[tuple[int, Sequence[Item]]]):
+class _Numbered(Dataset[tuple[int, Sequence[Item] | Exception]]):
+    """Scenes by number; what a user can get wrong is handed on, so that it is not wrapped in a worker's traceback."""
+
     def __init__(self, scenes: SceneSource[Item]) -> None:
         self.scenes = scenes
 
-    def __getitem__(self, index: int) -> tuple[int, Sequence[Item]]:
-        return index, self.scenes.scene(index)
+    def __getitem__(self, index: int) -> tuple[int, Sequence[Item] | Exception]:
+        try:
+            return index, self.scenes.scene(index)
+        except (ValueError, OSError) as error:
+            return index, error
 
 
 def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Iterator[tuple[int, int, Item]]:
@@ -99,6 +104,8 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
         made = (numbered[number] for number in count(first))
     empty = 0
     for number, samples in made:
+        if isinstance(samples, Exception):
+            raise samples
         empty = 0 if samples else empty + 1
         if empty == MOST_EMPTY_SCENES:
             raise ValueError(

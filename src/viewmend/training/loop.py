@@ -21,12 +21,15 @@ from viewmend.training.objective import Objective, Outcome
 from viewmend.training.plan import Recipe
 from viewmend.training.processes import Processes, processes
 from viewmend.training.ray_lookups import RayLookups, RaysObjective
-from viewmend.training.run_files import FILE, RunState, load_run, save_run
+from viewmend.training.run_files import FILE, RunError, RunState, load_run, save_run
 from viewmend.training.sample_files import sample_to_bytes
 from viewmend.training.samples import Sample
 from viewmend.training.schedule import Schedule, learning_rate_factor
 from viewmend.training.sources import training_source
 from viewmend.training.validation import Validation
+
+OWN_FILES = ("model.safetensors", "config.json", "README.md")
+"""What a run writes besides its log and itself, and another may have lying there."""
 
 
 def train(
@@ -68,6 +71,12 @@ class Run:
 
     def __init__(self, recipe: Recipe, out: Path, start: nn.Module | None, own: Processes) -> None:
         out.mkdir(parents=True, exist_ok=True)
+        others = [name for name in OWN_FILES if (out / name).exists()]
+        if others and not (out / FILE).exists():
+            raise RunError(
+                f"{out}: expected an empty folder, or a run to go on with ({FILE}), got {', '.join(others)} of "
+                "something else; choose another folder"
+            )
         torch.manual_seed(recipe.seed)
         self.recipe, self.out, self.own = recipe, out, own
         self.model = self._make_model(start).to(own.device)
@@ -115,6 +124,8 @@ class Run:
                 yield progress
             if step > self.state.step:
                 self._save(step, schedule)
+            elif self.own.first:
+                self._write_model()  # which may be lost or damaged, where nothing else is to do
             if self.validation is not None and step > begun and step % self.recipe.validate_every:
                 log.validated(self.validation.judge(self.averaged, step))
 
@@ -217,20 +228,31 @@ class Run:
         positions = self.own.gather([stream.position for stream in self.streams])
         self.state = RunState(step, schedule.elapsed_s(), positions)
         if self.own.first:
-            self._write_model()
             save_run(self.out, self.recipe, self.state, self._modules, self._optimizers)
+            self._write_model()
 
 
 def _model(recipe: Recipe, start: Inpainter | None) -> Inpainter:
     """The recipe's model with those weights of `start` whose name and shape it has; its part is ready to learn."""
     model = Inpainter(recipe.model).train()
-    own = model.state_dict()
-    given = {} if start is None else start.state_dict()
-    model.load_state_dict(own | {n: w for n, w in given.items() if n in own and own[n].shape == w.shape})
+    if start is not None:
+        fitting = fitting_weights(model, start)
+        if not fitting:
+            raise ValueError(
+                f"expected a model to begin with of which anything fits {recipe.name}, got none that does: its sizes "
+                "are others; begin without, or choose another recipe"
+            )
+        model.load_state_dict(model.state_dict() | fitting)
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(recipe.part == "all" or name.startswith("ray_reader.") == (recipe.part == "rays"))
     model.compute_dtype = torch.bfloat16 if recipe.bfloat16 else torch.float32
     return model
+
+
+def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tensor]:
+    """Those weights of `start` whose name and shape `model` has."""
+    own = model.state_dict()
+    return {n: w for n, w in start.state_dict().items() if n in own and own[n].shape == w.shape}
 
 
 def _costs(outcome: Outcome, total: torch.Tensor, adversarial: float, discriminator: float) -> Costs:

@@ -1,5 +1,6 @@
 """What a training run is: model, data and schedule."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -138,6 +139,13 @@ class Recipe:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        least = {"steps": 1, "batch": 1, "streams": 1, "checkpoint_every": 1, "workers": 0, "validate_every": 0}
+        wrong = [f"{name} of {getattr(self, name)}" for name, low in least.items() if getattr(self, name) < low]
+        wrong += [f"minutes of {self.minutes}"] if self.minutes is not None and not self.minutes > 0 else []
+        wrong += [] if 0 < self.learning_rate < math.inf else [f"learning_rate of {self.learning_rate}"]
+        wrong += [] if self.data.clip > 0 else [f"clip of {self.data.clip}"]
+        if wrong:
+            raise ValueError(f"expected positive numbers (workers and validate_every may be 0), got {', '.join(wrong)}")
         over_time = self.loss.temporal or (self.loss.adversarial and self.loss.discriminator == "clip")
         if over_time and self.data.clip < 2:
             raise ValueError(f"expected clips of 2 or more for a loss over time, got {self.data.clip}; set data.clip")

@@ -1,19 +1,18 @@
 """A run on disk: what it takes to go on (run.safetensors), whole or not there."""
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from viewmend.training.feed import FeedPosition
 from viewmend.training.plan import Recipe
+from viewmend.whole_files import write_tensors
 
 FILE = "run.safetensors"
 MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_every", "validate_every", "validation_views")
@@ -42,11 +41,8 @@ def save_run(
     tensors = {f"{name}/{key}": value for name, m in modules.items() for key, value in m.state_dict().items()}
     for name, optimizer in optimizers.items():
         tensors |= {f"{name}/{key}": value for key, value in _optimizer_tensors(optimizer).items()}
-    tensors = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
     metadata = {"state": json.dumps(asdict(state)), "recipe": json.dumps(_plain(recipe))}
-    partial = folder / f".{FILE}.{os.getpid()}"
-    save_file(tensors, partial, metadata)
-    partial.replace(folder / FILE)
+    write_tensors(folder / FILE, tensors, metadata)
 
 
 def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]) -> RunState:
@@ -70,12 +66,19 @@ def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimi
             f"{path}: expected a run of this recipe, got one that differs in {', '.join(other)}; write to another "
             "folder, or give the options that it was started with"
         )
-    for name, module in modules.items():
-        module.load_state_dict(_under(name, tensors))
-    for name, optimizer in optimizers.items():
-        _load_optimizer(optimizer, _under(name, tensors))
-    positions = tuple(FeedPosition(**position) for position in values["positions"])
-    return RunState(values["step"], values["elapsed_s"], positions)
+    try:
+        for name, module in modules.items():
+            module.load_state_dict(_under(name, tensors))
+        for name, optimizer in optimizers.items():
+            _load_optimizer(optimizer, _under(name, tensors))
+        positions = tuple(FeedPosition(**position) for position in values["positions"])
+        return RunState(values["step"], values["elapsed_s"], positions)
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise RunError(
+            f"{path}: expected a run of this version, got one whose values do not fit ({said}); remove the file to "
+            "start anew"
+        ) from error
 
 
 def _under(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -93,7 +96,11 @@ def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
     for name, value in tensors.items():
         number, key = name.split("/")
         states.setdefault(int(number), {})[key] = value
-    optimizer.load_state_dict({"state": states, "param_groups": optimizer.state_dict()["param_groups"]})
+    groups = optimizer.state_dict()["param_groups"]
+    count = sum(len(group["params"]) for group in groups)
+    if states and (set(states) != set(range(count)) or len({frozenset(state) for state in states.values()}) > 1):
+        raise ValueError(f"moments of {len(states)} parameters for {count}")
+    optimizer.load_state_dict({"state": states, "param_groups": groups})
 
 
 def _plain(recipe: Recipe) -> dict[str, Any]:

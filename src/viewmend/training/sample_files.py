@@ -17,6 +17,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.training.ray_lookups import RayLookups
 from viewmend.training.samples import Sample
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.whole_files import write_whole
 
 PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, RayLookups)
 KINDS = {kind.__name__: kind for kind in PARTS}
@@ -89,15 +90,15 @@ Kind = TypeVar("Kind", bound=Sample | RayLookups)
 class ShardScenes(Generic[Kind]):
     """Shards as scenes, in another order each time all were used, and their samples too."""
 
-    def __init__(self, folder: Path, seed: str, kinds: tuple[type[Kind], ...]) -> None:
-        """Find the shards, which hold these kinds alone.
+    def __init__(self, folder: Path, seed: str, kinds: tuple[type[Kind], ...], clip: int = 1) -> None:
+        """Find the shards, which hold these kinds alone, samples of `clip` times or more.
 
         Raises:
             ShardError: the folder has none.
         """
         self.paths = sorted(folder.glob("*.tar"))
         self.seed = seed
-        self.kinds = kinds
+        self.kinds, self.clip = kinds, clip
         if not self.paths:
             raise ShardError(f"{folder}: expected tar files, found none; make some with `viewmend samples --out`")
 
@@ -105,7 +106,7 @@ class ShardScenes(Generic[Kind]):
         """One shard.
 
         Raises:
-            ShardError: it is damaged, or holds another kind.
+            ShardError: it is damaged, or holds another kind, or shorter clips.
         """
         round_, position = divmod(number, len(self.paths))
         order = Random(f"{self.seed}/shards/{round_}").sample(self.paths, len(self.paths))
@@ -120,18 +121,26 @@ class ShardScenes(Generic[Kind]):
                 f"{order[position]}: expected {wanted}, got {got}; make samples for this recipe "
                 "(viewmend samples --recipe)"
             )
+        shortest = min((len(s.clip) for s in samples if isinstance(s, Sample)), default=self.clip)
+        if shortest < self.clip:
+            raise ShardError(
+                f"{order[position]}: expected clips of {self.clip} times, got {shortest}; make samples for this recipe "
+                f"(viewmend samples --recipe, or --clip {self.clip})"
+            )
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
 
 
 def _write_shard(samples: list[Sample | RayLookups], path: Path) -> Path:
-    partial = path.with_suffix(".partial")
-    with tarfile.open(partial, "w") as tar:
-        for number, sample in enumerate(samples):
-            data = sample_to_bytes(sample)
-            member = tarfile.TarInfo(f"{path.stem}-{number:04d}.safetensors")
-            member.size = len(data)
-            tar.addfile(member, io.BytesIO(data))
-    return partial.replace(path)
+    def write(beside: Path) -> None:
+        with tarfile.open(beside, "w") as tar:
+            for number, sample in enumerate(samples):
+                data = sample_to_bytes(sample)
+                member = tarfile.TarInfo(f"{path.stem}-{number:04d}.safetensors")
+                member.size = len(data)
+                tar.addfile(member, io.BytesIO(data))
+
+    write_whole(path, write)
+    return path
 
 
 def _taken_apart(value: Any, tensors: dict[str, torch.Tensor]) -> Any:

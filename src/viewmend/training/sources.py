@@ -30,7 +30,7 @@ def scene_source(plan: DataPlan, seed: str, validation: bool = False) -> SceneSo
         CaptureError, ShardError: what the plan names cannot be used.
     """
     if plan.shards is not None and not validation:
-        return ShardScenes(plan.shards, seed, (Sample,))
+        return ShardScenes(plan.shards, seed, (Sample,), plan.clip)
     seeds = range(FIRST_VALIDATION_SEED, FIRST_TEST_SEED) if validation else range(FIRST_VALIDATION_SEED)
     studio = StudioScenes(plan, seed, seeds)
     if not plan.captures:
