@@ -1,7 +1,7 @@
 # Two commands that do everything on a fresh machine; both may be run again and again, in either order.
 PYTHON ?= python3
 BIN := .venv/bin
-# Without a GPU, an open range would take a CUDA build of several gigabytes.
+# Without a GPU: the version whose CPU build the package index is known to have.
 CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
 
 .PHONY: demo test test-all gate format clean
@@ -15,7 +15,7 @@ test: gate ## environment, install, the gate, the tests
 test-all: gate ## the tests that take longer, too
 	$(BIN)/pytest -m ""
 
-gate: .venv/installed ## what CI, pre-commit and you run alike
+gate: .venv/installed ## what CI and you run alike
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright

@@ -20,7 +20,7 @@ from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.rendering.selection import select_closest
-from viewmend.views import IncompleteView, MultiViewFrame
+from viewmend.views import IncompleteView, MultiViewFrame, Silhouettes
 
 
 class DepthSensors:
@@ -74,7 +74,8 @@ def render(frame: MultiViewFrame, target: Cameras, center: torch.Tensor) -> Inco
     right = (depth > 0) & (depth <= surface + 0.03) & (surface > 0)
     error = mask * (~right).float()
     weights = right.float()[None]
-    return IncompleteView(target, rgb * right, mask, error, surface, chosen, weights, frame.time, nearest)
+    masks = None if frame.mask is None else Silhouettes(frame.mask, frame.cameras)
+    return IncompleteView(target, rgb * right, mask, error, surface, chosen, weights, frame.time, nearest, masks)
 
 
 def run(inpainter: ViewInpainter, frames: int = 4, size: int = 256, cameras: int = 6):

@@ -62,7 +62,7 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
         (["train", "smal"], "expected a recipe among"),
         (["train", "finetune"], "expected --capture DIR"),
         (["train", "small", "--performers", "people"], "--performers and --motions together"),
-        (["train", "small", "--temporal", "0.1"], "set data.clip"),
+        (["train", "small", "--temporal", "0.1"], "give --clip 2"),
         (["train", "small_rays", "--adversarial", "0.01"], "no adversarial loss for rays"),
         (["train", "small", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
         (["train", "small", "--from", "nothing"], "one of the shipped models"),

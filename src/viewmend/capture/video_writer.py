@@ -21,7 +21,7 @@ class VideoWriter:
         try:
             import av
         except ImportError:
-            raise ImportError(f"writing {path} needs PyAV; run: pip install 'viewmend[video]'") from None
+            raise ImportError(f"writing {path} needs PyAV; install it, or viewmend's extra 'video'") from None
         self._faithful = faithful
         path.parent.mkdir(parents=True, exist_ok=True)
         self._container = av.open(str(path), "w")

@@ -28,6 +28,8 @@ class Options:
     """Folder of BVH motions for them."""
     capture: tuple[Path, ...] = ()
     """Folders of captures of your own."""
+    cameras: tuple[int, int] | None = None
+    """Fewest and most cameras of the studio's rigs; 4 to 60."""
     workers: int = 2
     """Processes that make samples."""
     seed: int = 0
@@ -55,6 +57,7 @@ def run(options: Options) -> int:
             performers=options.performers,
             motions=options.motions,
             capture=options.capture,
+            cameras=options.cameras,
         ),
         None,
     )

@@ -17,8 +17,8 @@ class Options:
     """Open a page where a person walks around the subject: rendered, its holes, and mended, live.
 
     The page is at the address that is printed; nothing else is needed, and it asks nothing of anywhere else. Only this
-    machine can open it, unless --host and --token say otherwise. docs/live.md has the rest: the keys, the clock, the
-    budget, single pictures over HTTP, how to push a live rig.
+    machine can open it, unless --host and --token say otherwise. The page itself shows the keys (press ?);
+    docs/live.md has the rest: the clock, the budget, single pictures over HTTP, how to push a live rig.
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|studio|live")] = "studio"
@@ -63,7 +63,7 @@ def run(options: Options) -> int:
         import starlette  # noqa: F401
         import uvicorn  # noqa: F401
     except ImportError:
-        raise ValueError("viewmend serve needs its extra; run: pip install 'viewmend[live]'") from None
+        raise ValueError("viewmend serve needs its extra 'live'; from the clone: pip install -e '.[live]'") from None
     import os
 
     # Before torch is loaded. Its threads would spin between two pieces of work, on cores that a browser may need.

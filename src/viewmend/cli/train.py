@@ -32,14 +32,16 @@ class Options:
     out: Path = Path("out/train")
     """Folder for all that is written."""
     start: Annotated[str | None, tyro.conf.arg(name="from")] = None
-    """Name or folder of a model to begin with (finetune: small by default). For a published network its checkpoint, a
-    run's folder, or pretrained for the file among the known weights; without it, random weights."""
+    """Name or folder of a model to begin with (small and finetune: the shipped small by default). For a published
+    network its checkpoint, a run's folder, or pretrained for the file among the known weights; else, random weights."""
     performers: Path | None = None
     """Folder of glTF characters for a share of the scenes; never one that is kept for tests."""
     motions: Path | None = None
     """Folder of BVH motions for them."""
     capture: tuple[Path, ...] = ()
     """Folders of captures of your own to learn from."""
+    cameras: tuple[int, int] | None = None
+    """Fewest and most cameras of the studio's rigs, for rigs like yours; 4 to 60."""
     shards: Path | None = None
     """Folder that `viewmend samples` wrote; samples come from there alone."""
     data_device: str | None = None
@@ -81,6 +83,8 @@ class Options:
 
 def run(options: Options) -> int:
     """Train, with a bar on a terminal, else a line every twenty steps."""
+    import os
+
     import torch
 
     from viewmend.cli.console import say
@@ -100,7 +104,8 @@ def run(options: Options) -> int:
             train(recipe, options.out, start, reporter.report, kind)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
-    say(f"wrote {options.out}" if reporter.steps else f"{options.out}: this run was finished before; nothing to do")
+    if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
+        say(f"wrote {options.out}" if reporter.steps else f"{options.out}: this run was finished before; nothing to do")
     return 0
 
 
@@ -111,7 +116,7 @@ def _start(options: Options) -> "tuple[nn.Module | None, type[Run]]":
     from viewmend.training.baseline_run import BaselineRun
     from viewmend.training.loop import Run
 
-    name = options.start or ("small" if options.recipe == "finetune" else None)
+    name = options.start or ("small" if options.recipe in ("small", "finetune") else None)
     if options.recipe not in NETWORKS:
         return load_inpainter(name) if name is not None else None, Run
     weights = "" if name == "pretrained" else f"@{name}"
@@ -141,6 +146,8 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
         raise ValueError(
             f"expected --size-px with {', '.join(NETWORKS)} alone, got it with {options.recipe}; leave it out"
         )
+    if options.cameras is not None and not 4 <= options.cameras[0] <= options.cameras[1] <= 60:
+        raise ValueError(f"expected --cameras of 4 to 60, the fewer first, got {options.cameras}; for example 6 8")
     check_people(options.performers, options.motions)
     check_device(options.data_device or "cpu")
     data = DataPlan(
@@ -152,6 +159,7 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
         clip=1 if options.clip is None else options.clip,
     )
     recipe = recipes[options.recipe](data)
+    recipe = replace(recipe, data=replace(recipe.data, cameras=options.cameras or recipe.data.cameras))
     if options.recipe == "finetune" and isinstance(start, Inpainter):
         recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}

@@ -72,7 +72,7 @@ def _ray() -> Any:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError(
-            "expected Ray for --ray, got none; pip install 'viewmend[ray]', or leave --ray away"
+            "expected Ray for --ray, got none; install viewmend's extra 'ray', or leave --ray away"
         ) from error
     return ray
 

@@ -164,7 +164,7 @@ class LiveServer:
 
     async def _export(self, request: Request) -> Response:
         if not can_export():
-            return _refusal(501, "videos need PyAV; run: pip install 'viewmend[video]'")
+            return _refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
         if self._exporting:
             return _refusal(409, "another path is being rendered; ask again")
         self._exporting = True

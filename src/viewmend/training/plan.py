@@ -148,7 +148,7 @@ class Recipe:
             raise ValueError(f"expected positive numbers (workers and validate_every may be 0), got {', '.join(wrong)}")
         over_time = self.loss.temporal or (self.loss.adversarial and self.loss.discriminator == "clip")
         if over_time and self.data.clip < 2:
-            raise ValueError(f"expected clips of 2 or more for a loss over time, got {self.data.clip}; set data.clip")
+            raise ValueError(f"expected clips of 2 or more for a loss over time, got {self.data.clip}; give --clip 2")
         beyond = [n for n in ("adversarial", "temporal", "perceptual") if getattr(self.loss, n)]
         if self.part == "rays" and beyond:
             raise ValueError(f"expected no {' or '.join(beyond)} loss for rays alone, whose pixels are no image")

@@ -128,7 +128,10 @@ def rig_samples(
     times = sorted(frames)
     ends = [t for t in times if all(t - back in frames for back in range(plan.clip))]
     if not ends:
-        raise ValueError(f"expected {plan.clip} consecutive times for clips, got {times}; change the plan's times")
+        raise ValueError(
+            f"expected {plan.clip} consecutive times for clips, got {times}; leave --clip away, or use captures of "
+            f"{max(plan.times) + 1} frames or more"
+        )
     names = frames[times[-1]].cameras.names
     samples = []
     for held in random.sample(names, min(plan.held_cameras, len(names))):
