@@ -24,6 +24,8 @@ from viewmend.whole_files import write_whole
 
 PROTOCOL = 1
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error)
+"""What an .npz file that is not whole raises."""
 
 
 @dataclass(frozen=True)
@@ -151,15 +153,7 @@ class CellStore:
         try:
             with (self.folder / name).open("rb") as file, np.load(file) as arrays:
                 return {kind: arrays[kind] for kind in KINDS}
-        except (
-            OSError,
-            ValueError,
-            KeyError,
-            TypeError,
-            EOFError,
-            BadZipFile,
-            zlib.error,
-        ):  # without them there is no VFID, all else stands
+        except DAMAGED:  # without them there is no VFID, all else stands
             return None
 
     def _write_image(self, name: str, image: Picture) -> None:

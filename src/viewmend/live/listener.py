@@ -39,7 +39,7 @@ class Server(uvicorn.Server):
             )
         )
         self._since: WeakKeyDictionary[object, tuple[int, float]] = WeakKeyDictionary()
-        """Which request a connection has had answered (0 for none), and since when it asks for nothing more."""
+        """By its id, the last request that was answered, if any; and since when a connection asks for nothing more."""
 
     @contextlib.contextmanager
     def bound(self) -> Iterator[str]:

@@ -183,13 +183,13 @@ class LiveServer:
     async def _wait(self, request: Request, errand: PictureErrand | PathErrand, done: Future, limit_s: float):
         """The errand's result; it is given up when the client goes."""
         self._service.join(errand)
-        end = time.monotonic() + limit_s
+        end, waiting = time.monotonic() + limit_s, asyncio.wrap_future(done)
         try:
-            while not done.done():
-                await asyncio.wait([asyncio.wrap_future(done)], timeout=0.5)
-                if not done.done() and (time.monotonic() > end or await request.is_disconnected()):
+            while not waiting.done():
+                await asyncio.wait([waiting], timeout=0.5)
+                if not waiting.done() and (time.monotonic() > end or await request.is_disconnected()):
                     raise TimeoutError
-            return done.result()
+            return waiting.result()
         finally:
             self._service.leave(errand)
             done.cancel()

@@ -23,10 +23,13 @@ export class Transport {
       this.seeking = true;
       this.seek(Number(seek.value));
     });
-    seek.addEventListener("change", () => {
-      this.seeking = false;
-      this.sought = -1;
-    });
+    // Not every browser says "change" of a slider that was drawn away and back.
+    for (const end of ["change", "pointerup"]) {
+      seek.addEventListener(end, () => {
+        this.seeking = false;
+        this.sought = -1;
+      });
+    }
     byId("play").addEventListener("click", () => this.toggle());
     byId("live").addEventListener("click", () => this.live());
     byId("speed").addEventListener("change", () => this.speed(Number(byId("speed").value)));
