@@ -82,6 +82,12 @@ def test_a_class_in_a_file_is_a_method_and_a_changed_file_another(tmp_path):
     assert identity(make_method(f"{path}:Mine")) != identity(made)
 
 
+def test_a_class_that_does_not_take_the_device_is_refused(tmp_path):
+    (tmp_path / "own.py").write_text("class Bare:\n    pass\n")
+    with pytest.raises(ValueError, match=r"own\.py:Bare: expected something to call with the device"):
+        make_method(f"{tmp_path / 'own.py'}:Bare")
+
+
 @pytest.mark.parametrize("name", ["{}:Other", "{}:number", "absent.py:Mine"])
 def test_names_that_a_file_does_not_have_are_refused(name, tmp_path):
     (tmp_path / "own.py").write_text(OWN)

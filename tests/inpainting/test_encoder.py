@@ -24,7 +24,7 @@ def test_the_papers_encoder_has_the_sizes_of_the_table():
     encoder = Encoder(paper())
     shapes = [tuple(layer.weight.shape) for layer in encoder.layers]
     assert shapes == [
-        (64, 6, 3, 3),
+        (64, 5, 3, 3),
         (64, 64, 3, 3),
         (128, 64, 3, 3),
         (256, 128, 3, 3),
@@ -34,7 +34,7 @@ def test_the_papers_encoder_has_the_sizes_of_the_table():
         (256, 80, 3, 3),
         (128, 512, 3, 3),
     ]
-    extra_inputs = 3 * 64 * 9
+    extra_inputs = 2 * 64 * 9  # mask and depth
     assert sum(p.numel() for p in encoder.parameters()) == 4_206_400 + extra_inputs
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import cast
 
@@ -94,7 +95,12 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
         except MissingWeightsError as error:
             raise MethodMissing(str(error)) from error
     if ".py:" in name:
-        return _from_file(name)(device)
+        make = _from_file(name)
+        try:
+            signature(make).bind(device)
+        except TypeError as error:
+            raise ValueError(f"{name}: expected something to call with the device ('{device}'), got {error}") from error
+        return make(device)
     if name not in shipped_models() and not Path(name).is_dir():
         known = ", ".join([*shipped_models(), *(m.name for m in METHODS)])
         raise ValueError(

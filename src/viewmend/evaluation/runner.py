@@ -43,11 +43,7 @@ def run_evaluation(
         ValueError: a method cannot be made, two scenes have one name, `jobs` is not positive, or there is no cluster.
     """
     settings = settings or RunSettings()
-    names = [scene.name for scene in scenes]
-    if jobs < 1:
-        raise ValueError(f"expected at least one job, got {jobs}")
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder")
+    _check([scene.name for scene in scenes], jobs)
     identities = method_identities(methods, settings)
     keys = {scene.name: cell_keys(scene, identities, settings) for scene in scenes}
     tasks = []
@@ -70,6 +66,13 @@ def run_evaluation(
         cells = to_cells(task.scene, run, keys[task.scene.name], identities, origin)
         _remember(store, cells, run, keys[task.scene.name][0])
         yield [cell for cell, _ in cells]
+
+
+def _check(names: list[str], jobs: int) -> None:
+    if jobs < 1:
+        raise ValueError(f"expected at least one job, got {jobs}")
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder")
 
 
 def _remember(store: CellStore, cells: list[tuple[Cell, MethodRun]], run: SceneRun, key: CellKey) -> None:
