@@ -29,13 +29,13 @@ from viewmend.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
 from viewmend.baselines.framing import Canvas, Window, window_canvas, windows_over
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
 from viewmend.baselines.published import NETWORKS
-from viewmend.capture.studio.rigs import orbit
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.inpainting.config import base, small
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.protocol import Source, State, ViewInpainter
 from viewmend.pipeline import Observation, PipelineConfig, observe, view_of
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.views import IncompleteView
 
 SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13

@@ -15,7 +15,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as `viewmend serve` does,
 
 from measure import summarise, write
 
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.live.client import Client
 from viewmend.live.frames import ReadAhead
@@ -23,6 +22,7 @@ from viewmend.live.listener import Server
 from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
+from viewmend.studio.stage import Studio, StudioConfig
 
 SEED, CAMERAS, FRAMES, FPS = 10008, 8, 30, 15.0
 SIZES = ((320, 320), (512, 612))
@@ -48,7 +48,7 @@ def served(size: tuple[int, int], budget_ms: float | None, device: str):
 
 
 def walk(url: str, size: tuple[int, int], seconds: float, start: float, out: list[dict[str, object]]) -> None:
-    """Ask from a pose that moves, for some seconds; what was seen is added to `out`."""
+    """RenderRequest from a pose that moves, for some seconds; what was seen is added to `out`."""
     with Client(url) as viewer:
         frames, begun = [], time.perf_counter()
         while time.perf_counter() - begun < seconds:

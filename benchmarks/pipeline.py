@@ -7,12 +7,12 @@ from dataclasses import asdict
 import torch
 from measure import summarise, write
 
-from viewmend.capture.studio.rigs import orbit
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.inpainting.classical import Telea
 from viewmend.inpainting.config import small
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 
 SEED, WARM_UP = 10008, 3
 SIZES = ((320, 320), (512, 612))

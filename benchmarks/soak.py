@@ -28,9 +28,9 @@ from measure import write
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.live.client import Client
 from viewmend.live.publisher import Publisher
+from viewmend.studio.stage import Studio, StudioConfig
 
 SIZE, CAMERAS, FRAMES = 160, 6, 24
 ALLOWED_GROWTH = 0.05

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import torch
 
-from viewmend.capture.studio.imperfections import Imperfections
-from viewmend.capture.studio.render import light, render
-from viewmend.capture.studio.shading import stage_lights
-from viewmend.capture.studio.stage import Studio, StudioConfig
-from viewmend.capture.studio.textures import texture_pyramid
+from viewmend.studio.imperfections import Imperfections
+from viewmend.studio.render import light, render
+from viewmend.studio.shading import stage_lights
+from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.studio.textures import texture_pyramid
 
 
 def timed(work, runs: int, device: str) -> dict[str, float]:

@@ -67,7 +67,7 @@ def shares(scene: StudioScene) -> dict[str, float] | None:
             found |= seen(points, frames[time].select(names))
         return found
 
-    own, near = view.chosen, view.around(8)
+    own, near = view.source_views, view.closest_views(8)
     now, recent, further = by([NOW], own), by(RECENT, own), by(FURTHER, own)
     others, everyone = by([NOW], near), by([NOW], inputs.cameras.names)
     counted = {

@@ -4,7 +4,8 @@
 
 `Afterimage` fills a hole with the colours that it saw at the same pixels in the last views, darker the longer ago, and
 with the mean colour of the view where it never saw any. It asks no camera; one that does asks
-`source(time, view.chosen)` for their images and the geometry's depth in them, for any `time` up to the view's own.
+`source(time, view.source_views)` for their images and the geometry's depth in them, for any
+`time` up to the view's own.
 """
 
 from dataclasses import dataclass, replace

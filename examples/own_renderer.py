@@ -14,12 +14,12 @@ import torch
 
 from viewmend import Stream
 from viewmend.capture.images import write_image
-from viewmend.capture.studio.rigs import orbit
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.rendering.selection import select_closest
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.views import IncompleteView, MultiViewFrame, Silhouettes
 
 

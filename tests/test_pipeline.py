@@ -51,7 +51,7 @@ def test_a_view_is_rendered_and_mended():
     mended = stream([0], target, Asker())
     truth = photograph(target)
     view, rgb = mended.completed.view, mended.completed.rgb
-    assert view.chosen == ("c4", "c7", "c2")
+    assert view.source_views == ("c4", "c7", "c2")
     assert 50 < view.error.sum() < 0.7 * view.mask.sum()
     assert bool((rgb[:, view.error > 0] == 1).all()) and torch.equal(
         rgb[:, view.error == 0], view.rgb[:, view.error == 0]
@@ -90,9 +90,9 @@ def test_excluded_cameras_reach_neither_renderer_nor_inpainter(selection):
     config = replace(CONFIG, render=RenderConfig(selection=selection, keep_share=0.0))
     asker = Asker((0, ("c4", "c7")), (1, ("c4",)))
     observation = observe(photograph(SPARSE), None, config)
-    state = StreamState(State(), chosen=("c4", "c7", "c2"))
+    state = StreamState(State(), source_views=("c4", "c7", "c2"))
     mended = mend_view(observation, camera_at(120, "t"), state, asker, config, exclude=("c4",))
-    assert "c4" not in mended.completed.view.chosen
+    assert "c4" not in mended.completed.view.source_views
     assert asker.given[0].frame.cameras.names == ("c7",)
     assert asker.given[1] is None
 

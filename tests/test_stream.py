@@ -15,7 +15,7 @@ from viewmend.inpainting.config import small
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.reprojection_fill import ReprojectionFill
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
-from viewmend.stream import Effort, Stream
+from viewmend.stream import RenderQuality, Stream
 from viewmend.views import IncompleteView, MultiViewFrame
 
 CONFIG = PipelineConfig(hull=HullConfig(resolution=32))
@@ -85,7 +85,7 @@ def test_every_camera_image_is_encoded_once_whoever_looks():
     walk(stream, range(3), A, B, A, camera_at(145, "c"))
     assert len(model.encoded) == len(set(model.encoded)) and len(model.encoded) >= 3 * 4
     before = len(model.encoded)
-    stream.view(camera_at(320, "d"), None, 2, Effort(context_times=0))  # other cameras, no context
+    stream.view(camera_at(320, "d"), None, 2, RenderQuality(context_times=0))  # other cameras, no context
     for time in (0, 2, 1):  # seeking back and forth finds everything there
         stream.view(A, None, time)
     assert len(model.encoded) == before
@@ -108,7 +108,7 @@ def test_cameras_of_different_sizes_are_looked_at(model, inpainter):
     stream = Stream(model if inpainter == "model" else ReprojectionFill(3), CONFIG)
     stream.push(MultiViewFrame(replace(SPARSE, size_px=sizes), rgb, mask, 0))
     seen = stream.view(A, None, exclude=("c9",))
-    assert seen.completed.view.chosen and (seen.completed.rgb - seen.completed.view.rgb).abs().max() > 0.05
+    assert seen.completed.view.source_views and (seen.completed.rgb - seen.completed.view.rgb).abs().max() > 0.05
 
 
 def test_a_time_is_carved_once_and_stays(model):
@@ -129,13 +129,13 @@ def test_a_look_back_sees_no_later_time(model):
 def test_effort_takes_less_of_the_context(model):
     stream = Stream(model, CONFIG)
     everything = walk(stream, range(4), A)[0]
-    now = stream.view(A, None, 3, Effort(context_times=1)).completed
+    now = stream.view(A, None, 3, RenderQuality(context_times=1)).completed
     lone = Stream(model, CONFIG)
     lone.push(photograph(SPARSE, 3))
     assert (now.rgb - lone.view(A).completed.rgb).abs().max() < TOLERANCE
     assert not torch.equal(now.rgb, everything)
-    assert not torch.equal(stream.view(A, None, 3, Effort(top_k=4)).completed.rgb, everything)
-    raw = stream.view(A, None, 3, Effort(mend=False))
+    assert not torch.equal(stream.view(A, None, 3, RenderQuality(top_k=4)).completed.rgb, everything)
+    raw = stream.view(A, None, 3, RenderQuality(mend=False))
     assert torch.equal(raw.completed.rgb, raw.completed.view.rgb) and raw.stage_ms.inpainting == 0
 
 
@@ -164,7 +164,7 @@ def test_views_of_another_renderer_are_mended(model):
     assert torch.equal(mended.completed.rgb[:, error == 0], view.rgb[:, error == 0])
     assert (mended.completed.rgb - rgb)[:, error > 0].abs().mean() < 0.5 * rgb[:, error > 0].mean()
     with pytest.raises(ValueError, match=r"cameras among .* got \['x'\]"):
-        stream.mend(replace(view, nearest=("x",)))
+        stream.mend(replace(view, candidate_views=("x",)))
 
 
 class Sensors:

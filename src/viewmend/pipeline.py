@@ -14,7 +14,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.inpainting.protocol import State, ViewInpainter
-from viewmend.keeping import kept
+from viewmend.own_pages import to_own_pages
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame
 
@@ -33,7 +33,7 @@ class PipelineConfig:
 
 
 @runtime_checkable
-class DepthGiver(Protocol):
+class DepthProvider(Protocol):
     """All that an inpainter asks of G[t]; `GeometryProxy` is one, a renderer's own geometry may be another."""
 
     def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
@@ -47,13 +47,13 @@ class Observation:
 
     frame: MultiViewFrame
     """What the cameras saw, with masks."""
-    proxy: GeometryProxy | DepthGiver
+    proxy: GeometryProxy | DepthProvider
     """G[t]; rendering needs a `GeometryProxy`, filling does not."""
     geometry_ms: float
     """What the proxy took."""
     _depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False, compare=False)
 
-    def apart(self) -> "Observation":
+    def with_own_cache(self) -> "Observation":
         """The same time, remembered on its own from here on: what one viewer asks for saves no other any time."""
         return replace(self, _depths=dict(self._depths))
 
@@ -65,7 +65,7 @@ class Observation:
             right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
             if right or below:
                 rendered = torch.nn.functional.pad(rendered, (0, right, 0, below))  # padded as the images are
-            self._depths.update(zip(new, kept(rendered), strict=True))
+            self._depths.update(zip(new, to_own_pages(rendered), strict=True))
         width, height = self.frame.cameras.select(names).max_size_px
         return torch.stack([self._depths[name][:height, :width] for name in names])  # as `frame.select` cuts images
 
@@ -84,7 +84,7 @@ class StreamState:
     """What one viewer's stream carries from one view to the next: a value, never changed in place."""
 
     inpainter: State
-    chosen: tuple[str, ...] = ()
+    source_views: tuple[str, ...] = ()
     """The cameras of the last view."""
     history: tuple[Observation, ...] = ()
     """The last observations, at most `PipelineConfig.history` frames old."""
@@ -128,7 +128,7 @@ def observe(frame: MultiViewFrame, bounds: Bounds | None, config: PipelineConfig
             "foreground and name the files as each camera's 'mask'"
         )
     start = now_s(frame.rgb.device)
-    proxy = kept(reconstruct(frame.mask, frame.cameras, bounds, config.hull))
+    proxy = to_own_pages(reconstruct(frame.mask, frame.cameras, bounds, config.hull))
     return Observation(frame, proxy, ms_since(start, frame.rgb.device))
 
 
@@ -150,7 +150,7 @@ def mend_view(
         config: the pipeline's.
         exclude: names of cameras whose images must not be used for this viewer.
     """
-    view, rendering_ms = view_of(observation, target, config, state.chosen, exclude)
+    view, rendering_ms = view_of(observation, target, config, state.source_views, exclude)
     return complete_view(view, observation, state, inpainter, config, exclude, rendering_ms)
 
 
@@ -204,7 +204,7 @@ def complete_view(
 
     history = (*past, observation) if config.history else ()
     stages = StageMs(observation.geometry_ms, rendering_ms, inpainting_ms)
-    return MendedView(completed, StreamState(inpainter_state, view.chosen, history), stages)
+    return MendedView(completed, StreamState(inpainter_state, view.source_views, history), stages)
 
 
 def now_s(device: torch.device) -> float:

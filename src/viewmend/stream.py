@@ -13,9 +13,9 @@ from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.context import ContextCache, ContextFrame, window_times
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.protocol import Source, State, ViewInpainter
-from viewmend.keeping import kept
+from viewmend.own_pages import to_own_pages
 from viewmend.pipeline import (
-    DepthGiver,
+    DepthProvider,
     Observation,
     PipelineConfig,
     StageMs,
@@ -30,7 +30,7 @@ from viewmend.views import CompletedView, IncompleteView, MultiViewFrame
 
 
 @dataclass(frozen=True, kw_only=True)
-class Effort:
+class RenderQuality:
     """How much work one view may cost; the default is all that the model was trained with."""
 
     mend: bool = True
@@ -48,7 +48,7 @@ class Viewer:
     """What one viewer carries from one view to the next: a value, which `Stream.view` gives anew."""
 
     inpainter: State
-    chosen: tuple[str, ...] = ()
+    source_views: tuple[str, ...] = ()
     """The cameras of the last view."""
 
 
@@ -118,7 +118,7 @@ class Stream:
         """The times at hand, in order."""
         return tuple(sorted(self._moments))
 
-    def push(self, frame: MultiViewFrame, geometry: DepthGiver | None = None) -> Observation:
+    def push(self, frame: MultiViewFrame, geometry: DepthProvider | None = None) -> Observation:
         """Take in what the cameras saw at one time; a time that is at hand already stays as it is.
 
         Times may come in any order and with gaps. `geometry` replaces the visual hull: anything that knows its depth
@@ -153,7 +153,7 @@ class Stream:
         target: Cameras,
         viewer: Viewer | None = None,
         time: int | None = None,
-        effort: Effort | None = None,
+        effort: RenderQuality | None = None,
         exclude: Sequence[str] = (),
     ) -> StreamView:
         """Render one novel view and fill what is missing in it.
@@ -170,30 +170,30 @@ class Stream:
         """
         moment = self._moment(time)
         viewer = viewer or self.viewer()
-        view, rendering_ms = view_of(moment.observation, target, self.config, viewer.chosen, exclude)
-        return self._complete(view, moment, viewer, effort or Effort(), exclude, rendering_ms)
+        view, rendering_ms = view_of(moment.observation, target, self.config, viewer.source_views, exclude)
+        return self._complete(view, moment, viewer, effort or RenderQuality(), exclude, rendering_ms)
 
     def mend(
         self,
         view: IncompleteView,
         viewer: Viewer | None = None,
-        effort: Effort | None = None,
+        effort: RenderQuality | None = None,
         exclude: Sequence[str] = (),
     ) -> StreamView:
         """Fill what is missing in a view that any renderer made of a time that was pushed.
 
-        Name in `view.chosen` the cameras that coloured it, and in `view.nearest` all that may be looked at, the
-        closest first: holes are read from them.
+        Name in `view.source_views` the cameras that coloured it, and in `view.candidate_views` all that may be looked
+        at, the closest first: holes are read from them.
 
         Raises:
             ValueError: the view's time is not at hand, or it names cameras that are not in the frame.
         """
         moment = self._moment(view.time)
-        unknown = sorted({*view.chosen, *view.nearest} - set(moment.observation.frame.cameras.names))
+        unknown = sorted({*view.source_views, *view.candidate_views} - set(moment.observation.frame.cameras.names))
         if unknown:
             known = list(moment.observation.frame.cameras.names)
             raise ValueError(f"expected a view of cameras among {known}, got {unknown}; correct chosen and nearest")
-        return self._complete(view, moment, viewer or self.viewer(), effort or Effort(), exclude, 0.0)
+        return self._complete(view, moment, viewer or self.viewer(), effort or RenderQuality(), exclude, 0.0)
 
     def _moment(self, time: int | None) -> _Moment:
         if not self._moments or (time is not None and time not in self._moments):
@@ -205,24 +205,24 @@ class Stream:
         view: IncompleteView,
         moment: _Moment,
         viewer: Viewer,
-        effort: Effort,
+        effort: RenderQuality,
         exclude: Sequence[str],
         rendering_ms: float,
     ) -> StreamView:
         if not effort.mend:
             stages = StageMs(moment.observation.geometry_ms, rendering_ms, 0.0)
-            return StreamView(CompletedView(view, view.rgb), replace(viewer, chosen=view.chosen), stages)
+            return StreamView(CompletedView(view, view.rgb), replace(viewer, source_views=view.source_views), stages)
         moments = [*self._past(view.time, effort), moment]
         encoding_ms = self._encode(view, moments if effort.context_times != 0 else [])
         frames = {(f.name, f.time): f for m in moments for f in m.encoded.values()}
         before = replace(viewer.inpainter, cache=ContextCache(frames if effort.context_times != 0 else {}))
-        state = StreamState(before, viewer.chosen, tuple(m.observation for m in moments[:-1]))
+        state = StreamState(before, viewer.source_views, tuple(m.observation for m in moments[:-1]))
         inpainter = _WithEffort(self.inpainter, effort)
         mended = complete_view(view, moment.observation, state, inpainter, self.config, exclude, rendering_ms)
         for m in moments:
             self._moments.move_to_end(m.observation.frame.time)
         self._forget()
-        after = Viewer(replace(mended.state.inpainter, cache=ContextCache()), view.chosen)
+        after = Viewer(replace(mended.state.inpainter, cache=ContextCache()), view.source_views)
         return StreamView(mended.completed, after, mended.stage_ms, encoding_ms)
 
     @torch.no_grad()
@@ -236,10 +236,10 @@ class Stream:
         fresh = [(m, views) for m, views in missing if views is not None]
         encoded = self.inpainter.encode_contexts([views for _, views in fresh])
         for (moment, _), frames in zip(fresh, encoded, strict=True):
-            moment.encoded.update({frame.name: kept(frame) for frame in frames})
+            moment.encoded.update({frame.name: to_own_pages(frame) for frame in frames})
         return ms_since(start, view.rgb.device)
 
-    def _past(self, time: int, effort: Effort) -> list[_Moment]:
+    def _past(self, time: int, effort: RenderQuality) -> list[_Moment]:
         """The moments before `time` that may be context, in order of time."""
         if isinstance(self.inpainter, Inpainter):
             window = window_times(time, self.inpainter.config)[: effort.context_times]
@@ -258,7 +258,7 @@ class Stream:
 class _WithEffort:
     """An inpainter that does as much as it is asked to; inpainters other than ours stay as they are."""
 
-    def __init__(self, inpainter: ViewInpainter, effort: Effort) -> None:
+    def __init__(self, inpainter: ViewInpainter, effort: RenderQuality) -> None:
         self._inpainter = inpainter
         self._effort = effort
 
@@ -276,7 +276,7 @@ class _WithEffort:
     def _without_context(self, inpainter: Inpainter, view: IncompleteView, source: Source) -> CompletedView:
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb)
-        around = view.around(inpainter.config.rays)
+        around = view.closest_views(inpainter.config.rays)
         nearby = source(view.time, around) if around else None
         if inpainter.config.prefill:
             return inpainter.first_fill(view, nearby)

@@ -103,20 +103,20 @@ class IncompleteView:
     """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where F is right."""
     depth: Float[Tensor, "height width"]
     """z-depth of the proxy, metres; 0 where there is none."""
-    chosen: tuple[str, ...]
+    source_views: tuple[str, ...]
     """Names of the cameras that coloured the view."""
     weights: Float[Tensor, "chosen height width"]
     """Share of each chosen camera in each pixel; the sum is 1 where a pixel is coloured, else 0."""
     time: int
-    nearest: tuple[str, ...] = ()
+    candidate_views: tuple[str, ...] = ()
     """Names of all cameras that an inpainter may look at, the closest first; () where the renderer does not say."""
     silhouettes: Silhouettes | None = None
     """The masks of these cameras at the view's time: they say more exactly than the proxy whether a pixel shows the
     subject at all. None where the renderer does not say."""
 
-    def around(self, count: int) -> tuple[str, ...]:
+    def closest_views(self, count: int) -> tuple[str, ...]:
         """Names of this many cameras: the chosen ones, then the closest others."""
-        return tuple(dict.fromkeys((*self.chosen, *self.nearest)))[:count]
+        return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
 
 
 @dataclass(frozen=True)

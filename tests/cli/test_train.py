@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from viewmend.capture.plain_writer import write_capture
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.cli import main
 from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
 from viewmend.inpainting.config import small as small_model
 from viewmend.inpainting.inpainter import Inpainter
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.sample_files import read_shard
 
 MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, rays=3)

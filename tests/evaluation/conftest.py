@@ -4,11 +4,11 @@ from dataclasses import fields
 
 import pytest
 
-from viewmend.capture.studio.stage import StudioConfig
 from viewmend.evaluation.cells import Cell, CellKey
 from viewmend.evaluation.frame_scores import FrameScores
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scenes import StudioScene
+from viewmend.studio.stage import StudioConfig
 
 ORIGIN = Provenance("0", "abc", "3", "2", "cpu", 1, 1, 0.0)
 

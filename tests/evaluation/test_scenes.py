@@ -71,12 +71,12 @@ def test_the_left_out_camera_is_none_of_the_inputs_and_true_motion_explains_the_
     for frame in (first, second):
         assert frame.truth.cameras.names == (scene.held,) and scene.held not in frame.inputs.cameras.names
         assert frame.inputs.depth is None, "methods may not see true geometry"
-    assert first.came_from_px is None and second.came_from_px is not None
+    assert first.backward_flow_px is None and second.backward_flow_px is not None
     mask = second.truth.mask[0] > 127
-    seen = second.came_from_px.isfinite().all(-1)
+    seen = second.backward_flow_px.isfinite().all(-1)
     assert (seen & mask).sum() > 0.7 * mask.sum() and not (seen & ~mask).sum() > 0.05 * mask.sum()
     now, before = (f.truth.rgb[0].float() / 255 for f in (second, first))
-    assert warp_error(now, before, second.came_from_px, mask) < 0.03
+    assert warp_error(now, before, second.backward_flow_px, mask) < 0.03
 
 
 def test_held_camera_is_spread_over_the_rig():

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.geometry.alignment import WORTH_MOVING, shared_offset
 from viewmend.geometry.hull import HullConfig
+from viewmend.studio.stage import Studio, StudioConfig
 
 HULL = HullConfig(resolution=96)
 

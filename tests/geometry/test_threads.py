@@ -6,7 +6,7 @@ import threading
 import pytest
 import torch
 
-from viewmend.geometry.threads import share
+from viewmend.geometry.threads import parallel_for
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def test_every_item_is_worked_on_once(two_threads, count):
     def work(item: int) -> None:
         done[item] += 1
 
-    share(work, count)
+    parallel_for(work, count)
     assert done == [1] * count
 
 
@@ -34,14 +34,14 @@ def test_what_fails_is_raised_once_all_have_ended(two_threads):
             raise ValueError("three")
 
     with pytest.raises(ValueError, match="three"):
-        share(work, 8)
+        parallel_for(work, 8)
 
 
 def test_callers_may_be_many_and_within_one_another(two_threads):
     sums = []
 
     def outer(item: int) -> None:
-        share(lambda n: sums.append(n), 5)
+        parallel_for(lambda n: sums.append(n), 5)
 
     threads = [threading.Thread(target=share, args=(outer, 6)) for _ in range(4)]
     for thread in threads:
@@ -54,7 +54,7 @@ def test_callers_may_be_many_and_within_one_another(two_threads):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_forked_child_has_threads_of_its_own(two_threads):
-    share(lambda n: None, 4)
+    parallel_for(lambda n: None, 4)
     child = os.fork()
     if child == 0:
         done = [0] * 4
@@ -62,6 +62,6 @@ def test_a_forked_child_has_threads_of_its_own(two_threads):
         def work(item: int) -> None:
             done[item] += 1
 
-        share(work, 4)
+        parallel_for(work, 4)
         os._exit(0 if done == [1] * 4 else 1)
     assert os.waitpid(child, 0)[1] == 0

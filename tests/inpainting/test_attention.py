@@ -10,7 +10,7 @@ from reference.attention_twin import attend_twin, rotate_twin, transformer_twin
 from viewmend.inpainting import attention, rope
 from viewmend.inpainting.attention import attend, attend_and_sum, attend_weighted
 from viewmend.inpainting.pruning import most_attended, straight_through
-from viewmend.inpainting.transformer import Placed, Transformer
+from viewmend.inpainting.transformer import TokenPositions, Transformer
 
 SCALE = 0.3
 
@@ -137,7 +137,7 @@ def test_the_transformer_equals_its_twin(changes, top_k, grad, rng):
     places = [torch.rand(2, n, 3, generator=rng) for n in (3, 5)]
     steps = [torch.rand(2, n, 3, generator=rng) * 6 for n in (3, 5)]
     present = [torch.arange(n) < torch.tensor(c)[:, None] for n, c in ((3, asks), (5, counts))]
-    at, context_at = (Placed(*x) for x in zip(places, steps, present, strict=True))
+    at, context_at = (TokenPositions(*x) for x in zip(places, steps, present, strict=True))
     with torch.set_grad_enabled(grad):
         KV = net.project_context(R.flatten(0, 1)).unflatten(2, (2, 5))
         fast = net(P, at, KV, context_at, top_k)

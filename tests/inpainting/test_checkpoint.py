@@ -9,7 +9,7 @@ import pytest
 import torch
 from inpainting.plates import Rig, tiny, view
 
-from viewmend import whole_files
+from viewmend import atomic_writes
 from viewmend.inpainting import checkpoint
 from viewmend.inpainting.checkpoint import (
     DamagedCheckpointError,
@@ -108,7 +108,7 @@ def test_nothing_half_written(saved, monkeypatch):
         path.write_bytes(b"half")
         raise OSError("no space left")
 
-    monkeypatch.setattr(whole_files, "save_file", break_off)
+    monkeypatch.setattr(atomic_writes, "save_file", break_off)
     with pytest.raises(OSError, match="no space"):
         save_inpainter(tiny(1), saved, "")
     assert (saved / "model.safetensors").read_bytes() == before

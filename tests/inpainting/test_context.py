@@ -69,7 +69,7 @@ def test_only_what_is_missing_is_asked_for():
     _, state = net.step(view(8), rig, net.initial_state())
     assert rig.asked == [(t, NAMES) for t in window_times(8, net.config)]
     rig.asked.clear()
-    other = replace(view(8), chosen=("left", "third"))
+    other = replace(view(8), source_views=("left", "third"))
     _, state = net.step(other, rig, state)
     now, *past = rig.asked
     assert now == (8, ("third", "left")), "what is cached is asked for where rays are read"

@@ -91,4 +91,4 @@ def test_the_views_own_complete_patches_join_the_context_where_they_are():
     for place, is_input in zip(target.places.tolist(), target.incomplete.tolist(), strict=True):
         rows, cols = slice(place[1] * 16, place[1] * 16 + 28), slice(place[2] * 16, place[2] * 16 + 28)
         assert bool((incomplete.error[rows, cols] > 0).any()) == is_input
-    assert set(NAMES) == set(incomplete.chosen)
+    assert set(NAMES) == set(incomplete.source_views)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import torch
 from inpainting.plates import Rig, camera, look, view
 
-from viewmend.inpainting.prefill import fill
+from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.inpainting.reprojection_fill import ReprojectionFill
 
 
 def test_it_finds_the_true_colours_where_a_camera_sees_the_surface():
-    incomplete, inpainter = replace(view(5), nearest=("third", "left", "right")), ReprojectionFill()
+    incomplete, inpainter = replace(view(5), candidate_views=("third", "left", "right")), ReprojectionFill()
     assert isinstance(inpainter, ViewInpainter)
     completed, _ = inpainter.step(incomplete, Rig(), inpainter.initial_state())
     truth, mask = look(camera("novel"), 5)

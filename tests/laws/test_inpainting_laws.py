@@ -100,7 +100,7 @@ def test_order_of_cameras_changes_nothing():
             net([view(3)], [frames[::step]], nearby=[context(3, NAMES[::step])])[0].completed for step in (1, -1)
         )
     assert close(one, other)
-    swapped = replace(view(5), chosen=NAMES[::-1])
+    swapped = replace(view(5), source_views=NAMES[::-1])
     assert close(net.step(swapped, Rig(), net.initial_state())[0].rgb, mend(net, 5))
 
 

@@ -12,7 +12,7 @@ class Device:
     """What views take on some machine; its own cost model, unlike the controller's."""
 
     def __init__(self, shared=10.0, pixels=20.0, filling=200.0, context_share=0.6, noise=0.0, seed=0):
-        self.shared, self.pixels, self.filling, self.context_share = shared, pixels, filling, context_share
+        self.shared, self.pixels, self.relative_cost, self.context_share = shared, pixels, filling, context_share
         self.noise, self.chance = noise, random.Random(seed)
 
     def frame(self, level: Level) -> FrameMs:
@@ -20,8 +20,8 @@ class Device:
         size = 0.3 + 0.7 * level.scale**2
         context = 1 - self.context_share * (1 - level.context_times / 7) if level.context_times else 0.25
         by = 1 + self.noise * self.chance.uniform(-1, 1)
-        encoding = 0.2 * self.filling * by if level.context_times else None
-        filling = 0.8 * self.filling * size * context * by
+        encoding = 0.2 * self.relative_cost * by if level.context_times else None
+        filling = 0.8 * self.relative_cost * size * context * by
         return FrameMs(self.shared * by, self.pixels * level.scale**2 * by, filling, encoding)
 
 
@@ -31,7 +31,7 @@ def run(budget: Budget, device: Device, frames: int) -> tuple[list[int], list[fl
         ms = device.frame(budget.level)
         indices.append(budget.index)
         taken.append(ms.total)
-        budget.took(budget.level, ms)
+        budget.record(budget.level, ms)
     return indices, taken
 
 
@@ -79,14 +79,14 @@ def test_a_device_that_slows_down_is_followed_at_once_and_recovery_is_found():
 def test_one_slow_frame_changes_nothing():
     budget, device = Budget(100.0), Device(filling=50)
     run(budget, device, 200)
-    budget.took(budget.level, FrameMs(900.0, 30.0, 50.0))
+    budget.record(budget.level, FrameMs(900.0, 30.0, 50.0))
     assert budget.level == FULL
     run(budget, device, 50)
     assert budget.level == FULL
 
 
 def test_the_ladder_grows_in_work_and_its_top_is_all():
-    work = [level.filling for level in LADDER]
+    work = [level.relative_cost for level in LADDER]
     assert work == sorted(work) and LADDER[-1] == Level(1.0, 7, None)
     assert Budget(100.0).predicted_ms(FULL) == 0
 

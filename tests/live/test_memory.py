@@ -23,7 +23,7 @@ def test_what_lies_between_things_that_live_long_is_handed_back(monkeypatch):
     before = resident_mb()
     del blocks
     assert resident_mb() > before - 50
-    assert memory.Tidying().when_due(idle=True)
+    assert memory.HeapTrimmer().when_due(idle=True)
     assert resident_mb() < before - 200
     assert sum(map(len, kept)) == 150 * 60_000
 
@@ -31,7 +31,7 @@ def test_what_lies_between_things_that_live_long_is_handed_back(monkeypatch):
 def test_a_little_is_kept_and_busy_times_are_left_alone(monkeypatch):
     monkeypatch.setattr(memory, "SLACK_BYTES", sys.maxsize)
     monkeypatch.setattr(memory, "IDLE_S", 0.0)
-    tidying = memory.Tidying()
+    tidying = memory.HeapTrimmer()
     assert not tidying.when_due(idle=True)
     monkeypatch.setattr(memory, "SLACK_BYTES", 50e6)
     assert not tidying.when_due(idle=False)

@@ -4,10 +4,10 @@ import pytest
 import torch
 from reference.ball import camera_at, ring
 
-from viewmend.capture.studio.rigs import orbit
 from viewmend.geometry.cameras import project
 from viewmend.live.poses import cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
+from viewmend.studio.rigs import orbit
 
 CENTER = torch.tensor([0.1, 0.2, 0.3])
 FRAME = rig_frame(ring(4), torch.zeros(3), None)

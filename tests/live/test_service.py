@@ -11,9 +11,9 @@ from viewmend.live.clock import Span
 from viewmend.live.frames import Rig, SourceStatus
 from viewmend.live.poses import rig_frame, view_camera
 from viewmend.live.protocol import Camera
-from viewmend.live.renderer import Ask, Rendered, Renderer
+from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
-from viewmend.stream import Effort, Viewer
+from viewmend.stream import RenderQuality, Viewer
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
 CAMERA = view_camera(Camera(), FRAME, (16, 16))
@@ -46,7 +46,7 @@ class Drawing(Renderer):
     def render(self, ask, viewer):
         if ask.effort.top_k == 13:
             raise RuntimeError("bad luck")
-        return Rendered(ask.time, (), Viewer(State()), 0.0, 0.0, 0.0, 0.0)
+        return RenderResult(ask.time, (), Viewer(State()), 0.0, 0.0, 0.0, 0.0)
 
 
 class Eager:
@@ -61,7 +61,7 @@ class Eager:
     def due(self, now, scene):
         if self.bad:
             raise KeyError("mine")
-        return Ask(0, (CAMERA,), Effort(top_k=self.top_k))
+        return RenderRequest(0, (CAMERA,), RenderQuality(top_k=self.top_k))
 
     def show(self, ask, rendered):
         self.log.append(self.name)

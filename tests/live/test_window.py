@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.live.poses import rig_frame, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.live.window import Window, window_of
-from viewmend.stream import Effort, Stream
+from viewmend.stream import RenderQuality, Stream
+from viewmend.studio.stage import Studio, StudioConfig
 
-PLAIN = Effort(context_times=0)
+PLAIN = RenderQuality(context_times=0)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def test_a_view_without_holes_shown_keeps_its_identity(scene):
     camera = view_camera(Camera(azimuth=frame.azimuth), frame, (200, 160))
     window = window_of(proxy.mesh.vertices, camera)
     assert window is not None
-    part = window.widened(stream.view(window.of(camera), effort=Effort(mend=False)).completed, camera)
+    part = window.widened(stream.view(window.of(camera), effort=RenderQuality(mend=False)).completed, camera)
     assert part.rgb is part.view.rgb
 
 

@@ -1,4 +1,4 @@
-"""Slow, obvious twins of viewmend.inpainting.rays: one pixel, one point, one camera at a time."""
+"""Slow, obvious twins of viewmend.inpainting.ray_sampling: one pixel, one point, one camera at a time."""
 
 import numpy as np
 from reference.blend_twin import unit
@@ -49,7 +49,7 @@ def look(point, viewer, view, nearby, index, size_m, near, far, outline, patch):
     behind = (z - surface / coverage) / size_m if coverage > 0.3 else 0.0
     centre = -pose[:3, :3].T @ pose[:3, 3]
     cosine = unit(centre - point) @ unit(viewer - point)
-    chosen = camera.names[0] in view.chosen
+    chosen = camera.names[0] in view.source_views
     masks, proxy = frame.mask.double().numpy() / 255, (nearby.depth.numpy() > 0).astype(float)
     size_px = float(np.sqrt(masks.sum((1, 2)).mean()))
     side, half = max(1, round(outline * size_px)), max(1, round(patch / 2 * size_px))

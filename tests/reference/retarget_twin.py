@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from viewmend.capture.studio.bvh import Motion
-from viewmend.capture.studio.gltf import Character
-from viewmend.capture.studio.skeletons import find_parts
+from viewmend.studio.bvh import Motion
+from viewmend.studio.gltf import Character
+from viewmend.studio.skeletons import find_parts
 
 LIMB_ENDS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
 

@@ -1,4 +1,4 @@
-"""Rendered views of an analytic ball."""
+"""RenderResult views of an analytic ball."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def test_what_travels_is_consistent(selection):
     assert view.rgb[:, coloured].min() > 0.02
     torch.testing.assert_close(view.weights.sum(0), coloured.float())
     assert torch.equal(view.mask > 0, view.depth > 0)
-    assert view.time == 7 and set(view.chosen) == set(cameras.names)
+    assert view.time == 7 and set(view.source_views) == set(cameras.names)
 
 
 def test_holes_are_where_the_weights_end():
@@ -60,10 +60,10 @@ def test_excluded_cameras_leave_no_trace(selection):
     marked = frame.rgb.clone()
     marked[1] = 255
     with_it = render_view(replace(frame, rgb=marked), BALL, target, config)
-    assert "c1" in with_it.chosen
+    assert "c1" in with_it.source_views
     without = render_view(replace(frame, rgb=marked), BALL, target, config, ("c1", "c2", "c0"), exclude=("c1",))
     alone = render_view(frame.without(["c1"]), BALL, target, config)
-    assert set(without.chosen) == set(alone.chosen)
+    assert set(without.source_views) == set(alone.source_views)
     torch.testing.assert_close(without.rgb, alone.rgb)
     with pytest.raises(ValueError, match="all of them excluded"):
         render_view(frame, BALL, target, config, exclude=frame.cameras.names)
@@ -74,4 +74,4 @@ def test_an_empty_proxy_gives_an_empty_view(selection):
     empty = replace(BALL, mesh=Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32)), normals=torch.zeros(0, 3))
     view = render_view(photograph(ring(4)), empty, camera_at(5, "t"), RenderConfig(selection=selection))
     assert view.mask.sum() == 0 and view.error.sum() == 0 and view.rgb.sum() == 0
-    assert view.chosen[0] == "c0"
+    assert view.source_views[0] == "c0"

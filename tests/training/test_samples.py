@@ -7,11 +7,11 @@ from random import Random
 import pytest
 import torch
 
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.geometry.hull import HullConfig
 from viewmend.rendering.view import RenderConfig
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes, reduced
-from viewmend.training.feed import SampleFeed, samples_in_order
+from viewmend.training.replay import SampleReplay, samples_in_order
 from viewmend.training.sample_files import (
     ShardError,
     ShardScenes,
@@ -48,7 +48,7 @@ def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
     first, second = samples
     assert first is not None and second is not None
     assert torch.equal(first.view.rgb, second.view.rgb) and torch.equal(first.view.error, second.view.error)
-    assert held not in first.view.chosen
+    assert held not in first.view.source_views
     assert all(held not in views.frame.cameras.names for views in first.context)
 
 
@@ -104,10 +104,10 @@ def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
     for (scene, number, sample), (other_scene, other_number, other) in zip(first, helped, strict=False):
         assert (scene, number) == (other_scene, other_number) and same(sample, other)
     helped.close()
-    feed = SampleFeed(source, "7", fresh=1, buffer=3, workers=0)
+    feed = SampleReplay(source, "7", fresh=1, buffer=3, workers=0)
     batches = [feed.batch(step, 2) for step in range(3)]
     assert [len(batch) for batch in batches] == [1, 2, 2]
-    again = SampleFeed(source, "7", fresh=1, buffer=3, workers=0, start=feed.position)
+    again = SampleReplay(source, "7", fresh=1, buffer=3, workers=0, start=feed.position)
     for one, other in zip(feed.batch(3, 2), again.batch(3, 2), strict=True):
         assert same(one, other)
     assert feed.position == again.position
@@ -145,7 +145,7 @@ class Empty:
 
 def test_scenes_without_holes_are_an_error_not_a_wait():
     with pytest.raises(ValueError, match="got none in 100 scenes"):
-        SampleFeed(Empty(), "0", 1, 3, 0).batch(0, 1)
+        SampleReplay(Empty(), "0", 1, 3, 0).batch(0, 1)
 
 
 def test_samples_come_back_from_disk_bit_for_bit_and_damage_is_noticed(plan, tmp_path):
@@ -173,7 +173,7 @@ def test_captures_are_scenes_whose_truth_is_the_camera_left_out(studio, plan):
     assert samples and all(same(a, b) for a, b in zip(samples, scenes.scene(0), strict=True))
     for sample in samples:
         held = sample.view.camera.names[0]
-        assert max(sample.truth.shape) == 64 and held not in sample.view.chosen
+        assert max(sample.truth.shape) == 64 and held not in sample.view.source_views
         seen = reduced(studio.read(sample.view.time), 64).select([held])
         expected = (seen.rgb[0].float() * (seen.mask[0].float() / 255)).round().to(torch.uint8)
         assert torch.equal(sample.truth, expected)

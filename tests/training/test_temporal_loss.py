@@ -41,7 +41,7 @@ def seen(camera: Cameras, holes: tuple[slice, slice] | None, pushed_m: float = 0
         mask=mask,
         error=error,
         depth=depth.view(height, width) * mask,
-        chosen=(),
+        source_views=(),
         weights=torch.zeros(0, height, width),
         time=0,
     )

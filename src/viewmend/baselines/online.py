@@ -162,7 +162,7 @@ class _Looker:
         if self.config.framing != "mul":
             return own
         if time not in self.seen:
-            views = self.source(time, self.view.chosen) if self.view.chosen else None
+            views = self.source(time, self.view.source_views) if self.view.source_views else None
             self.seen[time] = None if views is None else (views, foreground(views))
         seen = self.seen[time]
         if seen is None:

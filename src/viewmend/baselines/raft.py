@@ -58,7 +58,7 @@ class Raft(nn.Module):
         start = torch.stack([x, y])[None].to(pair)
         flow = torch.zeros_like(start)
         for _ in range(UPDATES):
-            hidden, step = self.update_block(hidden, context, looked_up(pyramid, start + flow), flow)
+            hidden, step = self.update_block(hidden, context, ray_batch(pyramid, start + flow), flow)
             flow = flow + step
         predictor = self.mask_predictor
         assert isinstance(predictor.convrelu, nn.Module) and isinstance(predictor.conv, nn.Module)
@@ -89,7 +89,7 @@ def correlations(
     return levels
 
 
-def looked_up(
+def ray_batch(
     pyramid: Sequence[Float[Tensor, "place 1 _rows _cols"]], at: Float[Tensor, "1 2 rows cols"]
 ) -> Float[Tensor, "1 channel rows cols"]:
     """Correlations around the place `at` (x, y) of each place: level by level, columns of the square first."""

@@ -19,8 +19,8 @@ from torch.nn.functional import max_pool2d
 from viewmend.baselines.diffusion_fill import find_diffusion
 from viewmend.baselines.raft import load_raft
 from viewmend.baselines.rgvi_flow import FlowMap, Image, dis_flow, disagreeing, pull
+from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
 from viewmend.metrics.weights import find_weights, known_weights
 from viewmend.views import CompletedView, IncompleteView

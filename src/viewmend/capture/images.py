@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from viewmend.atomic_writes import write_atomically
 from viewmend.capture.errors import CaptureError
-from viewmend.whole_files import write_whole
 
 DEPTH_UNITS_PER_M = 1000
 """Depth is stored in whole millimetres, 16 bit."""
@@ -147,4 +147,4 @@ def _encode(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
             f"{path}: expected an image that the format can hold, got {image.shape} {image.dtype}; use .png"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda beside: beside.write_bytes(data.tobytes()))
+    write_atomically(path, lambda beside: beside.write_bytes(data.tobytes()))

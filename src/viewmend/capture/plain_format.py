@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.json_fields import Fields, shown
+from viewmend.geometry.cameras import is_intrinsics
 from viewmend.geometry.rigid import is_rotation
 
 FORMAT = "plain-capture/1"
@@ -168,8 +169,7 @@ def _intrinsics(entry: Fields) -> Float64[np.ndarray, "3 3"]:
         raise entry.wrong(
             "K", "an invertible matrix", f"a singular one, {shown(K.tolist())}", "give focal lengths in pixels"
         )
-    upper = K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]
-    if not upper or K[0, 0] < 0 or K[1, 1] < 0:
+    if not bool(is_intrinsics(torch.from_numpy(K))):
         expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
         raise entry.wrong("K", expected, shown(K.tolist()), "bring the calibration to OpenCV's axes and form")
     return K

@@ -94,7 +94,7 @@ def _make_samples(options: Options, recipe: "Recipe") -> None:
     from itertools import islice
 
     from viewmend.cli.console import track
-    from viewmend.training.feed import samples_in_order
+    from viewmend.training.replay import samples_in_order
     from viewmend.training.sample_files import write_shards
     from viewmend.training.sources import scene_source
 

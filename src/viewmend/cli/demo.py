@@ -47,11 +47,11 @@ def run(options: Options) -> int:
     if wrong:
         raise ValueError(f"expected a positive --{wrong[0]}, got {getattr(options, wrong[0])}; see --help")
     from viewmend.capture.prefetch import prefetch
-    from viewmend.capture.studio.stage import Studio, StudioConfig
     from viewmend.cli.console import print_json, say, track
     from viewmend.cli.demo_output import write_demo
     from viewmend.cli.mend_summary import MendSummary
     from viewmend.cli.mending import Mender, load_named
+    from viewmend.studio.stage import Studio, StudioConfig
 
     inpainter = load_named(options.model, None, "cpu")
     config = StudioConfig(
@@ -77,7 +77,7 @@ def run(options: Options) -> int:
 
 def _path(options: Options) -> "Cameras":
     """The camera that moves: around the subject and back, a little above the ring."""
-    from viewmend.capture.studio.rigs import orbit
+    from viewmend.studio.rigs import orbit
 
     phases = [n / max(1, options.frames) for n in range(options.frames)]
     azimuths = [SWEEP_RAD * (0.5 - 0.5 * math.cos(2 * math.pi * phase)) for phase in phases]

@@ -110,12 +110,12 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evalua
 
 def write_report(options: RunOptions, found: Evaluated) -> None:
     """OUT/report.md, .csv, .json and .html, and OUT/sheets/."""
+    from viewmend.atomic_writes import write_atomically
     from viewmend.cli.console import say
     from viewmend.evaluation.report_data import report_csv, report_json
     from viewmend.evaluation.report_markdown import markdown
     from viewmend.evaluation.report_page import page
     from viewmend.evaluation.report_sheets import write_sheets
-    from viewmend.whole_files import write_whole
 
     report, cells, store = found.report, found.cells, found.store
     if not cells and (options.out / "report.json").exists():
@@ -123,7 +123,7 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
     forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
     forms["html"] = page(report, cells, store, options.shown, options.video)
     for name, text in forms.items():
-        write_whole(options.out / f"report.{name}", partial(Path.write_text, data=text, encoding="utf-8"))
+        write_atomically(options.out / f"report.{name}", partial(Path.write_text, data=text, encoding="utf-8"))
     write_sheets(cells, store, options.out / "sheets")
     say(f"wrote {options.out}")
 

@@ -112,7 +112,7 @@ def sheet_row(step: MendStep) -> list[Tile]:
     view, rgb = step.completed.view, step.completed.rgb
     box = _box(view.mask > 0)
     tiles = []
-    for name in view.chosen:
+    for name in view.source_views:
         own = step.frame.select([name])
         assert own.mask is not None, "frames without masks are refused"
         tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > 127)]))

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.capture.studio.rigs import orbit
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
 from viewmend.geometry.upright import upright
+from viewmend.studio.rigs import orbit
 
 FULL_TURN_GAP_RAD = math.radians(130)
 """A rig with a larger gap between neighbours does not stand all around: the orbit swings over what it sees."""
@@ -102,7 +102,7 @@ def read_path(file: Path, like: Cameras) -> Cameras:
     K, size = first.K[0].cpu(), first.size_px[0].cpu()
     if "K" in given:
         K = _matrices(file, [given["K"]], "K", (3, 3))[0]
-        if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and K[2].tolist() == [0, 0, 1]):
+        if not bool(is_intrinsics(K)):
             raise ValueError(
                 f"{file}: expected 'K' as [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, got "
                 f"{given['K']}; correct it"

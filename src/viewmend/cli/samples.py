@@ -42,7 +42,7 @@ def run(options: Options) -> int:
 
     from viewmend.cli.console import say, track
     from viewmend.cli.train import chosen_recipe
-    from viewmend.training.feed import samples_in_order
+    from viewmend.training.replay import samples_in_order
     from viewmend.training.sample_files import write_shards
     from viewmend.training.sources import training_source
 

@@ -138,7 +138,7 @@ def _studio(options: Options) -> Callable[[], "CaptureSource"]:
     """Opens the studio; called on the thread that makes its frames, so that the page is there at once."""
 
     def open_studio() -> "CaptureSource":
-        from viewmend.capture.studio.stage import Studio, StudioConfig
+        from viewmend.studio.stage import Studio, StudioConfig
 
         config = StudioConfig(
             seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0

@@ -48,9 +48,9 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --{name} of at least {least[name]}, got {getattr(options, name)}; see --help")
     from viewmend.capture.errors import CaptureError
     from viewmend.capture.plain_writer import write_capture
-    from viewmend.capture.studio.imperfections import Imperfections
-    from viewmend.capture.studio.stage import Studio, StudioConfig
     from viewmend.cli.console import print_json, say, track
+    from viewmend.studio.imperfections import Imperfections
+    from viewmend.studio.stage import Studio, StudioConfig
 
     seeds = range(options.seed, options.seed + options.scenes)
     folders = [options.out / f"scene_{seed:05d}" for seed in seeds]

@@ -11,6 +11,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from viewmend.atomic_writes import write_atomically
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import read_rgb, write_image
 from viewmend.evaluation.film import FILM_FRAMES, Picture, frames_of
@@ -20,7 +21,6 @@ from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.scorers import KINDS, Features
-from viewmend.whole_files import write_whole
 
 PROTOCOL = 1
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
@@ -108,7 +108,7 @@ class CellStore:
             self._write_features(f"{cell.key.stem}.npz", run.features)
         values = asdict(replace(cell, features=None, true_features=None))
         text = json.dumps({name: values[name] for name in REMEMBERED}, indent=1, allow_nan=False) + "\n"
-        write_whole(self.folder / f"{cell.key.stem}.json", lambda path: path.write_text(text))
+        write_atomically(self.folder / f"{cell.key.stem}.json", lambda path: path.write_text(text))
 
     def save_scene(self, key: CellKey, run: SceneRun) -> None:
         """Remember what all methods of a scene share: rendered view, E, truth, and its videos' features."""
@@ -147,7 +147,7 @@ class CellStore:
             with path.open("wb") as file:
                 np.savez(file, **features)  # pyright: ignore[reportArgumentType]
 
-        write_whole(self.folder / name, write)
+        write_atomically(self.folder / name, write)
 
     def _read_features(self, name: str) -> Features | None:
         try:

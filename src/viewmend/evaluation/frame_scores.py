@@ -83,8 +83,8 @@ class TrueView:
     rgb: Float[Tensor, "3 height width"]
     """In [0, 1], black where there is no subject."""
     mask: Bool[Tensor, "height width"]
-    came_from_px: Float[Tensor, "height width 2"] | None
-    """See `temporal.came_from`."""
+    backward_flow_px: Float[Tensor, "height width 2"] | None
+    """See `temporal.backward_flow`."""
 
 
 @dataclass(frozen=True)
@@ -96,11 +96,11 @@ class Before:
     error: Float[Tensor, "height width"]
 
 
-def true_view(frame: MultiViewFrame, came_from_px: Float[Tensor, "height width 2"] | None) -> TrueView:
+def true_view(frame: MultiViewFrame, backward_flow_px: Float[Tensor, "height width 2"] | None) -> TrueView:
     """The truth of a frame of one view with a mask."""
     assert frame.mask is not None, "a held camera comes with its mask"
     mask = frame.mask[0]
-    return TrueView(frame.rgb[0].float() / 255 * (mask.float() / 255), mask >= FOREGROUND, came_from_px)
+    return TrueView(frame.rgb[0].float() / 255 * (mask.float() / 255), mask >= FOREGROUND, backward_flow_px)
 
 
 def score_frame(
@@ -170,7 +170,7 @@ def _temporal(completed: CompletedView, truth: TrueView, before: Before | None) 
     now, then, true_now, true_then = completed.rgb, before.completed, truth.rgb, before.truth
     found["change"] = change(now, then, now_or_then, ENOUGH_HOLE_PX)
     found["change_truth"] = change(true_now, true_then, now_or_then, ENOUGH_HOLE_PX)
-    if (moved := truth.came_from_px) is not None:
+    if (moved := truth.backward_flow_px) is not None:
         found["flicker"] = warp_error(now - true_now, then - true_then, moved, holes, ENOUGH_HOLE_PX)
         found["warp_error"] = warp_error(now, then, moved, holes, ENOUGH_HOLE_PX)
         found["warp_error_truth"] = warp_error(true_now, true_then, moved, holes, ENOUGH_HOLE_PX)

@@ -110,10 +110,10 @@ def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]
     for frame in scene.frames(settings.device):
         camera = frame.truth.cameras
         observation = observe(frame.inputs, frame.bounds, config)
-        chosen = () if last is None else last.view.chosen
+        chosen = () if last is None else last.view.source_views
         view, _ = view_of(observation, camera, config, chosen)
         holes = int((view.error > 0).sum())
-        last = _Moment(observation, view, true_view(frame.truth, frame.came_from_px), last, holes > most)
+        last = _Moment(observation, view, true_view(frame.truth, frame.backward_flow_px), last, holes > most)
         yield last
         most, last = max(most, holes), replace(last, before=None)
 
@@ -177,9 +177,9 @@ class _Stream:
             self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
             self._state = StreamState(self._inpainter.initial_state())
         # Depths that other methods asked for would be free for this one, and times depend on the list of methods.
-        mended = complete_view(view, moment.observation.apart(), self._state, self._inpainter, config)
+        mended = complete_view(view, moment.observation.with_own_cache(), self._state, self._inpainter, config)
         if not self._scores and mended.stage_ms.inpainting < SLOW_MS:
-            mended = complete_view(view, moment.observation.apart(), self._state, self._inpainter, config)
+            mended = complete_view(view, moment.observation.with_own_cache(), self._state, self._inpainter, config)
         rgb, before = mended.completed.rgb, None
         _check(rgb, view)
         if moment.before is not None and self._last is not None:

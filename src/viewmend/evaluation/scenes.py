@@ -11,10 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.studio.procedural import PerformerStyle, procedural_scene
-from viewmend.capture.studio.stage import Studio, StudioConfig
-from viewmend.evaluation.temporal import came_from
+from viewmend.evaluation.temporal import backward_flow
 from viewmend.geometry.bounds import Bounds
+from viewmend.studio.procedural import PerformerStyle, procedural_scene
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.views import MultiViewFrame
 
 FIRST_SEED = 10000
@@ -41,8 +41,8 @@ class SceneFrame:
     """What that camera saw (one view), with its mask."""
     bounds: Bounds | None
     """The volume that may hold the subject, None to find it."""
-    came_from_px: Float[Tensor, "height width 2"] | None = None
-    """Where in the previous true image each pixel's surface point was (`came_from`); None where nobody knows."""
+    backward_flow_px: Float[Tensor, "height width 2"] | None = None
+    """Where in the previous true image each pixel's surface point was (`backward_flow`); None where nobody knows."""
 
 
 @runtime_checkable
@@ -118,7 +118,7 @@ class StudioScene:
             source = None
             if before is not None and before.depth is not None:
                 now, then = (studio.scene(t).mesh for t in (time, time - 1))
-                source = came_from(now, then, before.depth[0], truth.cameras)
+                source = backward_flow(now, then, before.depth[0], truth.cameras)
             inputs = replace(frame.without([self.held]), depth=None)  # the truth: no method may look
             yield SceneFrame(inputs, truth, None, source)
             before = truth

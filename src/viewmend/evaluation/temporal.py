@@ -13,7 +13,7 @@ VISIBLE_M = 0.02
 """A surface point was seen if it lay at most this much behind the depth of the pixel it fell into."""
 
 
-def came_from(
+def backward_flow(
     now: Mesh, before: Mesh, depth_before: Float[Tensor, "height width"], camera: Cameras
 ) -> Float[Tensor, "height width 2"]:
     """Where each pixel's surface point was in the image of the time before, pixels; NaN where it was not seen.
@@ -38,7 +38,7 @@ def came_from(
 def warp_error(
     image: Float[Tensor, "channel height width"],
     before: Float[Tensor, "channel height width"],
-    came_from_px: Float[Tensor, "height width 2"],
+    backward_flow_px: Float[Tensor, "height width 2"],
     pixels: Bool[Tensor, "height width"],
     enough_px: int = 1,
 ) -> float | None:
@@ -47,11 +47,11 @@ def warp_error(
     Counted are those of `pixels` whose surface point was seen before; None where they are fewer than `enough_px`. The
     image before is sampled bilinearly, so the truth's own error is not 0: compare with it.
     """
-    counted = pixels & came_from_px.isfinite().all(-1)
+    counted = pixels & backward_flow_px.isfinite().all(-1)
     if int(counted.sum()) < enough_px:
         return None
     height, width = counted.shape
-    at = came_from_px[counted] * came_from_px.new_tensor([2 / width, 2 / height]) - 1
+    at = backward_flow_px[counted] * backward_flow_px.new_tensor([2 / width, 2 / height]) - 1
     warped = F.grid_sample(before[None], at[None, None], padding_mode="border", align_corners=False)[0, :, 0]
     return float((image[:, counted] - warped).abs().mean())
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from viewmend.geometry.rigid import invert_rigid
@@ -101,6 +101,12 @@ class Cameras:
         K[:, 1, 2] -= top
         size = torch.tensor([width, height], device=K.device).expand(len(self), 2).contiguous()
         return replace(self, K=K, size_px=size)
+
+
+def is_intrinsics(K: Float[Tensor, "*batch 3 3"]) -> Bool[Tensor, "*batch"]:
+    """Whether K is [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0."""
+    last = (K[..., 2, :] == K.new_tensor([0, 0, 1])).all(-1)
+    return (K[..., 0, 0] > 0) & (K[..., 1, 1] > 0) & (K[..., 1, 0] == 0) & last
 
 
 def concatenate_cameras(parts: Sequence[Cameras]) -> Cameras:

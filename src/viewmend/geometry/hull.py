@@ -11,7 +11,7 @@ from torch import Tensor
 from viewmend.geometry import _hull_torch
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
-from viewmend.geometry.threads import share
+from viewmend.geometry.threads import parallel_for
 
 TILES = 32
 """Tiles across a mask's shorter side, by which the search for the subject's box judges blocks of space."""
@@ -163,8 +163,8 @@ def _carve_cpu(
             P, lens, size, images, pool, BLOCK, sums, corner, voxel_m, needed, BLOCK, slab * BLOCK, out
         )
 
-    share(prepare, views)
-    share(carve, -(-shape[0] // BLOCK))
+    parallel_for(prepare, views)
+    parallel_for(carve, -(-shape[0] // BLOCK))
     return values
 
 
@@ -174,7 +174,7 @@ def _count_tiles(
     views, height, width = mask.shape
     sums = _tile_sums(views, height, width, tile)
     masks, out = mask.numpy(), sums.numpy()
-    share(lambda view: kernels.count_tiles(masks[view], height, width, tile, out[view]), views)
+    parallel_for(lambda view: kernels.count_tiles(masks[view], height, width, tile, out[view]), views)
     return sums
 
 
@@ -195,7 +195,7 @@ def _occupied_cpu(
     def judge(slab: int) -> None:
         kernels.occupied_blocks(P, lens, size, tile, sums, corner, block_m, needed, slab, slab + 1, out)
 
-    share(judge, shape[0])
+    parallel_for(judge, shape[0])
     return occupied
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from viewmend.geometry._rasterize_torch import edge_functions, homogeneous, rasterize_torch
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import Mesh
-from viewmend.geometry.threads import share
+from viewmend.geometry.threads import parallel_for
 
 NEAR_M = 1e-6
 """Surface nearer than this is not drawn."""
@@ -87,7 +87,7 @@ def _interpolate_cpu(band: Callable[..., None], attributes, mesh: Mesh, cameras:
         first, end = rows * part // BANDS, rows * (part + 1) // BANDS
         band(*given, P[view], triangles[view], first, end, images[view])
 
-    share(work, len(cameras) * BANDS)
+    parallel_for(work, len(cameras) * BANDS)
     return image
 
 
@@ -120,6 +120,6 @@ def _rasterize_cpu(kernels, mesh: Mesh, cameras: Cameras, side: int) -> Raster:
         first, end = rows * band // bands, rows * (band + 1) // bands
         kernels.draw_band(projected[view], faces, NEAR_M, side, first, end, columns, depths[view], triangles[view])
 
-    share(lambda view: kernels.project_vertices(vertices, P[view], projected[view]), views)
-    share(draw, views * bands)
+    parallel_for(lambda view: kernels.project_vertices(vertices, P[view], projected[view]), views)
+    parallel_for(draw, views * bands)
     return Raster(depth, triangle)

@@ -9,7 +9,7 @@ from functools import cache
 import torch
 
 
-def share(work: Callable[[int], object], count: int) -> None:
+def parallel_for(work: Callable[[int], object], count: int) -> None:
     """Call `work(0)` to `work(count - 1)` on as many threads as torch uses; `work` must release the GIL to gain.
 
     Plain threads and not numba's own: those abort the process when two of our callers run at once, and may not be

@@ -12,7 +12,7 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextFrame
 from viewmend.inpainting.coordinates import reproject
 from viewmend.inpainting.patches import STEP_PX, centers_px
-from viewmend.inpainting.transformer import Placed
+from viewmend.inpainting.transformer import TokenPositions
 from viewmend.views import IncompleteView
 
 
@@ -33,9 +33,9 @@ class Batch:
     """What the transformer works on."""
 
     queries: Float[Tensor, "sample query dim"]
-    at: Placed
+    at: TokenPositions
     keys_values: Float[Tensor, "block 2 sample key dim"]
-    context_at: Placed
+    context_at: TokenPositions
 
 
 def assemble(
@@ -86,10 +86,10 @@ def _carried(
 
 def _placed(
     parts: Sequence[tuple[Float[Tensor, "_ 3"], Bool[Tensor, "_"]]], targets: Sequence[Target], length: int
-) -> Placed:
+) -> TokenPositions:
     uvs = torch.stack([_padded(uvs, length) for uvs, _ in parts])
     sizes = torch.stack([F.pad(t.view.camera.size_px[0] / STEP_PX, (0, 1), value=1.0) for t in targets])
-    return Placed(uvs, uvs * sizes[:, None], torch.stack([_padded(present, length) for _, present in parts]))
+    return TokenPositions(uvs, uvs * sizes[:, None], torch.stack([_padded(present, length) for _, present in parts]))
 
 
 def _joined(parts: Sequence[Float[Tensor, "block 2 _ dim"]], length: int) -> Float[Tensor, "block 2 key dim"]:

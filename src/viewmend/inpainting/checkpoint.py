@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
+from viewmend.atomic_writes import write_atomically, write_tensors
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.inpainter import Inpainter
-from viewmend.whole_files import write_tensors, write_whole
 
 FORMAT = 1
 """Grows when an older program could no longer read what is written."""
@@ -72,8 +72,8 @@ def save_inpainter(inpainter: Inpainter, folder: str | Path, card: str) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     config = {"viewmend_format": FORMAT} | inpainter.config.to_dict()
-    write_whole(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
-    write_whole(folder / CARD, lambda path: path.write_text(card))
+    write_atomically(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
+    write_atomically(folder / CARD, lambda path: path.write_text(card))
     write_tensors(folder / WEIGHTS, inpainter.state_dict(), {"format": "pt"})
 
 

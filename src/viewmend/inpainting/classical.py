@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.inpainting.prefill import fill
+from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.protocol import Source, State
 from viewmend.views import CompletedView, IncompleteView
 

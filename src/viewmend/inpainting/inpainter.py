@@ -8,11 +8,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.inpainting.assembly import Target, assemble
+from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextCache, ContextFrame, window_times
 from viewmend.inpainting.coordinates import lift, patch_depths
-from viewmend.inpainting.copying import start_as_copier
 from viewmend.inpainting.decoder import Decoder, blend
+from viewmend.inpainting.identity_init import identity_init
 from viewmend.inpainting.images import Images, Tokeniser, context_images, target_images
 from viewmend.inpainting.patches import (
     PATCH_PX,
@@ -25,10 +26,9 @@ from viewmend.inpainting.patches import (
     padded_size,
     split,
 )
-from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
-from viewmend.inpainting.ray_reader import RayReader
-from viewmend.inpainting.steadying import LastView, steadied
+from viewmend.inpainting.ray_blend_net import RayBlendNet
+from viewmend.inpainting.temporal_accumulation import LastView, steadied
 from viewmend.inpainting.transformer import Transformer
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
@@ -56,9 +56,9 @@ class Inpainter(nn.Module):
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
         self.decoder = Decoder(config)
-        self.ray_reader = RayReader() if config.rays else None
+        self.ray_reader = RayBlendNet() if config.rays else None
         if config.colour_path:
-            start_as_copier(self.tokeniser.linear, self.decoder.linear, config)
+            identity_init(self.tokeniser.linear, self.decoder.linear, config)
         self.compute_dtype = torch.float32
         """Set to torch.bfloat16 to run the networks under autocast; coordinates stay float32."""
 
@@ -189,8 +189,8 @@ class Inpainter(nn.Module):
     ) -> tuple[CompletedView, State]:
         """The completed view and the state for the next one (section 9).
 
-        `source` is asked for frames of `view.chosen` (or `context_cameras`) that the window needs and the state has
-        not, and for those of `view.nearest` that `rays` reads now; a view without holes comes back at once, unasked.
+        `source` is asked for frames of `view.source_views` (or `context_cameras`) that the window needs and the state
+        has not, and for those of `view.candidate_views` that `rays` reads now; a view without holes comes back at once.
         """
         if not bool((view.error > 0).any()):
             return self.keep_steady(CompletedView(view, view.rgb), state)
@@ -211,7 +211,7 @@ class Inpainter(nn.Module):
     def context_names(self, view: IncompleteView) -> tuple[str, ...]:
         """The cameras that are context."""
         count = self.config.context_cameras
-        return view.chosen if count is None else view.around(count)
+        return view.source_views if count is None else view.closest_views(count)
 
     def _looked_at(
         self, view: IncompleteView, context: Sequence[ContextFrame | ContextViews]
@@ -225,7 +225,7 @@ class Inpainter(nn.Module):
         self, view: IncompleteView, source: Source, cache: ContextCache
     ) -> tuple[list[ContextViews], ContextViews | None]:
         """What the window needs and the cache has not, by time; and what the cameras near the view see now."""
-        around = view.around(self.config.rays)
+        around = view.closest_views(self.config.rays)
         fresh, nearby = [], None
         for time in window_times(view.time, self.config):
             new = cache.missing(self.context_names(view), time)

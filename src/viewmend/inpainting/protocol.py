@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from viewmend.inpainting.context import ContextCache
-from viewmend.inpainting.steadying import LastView
+from viewmend.inpainting.temporal_accumulation import LastView
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 Source = Callable[[int, tuple[str, ...]], ContextViews | None]

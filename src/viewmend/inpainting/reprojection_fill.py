@@ -4,12 +4,12 @@ import math
 
 import torch
 
+from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.prefill import fill
 from viewmend.inpainting.protocol import Source, State
-from viewmend.inpainting.rays import NEAR, OFFSETS, follow
+from viewmend.inpainting.ray_sampling import NEAR, OFFSETS, sample_along_rays
 from viewmend.views import CompletedView, IncompleteView
 
 TOLERANCE = 0.02
@@ -40,12 +40,12 @@ class ReprojectionFill:
             return CompletedView(view, view.rgb), state
         filled = fill(view.rgb, missing, view.mask > 0).movedim(0, -1).clone()
         left = torch.nonzero(missing & (view.depth > 0).any())
-        nearest = view.around(self.cameras)
+        nearest = view.closest_views(self.cameras)
         for time in window_times(view.time, self.config):
-            seen = source(time, nearest if time == view.time else view.chosen) if len(left) else None
+            seen = source(time, nearest if time == view.time else view.source_views) if len(left) else None
             if seen is None:
                 continue
-            point = follow(view, left, seen).features[:, OFFSETS.index(0.0)]
+            point = sample_along_rays(view, left, seen).features[:, OFFSETS.index(0.0)]
             rgb, mask, behind, cosine = point[..., :3], point[..., 3], point[..., 4], point[..., 6]
             visible = (point[..., 8] > 0) & (mask > 0.5) & (behind.abs() < math.tanh(TOLERANCE / NEAR))
             weight = visible * (FRONTAL_POWER * cosine).exp()

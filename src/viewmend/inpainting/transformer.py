@@ -23,7 +23,7 @@ COPY_GAIN = 0.5
 
 
 @dataclass(frozen=True)
-class Placed:
+class TokenPositions:
     """Where a padded batch of tokens is."""
 
     uvs: Float[Tensor, "sample token 3"]
@@ -99,9 +99,9 @@ class Transformer(nn.Module):
     def forward(
         self,
         tokens: Float[Tensor, "sample query dim"],
-        at: Placed,
+        at: TokenPositions,
         keys_values: Float[Tensor, "block 2 sample key dim"],
-        context_at: Placed,
+        context_at: TokenPositions,
         top_k: int | None,
     ) -> Float[Tensor, "sample query dim"]:
         """The input tokens after all blocks; only they change."""
@@ -139,7 +139,7 @@ class Transformer(nn.Module):
 class _Turns:
     """The rotations of one forward pass, which all blocks share."""
 
-    def __init__(self, transformer: Transformer, at: Placed, context_at: Placed) -> None:
+    def __init__(self, transformer: Transformer, at: TokenPositions, context_at: TokenPositions) -> None:
         config = transformer.config
         self.present = context_at.present
         self.score = self.value = None

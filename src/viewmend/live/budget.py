@@ -40,7 +40,7 @@ class Level:
     """Context tokens that survive pruning; None for all."""
 
     @property
-    def filling(self) -> float:
+    def relative_cost(self) -> float:
         """Work of filling, relative to the full level's."""
         tokens = min(self.top_k or 2048, 2048) / 2048
         if self.context_times == 0:
@@ -103,19 +103,19 @@ class Budget:
 
     def predicted_ms(self, level: Level) -> float:
         """What a view of this level would take; 0 before the first frame."""
-        filling = level.filling + (_median(self._context) if level.context_times else 0.0)
+        filling = level.relative_cost + (_median(self._context) if level.context_times else 0.0)
         return _median(self._geometry) + _median(self._pixels) * level.scale**2 + _median(self._filling) * filling
 
-    def took(self, level: Level, ms: FrameMs) -> None:
+    def record(self, level: Level, ms: FrameMs) -> None:
         """Learn from a frame, and choose the next one's level."""
         self.measured_ms = ms.total
         self._geometry.append(ms.geometry)
         self._pixels.append(ms.pixels / level.scale**2)
         if ms.filling is not None:
-            self._filling.append(ms.filling / level.filling)
+            self._filling.append(ms.filling / level.relative_cost)
         if ms.context is not None and ms.filling:
             # As a share of filling, which is measured at all levels: so it is known how a level without has changed.
-            self._context.append(ms.context / (ms.filling / level.filling))
+            self._context.append(ms.context / (ms.filling / level.relative_cost))
         self._since_up += 1
         if self._since_up == PROBATION:
             self._patience = PATIENCE

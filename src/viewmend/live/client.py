@@ -55,7 +55,7 @@ class Client:
             self._socket.send(json.dumps({"type": kind, **values}))
 
     def look(self, **values: object) -> int:
-        """Ask for views from now on, e.g. camera={"azimuth": 30}, width=320, height=320; the look's id."""
+        """RenderRequest for views from now on, e.g. camera={"azimuth": 30}, width=320, height=320; the look's id."""
         self._looks += 1
         self.send("look", id=self._looks, sent_ms=1000 * time.perf_counter(), **values)
         return self._looks

@@ -13,8 +13,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from viewmend.live.fields import ProtocolError
 from viewmend.live.guard import Patience, Rate
 from viewmend.live.protocol import MODES, VERSION, Ack, ClockChange, Hello, Limits, Look, Ping, parse
-from viewmend.live.seats import ViewerSeat
 from viewmend.live.service import RenderService
+from viewmend.live.sessions import ViewerSession
 
 HELLO_S = 10.0
 ACK_S = 30.0
@@ -22,7 +22,7 @@ TICK_S = 0.1
 
 
 @dataclass
-class Lobby:
+class SessionRegistry:
     """What all viewers' connections share."""
 
     service: RenderService
@@ -30,7 +30,7 @@ class Lobby:
     budget_ms: float | None
     about: dict[str, Any]
     """Of the message `welcome`: model, codecs, export, token_needed, server."""
-    seats: list[ViewerSeat] = field(default_factory=list)
+    seats: list[ViewerSession] = field(default_factory=list)
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
 
     def source_json(self) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class ClosingError(Exception):
 class ViewerConnection:
     """Reads what a viewer says and writes what it should know, whatever the other side does."""
 
-    def __init__(self, socket: WebSocket, lobby: Lobby) -> None:
+    def __init__(self, socket: WebSocket, lobby: SessionRegistry) -> None:
         self._socket = socket
         self._lobby = lobby
         self._service = lobby.service
@@ -71,7 +71,7 @@ class ViewerConnection:
         self._frame: bytes | None = None
         self._patience = Patience()
         self._rate = Rate(lobby.limits.messages_per_s)
-        self._seat = ViewerSeat(self._deliver, self._complain, lobby.budget_ms)
+        self._seat = ViewerSession(self._deliver, self._complain, lobby.budget_ms)
 
     async def run(self) -> None:
         """Serve an accepted socket until it ends."""

@@ -15,8 +15,8 @@ from torch import Tensor
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras
-from viewmend.keeping import kept
 from viewmend.live.clock import Span
+from viewmend.own_pages import to_own_pages
 from viewmend.views import MultiViewFrame
 
 RETRY_S = 1.0
@@ -95,7 +95,7 @@ class FrameStore:
 
     def put(self, time: int, frame: MultiViewFrame) -> None:
         """Keep a frame as that of this time."""
-        frame = kept(replace(frame, depth=None, time=time))
+        frame = to_own_pages(replace(frame, depth=None, time=time))
         self._frames[time] = frame
         self._bytes += _size(frame)
         while self._bytes > self._limit and len(self._frames) > 1:

@@ -1,7 +1,7 @@
 """Giving memory back.
 
-Stores are bounded, and have pages of their own (`keeping.py`). But glibc keeps what lies free between small things that
-live long and buffers of views that are gone. Left alone that comes to more than the stores.
+Stores are bounded, and have pages of their own (`own_pages.py`). But glibc keeps what lies free between small things
+that live long and buffers of views that are gone. Left alone that comes to more than the stores.
 """
 
 import ctypes
@@ -51,7 +51,7 @@ def resident_bytes() -> int | None:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-class Tidying:
+class HeapTrimmer:
     """Hands free memory back to the system now and then."""
 
     def __init__(self) -> None:

@@ -1,11 +1,11 @@
 """/metrics: counters and gauges as Prometheus reads them."""
 
-from viewmend.live.connection import Lobby
+from viewmend.live.connection import SessionRegistry
 from viewmend.live.memory import resident_bytes
 from viewmend.live.service import STAGES
 
 
-def metrics_text(lobby: Lobby) -> str:
+def metrics_text(lobby: SessionRegistry) -> str:
     """Everything that is counted."""
     service = lobby.service
     counts = dict(service.counts)

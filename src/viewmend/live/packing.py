@@ -1,4 +1,4 @@
-"""Rendered views as the binary messages that are sent."""
+"""RenderResult views as the binary messages that are sent."""
 
 import time
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Any
 from viewmend.live.pictures import COLOURS, Picture, depth_stride, pack_depth, picture, to_jpeg
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import Look, pack
-from viewmend.live.renderer import Ask, Rendered
+from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
 from viewmend.views import CompletedView
 
@@ -43,7 +43,7 @@ class Encoders:
 
 
 def frame_message(
-    look: Look, ask: Ask, rendered: Rendered, info: FrameInfo, encoders: Encoders
+    look: Look, ask: RenderRequest, rendered: RenderResult, info: FrameInfo, encoders: Encoders
 ) -> tuple[bytes, dict[str, float]]:
     """The message, and the milliseconds of every stage."""
     start = time.perf_counter()
@@ -76,8 +76,8 @@ def frame_message(
         "height": first.mask.shape[0],
         "full": info.full,
         "cameras": [{k: c[k] for k in keys} for v in rendered.completed for c in cameras_json(v.view.camera)],
-        "chosen": list(first.chosen),
-        "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.chosen))],
+        "chosen": list(first.source_views),
+        "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(hole_fraction(rendered.completed[0]), 5),
         "top_k": ask.effort.top_k,
         "context_times": ask.effort.context_times,

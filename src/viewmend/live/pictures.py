@@ -41,7 +41,9 @@ def picture(completed: CompletedView, mode: str) -> Picture:
 
 def _coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:
     """The chosen cameras' colours, mixed as they colour each pixel, with the picture's own light and dark."""
-    palette = torch.tensor([COLOURS[n % len(COLOURS)] for n in range(len(view.chosen))], device=view.rgb.device) / 255
+    palette = (
+        torch.tensor([COLOURS[n % len(COLOURS)] for n in range(len(view.source_views))], device=view.rgb.device) / 255
+    )
     mixed = torch.einsum("chw,cr->rhw", view.weights, palette)
     return mixed * (0.45 + 0.55 * view.rgb.mean(0))
 

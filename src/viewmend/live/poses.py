@@ -41,7 +41,7 @@ class RigFrame:
 
 
 def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> RigFrame:
-    """Axes about the subject: as `capture.studio.rigs.orbit` counts azimuths.
+    """Axes about the subject: as `studio.rigs.orbit` counts azimuths.
 
     The first view is halfway between the first camera and its neighbour, as far and as high as the cameras on average,
     and shows as much as they do.

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 from starlette.websockets import WebSocket
 
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import is_rotation, rigid
 from viewmend.live.fields import Fields, ProtocolError, read_json
 from viewmend.live.protocol import VERSION, unpack
@@ -85,9 +85,7 @@ def _cameras(given: list[Fields]) -> Cameras:
     if not bool(is_rotation(R).all()):
         raise ProtocolError("expected 'R' to be a rotation, world to camera, row by row; got another matrix")
     K = torch.tensor([camera.numbers("K", 9, 1e6) for camera in given]).view(-1, 3, 3)
-    if not bool(
-        ((K[:, 0, 0] > 0) & (K[:, 1, 1] > 0) & (K[:, 1, 0] == 0) & (K[:, 2] == K.new_tensor([0, 0, 1])).all(1)).all()
-    ):
+    if not bool(is_intrinsics(K).all()):
         raise ProtocolError(
             "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0; got another matrix"
         )

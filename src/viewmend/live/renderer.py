@@ -13,23 +13,23 @@ from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, 
 from viewmend.live.protocol import Camera
 from viewmend.live.window import window_of
 from viewmend.pipeline import Observation, PipelineConfig
-from viewmend.stream import Effort, Stream, StreamView, Viewer
+from viewmend.stream import RenderQuality, Stream, StreamView, Viewer
 from viewmend.views import CompletedView
 
 WARM_PX = 64
 
 
 @dataclass(frozen=True)
-class Ask:
+class RenderRequest:
     """One view to render: of which time, from where (one camera each eye), how well."""
 
     time: int
     cameras: tuple[Cameras, ...]
-    effort: Effort
+    effort: RenderQuality
 
 
 @dataclass(frozen=True)
-class Rendered:
+class RenderResult:
     """What came of it."""
 
     time: int
@@ -97,13 +97,13 @@ class Renderer:
         cameras = observation.frame.cameras
         frame = rig_frame(cameras, center, rig.up)
         warm = view_camera(Camera(azimuth=frame.azimuth), frame, (WARM_PX, WARM_PX)).to(self._device)
-        self._view(stream, warm, stream.viewer(), time, Effort())
+        self._view(stream, warm, stream.viewer(), time, RenderQuality())
         rig_json = {"name": rig.name, "cameras": cameras_json(cameras), "bounds": bounds_json(bounds or proxy.bounds)}
         self.rig_json = rig_json | frame.as_json() | {"fps": self._supply.span.fps or None}
         self._rig, self._stream, self.frame = rig, stream, frame
         return True
 
-    def render(self, ask: Ask, viewer: Viewer | None) -> Rendered:
+    def render(self, ask: RenderRequest, viewer: Viewer | None) -> RenderResult:
         """The views of all eyes, from one state.
 
         Raises:
@@ -115,7 +115,7 @@ class Renderer:
         _, geometry_ms = self._observe(self._stream, ask.time)
         before = viewer or self._stream.viewer()
         views = [self._view(self._stream, c.to(self._device), before, ask.time, ask.effort) for c in ask.cameras]
-        return Rendered(
+        return RenderResult(
             ask.time,
             tuple(view.completed for view in views),
             views[0].viewer,
@@ -135,7 +135,7 @@ class Renderer:
         observation = stream.push(frame.to(self._device))
         return observation, 0.0 if known else 1000 * (time.perf_counter() - start)
 
-    def _view(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: Effort) -> StreamView:
+    def _view(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: RenderQuality) -> StreamView:
         """The view; with its holes where the model fails."""
         try:
             view = self._windowed(stream, camera, viewer, at, effort)
@@ -149,7 +149,7 @@ class Renderer:
                 self.model_error = None
         return view
 
-    def _windowed(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: Effort) -> StreamView:
+    def _windowed(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: RenderQuality) -> StreamView:
         """The view, of which only the subject's surroundings are worked on where that changes nothing.
 
         With context it would: patches lie on a grid from the view's corner.

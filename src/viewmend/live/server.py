@@ -15,8 +15,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from viewmend.live.connection import Lobby, ViewerConnection
-from viewmend.live.errands import PathErrand, PictureErrand, can_export, parse_path, parse_query
+from viewmend.live.connection import SessionRegistry, ViewerConnection
 from viewmend.live.fields import Fields, ProtocolError, read_json
 from viewmend.live.guard import Guard
 from viewmend.live.metrics_text import metrics_text
@@ -24,6 +23,7 @@ from viewmend.live.page_files import HEADERS, page_files
 from viewmend.live.protocol import Limits
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import Pushed
+from viewmend.live.render_jobs import PathJob, PictureJob, can_export, parse_path, parse_query
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 
@@ -65,7 +65,7 @@ class LiveServer:
             "export": can_export(),
             "token_needed": bool(config.token),
         }
-        self.lobby = Lobby(service, config.limits, config.budget_ms, about)
+        self.lobby = SessionRegistry(service, config.limits, config.budget_ms, about)
 
     def app(self) -> Starlette:
         """The ASGI application; its lifespan starts and stops the service."""
@@ -149,7 +149,7 @@ class LiveServer:
         look, at = parse_query(dict(request.query_params), self._config.limits)
         if self._pictures >= PICTURES_AT_ONCE:
             return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
-        errand = PictureErrand(look, at)
+        errand = PictureJob(look, at)
         self._pictures += 1
         try:
             image, rendered = await self._wait(request, errand, errand.done, PICTURE_S)
@@ -172,7 +172,7 @@ class LiveServer:
             body = await _body(request)
             if body is None:
                 return _refusal(413, f"expected at most {BODY_BYTES} bytes")
-            errand = PathErrand(parse_path(Fields(read_json(body)), self._config.limits))
+            errand = PathJob(parse_path(Fields(read_json(body)), self._config.limits))
             video = await self._wait(request, errand, errand.done, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
@@ -180,7 +180,7 @@ class LiveServer:
             self._exporting = False
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
-    async def _wait(self, request: Request, errand: PictureErrand | PathErrand, done: Future, limit_s: float):
+    async def _wait(self, request: Request, errand: PictureJob | PathJob, done: Future, limit_s: float):
         """The errand's result; it is given up when the client goes."""
         self._service.join(errand)
         end, waiting = time.monotonic() + limit_s, asyncio.wrap_future(done)

@@ -7,9 +7,9 @@ from collections import Counter
 
 from viewmend.live.clock import Clock, edge_of
 from viewmend.live.frames import FrameSupply
-from viewmend.live.memory import Tidying
+from viewmend.live.memory import HeapTrimmer
 from viewmend.live.renderer import NotThereError, Renderer
-from viewmend.live.seats import Scene, Seat, ViewerSeat
+from viewmend.live.sessions import Scene, Session, ViewerSession
 
 TICK_S = 0.004
 """How often clocks are looked at while somebody is there."""
@@ -36,7 +36,7 @@ class RenderService:
         self.recording = Clock()
         """The edge of a recording."""
         self.recording.live = False
-        self._seats: list[Seat] = []
+        self._seats: list[Session] = []
         self._stopped = False
         self._last = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
@@ -61,13 +61,13 @@ class RenderService:
         with self.lock:
             self.lock.notify_all()
 
-    def join(self, seat: Seat) -> None:
+    def join(self, seat: Session) -> None:
         """Serve this one, too."""
         with self.lock:
             self._seats.append(seat)
             self.lock.notify_all()
 
-    def leave(self, seat: Seat) -> None:
+    def leave(self, seat: Session) -> None:
         """Serve it no more."""
         with self.lock:
             if seat in self._seats:
@@ -84,7 +84,7 @@ class RenderService:
         return self.renderer.frame is not None and self.renderer.is_of(self.supply.rig)
 
     def _run(self) -> None:
-        tidying = Tidying()
+        tidying = HeapTrimmer()
         while not self._stopped:
             try:
                 worked = self._prepare() or self._turn()
@@ -117,7 +117,9 @@ class RenderService:
         if not self.ready or self.renderer.frame is None:
             return False
         with self.lock:
-            crowd = sum(isinstance(s, ViewerSeat) and bool(s.recent) and s.recent[-1].at > now - 1 for s in self._seats)
+            crowd = sum(
+                isinstance(s, ViewerSession) and bool(s.recent) and s.recent[-1].at > now - 1 for s in self._seats
+            )
             scene = Scene(span, self.edge, self.renderer.frame, self._present, max(1, crowd))
             for seat in list(self._seats):
                 try:

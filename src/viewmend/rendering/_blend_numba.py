@@ -10,7 +10,7 @@ from numba import njit
 from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.threads import share
+from viewmend.geometry.threads import parallel_for
 from viewmend.rendering.blend_rule import GRAZING, Blend, BlendConfig
 from viewmend.views import ContextViews
 
@@ -51,7 +51,7 @@ def blend_numba(
     def work(band: int) -> None:
         _blend_rows(band * ROWS, min(height, (band + 1) * ROWS), *inputs, *outputs)
 
-    share(work, -(-height // ROWS))
+    parallel_for(work, -(-height // ROWS))
     return Blend(rgb, weights, disagreement)
 
 

@@ -45,7 +45,7 @@ def render_view(
     proxy: GeometryProxy,
     target: Cameras,
     config: RenderConfig,
-    previous_chosen: Sequence[str] = (),
+    previous_source_views: Sequence[str] = (),
     exclude: Sequence[str] = (),
     source_depth: SourceDepth | None = None,
 ) -> IncompleteView:
@@ -56,7 +56,7 @@ def render_view(
         proxy: G[t], on the frame's device.
         target: the novel view's camera (one view), on the same device.
         config: which cameras, how blended.
-        previous_chosen: the cameras of the stream's last view, for covering selection's hysteresis.
+        previous_source_views: the cameras of the stream's last view, for covering selection's hysteresis.
         exclude: names of cameras that must not be used, whatever else holds.
         source_depth: the proxy's depth in cameras, for callers that remember it; by default it is rendered here.
 
@@ -71,7 +71,7 @@ def render_view(
 
     center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
     nearest = select_closest(target, usable, center, len(usable))
-    chosen = _select(usable, nearest, proxy, target, depth, config, previous_chosen, source_depth)
+    chosen = _select(usable, nearest, proxy, target, depth, config, previous_source_views, source_depth)
     normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
     sources = ContextViews(frame.select(chosen), source_depth(chosen))
     bias_m = config.blend.depth_bias * float(proxy.bounds.size_m.norm())
@@ -98,7 +98,7 @@ def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:
 
 def _select(
     usable: Cameras,
-    nearest: tuple[str, ...],
+    candidate_views: tuple[str, ...],
     proxy: GeometryProxy,
     target: Cameras,
     depth: Float[Tensor, "height width"],
@@ -108,9 +108,9 @@ def _select(
 ) -> tuple[str, ...]:
     """Names of the cameras that colour the view, among those of `usable`."""
     if config.selection == "closest":
-        return nearest[: config.cameras]
+        return candidate_views[: config.cameras]
     evidence = _evidence(usable, proxy, target, depth, config, source_depth)
-    return select_covering(evidence, usable.names, nearest, config.cameras, previous, config.keep_share)
+    return select_covering(evidence, usable.names, candidate_views, config.cameras, previous, config.keep_share)
 
 
 def _evidence(

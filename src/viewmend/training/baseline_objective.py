@@ -12,12 +12,12 @@ from viewmend.baselines.e2fgvi import E2FGVI, LocalFlows
 from viewmend.baselines.token_transformer import TokenTransformer
 from viewmend.training.baseline_clips import FRAMINGS, TrainingClip, training_clip
 from viewmend.training.losses import ImageLoss
-from viewmend.training.objective import Outcome
+from viewmend.training.objective import StepOutput
 from viewmend.training.samples import Sample
 
 
 @dataclass(frozen=True)
-class BaselineOutcome(Outcome):
+class BaselineOutcome(StepOutput):
     """`completed` is each clip's last view; `temporal` is the flow's term."""
 
     clips: tuple[TrainingClip, ...]

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from viewmend.atomic_writes import write_tensors
 from viewmend.baselines.e2fgvi import E2FGVI
 from viewmend.baselines.hierarchical_encoder import SLOPE
 from viewmend.baselines.published import NETWORKS, TRAINED
@@ -14,9 +15,8 @@ from viewmend.training.adversary import BETAS, Adversary
 from viewmend.training.baseline_objective import BaselineObjective, BaselineOutcome
 from viewmend.training.loop import Run
 from viewmend.training.model_card import model_card
-from viewmend.training.objective import Outcome
+from viewmend.training.objective import StepOutput
 from viewmend.training.plan import DataPlan, LossWeights, Recipe
-from viewmend.whole_files import write_tensors
 
 CLIP = 5
 """Consecutive views in the authors' training clips."""
@@ -91,7 +91,7 @@ class BaselineRun(Run):
     def _rate_factor(self, step: int, progress: float) -> float:
         return 1.0 if progress < FULL_RATE else 0.1
 
-    def _judge(self, adversary: Adversary, batch: list[Any], outcome: Outcome, share: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, share: float):
         assert isinstance(outcome, BaselineOutcome)
         truth = [(clip.truth.transpose(0, 1) + 1) / 2 for clip in outcome.clips]
         made = [(images.transpose(0, 1) + 1) / 2 for images in outcome.composed]

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from viewmend.training.schedule import Pace
-from viewmend.training.validation import Judgement
+from viewmend.training.validation import ValidationScores
 
 
 @dataclass(frozen=True)
-class Costs:
+class LossTerms:
     """What one step cost, the mean of all streams."""
 
     inside: float
@@ -36,7 +36,7 @@ class Progress:
     progress: float
     """Share of the run before this one, 0 to 1."""
     learning_rate: float
-    costs: Costs
+    costs: LossTerms
     elapsed_s: float
     pace: Pace
 
@@ -75,7 +75,7 @@ class Log:
         rates["learning_rate"] = progress.learning_rate
         self._plot(progress.step, {f"rate/{n}": v for n, v in rates.items()})
 
-    def validated(self, judgement: Judgement) -> None:
+    def validated(self, judgement: ValidationScores) -> None:
         """What the averaged weights scored after a step."""
         self._write({"step": judgement.step, "validation": asdict(judgement)})
         self._plot(judgement.step, {f"validation/{n}": v for n, v in asdict(judgement).items() if n != "step"})

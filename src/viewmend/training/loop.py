@@ -14,13 +14,13 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from viewmend.inpainting.checkpoint import save_inpainter
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.training.adversary import Adversary
-from viewmend.training.feed import FeedPosition, SampleFeed
-from viewmend.training.logs import Costs, Log, Progress
+from viewmend.training.logs import Log, LossTerms, Progress
 from viewmend.training.model_card import model_card
-from viewmend.training.objective import Objective, Outcome
+from viewmend.training.objective import Objective, StepOutput
 from viewmend.training.plan import Recipe
 from viewmend.training.processes import Processes, processes
-from viewmend.training.ray_lookups import RayLookups, RaysObjective
+from viewmend.training.ray_batches import RayBatch, RaysObjective
+from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import FILE, RunError, RunState, load_run, save_run
 from viewmend.training.sample_files import sample_to_bytes
 from viewmend.training.samples import Sample
@@ -93,7 +93,7 @@ class Run:
             self._optimizers["discriminator_optimizer"] = self.adversary.optimizer
         if (out / FILE).exists():
             self.state = load_run(out, recipe, self._modules, self._optimizers)
-        self.shared = own.share(self.objective)
+        self.shared = own.wrap_ddp(self.objective)
         self.streams = self._streams()
         self.validation = self._make_validation() if recipe.validate_every and own.first else None
 
@@ -139,7 +139,7 @@ class Run:
         return _model(self.recipe, start)
 
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
-        """A module whose call on a batch of samples is an `Outcome`."""
+        """A module whose call on a batch of samples is an `StepOutput`."""
         assert isinstance(self.model, Inpainter)
         return (RaysObjective if self.recipe.part == "rays" else Objective)(self.model, self.recipe)
 
@@ -153,7 +153,7 @@ class Run:
     def _rate_factor(self, step: int, progress: float) -> float:
         return learning_rate_factor(step, progress, self.recipe.warmup)
 
-    def _judge(self, adversary: Adversary, batch: list[Any], outcome: Outcome, share: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, share: float):
         """See `Adversary.judge`."""
         return adversary.judge(batch, outcome.completed, share)
 
@@ -161,7 +161,7 @@ class Run:
         assert isinstance(self.averaged, Inpainter)
         save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
 
-    def _step(self, step: int, batches: list[list[Sample | RayLookups]]) -> Costs:
+    def _step(self, step: int, batches: list[list[Sample | RayBatch]]) -> LossTerms:
         """One step of all weights, with the mean of the streams' gradients."""
         self.optimizer.zero_grad(set_to_none=True)
         costs = []
@@ -172,7 +172,7 @@ class Run:
             last = number + 1 == len(batches)
             with nullcontext() if last else _without_meeting(self.shared):
                 outcome = self.shared(batch)
-                assert isinstance(outcome, Outcome)
+                assert isinstance(outcome, StepOutput)
                 total, adversarial, judged = outcome.total, 0.0, 0.0
                 if self.adversary is not None:
                     term, judged = self._judge(self.adversary, batch, outcome, 1 / len(batches))
@@ -187,11 +187,11 @@ class Run:
             self.adversary.step()
         return self._mean(costs)
 
-    def _mean(self, costs: list[Costs]) -> Costs:
+    def _mean(self, costs: list[LossTerms]) -> LossTerms:
         values = torch.tensor([astuple(cost) for cost in costs], device=self.own.device).mean(0)
-        return Costs(*self.own.mean(values).tolist())
+        return LossTerms(*self.own.mean(values).tolist())
 
-    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample | RayLookups]) -> None:
+    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample | RayBatch]) -> None:
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -203,7 +203,7 @@ class Run:
             "lower the learning rate and begin with the last checkpoint"
         )
 
-    def _streams(self) -> list[SampleFeed[Sample | RayLookups]]:
+    def _streams(self) -> list[SampleReplay[Sample | RayBatch]]:
         """This process's streams: numbers rank, rank + count and so on."""
         recipe, own = self.recipe, self.own
         count = max(recipe.streams, own.count)
@@ -219,9 +219,9 @@ class Run:
         streams = []
         for number in range(own.rank, count, own.count):
             seed = f"{recipe.seed}/{number}"
-            at: FeedPosition | None = self.state.positions[number] if self.state.positions else None
+            at: ReplayPosition | None = self.state.positions[number] if self.state.positions else None
             source = training_source(recipe, seed)
-            streams.append(SampleFeed(source, seed, recipe.fresh, recipe.buffer, recipe.workers, at))
+            streams.append(SampleReplay(source, seed, recipe.fresh, recipe.buffer, recipe.workers, at))
         return streams
 
     def _save(self, step: int, schedule: Schedule) -> None:
@@ -255,8 +255,8 @@ def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tenso
     return {n: w for n, w in start.state_dict().items() if n in own and own[n].shape == w.shape}
 
 
-def _costs(outcome: Outcome, total: torch.Tensor, adversarial: float, discriminator: float) -> Costs:
-    return Costs(
+def _costs(outcome: StepOutput, total: torch.Tensor, adversarial: float, discriminator: float) -> LossTerms:
+    return LossTerms(
         inside=float(outcome.image.inside.detach()),
         outside=float(outcome.image.outside.detach()),
         total=float(total.detach()),

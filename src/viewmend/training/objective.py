@@ -16,7 +16,7 @@ from viewmend.views import CompletedView
 
 
 @dataclass(frozen=True)
-class Outcome:
+class StepOutput:
     """What a model made of a batch, and what that costs; a term that is switched off is 0."""
 
     image: ImageLoss
@@ -37,7 +37,7 @@ class Objective(nn.Module):
         self.recipe = recipe
         self.features = load_vgg16(recipe.loss.perceptual_weights) if recipe.loss.perceptual else None
 
-    def forward(self, batch: list[Sample]) -> Outcome:
+    def forward(self, batch: list[Sample]) -> StepOutput:
         """All terms of `batch`."""
         weights = self.recipe.loss
         views = [sample for last in batch for sample in last.clip]
@@ -49,7 +49,7 @@ class Objective(nn.Module):
         temporal, perceptual = self._temporal(batch, completed), self._perceptual(views, completed)
         total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
         total = total + weights.temporal * temporal + weights.perceptual * perceptual
-        return Outcome(image, temporal, perceptual, total, completed)
+        return StepOutput(image, temporal, perceptual, total, completed)
 
     def _temporal(self, batch: list[Sample], completed: tuple[Tensor, ...]) -> Float[Tensor, ""]:
         """The change between consecutive views of each clip."""

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
-from viewmend.training.feed import FeedPosition
+from viewmend.training.replay import ReplayPosition
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,14 @@ class Processes:
         """Whether this one writes files and reports."""
         return self.rank == 0
 
-    def share(self, module: nn.Module) -> nn.Module:
+    def wrap_ddp(self, module: nn.Module) -> nn.Module:
         """The module with gradients averaged over all processes; itself where there is one process only."""
         if self.count == 1 or not any(p.requires_grad for p in module.parameters()):
             return module
         devices = [self.device.index] if self.device.type == "cuda" else None
         return DistributedDataParallel(module, device_ids=devices, find_unused_parameters=True)
 
-    def gather(self, positions: list[FeedPosition]) -> tuple[FeedPosition, ...]:
+    def gather(self, positions: list[ReplayPosition]) -> tuple[ReplayPosition, ...]:
         """The positions of all processes' streams, in the order of the streams: number n is of process n % count."""
         own = torch.tensor([[p.scene, p.sample, p.buffered] for p in positions], device=self.device)
         if self.count == 1:
@@ -40,7 +40,7 @@ class Processes:
         else:
             everyones = [torch.empty_like(own) for _ in range(self.count)]
             torch.distributed.all_gather(everyones, own)
-        return tuple(FeedPosition(*row.tolist()) for rows in zip(*everyones, strict=True) for row in rows)
+        return tuple(ReplayPosition(*row.tolist()) for rows in zip(*everyones, strict=True) for row in rows)
 
     def mean(self, value: torch.Tensor) -> torch.Tensor:
         """The mean of the processes' values."""

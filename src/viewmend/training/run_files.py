@@ -10,9 +10,9 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from viewmend.training.feed import FeedPosition
+from viewmend.atomic_writes import write_tensors
 from viewmend.training.plan import Recipe
-from viewmend.whole_files import write_tensors
+from viewmend.training.replay import ReplayPosition
 
 FILE = "run.safetensors"
 MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_every", "validate_every", "validation_views")
@@ -30,7 +30,7 @@ class RunState:
     step: int
     """Steps that were made."""
     elapsed_s: float
-    positions: tuple[FeedPosition, ...]
+    positions: tuple[ReplayPosition, ...]
     """Of all streams, in their order."""
 
 
@@ -71,7 +71,7 @@ def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimi
             module.load_state_dict(_under(name, tensors))
         for name, optimizer in optimizers.items():
             _load_optimizer(optimizer, _under(name, tensors))
-        positions = tuple(FeedPosition(**position) for position in values["positions"])
+        positions = tuple(ReplayPosition(**position) for position in values["positions"])
         return RunState(values["step"], values["elapsed_s"], positions)
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         said = " ".join(str(error).split())[:200]

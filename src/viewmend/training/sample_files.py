@@ -13,13 +13,13 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
+from viewmend.atomic_writes import write_atomically
 from viewmend.geometry.cameras import Cameras
-from viewmend.training.ray_lookups import RayLookups
+from viewmend.training.ray_batches import RayBatch
 from viewmend.training.samples import Sample
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
-from viewmend.whole_files import write_whole
 
-PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, RayLookups)
+PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, RayBatch)
 KINDS = {kind.__name__: kind for kind in PARTS}
 """The dataclasses that a sample is made of, and what is looked up of one."""
 STRUCTURE = "structure"
@@ -30,7 +30,7 @@ class ShardError(ValueError):
     """Samples that cannot be read: which file, what was expected, what came, the next step."""
 
 
-def sample_to_bytes(sample: Sample | RayLookups) -> bytes:
+def sample_to_bytes(sample: Sample | RayBatch) -> bytes:
     """A safetensors file with the sample's tensors, and the rest of it as JSON in a tensor of bytes."""
     tensors: dict[str, torch.Tensor] = {}
     structure = json.dumps(_taken_apart(sample, tensors)).encode()
@@ -38,7 +38,7 @@ def sample_to_bytes(sample: Sample | RayLookups) -> bytes:
     return save(tensors)
 
 
-def sample_from_bytes(data: bytes) -> Sample | RayLookups:
+def sample_from_bytes(data: bytes) -> Sample | RayBatch:
     """Inverse of `sample_to_bytes`.
 
     Raises:
@@ -51,15 +51,15 @@ def sample_from_bytes(data: bytes) -> Sample | RayLookups:
         raise ShardError(
             f"expected a sample, got {len(data)} bytes that do not read ({error}); make it again"
         ) from error
-    if not isinstance(sample, Sample | RayLookups):
+    if not isinstance(sample, Sample | RayBatch):
         raise ShardError(f"expected a sample, got a {type(sample).__name__}; make it again")
     return sample
 
 
-def write_shards(samples: Iterable[Sample | RayLookups], folder: Path, per_shard: int = 48) -> Iterator[Path]:
+def write_shards(samples: Iterable[Sample | RayBatch], folder: Path, per_shard: int = 48) -> Iterator[Path]:
     """Tar files of so many samples each, shard-00000.tar and on, every one whole or not there; yields their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    pending: list[Sample | RayLookups] = []
+    pending: list[Sample | RayBatch] = []
     number = 0
     for sample in samples:
         pending.append(sample)
@@ -70,7 +70,7 @@ def write_shards(samples: Iterable[Sample | RayLookups], folder: Path, per_shard
         yield _write_shard(pending, folder / f"shard-{number:05d}.tar")
 
 
-def read_shard(path: Path) -> list[Sample | RayLookups]:
+def read_shard(path: Path) -> list[Sample | RayBatch]:
     """All samples of a shard.
 
     Raises:
@@ -84,7 +84,7 @@ def read_shard(path: Path) -> list[Sample | RayLookups]:
         raise ShardError(f"{path}: expected a tar of samples ({error}); make this shard again") from error
 
 
-Kind = TypeVar("Kind", bound=Sample | RayLookups)
+Kind = TypeVar("Kind", bound=Sample | RayBatch)
 
 
 class ShardScenes(Generic[Kind]):
@@ -130,7 +130,7 @@ class ShardScenes(Generic[Kind]):
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
 
 
-def _write_shard(samples: list[Sample | RayLookups], path: Path) -> Path:
+def _write_shard(samples: list[Sample | RayBatch], path: Path) -> Path:
     def write(beside: Path) -> None:
         with tarfile.open(beside, "w") as tar:
             for number, sample in enumerate(samples):
@@ -139,7 +139,7 @@ def _write_shard(samples: list[Sample | RayLookups], path: Path) -> Path:
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
 
-    write_whole(path, write)
+    write_atomically(path, write)
     return path
 
 

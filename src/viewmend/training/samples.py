@@ -91,14 +91,14 @@ class LeaveOneOut:
         if float(view.error.sum()) < min_hole_px:
             return None
         view = widened(view, widened_px)
-        wanted = view.around(max(len(view.chosen), cameras[0]))
+        wanted = view.closest_views(max(len(view.source_views), cameras[0]))
         context = []
         for tau in times:
             names = [n for n in wanted if n in self.frames[tau].cameras.names]
             frame = self.frames[tau].select(names)
             context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
         assert truth.mask is not None, "what trains has masks"
-        around = view.around(cameras[1])
+        around = view.closest_views(cameras[1])
         near = self.frames[time].select(around)
         nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)

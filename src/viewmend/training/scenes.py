@@ -5,11 +5,11 @@ from dataclasses import replace
 from random import Random
 from typing import Protocol, TypeVar, runtime_checkable
 
-from viewmend.capture.studio.imperfections import Imperfections
-from viewmend.capture.studio.stage import Studio, StudioConfig
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import HullConfig
 from viewmend.rendering.view import RenderConfig
+from viewmend.studio.imperfections import Imperfections
+from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.plan import DataPlan
 from viewmend.training.samples import LeaveOneOut, Sample
 from viewmend.views import MultiViewFrame

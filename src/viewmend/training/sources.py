@@ -2,13 +2,13 @@
 
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes, open_captures
 from viewmend.training.plan import DataPlan, Recipe
-from viewmend.training.ray_lookups import LookedUpScenes, RayLookups
+from viewmend.training.ray_batches import RayBatch, RayBatchScenes
 from viewmend.training.sample_files import ShardScenes
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, SceneSource, StudioScenes
 
 
-def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayLookups]:
+def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayBatch]:
     """A stream's scenes, as the recipe's part needs them.
 
     Raises:
@@ -17,8 +17,8 @@ def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayLookup
     if recipe.part != "rays":
         return scene_source(recipe.data, seed)
     shards = recipe.data.shards
-    scenes = scene_source(recipe.data, seed) if shards is None else ShardScenes(shards, seed, (Sample, RayLookups))
-    return LookedUpScenes(scenes, seed, recipe.pixels)
+    scenes = scene_source(recipe.data, seed) if shards is None else ShardScenes(shards, seed, (Sample, RayBatch))
+    return RayBatchScenes(scenes, seed, recipe.pixels)
 
 
 def scene_source(plan: DataPlan, seed: str, validation: bool = False) -> SceneSource[Sample]:

@@ -22,7 +22,7 @@ TILE_PX = 256
 
 
 @dataclass(frozen=True)
-class Judgement:
+class ValidationScores:
     """Means over the views, in dB."""
 
     step: int
@@ -45,7 +45,7 @@ class Validation:
         self._telea: list[float] = []
 
     @torch.no_grad()
-    def judge(self, model: nn.Module, step: int) -> Judgement:
+    def judge(self, model: nn.Module, step: int) -> ValidationScores:
         """Mend every view, score it, and leave a picture of the first few."""
         if not self._samples:
             self._samples = self._views()
@@ -63,7 +63,7 @@ class Validation:
             shown.append(torch.cat([sample.view.rgb, completed, sample.truth / 255], 2))
         model.train(training)
         _write(self.folder / f"validation-{step:06d}.png", shown[:SHOWN])
-        return Judgement(step, *(sum(x) / len(x) for x in (ours, self._telea, fills)))
+        return ValidationScores(step, *(sum(x) / len(x) for x in (ours, self._telea, fills)))
 
     def _views(self) -> list[Sample]:
         # One view a scene and no clips: more scenes say more.

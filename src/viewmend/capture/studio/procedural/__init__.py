@@ -1,9 +1,0 @@
-"""Procedural performers: clothed, articulated people drawn from a seed, with nothing to download."""
-
-from viewmend.capture.studio.procedural.performer import (
-    PerformerStyle,
-    procedural_performer,
-    procedural_scene,
-)
-
-__all__ = ["PerformerStyle", "procedural_performer", "procedural_scene"]

@@ -1,0 +1,287 @@
+"""The body's shape: a torso and four limbs as surfaces around their axes, joined by a smooth union of their fields.
+
+Each part is both a parametric surface (angle around the axis, place along it), which gives texture coordinates, and
+a field (signed distance, first order), which gives the union and the skinning weights. A garment is a bigger body.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from viewmend.studio.procedural.physique import Physique, leg_stretch
+from viewmend.studio.procedural.skeleton import SIDES, Skeleton, unit
+
+# Height, half width (masculine, feminine), front depth (masculine, feminine), back depth, z of the centre line.
+TORSO = np.array(
+    [
+        (0.468, 0.010, 0.010, 0.012, 0.012, 0.014, 0.000),
+        (0.474, 0.038, 0.038, 0.030, 0.030, 0.036, 0.000),
+        (0.490, 0.076, 0.082, 0.044, 0.043, 0.056, 0.000),
+        (0.515, 0.094, 0.102, 0.052, 0.050, 0.066, 0.000),
+        (0.545, 0.094, 0.101, 0.055, 0.053, 0.064, 0.001),
+        (0.575, 0.088, 0.091, 0.056, 0.052, 0.054, 0.003),
+        (0.605, 0.083, 0.076, 0.056, 0.050, 0.049, 0.004),
+        (0.630, 0.082, 0.071, 0.056, 0.049, 0.049, 0.003),
+        (0.660, 0.085, 0.073, 0.057, 0.051, 0.052, 0.000),
+        (0.690, 0.090, 0.079, 0.060, 0.054, 0.056, -0.003),
+        (0.720, 0.096, 0.085, 0.064, 0.056, 0.058, -0.006),
+        (0.750, 0.100, 0.089, 0.063, 0.056, 0.057, -0.009),
+        (0.775, 0.100, 0.089, 0.056, 0.051, 0.053, -0.011),
+        (0.797, 0.100, 0.090, 0.046, 0.043, 0.047, -0.013),
+        (0.811, 0.092, 0.082, 0.039, 0.037, 0.043, -0.014),
+        (0.822, 0.072, 0.062, 0.035, 0.033, 0.040, -0.013),
+        (0.833, 0.051, 0.043, 0.032, 0.030, 0.037, -0.012),
+        (0.842, 0.040, 0.034, 0.032, 0.029, 0.036, -0.011),
+        (0.852, 0.0355, 0.0300, 0.032, 0.029, 0.034, -0.008),
+        (0.872, 0.0345, 0.0290, 0.032, 0.029, 0.034, -0.004),
+        (0.900, 0.0340, 0.0285, 0.032, 0.029, 0.034, 0.000),
+    ]
+)
+# Place along the limb (0 shoulder or hip, 1 wrist or ankle), radius, shift backwards of the centre line.
+ARM_PROFILE = np.array(
+    [
+        (-0.04, 0.022, 0.0),
+        (0.03, 0.0270, 0.0),
+        (0.14, 0.0292, 0.0),
+        (0.32, 0.0275, -0.001),
+        (0.46, 0.0235, 0.0),
+        (0.54, 0.0225, 0.001),
+        (0.64, 0.0245, 0.0),
+        (0.76, 0.0215, 0.0),
+        (0.90, 0.0165, 0.0),
+        (1.00, 0.0155, 0.0),
+        (1.06, 0.0150, 0.0),
+    ]
+)
+LEG_PROFILE = np.array(
+    [
+        (-0.04, 0.046, 0.004),
+        (0.04, 0.0520, 0.004),
+        (0.14, 0.0515, 0.002),
+        (0.32, 0.0435, -0.003),
+        (0.45, 0.0350, -0.002),
+        (0.505, 0.0335, -0.002),
+        (0.56, 0.0310, 0.003),
+        (0.66, 0.0335, 0.010),
+        (0.74, 0.0315, 0.010),
+        (0.86, 0.0235, 0.005),
+        (0.95, 0.0205, 0.001),
+        (1.00, 0.0210, 0.000),
+        (1.08, 0.0210, 0.000),
+    ]
+)
+
+
+def smooth_table(xs: Float[np.ndarray, "knot"], table: Float[np.ndarray, "knot column"], samples: int = 256):
+    """Resample knots evenly and round their corners: (positions [sample], values [sample column])."""
+    grid = np.linspace(xs[0], xs[-1], samples)
+    values = np.stack([np.interp(grid, xs, column) for column in table.T], axis=1)
+    for _ in range(2):
+        padded = np.pad(values, ((4, 4), (0, 0)), mode="edge")
+        values = np.stack([padded[i : i + samples] for i in range(9)]).mean(0)
+    return grid, values
+
+
+@dataclass(frozen=True)
+class Torso:
+    """Trunk and neck around a vertical, slightly curved axis. All metres, heights in world coordinates."""
+
+    y: Float[np.ndarray, "sample"]
+    width: Float[np.ndarray, "sample"]
+    front: Float[np.ndarray, "sample"]
+    back: Float[np.ndarray, "sample"]
+    z: Float[np.ndarray, "sample"]
+    bumps: Float[np.ndarray, "bump 5"]
+    """Azimuth, height, width in radians, width in metres, height of the swelling: bust and buttocks."""
+
+    @property
+    def arc(self) -> Float[np.ndarray, "sample"]:
+        """Length along the side's outline from the lowest ring, metres: even steps of it make even rows."""
+        steps = np.hypot(np.diff(self.y), np.diff(self.width))
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def radius(self, azimuth: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+        """Distance of the surface from the axis; azimuth 0 is the front, a quarter turn the left."""
+        a, f, b = (np.interp(y, self.y, table) for table in (self.width, self.front, self.back))
+        sine, cosine = np.abs(np.sin(azimuth)), np.cos(azimuth)
+        depth = np.where(cosine > 0, f, b)
+        r = ((sine / a) ** 2.4 + (np.abs(cosine) / depth) ** 2.4) ** (-1 / 2.4)
+        for place, height, spread, tall, swell in self.bumps:
+            turn = np.angle(np.exp(1j * (azimuth - place)))
+            drop = np.where(y > height, 1.5 * tall, tall)
+            r = r + swell * np.exp(-((turn / spread) ** 2) - ((y - height) / drop) ** 2)
+        return r
+
+    def point(self, azimuth: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+        """The surface at this azimuth and height."""
+        r = self.radius(azimuth, y)
+        return np.stack([r * np.sin(azimuth), y, r * np.cos(azimuth) + np.interp(y, self.y, self.z)], -1)
+
+    def field(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Distance to the surface to first order, negative inside."""
+        x, y = points[..., 0], points[..., 1]
+        z = points[..., 2] - np.interp(y, self.y, self.z)
+        clamped = np.clip(y, self.y[0], self.y[-1])
+        slope = np.interp(y, self.y, np.gradient(self.width, self.y))
+        radial = (np.hypot(x, z) - self.radius(np.arctan2(x, z), clamped)) / np.hypot(1.0, slope)
+        return np.maximum(radial, np.abs(y - clamped)) + np.where(radial > 0, 0.3 * np.abs(y - clamped), 0.0)
+
+    def outside(self, other: "Torso", gap_m: float) -> "Torso":
+        """This torso, widened where it would come nearer than `gap_m` to `other` (on the same samples)."""
+        names = ("width", "front", "back")
+        return replace(self, **{n: np.maximum(getattr(self, n), getattr(other, n) + gap_m) for n in names})
+
+    def eased(self, ease_m: float, hang: float = 0.0, flare: float = 0.0) -> "Torso":
+        """The torso of a garment: `ease_m` wider; with `hang` 1 the cloth below the chest never comes back in."""
+        tables = []
+        below = np.interp(self.y, [self.y[0], self.y[-1] * 0.8], [1.0, 0.0])
+        for table in (self.width, self.front, self.back):
+            # Cloth falls straight down from where the body below the arms is widest so far.
+            chest = self.y < 0.84 * self.y[-1]
+            fallen = np.maximum.accumulate(np.where(chest, table, 0)[::-1])[::-1]
+            tables.append(np.where(chest, table + hang * (fallen - table), table) + ease_m + flare * below)
+        bumps = self.bumps.copy()
+        bumps[:, 3] *= 1 + 0.6 * hang
+        return replace(self, width=tables[0], front=tables[1], back=tables[2], bumps=bumps)
+
+
+@dataclass(frozen=True)
+class Limb:
+    """An arm or a leg: a round profile about the line from its first joint to its last. Metres."""
+
+    start: Float[np.ndarray, "3"]
+    end: Float[np.ndarray, "3"]
+    forward: Float[np.ndarray, "3"]
+    t: Float[np.ndarray, "sample"]
+    r: Float[np.ndarray, "sample"]
+    shift: Float[np.ndarray, "sample"]
+    """How far the centre line stands behind the axis."""
+
+    @property
+    def length(self) -> float:
+        """Metres from the first joint to the last."""
+        return float(np.linalg.norm(self.end - self.start))
+
+    @property
+    def frame(self) -> Float[np.ndarray, "3 3"]:
+        """Rows: sideways, up the limb, and forward."""
+        up = unit(self.start - self.end)
+        side = unit(np.cross(up, self.forward))
+        return np.stack([side, up, np.cross(side, up)])
+
+    def center(self, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+        """The centre line at `t`."""
+        axis = self.start + t[..., None] * (self.end - self.start)
+        return axis - np.interp(t, self.t, self.shift)[..., None] * self.frame[2]
+
+    def point(self, azimuth: Float[np.ndarray, "*n"], t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+        """The surface at this azimuth (0 is forward) and place along the limb."""
+        around = np.sin(azimuth)[..., None] * self.frame[0] + np.cos(azimuth)[..., None] * self.frame[2]
+        return self.center(t) + np.interp(t, self.t, self.r)[..., None] * around
+
+    def along(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Place along the limb of the nearest point of its axis, not clamped."""
+        return (self.start - points) @ self.frame[1] / self.length
+
+    def field(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Distance to the surface to first order, negative inside."""
+        t = np.clip(self.along(points), self.t[0], self.t[-1])
+        return np.linalg.norm(points - self.center(t), axis=-1) - np.interp(t, self.t, self.r)
+
+    def eased(self, ease_m: float, hang_from: float = 2.0, flare: float = 0.0) -> "Limb":
+        """The sleeve or leg of a garment; beyond `hang_from` it hangs straight down and widens by `flare` metres."""
+        # Close at the joint, where the garment's trunk begins.
+        r = self.r + ease_m * np.interp(self.t, [0.0, 0.25], [0.5, 1.0])
+        hanging = self.t > hang_from
+        held = float(np.interp(hang_from, self.t, r))
+        far = np.clip((self.t - hang_from) / max(1 - hang_from, 1e-3), 0, 1)
+        r = np.where(hanging, np.maximum(r, held) + flare * far, r)
+        shift = np.where(hanging, np.interp(hang_from, self.t, self.shift), self.shift)
+        return replace(self, r=r, shift=shift)
+
+
+@dataclass(frozen=True)
+class Body:
+    """Torso and limbs; limbs are left arm, right arm, left leg, right leg."""
+
+    torso: Torso
+    arms: tuple[Limb, Limb]
+    legs: tuple[Limb, Limb]
+    blend_m: float
+    """Softness of the union."""
+
+    @property
+    def limbs(self) -> tuple[Limb, Limb, Limb, Limb]:
+        """Arms and legs, left first."""
+        return (*self.arms, *self.legs)
+
+    @property
+    def parts(self) -> tuple[Torso | Limb, ...]:
+        """Torso, arms, legs."""
+        return (self.torso, *self.limbs)
+
+    def fields(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "part *n"]:
+        """The field of each part."""
+        return np.stack([part.field(points) for part in self.parts])
+
+    def settle(
+        self, points: Float[np.ndarray, "*n 3"], outward: Float[np.ndarray, "*n 3"], part: int, seam_m: float = 0.002
+    ) -> Float[np.ndarray, "*n 3"]:
+        """Move a part's surface outward onto the smooth union of all parts.
+
+        The other parts count as `seam_m` thinner: this part's sheet dives under theirs exactly where their fields
+        cross, so that overlapping sheets meet in a clean seam.
+        """
+        bias = np.full(len(self.parts), seam_m)
+        bias[part] = 0.0
+        bias[opposite(part)] = np.inf
+        moved = np.zeros(points.shape[:-1])
+        for _ in range(4):
+            fields = self.fields(points + moved[..., None] * outward) + bias.reshape(-1, *[1] * moved.ndim)
+            k = self.blend_m
+            union = -k * np.log(np.exp(np.clip(-fields / k, -30, 30)).sum(0))
+            moved = np.clip(moved - 0.8 * union, 0.0, 2.0 * k)
+        return points + moved[..., None] * outward
+
+
+def opposite(part: int) -> list[int]:
+    """The limb of the other side (a pair's cloth must not grow together); none for the torso."""
+    return [] if part == 0 else [part + 1 if part % 2 else part - 1]
+
+
+def build_body(person: Physique, skeleton: Skeleton) -> Body:
+    """The naked shape of this person in the bind pose (head, hands and feet are drawn elsewhere)."""
+    H, f, w = person.height_m, person.femininity, person.weight
+    y, a_m, a_f, d_m, d_f, back, z = TORSO.T
+    belly = np.exp(-(((y - 0.605) / 0.065) ** 2)) * np.where(w > 0, 1.0, 0.35)
+    trunk = np.clip((0.85 - y) / 0.05, 0, 1)
+    width = (a_m + f * (a_f - a_m)) * (1 + trunk * (0.05 * w + 0.02 * (person.muscle - 0.5))) + 0.008 * w * belly
+    front = (d_m + f * (d_f - d_m)) * (1 + 0.04 * w * trunk) + 0.026 * w * belly
+    rear = back * (1 + 0.05 * w * trunk) + 0.008 * w * belly
+    columns = np.stack([width, front, rear, z], 1) * H
+    heights, table = smooth_table(leg_stretch(y, person.leg_share) * H, columns)
+    bust = (0.010 + 0.010 * f * (1 + 0.3 * w)) * f + 0.003 * (1 - f)
+    bumps = [(s * 0.62, 0.722, 0.42, 0.026, bust) for s in (1, -1)]
+    bumps += [(np.pi + s * 0.5, 0.51 * person.leg_share, 0.42, 0.030, 0.010 + 0.004 * f) for s in (1, -1)]
+    bump_table = np.array(bumps) * np.array([1, H, 1, H, H])
+    torso = Torso(heights, table[:, 0], table[:, 1], table[:, 2], table[:, 3], bump_table)
+    girth = 1 + 0.10 * w + 0.10 * (person.muscle - 0.5) - 0.06 * f
+    leg_girth = 1 + 0.10 * w + 0.05 * (person.muscle - 0.5) + 0.03 * f
+    forward = np.array([0.0, 0.0, 1.0])
+    arms = [_limb(skeleton, f"{s}_upperarm", f"{s}_hand", ARM_PROFILE, girth * H, H, forward) for s in SIDES]
+    legs = [_limb(skeleton, f"{s}_thigh", f"{s}_foot", LEG_PROFILE, leg_girth * H, H, forward) for s in SIDES]
+    return Body(torso, (arms[0], arms[1]), (legs[0], legs[1]), 0.010 * H)
+
+
+def _limb(
+    skeleton: Skeleton,
+    first: str,
+    last: str,
+    profile: Float[np.ndarray, "knot 3"],
+    girth_m: float,
+    height_m: float,
+    forward: Float[np.ndarray, "3"],
+) -> Limb:
+    t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth_m, height_m]))
+    return Limb(skeleton.at(first), skeleton.at(last), forward, t, table[:, 0], table[:, 1])

@@ -1,0 +1,84 @@
+"""What arms do: families of oscillating joint angles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from viewmend.studio.procedural.stance import ArmPose
+
+# Per family: (base, amplitude) of flexion, abduction, twist, elbow; the harmonic of the beat; phase between the arms.
+FAMILIES: dict[str, tuple[tuple[tuple[float, float], ...], float, float]] = {
+    "hang": (((0.02, 0.05), (0.17, 0.03), (0.25, 0.05), (0.28, 0.06)), 0.5, 0.5),
+    "swing": (((0.0, 0.45), (0.16, 0.02), (0.30, 0.05), (0.50, 0.22)), 1.0, 0.5),
+    "drive": (((0.05, 0.75), (0.20, 0.04), (0.35, 0.10), (1.55, 0.20)), 1.0, 0.5),
+    "talk": (((0.42, 0.18), (0.22, 0.10), (0.20, 0.25), (1.35, 0.35)), 1.0, 0.35),
+    "sides": (((0.10, 0.15), (1.30, 0.30), (0.10, 0.40), (0.45, 0.35)), 1.0, 0.5),
+    "overhead": (((2.50, 0.25), (0.30, 0.15), (0.10, 0.30), (0.55, 0.35)), 1.0, 0.0),
+    "pump": (((0.75, 0.40), (0.32, 0.10), (0.15, 0.15), (1.65, 0.35)), 1.0, 0.5),
+    "disco": (((1.20, 1.10), (0.45, 0.25), (0.10, 0.20), (0.45, 0.30)), 0.5, 0.5),
+    "hips": (((-0.28, 0.05), (0.78, 0.06), (1.15, 0.05), (1.75, 0.05)), 0.5, 0.0),
+    "clap": (((1.05, 0.10), (0.12, 0.16), (0.40, 0.10), (0.95, 0.10)), 1.0, 0.0),
+    "wings": (((0.00, 0.20), (1.55, 1.20), (0.00, 0.20), (0.25, 0.15)), 0.5, 0.0),
+    "jacks": (((0.10, 0.05), (1.55, 1.25), (0.00, 0.05), (0.20, 0.05)), 1.0, 0.0),
+    "box": (((1.15, 0.30), (0.22, 0.05), (0.45, 0.10), (1.20, -1.00)), 1.0, 0.5),
+    "wave": (((0.10, 0.10), (1.25, 0.08), (-1.40, 0.10), (1.35, 0.40)), 2.0, 0.0),
+    "laps": (((0.48, 0.06), (0.16, 0.03), (0.20, 0.08), (0.90, 0.12)), 0.5, 0.4),
+}
+FASTEST_RAD_S = 7.0
+"""Of an arm's joint; hands then stay below about ten metres a second."""
+CURLS = {"box": 1.5, "drive": 1.0, "pump": 1.3, "clap": 0.05, "wave": 0.0, "jacks": 0.1, "hips": 0.6}
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """A family with a person's own bases, amplitudes and phases, for left and right."""
+
+    families: tuple[str, str]
+    bases: Float[np.ndarray, "side angle"]
+    amplitudes: Float[np.ndarray, "side angle"]
+    phases: Float[np.ndarray, "side angle"]
+    harmonics: Float[np.ndarray, "side"]
+
+    def angles(self, beats: float) -> Float[np.ndarray, "side angle"]:
+        """Flexion, abduction, twist, elbow, curl of both arms at this point of the music."""
+        moving = self.bases + self.amplitudes * np.sin(2 * np.pi * (self.harmonics[:, None] * beats + self.phases))
+        moving[:, 1] = np.maximum(moving[:, 1], 0.02)
+        moving[:, 3] = np.maximum(moving[:, 3], 0.02)
+        return moving
+
+
+def sample_gesture(
+    rng: np.random.Generator, families: tuple[str, ...], bulk: float, energy: float, beat_hz: float
+) -> Gesture:
+    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes.
+
+    At `beat_hz` no joint turns faster than an arm can.
+    """
+    first = families[int(rng.integers(len(families)))]
+    names = (first, "hang" if first == "wave" else first)
+    if first == "wave" and rng.random() < 0.5:
+        names = (names[1], names[0])
+    phase = rng.random()
+    own = rng.uniform(0, 1, 4)
+    bases, amplitudes, phases, harmonics = [], [], [], []
+    for i, name in enumerate(names):
+        angles, harmonic, apart = FAMILIES[name]
+        table = np.array(angles)
+        base = table[:, 0] + 0.08 * rng.standard_normal(4)
+        base[1] = max(base[1], table[1, 0]) + bulk * np.clip(1.2 - base[1], 0, 1)
+        most = FASTEST_RAD_S / (2 * np.pi * harmonic * beat_hz)
+        amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
+        # The main angle beats with the music; the others follow it loosely.
+        offsets = phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
+        bases.append([*base, CURLS.get(name, 0.3)])
+        amplitudes.append([*amplitude, 0.05])
+        phases.append([*offsets, phase])
+        harmonics.append(harmonic)
+    return Gesture(names, np.array(bases), np.array(amplitudes), np.array(phases), np.array(harmonics))
+
+
+def arm_poses(angles: Float[np.ndarray, "side angle"]) -> tuple[ArmPose, ArmPose]:
+    """Both arms at these angles."""
+    left, right = (ArmPose(flexion=a[0], abduction=a[1], twist=a[2], elbow=a[3], curl=a[4]) for a in angles.tolist())
+    return left, right

@@ -1,0 +1,136 @@
+"""Seeded motions: feet and pelvis by a score, arms by gestures that take turns, and a head that looks about."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from viewmend.studio.procedural.gestures import Gesture, arm_poses, sample_gesture
+from viewmend.studio.procedural.grounds import GROUNDS, Score, Tempo, ease
+from viewmend.studio.procedural.physique import Physique
+from viewmend.studio.procedural.skeleton import SIDES, Skeleton
+from viewmend.studio.procedural.stance import ArmPose, FootPose, Stance
+
+MOTIONS: dict[Tempo, tuple[str, ...]] = {
+    "calm": ("walk", "talk", "turn", "reach", "sit", "crouch", "sway"),
+    "dance": ("groove", "sidestep", "spin", "march", "lunge"),
+    "fast": ("run", "jacks", "box", "groove", "spin"),
+}
+GESTURES: dict[str, tuple[str, ...]] = {
+    "walk": ("swing",),
+    "talk": ("talk", "wave", "hips", "hang"),
+    "turn": ("hang", "talk", "hips", "wave"),
+    "reach": ("hang",),
+    "sit": ("laps", "talk", "wave"),
+    "crouch": ("pump", "laps", "clap"),
+    "sway": ("hang", "hips", "sides", "wave"),
+    "groove": ("pump", "disco", "sides", "overhead", "wings", "clap", "hips"),
+    "sidestep": ("clap", "pump", "sides", "wings", "disco"),
+    "spin": ("sides", "overhead", "wings"),
+    "march": ("drive", "swing", "overhead"),
+    "lunge": ("sides", "overhead", "disco"),
+    "run": ("drive",),
+    "jacks": ("jacks",),
+    "box": ("box",),
+}
+BEAT_HZ: dict[Tempo, tuple[float, float]] = {"calm": (0.35, 0.6), "dance": (0.8, 1.15), "fast": (1.3, 1.8)}
+ENERGY: dict[Tempo, float] = {"calm": 0.8, "dance": 1.0, "fast": 1.1}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A motion of one person; `stance` is a smooth, deterministic function of time."""
+
+    score: Score
+    gestures: tuple[Gesture, Gesture]
+    bar_s: float
+    """The two gestures take turns this often."""
+    center: tuple[float, float] = (0.0, 0.0)
+
+    def stance(self, time_s: float) -> Stance:
+        """The body at this time."""
+        beats = self.score.beat_hz * time_s + float(self.score.amounts[7])
+        base = GROUNDS[self.score.kind](self.score, time_s, beats)
+        stance = self._arms(base, time_s, beats)
+        glance = self.score.amounts
+        look = 0.45 * np.sin(0.9 * time_s + 6 * glance[0]) * np.sin(0.37 * time_s + 6 * glance[1])
+        nod = 0.10 * np.sin(0.7 * time_s + 6 * glance[2]) + (0.10 if self.score.tempo != "calm" else 0.03) * np.sin(
+            2 * np.pi * beats
+        )
+        return replace(
+            stance,
+            look=float(look) - 0.5 * stance.twist,
+            nod=stance.nod + float(nod) - 0.45 * (stance.bend + stance.lean),
+            tilt=0.10 * float(np.sin(np.pi * beats)),
+            pelvis=stance.pelvis + np.array([self.center[0], 0, self.center[1]]),
+            feet=_shifted(stance.feet, self.center),
+            arms=_shifted_arms(stance.arms, self.center),
+        )
+
+    def gripping(self, side: str) -> "Motion":
+        """The same motion with this hand closed round something."""
+        i = SIDES.index(side)
+        gestures = []
+        for gesture in self.gestures:
+            bases, amplitudes = gesture.bases.copy(), gesture.amplitudes.copy()
+            bases[i, 4], amplitudes[i, 4] = 1.3, 0.0
+            gestures.append(replace(gesture, bases=bases, amplitudes=amplitudes))
+        return replace(self, gestures=(gestures[0], gestures[1]))
+
+    def _arms(self, base: Stance, time_s: float, beats: float) -> Stance:
+        if self.score.kind == "reach":
+            return base
+        bar = time_s / self.bar_s + float(self.score.amounts[6])
+        # The distance from the middle of the second gesture's bar, in bars, goes up and down between 0 and 1.
+        share = ease((0.7 - abs(bar % 2.0 - 1.0)) / 0.4)
+        first, second = (gesture.angles(beats) for gesture in self.gestures)
+        return replace(base, arms=arm_poses(first + share * (second - first)))
+
+
+def _shifted(feet: tuple[FootPose, FootPose], center: tuple[float, float]) -> tuple[FootPose, FootPose]:
+    offset = np.array([center[0], 0.0, center[1]])
+    left, right = (replace(foot, place=foot.place + offset) for foot in feet)
+    return left, right
+
+
+def _shifted_arms(arms: tuple[ArmPose, ArmPose], center: tuple[float, float]) -> tuple[ArmPose, ArmPose]:
+    offset = np.array([center[0], 0.0, center[1]])
+    left, right = (arm if arm.target is None else replace(arm, target=arm.target + offset) for arm in arms)
+    return left, right
+
+
+def sample_motion(
+    rng: np.random.Generator,
+    person: Physique,
+    skeleton: Skeleton,
+    tempo: Tempo,
+    kind: str | None,
+    bulk: float,
+    center: tuple[float, float] = (0.0, 0.0),
+) -> Motion:
+    """Draw a motion of this tempo; `kind` fixes which."""
+    chosen = kind or MOTIONS[tempo][int(rng.integers(len(MOTIONS[tempo])))]
+    low, high = BEAT_HZ[tempo]
+    beat = float(rng.uniform(low, high))
+    if chosen == "walk":
+        beat = float(rng.uniform(0.75, 0.98))
+    if chosen == "jacks":
+        beat = float(rng.uniform(0.85, 1.15))
+    if chosen == "run":
+        beat = float(rng.uniform(1.25, 1.5))
+    gestures = [sample_gesture(rng, GESTURES[chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
+    path = 0.0
+    if chosen in ("walk", "run"):
+        path = float(rng.uniform(0.42, 0.65)) if rng.random() < 0.7 else 0.0
+    if chosen == "sidestep":
+        path = float(rng.uniform(0.12, 0.3))
+    score = Score(
+        chosen,
+        tempo,
+        beat,
+        skeleton,
+        person.height_m,
+        float(rng.uniform(-np.pi, np.pi)),
+        path,
+        rng.uniform(0, 1, 8),
+    )
+    return Motion(score, (gestures[0], gestures[1]), float(rng.uniform(2.5, 5.0)), center)

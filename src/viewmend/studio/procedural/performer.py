@@ -1,0 +1,112 @@
+"""Performers and scenes drawn from a seed."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from viewmend.studio.procedural.grounds import Tempo, seat_height
+from viewmend.studio.procedural.motion import MOTIONS
+from viewmend.studio.procedural.patches import Patch, assemble
+from viewmend.studio.procedural.person import ProceduralPerson, draw_person
+from viewmend.studio.procedural.props import STANDING, standing_prop, stool
+from viewmend.studio.procedural.scene import ProceduralPerformer, still
+
+TEMPOS: tuple[Tempo, ...] = ("calm", "dance", "fast")
+ROAMING = ("walk", "run", "sidestep")
+"""Motions that need the floor for themselves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PerformerStyle:
+    """What of a performer or scene is fixed; None leaves it to the seed."""
+
+    tempo: Tempo | None = None
+    motion: str | None = None
+    """One of those in `motion.MOTIONS`."""
+    people: int | None = None
+    """1 or 2, for scenes."""
+    holding: bool | None = None
+    """Whether something is held in a hand."""
+    furniture: bool | None = None
+    """Whether things stand around, for scenes (who sits has a stool anyway)."""
+
+
+def procedural_performer(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
+    """A clothed person in motion around the stage's centre, the same for the same seed and style, bit for bit.
+
+    Args:
+        seed: any non-negative number; from 10000 on they are for tests, never for training.
+        style: what to fix.
+
+    Raises:
+        ValueError: the style names a motion that does not exist.
+    """
+    return procedural_scene(seed, style=replace(style or PerformerStyle(), people=1, furniture=False))
+
+
+def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
+    """One or two performers, perhaps with things in their hands and around them; deterministic as the above.
+
+    Raises:
+        ValueError: the style names a motion that does not exist, or another number of people than 1 or 2.
+    """
+    style = style or PerformerStyle()
+    _check(style)
+    rng = np.random.default_rng([seed, 77])
+    chance = rng.random(3)
+    count = style.people or (2 if chance[0] < 0.2 else 1)
+    tempo: Tempo = style.tempo or TEMPOS[int(rng.integers(3))]
+    angle = rng.uniform(0, 2 * np.pi)
+    aside = np.array([np.sin(angle), np.cos(angle)]) * (0.46 if count == 2 else 0.0)
+    people = []
+    for i, seeds in enumerate(np.random.SeedSequence(seed).spawn(count)):
+        kind = style.motion or _kind(rng, tempo, crowded=count == 2)
+        x, z = (aside * (1 - 2 * i)).tolist()
+        people.append(draw_person(seeds, tempo, kind, style.holding, (x, z)))
+    patches, names = _seats(people, rng), []
+    roams = any(person.motion.score.kind in ROAMING for person in people)
+    if (chance[1] < 0.5 if style.furniture is None else style.furniture) and not roams:
+        more, names = _furniture(rng, angle)
+        patches += more
+    words = " and ".join(person.description for person in people)
+    if names:
+        words += ", beside " + " and ".join(names)
+    return ProceduralPerformer(tuple(people), still(assemble(patches)) if patches else None, words)
+
+
+def _check(style: PerformerStyle) -> None:
+    known = sorted({kind for kinds in MOTIONS.values() for kind in kinds})
+    if style.motion is not None and style.motion not in known:
+        raise ValueError(f"expected a motion among {known}, got {style.motion!r}; choose one of them")
+    if style.people not in (None, 1, 2):
+        raise ValueError(f"expected 1 or 2 people, got {style.people}; the stage holds no more")
+
+
+def _kind(rng: np.random.Generator, tempo: Tempo, crowded: bool) -> str:
+    kinds = [kind for kind in MOTIONS[tempo] if not (crowded and kind in ROAMING)]
+    return kinds[int(rng.integers(len(kinds)))]
+
+
+def _seats(people: list[ProceduralPerson], rng: np.random.Generator) -> list[Patch]:
+    """A stool under everyone who sits."""
+    patches: list[Patch] = []
+    for person in people:
+        score, center = person.motion.score, person.motion.center
+        if score.kind == "sit":
+            under = np.array([center[0], 0.0, center[1]])
+            back = 0.03 * score.height_m * np.array([np.sin(score.heading), 0, np.cos(score.heading)])
+            patches += stool(rng, under - back, score.heading, seat_height(score.height_m))
+    return patches
+
+
+def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], list[str]]:
+    """One or two things on the floor, off the line through two people."""
+    patches: list[Patch] = []
+    names: list[str] = []
+    for i in range(int(rng.integers(1, 3))):
+        kind = STANDING[int(rng.integers(len(STANDING)))]
+        turn = angle + np.pi / 2 + i * np.pi + rng.uniform(-0.6, 0.6)
+        at = rng.uniform(0.78, 0.95) * np.array([np.sin(turn), 0, np.cos(turn)])
+        patches += standing_prop(kind, rng, at, float(rng.uniform(0, 6.3)))
+        names.append(f"a {kind}")
+    return patches, names

@@ -1,0 +1,216 @@
+"""Puts a motion on a character: each limb turns as the actor's does, whatever the two rest poses are."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.studio.bvh import Motion
+from viewmend.studio.gltf import Character
+from viewmend.studio.skeletons import PARTS, find_parts
+
+_LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
+"""Limbs whose rest directions are aligned, and the part that each points to."""
+
+
+@dataclass(frozen=True)
+class Retarget:
+    """A motion made ready for a character: R_j(t) = G_s(j)(t) A_j R0_j for each mapped joint j.
+
+    Both are first brought upright (y up, facing +z, metres): by a turn to the nearest axes, from where the hips, the
+    head and the two sides lie in the rest poses, and the character by a power of ten where it is no one's height.
+    """
+
+    character: Character
+    upright_from_file: Float[Tensor, "4 4"]
+    """Of the character."""
+    driver: tuple[int, ...]
+    """For each node of the character the position among `rotations`' joints that turns it, -1 where none does."""
+    rotations: Float[Tensor, "frame driver 3 3"]
+    """G_s(j)(t) A_j R0_j of the driven nodes."""
+    hips: int
+    """Node of the hips."""
+    hips_path: Float[Tensor, "frame 3"]
+    """World positions of the hips, metres."""
+    seconds_per_frame: float
+
+    def joint_matrices(self, frame: float) -> Float[Tensor, "joint 4 4"]:
+        """world_from_bind of every joint, at a frame or between two."""
+        before = min(max(int(frame), 0), len(self.hips_path) - 1)
+        after = min(before + 1, len(self.hips_path) - 1)
+        fraction = frame - before
+        turns = _orthonormal(torch.lerp(self.rotations[before], self.rotations[after], fraction))
+        position = torch.lerp(self.hips_path[before], self.hips_path[after], fraction)
+        world = node_matrices(self.character, self.upright_from_file, self.driver, turns, (self.hips, position))
+        return world[self.character.node_of_joint] @ self.character.joint_from_bind
+
+
+def retarget(character: Character, motion: Motion) -> Retarget:
+    """Put a motion on a character.
+
+    Raises:
+        ValueError: one of the skeletons has no hips, arms or legs by any known name.
+    """
+    target = find_parts([n.name for n in character.nodes], [n.parent for n in character.nodes])
+    source = find_parts(motion.names, motion.parents)
+    node_of = {part: [n.name for n in character.nodes].index(name) for part, name in target.items()}
+    joint_of = {part: motion.names.index(name) for part, name in source.items()}
+    no_driver = (-1,) * len(character.nodes)
+    file_rest = node_matrices(character, torch.eye(4), no_driver, torch.zeros(0, 3, 3), None)[:, :3, 3]
+    upright = torch.eye(4)
+    upright[:3, :3] = _upright({p: file_rest[n] for p, n in node_of.items()})
+    height = float(file_rest[node_of["Hips"]].sub(file_rest[node_of["LeftFoot"]]).norm())
+    # Hips are 0.6 to 1 m above the ankles of an adult; a file in centimetres is 100 times that.
+    upright[:3, :3] *= 10.0 ** -round(float(torch.tensor(height / 0.8).log10()))
+    rest = file_rest @ upright[:3, :3].T
+    turn = _upright({p: motion.rest[j] for p, j in joint_of.items()})
+    source_rest = motion.rest @ turn.T
+    rotations = turn @ motion.rotations @ turn.T
+
+    parts = [p for p in PARTS if p in node_of and p in joint_of]
+    alignment = {p: _alignment(p, rest, node_of, source_rest, joint_of) for p in parts}
+    rest_turns = _rest_rotations(character, upright)
+    driven = [rotations[:, joint_of[p]] @ alignment[p] @ rest_turns[node_of[p]] for p in parts]
+    driver = [-1] * len(character.nodes)
+    for place, part in enumerate(parts):
+        driver[node_of[part]] = place
+    path = _hips_path(rest, node_of, source_rest, joint_of, rotations, _joint_path(motion, joint_of["Hips"]) @ turn.T)
+    return Retarget(
+        *(character, upright, tuple(driver), torch.stack(driven, 1), node_of["Hips"], path, motion.seconds_per_frame)
+    )
+
+
+def node_matrices(
+    character: Character,
+    upright_from_file: Float[Tensor, "4 4"],
+    driver: tuple[int, ...],
+    turns: Float[Tensor, "driver 3 3"],
+    hips: tuple[int, Float[Tensor, "3"]] | None,
+) -> Float[Tensor, "node 4 4"]:
+    """World matrices of the nodes: driven ones turned to `turns` (global rotations), the others as at rest.
+
+    Local translations and scales stay those of the file, but the hips' node (if given) is put at its position.
+    """
+    start = upright_from_file[:3, :3]
+    unit = start / start[0].norm()
+    linear: list[Tensor] = []
+    turned: list[Tensor] = []
+    moved: list[Tensor] = []
+    for n, node in enumerate(character.nodes):
+        parent = node.parent
+        above, above_turn = (start, unit) if parent < 0 else (linear[parent], turned[parent])
+        origin = upright_from_file[:3, 3] if parent < 0 else moved[parent]
+        local = node.rotation if driver[n] < 0 else above_turn.T @ turns[driver[n]]
+        turned.append(above_turn @ local)
+        linear.append((above @ local) * node.scale)
+        at_hips = hips is not None and hips[0] == n
+        moved.append(hips[1] if hips is not None and at_hips else above @ node.translation + origin)
+    matrices = torch.zeros(len(character.nodes), 4, 4)
+    matrices[:, :3, :3] = torch.stack(linear)
+    matrices[:, :3, 3] = torch.stack(moved)
+    matrices[:, 3, 3] = 1
+    return matrices
+
+
+def _rest_rotations(character: Character, upright: Float[Tensor, "4 4"]) -> list[Tensor]:
+    """R0: the nodes' global rest rotations, scale removed."""
+    turned: list[Tensor] = []
+    for node in character.nodes:
+        above = upright[:3, :3] / upright[0, :3].norm() if node.parent < 0 else turned[node.parent]
+        turned.append(above @ node.rotation)
+    return turned
+
+
+def _upright(rest: dict[str, Tensor]) -> Float[Tensor, "3 3"]:
+    """The turn by right angles that brings a rest pose to y up and its left side to +x."""
+    legs = (rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - (rest["LeftFoot"] + rest["RightFoot"]) / 2
+    up = torch.zeros(3)
+    up[int(legs.abs().argmax())] = float(legs[legs.abs().argmax()].sign())
+    left = rest["LeftUpLeg"] - rest["RightUpLeg"]
+    left = left - (left @ up) * up
+    side = torch.zeros(3)
+    side[int(left.abs().argmax())] = float(left[left.abs().argmax()].sign())
+    return torch.stack([side, up, torch.linalg.cross(side, up)])
+
+
+def _alignment(
+    part: str,
+    rest: Float[Tensor, "node 3"],
+    node_of: dict[str, int],
+    source_rest: Float[Tensor, "joint 3"],
+    joint_of: dict[str, int],
+) -> Float[Tensor, "3 3"]:
+    """A_j: the smallest rotation from the character's bone direction at rest to the motion's."""
+    side = "Left" if part.startswith("Left") else "Right"
+    limb = part.removeprefix(side)
+    limb = "ForeArm" if limb == "Hand" else limb
+    start, end = side + limb, side + _LIMBS.get(limb, "")
+    if limb not in _LIMBS or not all(p in node_of and p in joint_of for p in (start, end)):
+        return torch.eye(3)
+    a = rest[node_of[end]] - rest[node_of[start]]
+    b = source_rest[joint_of[end]] - source_rest[joint_of[start]]
+    return smallest_rotation(a, b)
+
+
+def smallest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The rotation by the smallest angle that takes direction a to direction b (any half turn if opposite)."""
+    a, b = a / a.norm(), b / b.norm()
+    cosine = float(a @ b)
+    if cosine < -1 + 1e-6:
+        axis = torch.linalg.cross(a, torch.eye(3)[int(a.abs().argmin())])
+        axis = axis / axis.norm()
+        return 2 * torch.outer(axis, axis) - torch.eye(3)
+    v = torch.linalg.cross(a, b)
+    zero = torch.zeros(())
+    skew = torch.stack([zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero]).reshape(3, 3)
+    return torch.eye(3) + skew + skew @ skew / (1 + cosine)
+
+
+def _hips_path(
+    rest: Float[Tensor, "node 3"],
+    node_of: dict[str, int],
+    source_rest: Float[Tensor, "joint 3"],
+    joint_of: dict[str, int],
+    rotations: Float[Tensor, "frame joint 3 3"],
+    hips: Float[Tensor, "frame 3"],
+) -> Float[Tensor, "frame 3"]:
+    """Where the hips are, s (p + G_root o_b) - G_root o_a: the middle of the hip joints moves as the actor's.
+
+    Scaled by leg length, s.
+    """
+    scale = _leg_length(rest, node_of) / _leg_length(source_rest, joint_of)
+    o_a = _hip_middle(rest, node_of)
+    o_b = _hip_middle(source_rest, joint_of)
+    turn = rotations[:, joint_of["Hips"]]
+    return scale * (hips + turn @ o_b) - turn @ o_a
+
+
+def _joint_path(motion: Motion, joint: int) -> Float[Tensor, "frame 3"]:
+    """World positions of a joint of the motion."""
+    path = motion.root
+    while motion.parents[joint] >= 0:
+        parent = motion.parents[joint]
+        path = path + motion.rotations[:, parent] @ (motion.rest[joint] - motion.rest[parent])
+        joint = parent
+    return path
+
+
+def _hip_middle(rest: Float[Tensor, "joint 3"], at: dict[str, int]) -> Float[Tensor, "3"]:
+    return (rest[at["LeftUpLeg"]] + rest[at["RightUpLeg"]]) / 2 - rest[at["Hips"]]
+
+
+def _leg_length(rest: Float[Tensor, "joint 3"], at: dict[str, int]) -> float:
+    total = 0.0
+    for side in ("Left", "Right"):
+        hip, knee, foot = (rest[at[side + part]] for part in ("UpLeg", "Leg", "Foot"))
+        total += float((knee - hip).norm() + (foot - knee).norm()) / 2
+    return total
+
+
+def _orthonormal(matrices: Float[Tensor, "batch 3 3"]) -> Float[Tensor, "batch 3 3"]:
+    """The rotations nearest to blends of two near rotations (Gram-Schmidt: exact where they are rotations)."""
+    x = torch.nn.functional.normalize(matrices[..., 0], dim=-1)
+    y = matrices[..., 1] - (matrices[..., 1] * x).sum(-1, keepdim=True) * x
+    y = torch.nn.functional.normalize(y, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)

@@ -1,0 +1,137 @@
+"""Light on the stage: a soft surrounding and a few lamps, with the shadows that the performer casts on itself."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, project
+from viewmend.geometry.mesh import Mesh
+from viewmend.geometry.rasterize import rasterize
+from viewmend.geometry.rigid import look_at
+from viewmend.geometry.threads import parallel_for
+
+SHADOW_PX = 128
+SHADOW_DISTANCE_M = 12.0
+"""Lights are this far away: near enough to be a pinhole camera, far enough to look parallel."""
+SHADOW_BIAS_M = 0.015
+GLOSS_DOUBLINGS = 4
+"""Highlights fall off with the power 2^this of the half vector's cosine: a power that needs no logarithm."""
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Light from a sphere of directions (diffuse, with shadows), and lamps that make highlights. Linear light."""
+
+    toward: Float[Tensor, "light 3"]
+    """Unit vectors from the stage to each direction."""
+    strength: Float[Tensor, "light 3"]
+    """What a white surface that faces the direction reflects of it."""
+    lamps: Float[Tensor, "lamp 3"]
+    """Unit vectors to the lamps."""
+    gloss: Float[Tensor, "lamp 3"]
+    """The colour of each lamp's highlight at its middle."""
+
+    def to(self, device: torch.device | str) -> "Lights":
+        """The same lights on `device`."""
+        return Lights(*(t.to(device) for t in (self.toward, self.strength, self.lamps, self.gloss)))
+
+
+def stage_lights(seed: int, directions: int = 16, evenness: float = 0.65) -> Lights:
+    """Seeded lights as on a capture stage: much the same from all sides, and a little not.
+
+    A surrounding that is brighter above than below gives the share `evenness`; three large soft lamps of slightly
+    different strength and tint, around and above, give the rest.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    toward = _sphere(directions)
+    surrounding = (0.75 + 0.45 * toward[:, 1:2]).expand(-1, 3)
+    angle = torch.rand((), generator=generator) * 2 * math.pi + torch.arange(3) * 2 * math.pi / 3
+    angle = angle + 0.5 * torch.rand(3, generator=generator)
+    height = 0.4 + 0.7 * torch.rand(3, generator=generator)
+    lamps = torch.nn.functional.normalize(torch.stack([angle.cos(), height, angle.sin()], -1), dim=-1)
+    tint = 1 + 0.08 * (2 * torch.rand(3, 3, generator=generator) - 1)
+    power = (0.5 + torch.rand(3, 1, generator=generator)) * tint
+    lobes = torch.exp(6 * (toward @ lamps.T - 1)) @ power
+    # A white wall of any heading reflects the same on average, whatever the seed: exposure is the camera's matter.
+    heading = torch.arange(16) * math.pi / 8
+    walls = torch.stack([heading.cos(), torch.zeros(16), heading.sin()], -1)
+    facing = (walls @ toward.T).clamp(min=0)
+    parts = [share * part / (facing @ part).mean() for share, part in ((evenness, surrounding), (1 - evenness, lobes))]
+    return Lights(toward, 0.95 * (parts[0] + parts[1]), lamps, 0.05 * power)
+
+
+def _sphere(count: int) -> Float[Tensor, "direction 3"]:
+    """Directions spread evenly (a Fibonacci spiral)."""
+    place = torch.arange(count) + 0.5
+    y = 1 - 2 * place / count
+    angle = place * math.pi * (3 - math.sqrt(5))
+    radius = (1 - y * y).sqrt()
+    return torch.stack([radius * angle.cos(), y, radius * angle.sin()], -1)
+
+
+def irradiance(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -> Float[Tensor, "vertex 3"]:
+    """What a white surface reflects at each vertex: all lights that it faces and sees. Linear light.
+
+    One small shadow map per direction; together they are soft shadows and ambient occlusion at once.
+    """
+    facing = (normals @ lights.toward.T).clamp(min=0)
+    return (facing * visibility(mesh, normals, lights)) @ lights.strength
+
+
+def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -> Float[Tensor, "vertex light"]:
+    """How much of each direction the mesh leaves free at its vertices, 0 to 1."""
+    cameras = _light_cameras(mesh, lights)
+    depth = rasterize(mesh, cameras).depth
+    depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
+    pixels, z = project(mesh.vertices + SHADOW_BIAS_M * normals, cameras)
+    if z.device.type == "cpu":
+        try:
+            from viewmend.studio import _shade_numba as kernels
+        except ImportError:
+            pass
+        else:
+            seen = torch.empty_like(z)
+
+            def look(n: int) -> None:
+                kernels.unshadowed(pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
+
+            parallel_for(look, len(cameras))
+            return seen.T
+    return unshadowed_torch(pixels, z, depth).T
+
+
+def unshadowed_torch(
+    pixels: Float[Tensor, "light vertex 2"],
+    z: Float[Tensor, "light vertex"],
+    depth: Float[Tensor, "light shadow shadow"],
+) -> Float[Tensor, "light vertex"]:
+    """Share of the four nearest texels of each shadow map that lie no nearer to the light than the vertex."""
+    corner = (pixels - 0.5).floor()
+    fraction = pixels - 0.5 - corner
+    seen = torch.zeros_like(z)
+    view = torch.arange(len(z), device=z.device)[:, None]
+    for x, wx in ((0, 1 - fraction[..., 0]), (1, fraction[..., 0])):
+        for y, wy in ((0, 1 - fraction[..., 1]), (1, fraction[..., 1])):
+            column = (corner[..., 0].long() + x).clamp(0, depth.shape[2] - 1)
+            row = (corner[..., 1].long() + y).clamp(0, depth.shape[1] - 1)
+            seen += wx * wy * (z < depth[view, row, column] + SHADOW_BIAS_M)
+    return seen
+
+
+def _light_cameras(mesh: Mesh, lights: Lights) -> Cameras:
+    """A far camera at each light that holds the whole mesh."""
+    low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
+    middle = (low + high) / 2
+    radius = float((high - low).norm()) / 2 + 0.02
+    distance = SHADOW_DISTANCE_M + radius
+    up = torch.tensor([0.0, 0.6, 0.8], device=middle.device)
+    side = torch.tensor([1.0, 0.0, 0.0], device=middle.device)
+    cameras = []
+    for toward in lights.toward:
+        turn = side if float((toward @ up).abs()) > 0.99 else up
+        pose = look_at(middle + toward * distance, middle, turn)
+        cameras.append(pinhole(2 * math.asin(radius / distance), SHADOW_PX, SHADOW_PX, pose))
+    return concatenate_cameras(cameras)

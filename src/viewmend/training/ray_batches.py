@@ -1,0 +1,130 @@
+"""Samples as the ray reader alone needs them: some missing pixels, looked up in the cameras once. Ours.
+
+A hundredth of a sample's size, and most of a step's work: a buffer, or a folder of shards, holds thousands of scenes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from random import Random
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor, nn
+
+from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.ray_blend_net import RayInputs, look_around
+from viewmend.inpainting.ray_sampling import CELL_CHANNELS
+from viewmend.training.losses import ImageLoss, mean_loss, pixel_loss
+from viewmend.training.objective import StepOutput
+from viewmend.training.plan import Recipe
+from viewmend.training.samples import Sample
+from viewmend.training.scenes import SceneSource
+
+DARKEST = 0.6
+"""Least of the gains of varied colours."""
+BLINDED_SHARE, MOST_BLIND = 0.3, 3
+"""Share of the varied samples that lose cameras, and how many at most."""
+
+
+@dataclass(frozen=True)
+class RayBatch:
+    """What the cameras show along the rays of some missing pixels of a sample."""
+
+    features: Float[Tensor, "pixel point view 14"]
+    """`RaySamples.features`, half precision."""
+    occupancy: Float[Tensor, "pixel point 4"]
+    around: UInt8[Tensor, "pixel 8 11 11"]
+    """The view about each pixel, in 255ths,"""
+    far: UInt8[Tensor, "place 12 11 11"]
+    """and what is farther around at each place that differs."""
+    place: Int[Tensor, "pixel"]
+    """At which of these each pixel is."""
+    truth: UInt8[Tensor, "pixel 3"]
+    """F* there."""
+
+    def to(self, device: torch.device | str) -> "RayBatch":
+        """The same on `device`."""
+        values = (self.features, self.occupancy, self.around, self.far, self.place, self.truth)
+        return RayBatch(*(value.to(device) for value in values))
+
+    def inputs(self) -> RayInputs:
+        """As the reader takes them."""
+        around, far = self.around.float() / 255, self.far.float() / 255
+        return RayInputs(self.features.float(), self.occupancy.float(), around, far, self.place)
+
+
+class RayBatchScenes:
+    """A source's scenes, of each sample at most so many random missing pixels; the same for the same number."""
+
+    def __init__(self, scenes: SceneSource[Sample | RayBatch], seed: str, most_px: int) -> None:
+        self.scenes = scenes
+        self.seed = seed
+        self.most_px = most_px
+
+    def scene(self, number: int) -> list[RayBatch]:
+        """Scene `number`; what was looked up before stays as it is."""
+        random = Random(f"{self.seed}/pixels/{number}")
+        return [s if isinstance(s, RayBatch) else ray_batch(s, self.most_px, random) for s in self.scenes.scene(number)]
+
+
+def ray_batch(sample: Sample, most_px: int, random: Random) -> RayBatch:
+    """The sample at no more than `most_px` of its missing pixels."""
+    missing = torch.nonzero(sample.view.error > 0)
+    pixels = missing[random.sample(range(len(missing)), min(most_px, len(missing)))]
+    seen = look_around(sample.view, sample.nearby, pixels)
+    return RayBatch(
+        seen.features.half(),
+        seen.occupancy.half(),
+        (255 * seen.around).round().to(torch.uint8),
+        (255 * seen.far).round().to(torch.uint8),
+        seen.place,
+        sample.truth[:, *pixels.unbind(1)].T.contiguous(),
+    )
+
+
+def varied(lookups: RayBatch) -> RayBatch:
+    """The same pixels as they might have been, by torch's random numbers: other colours, turned, with fewer cameras.
+
+    Channels change places and everything gets darker, for cameras, surroundings and truth alike; the surroundings are
+    flipped and turned; of three tenths of the samples up to three cameras that did not colour the view see nothing.
+    """
+    channels, gain = torch.randperm(3), float(torch.empty(()).uniform_(DARKEST, 1))
+    features, around, far = (values.clone() for values in (lookups.features, lookups.around, lookups.far))
+    for values, first in ((features, 0), (features, 10)):
+        values[..., first : first + 3] = gain * values[..., first + channels]
+    for values, first in ((around, 0), (around, 5), (far, 0), (far, CELL_CHANNELS)):
+        values[:, first : first + 3] = (gain * values[:, first + channels].float()).round().to(torch.uint8)
+    flipped = [axis for axis in (2, 3) if bool(torch.rand(()) < 0.5)]
+    around, far = around.flip(flipped), far.flip(flipped)
+    if bool(torch.rand(()) < 0.5):
+        around, far = around.transpose(2, 3), far.transpose(2, 3)
+    if bool(torch.rand(()) < BLINDED_SHARE) and features.numel():
+        blind = torch.randperm(features.shape[2])[: int(torch.randint(1, MOST_BLIND + 1, ()))].to(features.device)
+        chosen = (features[:, :, blind, 7] > 0).flatten(0, 1).any(0)
+        features[:, :, blind[~chosen]] = 0
+    truth = (gain * lookups.truth[:, channels].float()).round().to(torch.uint8)
+    return RayBatch(features, lookups.occupancy, around, far, lookups.place, truth)
+
+
+class RaysObjective(nn.Module):
+    """L_in, and the logarithmic error, of what the ray reader makes of the pixels of a batch."""
+
+    def __init__(self, model: Inpainter, recipe: Recipe) -> None:
+        super().__init__()
+        self.model = model
+        self.recipe = recipe
+
+    def forward(self, batch: Sequence[RayBatch]) -> StepOutput:
+        """Both terms, the means over the samples."""
+        loss = rays_loss(self.model, [varied(b) for b in batch] if self.recipe.varied else batch)
+        weights, zero = self.recipe.loss, torch.zeros_like(loss.inside)
+        return StepOutput(loss, zero, zero, weights.image * loss.inside + weights.log_error * loss.log_error, ())
+
+
+def rays_loss(model: Inpainter, batch: Sequence[RayBatch]) -> ImageLoss:
+    """`image_loss` over the looked-up pixels alone: nothing is outside."""
+    assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
+    told = RayInputs.cat([lookups.inputs() for lookups in batch])
+    with model.autocast():
+        colours = model.ray_reader.mix(told).float().split([len(b.truth) for b in batch])
+    return mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])
