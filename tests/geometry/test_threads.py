@@ -43,7 +43,7 @@ def test_callers_may_be_many_and_within_one_another(two_threads):
     def outer(item: int) -> None:
         parallel_for(lambda n: sums.append(n), 5)
 
-    threads = [threading.Thread(target=share, args=(outer, 6)) for _ in range(4)]
+    threads = [threading.Thread(target=parallel_for, args=(outer, 6)) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
