@@ -1,30 +1,36 @@
-"""Writing videos, with PyAV (the extra `viewmend[video]`)."""
+"""Writing MP4 files, with PyAV (the extra `viewmend[video]`)."""
 
+from collections.abc import Iterable
 from fractions import Fraction
+from importlib.util import find_spec
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
+Picture = UInt8[np.ndarray, "height width 3"]
+
 
 class VideoWriter:
-    """An H.264 file of RGB frames of one size; a context manager. The first frame says how large.
+    """An H.264 MP4 of RGB frames of one size; a context manager. The first frame says how large.
 
-    As it is, any player shows it (4:2:0; an odd last row or column is dropped). `faithful` keeps all pixels and all
-    colours nearly as they are, for files to compute on.
+    By default any player shows it (4:2:0), and an odd last row or column is dropped. `faithful` keeps every pixel
+    and nearly every colour: a capture's videos are computed on.
 
     Raises:
         ImportError: PyAV is not installed.
     """
 
-    def __init__(self, path: Path, fps: float, faithful: bool = False):
+    def __init__(self, file: Path | BytesIO, fps: float, faithful: bool = False):
         try:
             import av
         except ImportError:
-            raise ImportError(f"writing {path} needs PyAV; install it, or viewmend's extra 'video'") from None
+            raise ImportError("writing videos needs PyAV; install it, or viewmend's extra 'video'") from None
         self._faithful = faithful
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._container = av.open(str(path), "w")
+        if isinstance(file, Path):
+            file.parent.mkdir(parents=True, exist_ok=True)
+        self._container = av.open(file, "w", format="mp4")
         self._stream = self._container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         self._stream.pix_fmt = "yuv444p" if faithful else "yuv420p"
         self._stream.options = {"crf": "8" if faithful else "18", "preset": "veryfast"}
@@ -36,7 +42,7 @@ class VideoWriter:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def add(self, rgb: UInt8[np.ndarray, "height width 3"]) -> None:
+    def add(self, rgb: Picture) -> None:
         """Append a frame."""
         from av import VideoFrame
 
@@ -54,3 +60,19 @@ class VideoWriter:
             self._container.mux(self._stream.encode(None))
             self._begun = False
         self._container.close()
+
+
+def write_mp4(file: Path | BytesIO, frames: Iterable[Picture], fps: float) -> None:
+    """All frames as an MP4 that any player shows.
+
+    Raises:
+        ImportError: PyAV is not installed.
+    """
+    with VideoWriter(file, fps) as video:
+        for frame in frames:
+            video.add(frame)
+
+
+def can_write_mp4() -> bool:
+    """Whether PyAV is installed."""
+    return find_spec("av") is not None

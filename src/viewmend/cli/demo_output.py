@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from viewmend.atomic_writes import write_atomically
 from viewmend.capture.images import write_image
-from viewmend.capture.video_writer import VideoWriter
+from viewmend.capture.video_writer import write_mp4
 from viewmend.cli.console import say
 from viewmend.cli.mend_output import SHEET_ROWS, holes_marked, sheet_row
 from viewmend.cli.mending import MendStep
@@ -52,17 +53,11 @@ def _panel(step: MendStep) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def _write_video(file: Path, panels: Sequence[UInt8[np.ndarray, "height width 3"]], fps: float) -> Path:
-    beside = file.with_name(f".{file.name}.part.mp4")
     try:
-        with VideoWriter(beside, fps) as video:
-            for panel in panels:
-                video.add(panel)
-        beside.replace(file)
+        write_atomically(file, lambda beside: write_mp4(beside, panels, fps))
     except ImportError as missing:
         say(f"{missing}; writing pictures instead")
         for n, panel in enumerate(panels):
             write_image(file.parent / "frames" / f"{n:06d}.png", panel)
         return file.parent / "frames"
-    finally:
-        beside.unlink(missing_ok=True)
     return file

@@ -6,12 +6,11 @@ import shutil
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.capture.images import write_image
+from viewmend.capture.images import read_rgb, write_image
 from viewmend.cli.mending import MendStep
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.views import IncompleteView
@@ -75,17 +74,11 @@ class MendOutput:
 
     def _to_video(self) -> None:
         """Replace the mended pictures by a video, where PyAV is installed."""
-        import cv2
+        from viewmend.capture.video_writer import write_mp4
 
-        from viewmend.capture.video_writer import VideoWriter
-
-        pictures = sorted((self._draft / "mended").glob("*.png"))
+        files = sorted((self._draft / "mended").glob("*.png"))
         try:
-            with VideoWriter(self._draft / "mended.mp4", self._fps) as video:
-                for file in pictures:
-                    image = cv2.imread(str(file))
-                    assert image is not None, f"{file} was just written"
-                    video.add(np.ascontiguousarray(image[..., ::-1]))
+            write_mp4(self._draft / "mended.mp4", (read_rgb(file, str(file)) for file in files), self._fps)
         except ImportError:
             return
         shutil.rmtree(self._draft / "mended")

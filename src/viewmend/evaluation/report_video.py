@@ -1,10 +1,11 @@
 """A short video of a scene: rendered view, all methods, truth, side by side."""
 
+import io
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from viewmend.capture.video_writer import VideoWriter
+from viewmend.capture.video_writer import write_mp4
 from viewmend.contact_sheet import Tile, contact_sheet, in_rows
 from viewmend.evaluation.cells import Cell, CellStore
 from viewmend.evaluation.film import FILM_PX, Picture
@@ -23,17 +24,13 @@ def scene_video(cells: Sequence[Cell], store: CellStore) -> tuple[str, bytes] | 
     frames = _frames(cells, store)
     if len(frames) < LEAST_FRAMES:
         return None
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            path, kind = Path(folder) / "scene.mp4", "video/mp4"
-            with VideoWriter(path, FPS) as writer:
-                for frame in frames:
-                    writer.add(frame)
-        except ImportError:
-            path, kind = Path(folder) / "scene.webm", "video/webm"
-            _write_webm(path, frames)
-        data = path.read_bytes() if path.is_file() else b""
-    return (kind, data) if data else None
+    try:
+        mp4 = io.BytesIO()
+        write_mp4(mp4, frames, FPS)
+        return "video/mp4", mp4.getvalue()
+    except ImportError:
+        webm = _webm(frames)
+        return ("video/webm", webm) if webm else None
 
 
 def _frames(cells: Sequence[Cell], store: CellStore) -> list[Picture]:
@@ -48,11 +45,15 @@ def _frames(cells: Sequence[Cell], store: CellStore) -> list[Picture]:
     return sheets
 
 
-def _write_webm(path: Path, frames: Sequence[Picture]) -> None:
+def _webm(frames: Sequence[Picture]) -> bytes:
+    """A video by OpenCV, which can write no H.264; empty where it has no VP8 either."""
     import cv2
 
     height, width = (size // 2 * 2 for size in frames[0].shape[:2])
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), FPS, (width, height))
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame[:height, :width], cv2.COLOR_RGB2BGR))
-    writer.release()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.webm"
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), FPS, (width, height))
+        for frame in frames:
+            writer.write(cv2.cvtColor(frame[:height, :width], cv2.COLOR_RGB2BGR))
+        writer.release()
+        return path.read_bytes() if path.is_file() else b""

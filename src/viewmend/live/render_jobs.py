@@ -4,12 +4,10 @@ import io
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass
-from fractions import Fraction
 
-import numpy as np
-
+from viewmend.capture.video_writer import VideoWriter
 from viewmend.live.fields import Fields, ProtocolError
-from viewmend.live.pictures import Picture, picture, to_jpeg
+from viewmend.live.pictures import picture, to_jpeg
 from viewmend.live.poses import view_camera
 from viewmend.live.protocol import Camera, Limits, Look, parse_camera, parse_look
 from viewmend.live.renderer import RenderRequest, RenderResult
@@ -109,7 +107,8 @@ class PathJob:
         self._path = path
         self._times = path.times
         self._count = 0
-        self._video = _Mp4(path.fps)
+        self._mp4 = io.BytesIO()
+        self._video = VideoWriter(self._mp4, path.fps)
 
     def due(self, now: float, scene: Scene) -> RenderRequest | None:
         """The next pose."""
@@ -130,47 +129,11 @@ class PathJob:
         self._video.add(picture(rendered.completed[0], self._path.look.modes[0]))
         self._count += 1
         if self._count == len(self._path.poses):
+            self._video.close()
             with suppress(InvalidStateError):
-                self.done.set_result(self._video.close())
+                self.done.set_result(self._mp4.getvalue())
 
     def fail(self, message: str) -> None:
         """Done, badly."""
         with suppress(InvalidStateError):
             self.done.set_exception(RuntimeError(message))
-
-
-def can_export() -> bool:
-    """Whether PyAV is installed."""
-    try:
-        import av  # noqa: F401
-    except ImportError:
-        return False
-    return True
-
-
-class _Mp4:
-    """An H.264 file in memory, which any player shows (an odd last row or column is dropped)."""
-
-    def __init__(self, fps: float) -> None:
-        import av
-
-        self._file = io.BytesIO()
-        self._container = av.open(self._file, "w", format="mp4")
-        self._stream = self._container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": "18", "preset": "veryfast"}
-        self._begun = False
-
-    def add(self, image: Picture) -> None:
-        from av import VideoFrame
-
-        image = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
-        if not self._begun:
-            self._stream.height, self._stream.width = image.shape[:2]
-            self._begun = True
-        self._container.mux(self._stream.encode(VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")))
-
-    def close(self) -> bytes:
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
-        return self._file.getvalue()

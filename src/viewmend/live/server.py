@@ -15,6 +15,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from viewmend.capture.video_writer import can_write_mp4
 from viewmend.live.connection import SessionRegistry, ViewerConnection
 from viewmend.live.fields import Fields, ProtocolError, read_json
 from viewmend.live.guard import Guard
@@ -23,7 +24,7 @@ from viewmend.live.page_files import HEADERS, page_files
 from viewmend.live.protocol import Limits
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import Pushed
-from viewmend.live.render_jobs import PathJob, PictureJob, can_export, parse_path, parse_query
+from viewmend.live.render_jobs import PathJob, PictureJob, parse_path, parse_query
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 
@@ -62,7 +63,7 @@ class LiveServer:
             "server": f"viewmend {self._version}",
             "model": config.model,
             "codecs": ["jpeg", *video_codecs()],
-            "export": can_export(),
+            "export": can_write_mp4(),
             "token_needed": bool(config.token),
         }
         self.lobby = SessionRegistry(service, config.limits, config.budget_ms, about)
@@ -163,7 +164,7 @@ class LiveServer:
         return Response(image, media_type="image/jpeg", headers=headers)
 
     async def _export(self, request: Request) -> Response:
-        if not can_export():
+        if not can_write_mp4():
             return _refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
         if self._exporting:
             return _refusal(409, "another path is being rendered; ask again")
