@@ -10,7 +10,6 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.protocol import State
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
-from viewmend.rendering.view import RenderConfig
 from viewmend.views import CompletedView
 
 CONFIG = PipelineConfig(hull=HullConfig(resolution=32), history=3)
@@ -85,27 +84,23 @@ def test_a_camera_with_a_gap_is_left_out_of_the_context():
     assert asker.given[1] is None
 
 
-@pytest.mark.parametrize("selection", ["closest", "covering"])
-def test_excluded_cameras_reach_neither_renderer_nor_inpainter(selection):
-    config = replace(CONFIG, render=RenderConfig(selection=selection, keep_share=0.0))
+def test_excluded_cameras_reach_neither_renderer_nor_inpainter():
     asker = Asker((0, ("c4", "c7")), (1, ("c4",)))
-    observation = observe(photograph(SPARSE), None, config)
-    state = StreamState(State(), source_views=("c4", "c7", "c2"))
-    mended = mend_view(observation, camera_at(120, "t"), state, asker, config, exclude=("c4",))
+    observation = observe(photograph(SPARSE), None, CONFIG)
+    mended = mend_view(observation, camera_at(120, "t"), start(asker), asker, CONFIG, exclude=("c4",))
     assert "c4" not in mended.completed.view.source_views
     assert asker.given[0].frame.cameras.names == ("c7",)
     assert asker.given[1] is None
 
 
 def test_what_one_viewer_does_another_does_not_feel():
-    config = replace(CONFIG, render=RenderConfig(selection="covering"))
     a, b = camera_at(20, "a"), camera_at(200, "b")
-    alone = [stream(range(3), target, Asker(), config).completed.rgb for target in (a, b)]
+    alone = [stream(range(3), target, Asker()).completed.rgb for target in (a, b)]
     asker = Asker()
     states = [start(asker), start(asker)]
     for time in range(3):
-        shared = observe(photograph(SPARSE, time), None, config)
-        together = [mend_view(shared, t, s, asker, config) for t, s in zip((a, b), states, strict=True)]
+        shared = observe(photograph(SPARSE, time), None, CONFIG)
+        together = [mend_view(shared, t, s, asker, CONFIG) for t, s in zip((a, b), states, strict=True)]
         states = [m.state for m in together]
     for one, two in zip(alone, together, strict=True):
         assert torch.equal(one, two.completed.rgb)

@@ -84,8 +84,6 @@ class StreamState:
     """What one viewer's stream carries from one view to the next: a value, never changed in place."""
 
     inpainter: State
-    source_views: tuple[str, ...] = ()
-    """The cameras of the last view."""
     history: tuple[Observation, ...] = ()
     """The last observations, at most `PipelineConfig.history` frames old."""
 
@@ -150,7 +148,7 @@ def mend_view(
         config: the pipeline's.
         exclude: names of cameras whose images must not be used for this viewer.
     """
-    view, rendering_ms = view_of(observation, target, config, state.source_views, exclude)
+    view, rendering_ms = view_of(observation, target, config, exclude)
     return complete_view(view, observation, state, inpainter, config, exclude, rendering_ms)
 
 
@@ -158,12 +156,9 @@ def view_of(
     observation: Observation,
     target: Cameras,
     config: PipelineConfig,
-    chosen: Sequence[str] = (),
     exclude: Sequence[str] = (),
 ) -> tuple[IncompleteView, float]:
     """Render one novel view: the first half of `mend_view`, and the milliseconds that it took.
-
-    `chosen` are the cameras of the viewer's last view.
 
     Raises:
         ValueError: the observation's geometry is not a `GeometryProxy`, or no camera is left.
@@ -173,7 +168,7 @@ def view_of(
         raise ValueError(f"expected a GeometryProxy to render, got {got}; render the view yourself and fill it then")
     frame, device = observation.frame, observation.frame.rgb.device
     start = now_s(device)
-    view = render_view(frame, observation.proxy, target, config.render, chosen, exclude, source_depth=observation.depth)
+    view = render_view(frame, observation.proxy, target, config.render, exclude, source_depth=observation.depth)
     return view, ms_since(start, device)
 
 
@@ -204,7 +199,7 @@ def complete_view(
 
     history = (*past, observation) if config.history else ()
     stages = StageMs(observation.geometry_ms, rendering_ms, inpainting_ms)
-    return MendedView(completed, StreamState(inpainter_state, view.source_views, history), stages)
+    return MendedView(completed, StreamState(inpainter_state, history), stages)
 
 
 def now_s(device: torch.device) -> float:

@@ -48,8 +48,6 @@ class Viewer:
     """What one viewer carries from one view to the next: a value, which `Stream.view` gives anew."""
 
     inpainter: State
-    source_views: tuple[str, ...] = ()
-    """The cameras of the last view."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +168,7 @@ class Stream:
         """
         moment = self._moment(time)
         viewer = viewer or self.viewer()
-        view, rendering_ms = view_of(moment.observation, target, self.config, viewer.source_views, exclude)
+        view, rendering_ms = view_of(moment.observation, target, self.config, exclude)
         return self._complete(view, moment, viewer, effort or RenderQuality(), exclude, rendering_ms)
 
     def mend(
@@ -211,18 +209,18 @@ class Stream:
     ) -> StreamView:
         if not effort.mend:
             stages = StageMs(moment.observation.geometry_ms, rendering_ms, 0.0)
-            return StreamView(CompletedView(view, view.rgb), replace(viewer, source_views=view.source_views), stages)
+            return StreamView(CompletedView(view, view.rgb), viewer, stages)
         moments = [*self._past(view.time, effort), moment]
         encoding_ms = self._encode(view, moments if effort.context_times != 0 else [])
         frames = {(f.name, f.time): f for m in moments for f in m.encoded.values()}
         before = replace(viewer.inpainter, cache=ContextCache(frames if effort.context_times != 0 else {}))
-        state = StreamState(before, viewer.source_views, tuple(m.observation for m in moments[:-1]))
+        state = StreamState(before, tuple(m.observation for m in moments[:-1]))
         inpainter = _WithEffort(self.inpainter, effort)
         mended = complete_view(view, moment.observation, state, inpainter, self.config, exclude, rendering_ms)
         for m in moments:
             self._moments.move_to_end(m.observation.frame.time)
         self._forget()
-        after = Viewer(replace(mended.state.inpainter, cache=ContextCache()), view.source_views)
+        after = Viewer(replace(mended.state.inpainter, cache=ContextCache()))
         return StreamView(mended.completed, after, mended.stage_ms, encoding_ms)
 
     @torch.no_grad()

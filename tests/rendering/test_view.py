@@ -13,11 +13,10 @@ from viewmend.rendering.view import RenderConfig, render_view
 BALL = proxy()
 
 
-@pytest.mark.parametrize("selection", ["closest", "covering"])
-def test_the_ball_is_rendered_as_it_is(selection):
+def test_the_ball_is_rendered_as_it_is():
     target = camera_at(40, "t", 64, 0.4)
     truth = photograph(target)
-    view = render_view(photograph(ring(12, 96)), BALL, target, RenderConfig(selection=selection))
+    view = render_view(photograph(ring(12, 96)), BALL, target, RenderConfig())
     right = (view.mask > 0) & (view.error == 0) & (truth.mask[0] > 0)
     assert right.sum() > 0.97 * (truth.mask > 0).sum()
     # The exact colour is a function of position; one source pixel is 1.5 cm, 3 % of the range, at the rim more.
@@ -25,10 +24,9 @@ def test_the_ball_is_rendered_as_it_is(selection):
     assert (view.mask - (truth.mask[0] > 0).float()).abs().mean() < 0.01
 
 
-@pytest.mark.parametrize("selection", ["closest", "covering"])
-def test_what_travels_is_consistent(selection):
+def test_what_travels_is_consistent():
     cameras = ring(12)[[0, 2, 3]]  # nothing sees the back
-    view = render_view(photograph(cameras, 7), BALL, camera_at(135, "t"), RenderConfig(selection=selection))
+    view = render_view(photograph(cameras, 7), BALL, camera_at(135, "t"), RenderConfig())
     missing, coloured = view.error == 1, (view.error == 0) & (view.mask == 1)
     assert missing.sum() > 50 and coloured.sum() > 50
     assert bool((view.mask[missing] == 1).all())
@@ -53,15 +51,14 @@ def test_an_unknown_rule_is_named():
         error_rule("unsen")
 
 
-@pytest.mark.parametrize("selection", ["closest", "covering"])
-def test_excluded_cameras_leave_no_trace(selection):
+def test_excluded_cameras_leave_no_trace():
     frame, target = photograph(ring(6)), camera_at(60, "t")
-    config = RenderConfig(selection=selection, keep_share=0.0)
+    config = RenderConfig()
     marked = frame.rgb.clone()
     marked[1] = 255
     with_it = render_view(replace(frame, rgb=marked), BALL, target, config)
     assert "c1" in with_it.source_views
-    without = render_view(replace(frame, rgb=marked), BALL, target, config, ("c1", "c2", "c0"), exclude=("c1",))
+    without = render_view(replace(frame, rgb=marked), BALL, target, config, exclude=("c1",))
     alone = render_view(frame.without(["c1"]), BALL, target, config)
     assert set(without.source_views) == set(alone.source_views)
     torch.testing.assert_close(without.rgb, alone.rgb)
@@ -69,9 +66,8 @@ def test_excluded_cameras_leave_no_trace(selection):
         render_view(frame, BALL, target, config, exclude=frame.cameras.names)
 
 
-@pytest.mark.parametrize("selection", ["closest", "covering"])
-def test_an_empty_proxy_gives_an_empty_view(selection):
+def test_an_empty_proxy_gives_an_empty_view():
     empty = replace(BALL, mesh=Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32)), normals=torch.zeros(0, 3))
-    view = render_view(photograph(ring(4)), empty, camera_at(5, "t"), RenderConfig(selection=selection))
+    view = render_view(photograph(ring(4)), empty, camera_at(5, "t"), RenderConfig())
     assert view.mask.sum() == 0 and view.error.sum() == 0 and view.rgb.sum() == 0
     assert view.source_views[0] == "c0"

@@ -1,4 +1,4 @@
-"""Which cameras colour a novel view: the closest ones (the paper), or those that see most of it (RIFTCast)."""
+"""Which cameras colour a novel view: those closest in angle (the paper, section 2)."""
 
 from collections.abc import Sequence
 
@@ -34,46 +34,3 @@ def select_closest(
     angle = angles_to(target, cameras, subject_center).tolist()
     allowed = [v for v, name in enumerate(cameras.names) if name not in exclude]
     return tuple(cameras.names[v] for v in sorted(allowed, key=lambda v: angle[v])[:k])
-
-
-def select_covering(
-    evidence: Float[Tensor, "view point"],
-    names: Sequence[str],
-    closest: Sequence[str],
-    k: int = 3,
-    previous: Sequence[str] = (),
-    keep_share: float = 0.85,
-) -> tuple[str, ...]:
-    """Names of k cameras that together see as much of the target's pixels as possible (RIFTCast, greedy cover).
-
-    Deviations from RIFTCast: points are surface samples at target pixels, so that a face counts by its area in the
-    target; a point counts by how well the best chosen camera sees it, not only whether one does; and when nothing more
-    can be gained the next closest cameras fill the places.
-
-    Args:
-        evidence: how well each camera sees each point, 0 for not at all to 1 for as well as can be.
-        names: names of the rows of `evidence`.
-        closest: the cameras that may be chosen, nearest first; one that is not here is never chosen, nor kept.
-        k: how many to choose.
-        previous: the last choice; it stays while the points it sees are more than `keep_share` of all that the
-            allowed cameras can see, which keeps the texture from flickering.
-        keep_share: see `previous`.
-    """
-    row = {name: v for v, name in enumerate(names)}
-    allowed = [name for name in closest if name in row]
-    if not allowed:
-        return ()
-    kept = [name for name in dict.fromkeys(previous) if name in allowed]
-    if len(kept) == min(k, len(allowed)) and evidence.shape[1]:
-        seen = (evidence[[row[n] for n in kept]] > 0).any(0).sum()
-        seeable = (evidence[[row[n] for n in allowed]] > 0).any(0).sum()
-        if float(seen) > keep_share * float(seeable):
-            return tuple(kept)
-    chosen: list[str] = []
-    best = torch.zeros_like(evidence[0])
-    while len(chosen) < min(k, len(allowed)):
-        rest = [name for name in allowed if name not in chosen]
-        gain = (evidence[[row[n] for n in rest]] - best).clamp(min=0).sum(1)
-        chosen.append(rest[int(gain.argmax())])  # ties, and no gain at all: the first, which is the closest
-        best = torch.maximum(best, evidence[row[chosen[-1]]])
-    return tuple(chosen)
