@@ -1,25 +1,89 @@
 """A plain capture's `cameras.json`, format "plain-capture/1": parsed strictly, in this project's conventions."""
 
-import json
+import difflib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+from msgspec import Meta, Struct
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.json_fields import Fields, shown
 from viewmend.geometry.cameras import is_intrinsics
 from viewmend.geometry.rigid import is_rotation
+from viewmend.json_input import Number, Triple, read_json, shown, typed
 
 FORMAT = "plain-capture/1"
 CALIBRATION = "cameras.json"
 ROTATION_TOLERANCE = 1e-3
-CAPTURE_KEYS = ("format", "first_pixel_center", "metres_per_unit", "up", "fps", "bounds", "frames", "cameras")
-CAMERA_KEYS = ("name", "width", "height", "K", "R", "t", "dist", "image", "video", "mask", "depth")
 Stream = Literal["image", "video", "mask", "depth"]
+STREAMS: tuple[Stream, ...] = ("image", "video", "mask", "depth")
+Text = Annotated[str, Meta(min_length=1)]
+Pixels = Annotated[int, Meta(ge=1, le=2**31 - 1)]
+Positive = Annotated[float, Meta(gt=0, le=1e300)]
+Matrix = tuple[Triple, Triple, Triple]
+
+
+class CameraEntry(Struct, frozen=True, kw_only=True):
+    """One of the file's `cameras`."""
+
+    name: Text
+    width: Pixels
+    height: Pixels
+    K: Matrix
+    R: Matrix
+    t: Triple
+    dist: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    image: Text | None = None
+    video: Text | None = None
+    mask: Text | None = None
+    depth: Text | None = None
+
+    def __post_init__(self) -> None:
+        if not bool(is_intrinsics(torch.tensor(self.K, dtype=torch.float64))):
+            expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
+            raise _wrong("K", expected, shown(self.K), "bring the calibration to OpenCV's axes and form, in pixels")
+        R = np.array(self.R)
+        if not bool(is_rotation(torch.from_numpy(R), ROTATION_TOLERANCE)):
+            off = abs(R @ R.T - np.eye(3)).max()
+            got = f"determinant {np.linalg.det(R):.4g}, R R^T off by {off:.2g}, {shown(self.R)}"
+            raise _wrong("R", "a rotation, world to camera", got, "check axes, signs and the number of digits")
+        if (self.image is None) == (self.video is None):
+            got = "neither" if self.image is None else "both"
+            raise _wrong("image", "either 'image' or 'video'", got, "name one of the two")
+        for stream in STREAMS:
+            if not stays_inside(getattr(self, stream) or "inside"):
+                got = shown(getattr(self, stream))
+                next_step = "move the file in and write it relative"
+                raise _wrong(stream, "a path inside the capture folder", got, next_step)
+
+
+class CalibrationFile(Struct, frozen=True, kw_only=True):
+    """All of the file."""
+
+    format: str
+    first_pixel_center: tuple[Number, Number] = (0.0, 0.0)
+    metres_per_unit: Positive = 1.0
+    up: Triple | None = None
+    fps: Positive | None = None
+    bounds: tuple[Triple, Triple] | None = None
+    frames: Annotated[tuple[Text, ...], Meta(min_length=1)]
+    cameras: tuple[CameraEntry, ...]
+
+    def __post_init__(self) -> None:
+        if self.bounds is not None and not all(low < high for low, high in zip(*self.bounds, strict=True)):
+            raise _wrong("bounds", "[low corner, high corner]", shown(self.bounds), "put the smaller numbers first")
+        if self.up is not None and not any(self.up):
+            raise _wrong("up", "a direction or null", shown(self.up), "write null where it is unknown")
+        if len(self.cameras) < 2:
+            raise _wrong("cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras")
+        for key, names in (("frames", self.frames), ("cameras", tuple(camera.name for camera in self.cameras))):
+            twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+            if twice:
+                raise _wrong(key, "different names", f"{twice} more than once", "rename or remove the duplicates")
 
 
 @dataclass(frozen=True)
@@ -44,8 +108,7 @@ class PlainCamera:
     @property
     def streams(self) -> tuple[Stream, ...]:
         """What the camera has files of."""
-        every: tuple[Stream, ...] = ("image", "video", "mask", "depth")
-        return tuple(stream for stream in every if getattr(self, stream) is not None)
+        return tuple(stream for stream in STREAMS if getattr(self, stream) is not None)
 
     def file(self, stream: Stream, frame: str) -> str:
         """Path of a stream's file at this frame, relative to the capture; the camera must have the stream."""
@@ -77,121 +140,68 @@ def read_calibration(folder: Path) -> PlainCalibration:
         CaptureError: the file is absent, is no JSON, lacks a key, or holds a value that cannot be right.
     """
     path = folder / CALIBRATION
-    root = Fields(_load(path), str(path))
-    version = root.text("format")
-    if version != FORMAT:
-        raise root.wrong(
-            "format", f'"{FORMAT}"', shown(version), "convert the capture, or use the viewmend that reads it"
-        )
-    root.check_spelling(CAPTURE_KEYS)
-    scale = root.number("metres_per_unit", default=1.0)
-    if scale <= 0:
-        raise root.wrong("metres_per_unit", "a number above 0", shown(scale), "write 0.001 for millimetres")
-    first = root.array("first_pixel_center", (2,), default=np.zeros(2))
-    bounds = root.array("bounds", (2, 3), default=None)
-    if bounds is not None and not (bounds[0] < bounds[1]).all():
-        raise root.wrong("bounds", "[low corner, high corner]", shown(bounds.tolist()), "put the smaller numbers first")
-    up = root.array("up", (3,), default=None)
-    if up is not None and not np.linalg.norm(up) > 0:
-        raise root.wrong("up", "a direction or null", shown(up.tolist()), "write null where it is unknown")
-    fps = root.number("fps", default=None)
-    if fps is not None and fps <= 0:
-        raise root.wrong("fps", "a number above 0 or null", shown(fps), "write null for a static capture")
-    return PlainCalibration(
-        frames=_frames(root),
-        cameras=_cameras(root, 0.5 - first, scale),
-        up=None if up is None else up / np.linalg.norm(up),
-        fps=fps,
-        bounds_m=None if bounds is None else bounds * scale,
-        metres_per_unit=scale,
-    )
-
-
-def _load(path: Path) -> object:
     if not path.is_file():
-        there = "the folder has none" if path.parent.is_dir() else "there is no such folder"
+        there = "the folder has none" if folder.is_dir() else "there is no such folder"
         raise CaptureError(f"expected a capture folder with {path}, but {there}; check the path")
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # of syntax, of bytes, of numbers with thousands of digits
-        raise CaptureError(f"{path}: expected JSON, got something else: {error}; mend the file there") from None
-
-
-def _frames(root: Fields) -> tuple[str, ...]:
-    frames = root.list("frames")
-    for index, frame in enumerate(frames):
-        if not isinstance(frame, str) or not frame:
-            raise root.wrong(f"frames[{index}]", "a frame id, a string", shown(frame), "put it in quotes")
-    _check_unique(root, "frames", [str(f) for f in frames])
-    return tuple(str(f) for f in frames)
-
-
-def _cameras(root: Fields, shift_px: Float64[np.ndarray, "2"], scale: float) -> tuple[PlainCamera, ...]:
-    entries = root.list("cameras")
-    if len(entries) < 2:
-        raise root.wrong("cameras", "two cameras or more", str(len(entries)), "add the rig's other cameras")
-    cameras = tuple(_camera(Fields(e, f"{root.where}: cameras[{i}]"), shift_px, scale) for i, e in enumerate(entries))
-    _check_unique(root, "cameras", [c.name for c in cameras])
-    return cameras
-
-
-def _check_unique(root: Fields, key: str, names: list[str]) -> None:
-    twice = sorted({n for n in names if names.count(n) > 1}) if len(set(names)) < len(names) else []
-    if twice:
-        raise root.wrong(key, "different names", f"{twice} more than once", "rename or remove the duplicates")
-
-
-def _camera(entry: Fields, shift_px: Float64[np.ndarray, "2"], scale: float) -> PlainCamera:
-    name = entry.text("name")
-    entry = Fields(entry.data, f"{entry.where.split(': cameras[')[0]}: camera '{name}'")
-    entry.check_spelling(CAMERA_KEYS)
-    K = _intrinsics(entry)
-    K[:2, 2] += shift_px
-    streams = {key: _stream(entry, key) for key in ("image", "video", "mask", "depth")}
-    if (streams["image"] is None) == (streams["video"] is None):
-        got = "neither" if streams["image"] is None else "both"
-        raise entry.wrong("image", "either 'image' or 'video'", got, "name one of the two")
-    return PlainCamera(
-        name=name,
-        width=entry.positive_integer("width"),
-        height=entry.positive_integer("height"),
-        K=K,
-        R=_rotation(entry),
-        t_m=entry.array("t", (3,)) * scale,
-        dist=entry.array("dist", (5,), default=np.zeros(5)),
-        **streams,
+        file = _parsed(path.read_bytes())
+    except ValueError as error:
+        raise CaptureError(f"{path}: {error}") from None
+    shift_px = 0.5 - np.array(file.first_pixel_center)
+    up = None if file.up is None else np.array(file.up)
+    return PlainCalibration(
+        frames=file.frames,
+        cameras=tuple(_camera(entry, shift_px, file.metres_per_unit) for entry in file.cameras),
+        up=None if up is None else up / np.linalg.norm(up),
+        fps=file.fps,
+        bounds_m=None if file.bounds is None else np.array(file.bounds) * file.metres_per_unit,
+        metres_per_unit=file.metres_per_unit,
     )
 
 
-def _intrinsics(entry: Fields) -> Float64[np.ndarray, "3 3"]:
-    K = entry.array("K", (3, 3))
-    if K[0, 0] * K[1, 1] == 0:
-        raise entry.wrong(
-            "K", "an invertible matrix", f"a singular one, {shown(K.tolist())}", "give focal lengths in pixels"
-        )
-    if not bool(is_intrinsics(torch.from_numpy(K))):
-        expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
-        raise entry.wrong("K", expected, shown(K.tolist()), "bring the calibration to OpenCV's axes and form")
-    return K
+def _parsed(text: bytes) -> CalibrationFile:
+    content = typed(read_json(text), dict[str, Any], "see docs/plain-capture.md")
+    version = content.get("format")
+    if version != FORMAT:
+        got = "nothing" if version is None else shown(version)
+        raise _wrong("format", f'"{FORMAT}"', got, "convert the capture, or use the viewmend that reads it")
+    _check_spelling(content, CalibrationFile.__struct_fields__)
+    for entry in content["cameras"] if isinstance(content.get("cameras"), list) else ():
+        if isinstance(entry, dict):
+            _check_spelling(entry, CameraEntry.__struct_fields__)
+    return typed(content, CalibrationFile)
 
 
-def _rotation(entry: Fields) -> Float64[np.ndarray, "3 3"]:
-    R = entry.array("R", (3, 3))
-    if not bool(is_rotation(torch.from_numpy(R), ROTATION_TOLERANCE)):
-        off = abs(R @ R.T - np.eye(3)).max()
-        got = f"determinant {np.linalg.det(R):.4g}, R R^T off by {off:.2g}, {shown(R.tolist())}"
-        raise entry.wrong("R", "a rotation, world to camera", got, "check axes, signs and the number of digits")
-    u, _, vt = np.linalg.svd(R)  # the nearest rotation: calibrations carry few digits
-    return u @ vt
+def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:
+    """Unknown keys are notes and pass, unless they look like a known key that is absent (a typo)."""
+    absent = [key for key in known if key not in entry]
+    for key in entry.keys() - set(known):
+        close = difflib.get_close_matches(key.lower(), [a.lower() for a in absent], n=1, cutoff=0.8)
+        if close:
+            raise _wrong(key, f"the key '{close[0]}'", f"'{key}'", "rename the key")
 
 
-def _stream(entry: Fields, key: str) -> str | None:
-    pattern = entry.text(key, default=None)
-    if pattern is not None and not stays_inside(pattern):
-        raise entry.wrong(
-            key, "a path inside the capture folder", shown(pattern), "move the file in and write it relative"
-        )
-    return pattern
+def _wrong(key: str, expected: str, got: str, next_step: str) -> ValueError:
+    return ValueError(f"{key}: expected {expected}, got {got}; {next_step}")
+
+
+def _camera(entry: CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> PlainCamera:
+    K = np.array(entry.K)
+    K[:2, 2] += shift_px
+    u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations carry few digits
+    return PlainCamera(
+        name=entry.name,
+        width=entry.width,
+        height=entry.height,
+        K=K,
+        R=u @ vt,
+        t_m=np.array(entry.t) * scale,
+        dist=np.array(entry.dist),
+        image=entry.image,
+        video=entry.video,
+        mask=entry.mask,
+        depth=entry.depth,
+    )
 
 
 def stays_inside(path: str) -> bool:
