@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from time import sleep
 
 import cv2
 import numpy as np
@@ -10,8 +11,13 @@ import torch
 from reference.ball import BallCapture, camera_at
 
 from viewmend.capture.plain_writer import write_capture
-from viewmend.cli import main
+from viewmend.capture.prepare import open_masked, prepare
+from viewmend.cli import main, serve
+from viewmend.contact_sheet import picture
 from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.inpainting.classical import Telea
+from viewmend.live.renderer import Renderer, RenderRequest
+from viewmend.stream import RenderQuality
 
 KEYS = [
     "frames", "hole_fraction", "psnr_whole", "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg",
@@ -193,13 +199,19 @@ def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, capsys):
     assert "principal points" not in said and "a mask or a camera is wrong" in said
 
 
-def test_a_shift_of_all_images_is_said_and_undone(folder, tmp_path, capsys):
-    shifted = tmp_path / "shifted"
-    shutil.copytree(folder, shifted)
-    capture = json.loads((shifted / "cameras.json").read_text())
+@pytest.fixture
+def shifted(folder, tmp_path):
+    """The same capture, whose calibration says that all images are a pixel further right."""
+    path = tmp_path / "shifted"
+    shutil.copytree(folder, path)
+    capture = json.loads((path / "cameras.json").read_text())
     for camera in capture["cameras"]:
         camera["K"][0][2] += 1.0
-    (shifted / "cameras.json").write_text(json.dumps(capture))
+    (path / "cameras.json").write_text(json.dumps(capture))
+    return path
+
+
+def test_a_shift_of_all_images_is_said_and_undone(folder, shifted, tmp_path, capsys):
     _, exact, nothing = mend(capsys, folder, tmp_path / "exact", "--leave-out", "held")
     _, undone, said = mend(capsys, shifted, tmp_path / "undone", "--leave-out", "held")
     _, left, also_nothing = mend(capsys, shifted, tmp_path / "left", "--leave-out", "held", "--no-align")
@@ -207,3 +219,25 @@ def test_a_shift_of_all_images_is_said_and_undone(folder, tmp_path, capsys):
     assert "principal points" not in nothing + also_nothing
     assert undone["hull_iou"]["held"] == pytest.approx(exact["hull_iou"]["held"], abs=0.02)
     assert left["hull_iou"]["held"] < undone["hull_iou"]["held"] - 0.02
+
+
+def test_the_page_shows_the_same_pixels(shifted, tmp_path, capsys):
+    prepared = prepare(open_masked(shifted))
+    camera = prepared.cameras[0]
+    file = tmp_path / "path.json"
+    pose = camera.world_from_camera[0].tolist()
+    file.write_text(json.dumps({"world_from_camera": [pose], "K": camera.K[0].tolist(), "width": 48, "height": 48}))
+    assert mend(capsys, shifted, tmp_path / "out", "--path", file, "--frames", "0:1")[0] == 0
+    supply = serve._supply(serve.Options(source=str(shifted)))
+    supply.start()
+    try:
+        while supply.read(0) is None:
+            assert supply.status.error is None
+            sleep(0.05)
+        renderer = Renderer(supply, Telea())
+        renderer.prepare(0)
+        (view,) = renderer.render(RenderRequest(0, (camera,), RenderQuality()), None).completed
+    finally:
+        supply.stop()
+    mended = cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1]
+    assert mended.std() > 20 and np.abs(picture(view.rgb).astype(int) - mended).max() <= 1

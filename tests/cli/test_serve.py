@@ -41,7 +41,7 @@ def test_a_capture_without_masks_is_refused(tmp_path, capsys):
     (folder / "cameras.json").write_text(json.dumps(calibration))
     capsys.readouterr()
     assert main(["serve", str(folder)]) == 2
-    assert "expected a capture with masks" in capsys.readouterr().err
+    assert "expected a 'mask' for every camera" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])

@@ -1,15 +1,13 @@
-"""Frames at hand: read ahead, made ahead, bounded, smaller."""
+"""Frames at hand: read ahead, made ahead, bounded, pushed."""
 
 import threading
-from dataclasses import replace
 from time import sleep
 
 import pytest
-import torch
 from live_servers import CAMERAS, wait_until
-from reference.ball import BallCapture, photograph
+from reference.ball import BallCapture
 
-from viewmend.live.frames import ReadAhead, shrunk
+from viewmend.live.frames import ReadAhead
 
 
 class Slow(BallCapture):
@@ -106,15 +104,3 @@ def test_failures_are_said_and_tried_again():
     wait_until(lambda: supply.status.state == "ready")
     assert supply.status.error is None and supply.span.fps == 0
     supply.stop()
-
-
-def test_large_images_are_made_smaller_with_their_cameras():
-    sizes = torch.tensor([[48, 48], [40, 48], [48, 30], [48, 48], [48, 48], [48, 48]])
-    frame = replace(photograph(CAMERAS), cameras=replace(CAMERAS, size_px=sizes))
-    small = shrunk(frame, 24)
-    assert small.cameras.size_px.tolist()[:3] == [[24, 24], [20, 24], [24, 15]] and small.rgb.shape == (6, 3, 24, 24)
-    assert int(small.rgb[1, :, :, 20:].max()) == 0 and int(small.mask[2, 15:].max()) == 0
-    like = photograph(small.cameras[0])
-    assert float((like.rgb[0].float() - small.rgb[0].float()).abs().mean()) < 5
-    assert shrunk(frame, None) is frame and shrunk(frame, 48) is frame
-    assert shrunk(replace(frame, mask=None), 24).mask is None

@@ -1,14 +1,14 @@
 """`viewmend mend`: novel views of a capture, rendered and mended, and scored against a camera that was left out."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 if TYPE_CHECKING:
-    from viewmend.capture.plain import PlainCapture
+    from viewmend.capture.source import CaptureSource
     from viewmend.geometry.cameras import Cameras
     from viewmend.views import MultiViewFrame
 
@@ -61,19 +61,23 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --context of at least 1 camera, got {options.context}; the paper uses 3")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+    from viewmend.capture.prepare import prepare
+    from viewmend.cli.alignment import say_alignment
     from viewmend.cli.console import print_json, say, track
     from viewmend.cli.mend_output import MendOutput
     from viewmend.cli.mend_summary import MendSummary
     from viewmend.cli.mending import Mender, load_named
 
-    capture = _open(options)
-    times = _times(options.frames, len(capture.frame_ids))
-    inpainter = load_named(options.model, options.top_k, options.device)
     held = () if options.leave_out is None else (options.leave_out,)
+    opened = _open(options, held)
+    times = _times(options.frames, len(opened.frame_ids))
+    inpainter = load_named(options.model, options.top_k, options.device)
+    inputs = [name for name in opened.cameras.names if name not in held]
+    capture = prepare(opened, inputs, align=options.align, first=times[0])
+    say_alignment(capture.alignment)
     mender = Mender(inpainter, options.context, capture.bounds, held)
     summary = MendSummary()
-    offset_px = _offset(options, capture, times[0]) if options.align else (0.0, 0.0)
-    views = _views(options, capture, times, offset_px)
+    views = _views(options, capture, times)
     with MendOutput(options.out, fps=capture.fps or 15.0) as output:
         for frame, target in track(views, "mending", _count(options, capture, times)):
             truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
@@ -88,50 +92,19 @@ def run(options: Options) -> int:
     return 0
 
 
-def _open(options: Options) -> "PlainCapture":
+def _open(options: Options, held: tuple[str, ...]) -> "CaptureSource":
     from viewmend.capture.errors import CaptureError
-    from viewmend.capture.plain import open_capture
+    from viewmend.capture.prepare import open_masked
 
-    held = options.leave_out
     names = None
     if options.use_cameras is not None:
         names = [name.strip() for name in options.use_cameras.split(",") if name.strip()]
-        names = list(dict.fromkeys(names + ([held] if held else [])))
-    capture = open_capture(options.capture, names)
-    if held is not None and held not in capture.cameras.names:
-        raise CaptureError(f"{options.capture}: expected --leave-out among {list(capture.cameras.names)}, got '{held}'")
-    if not capture.has_masks:
-        raise CaptureError(
-            f"{options.capture}: expected a 'mask' for every camera, got none: the visual hull is carved from them; "
-            "segment the foreground and name the files in cameras.json"
-        )
-    inputs = len(capture.cameras) - (held is not None)
-    if inputs < 2:
-        raise CaptureError(f"{options.capture}: expected at least 2 input cameras, got {inputs}; use more cameras")
+        names = list(dict.fromkeys([*names, *held]))
+    capture = open_masked(options.capture, names, held=len(held))
+    if not set(held) <= set(capture.cameras.names):
+        known, got = list(capture.cameras.names), options.leave_out
+        raise CaptureError(f"{options.capture}: expected --leave-out among {known}, got '{got}'")
     return capture
-
-
-def _offset(options: Options, capture: "PlainCapture", time: int) -> tuple[float, float]:
-    """The shift of the calibration that the input cameras' masks ask for; it is said if there is one."""
-    from viewmend.cli.console import say
-    from viewmend.geometry.alignment import LEAST_IOU, shared_offset
-
-    frame = capture.read(time).without([options.leave_out] if options.leave_out else [])
-    if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > 0).any()):
-        return (0.0, 0.0)
-    found = shared_offset(frame.mask, frame.cameras, capture.bounds)
-    if found.offset_px != (0.0, 0.0):
-        x, y = found.offset_px
-        say(
-            f"all principal points moved by ({x:+.2f}, {y:+.2f}) pixels: hull and masks then agree better, IoU "
-            f"{found.iou_before:.3f} -> {found.iou_after:.3f}; check first_pixel_center, or use --no-align"
-        )
-    if found.iou_after < LEAST_IOU:
-        say(
-            f"the hull hardly agrees with the masks of frame {time}, IoU {found.iou_after:.3f}: a mask or a camera is "
-            "wrong; look at it with viewmend info --out"
-        )
-    return found.offset_px
 
 
 def _times(frames: str | None, count: int) -> range:
@@ -147,21 +120,19 @@ def _times(frames: str | None, count: int) -> range:
     return wanted
 
 
-def _count(options: Options, capture: "PlainCapture", times: range) -> int:
+def _count(options: Options, capture: "CaptureSource", times: range) -> int:
     from viewmend.cli.novel_paths import STATIC_VIEWS
 
     return STATIC_VIEWS if options.path == "orbit" and len(capture.frame_ids) == 1 else len(times)
 
 
-def _views(
-    options: Options, capture: "PlainCapture", times: range, offset_px: tuple[float, float]
-) -> "Iterator[tuple[MultiViewFrame, Cameras]]":
-    """Each frame with the novel view's camera, in order of time; the rig's principal points are moved."""
+def _views(options: Options, capture: "CaptureSource", times: range) -> "Iterator[tuple[MultiViewFrame, Cameras]]":
+    """Each frame with the novel view's camera, in order of time."""
     from viewmend.capture.prefetch import prefetch
     from viewmend.cli.novel_paths import paired, read_path
 
     if options.leave_out is not None:
-        plan = [(time, capture.cameras.select([options.leave_out]).moved(*offset_px)) for time in times]
+        plan = [(time, capture.cameras.select([options.leave_out])) for time in times]
     elif options.path == "orbit":
         plan = _orbit(capture, times)
     else:
@@ -170,12 +141,11 @@ def _views(
     frame = None
     for time, target in plan:
         if frame is None or frame.time != time:
-            frame = next(frames)
-            frame = replace(frame, cameras=frame.cameras.moved(*offset_px)).to(options.device)
+            frame = next(frames).to(options.device)
         yield frame, target.to(options.device)
 
 
-def _orbit(capture: "PlainCapture", times: range) -> "list[tuple[int, Cameras]]":
+def _orbit(capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
     from viewmend.cli.novel_paths import FRAMES_PER_TURN, STATIC_VIEWS, orbit_around, paired
     from viewmend.geometry.proxy import reconstruct
 

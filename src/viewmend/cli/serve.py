@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -38,6 +37,8 @@ class Options:
     """Milliseconds that a view may take: what it is made with is chosen by that, frame by frame. 0: always all."""
     width: int = 1024
     """The longest side of the cameras' images: larger ones are made smaller when they are read."""
+    align: bool = True
+    """Take a capture's calibration as it is. By default it is aligned as `viewmend mend` does."""
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
     viewers: int = 8
@@ -121,28 +122,35 @@ def _supply(options: Options) -> "FrameSupply":
     memory_mb = options.memory_mb / 2
     if options.source == "live":
         return Pushed(options.fps, memory_mb)
-    if options.source == "studio":
-        return ReadAhead(_studio(options), options.fps, made=True, memory_mb=memory_mb, max_side_px=options.width)
-    from viewmend.capture.plain import open_capture
-
-    capture = open_capture(Path(options.source))
-    if not capture.has_masks:
-        raise ValueError(
-            f"{options.source}: expected a capture with masks, got one without; segment the foreground and name the "
-            "files as each camera's 'mask'"
-        )
-    return ReadAhead(lambda: capture, options.fps, memory_mb=memory_mb, max_side_px=options.width)
+    made = options.source == "studio"
+    return ReadAhead(_studio(options) if made else _capture(options), options.fps, made=made, memory_mb=memory_mb)
 
 
-def _studio(options: Options) -> Callable[[], "CaptureSource"]:
+def _studio(options: Options) -> "Callable[[], CaptureSource]":
     """Opens the studio; called on the thread that makes its frames, so that the page is there at once."""
 
     def open_studio() -> "CaptureSource":
+        from viewmend.capture.prepare import prepare
         from viewmend.studio.stage import Studio, StudioConfig
 
         config = StudioConfig(
             seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
         )
-        return Studio(config)
+        return prepare(Studio(config), longest_px=options.width, align=False)
 
     return open_studio
+
+
+def _capture(options: Options) -> "Callable[[], CaptureSource]":
+    """Prepares the capture on the thread that reads it; what is wrong with the folder is said at once."""
+    from viewmend.capture.prepare import open_masked, prepare
+    from viewmend.cli.alignment import say_alignment
+
+    capture = open_masked(options.source)
+
+    def open_capture() -> "CaptureSource":
+        prepared = prepare(capture, longest_px=options.width, align=options.align)
+        say_alignment(prepared.alignment)
+        return prepared
+
+    return open_capture

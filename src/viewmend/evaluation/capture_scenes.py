@@ -3,16 +3,14 @@
 import hashlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from viewmend.capture.errors import CaptureError
-from viewmend.capture.plain import PlainCapture, open_capture
 from viewmend.capture.plain_format import read_calibration
+from viewmend.capture.prepare import open_masked, prepare
 from viewmend.evaluation.scenes import SceneFrame
-from viewmend.geometry.alignment import shared_offset
 from viewmend.geometry.cameras import Cameras
 
 
@@ -40,18 +38,13 @@ class CaptureScene:
 
     def frames(self, device: str) -> Iterator[SceneFrame]:
         """Those in which the camera that was left out, and at least two of the inputs, have images."""
-        capture = _open(self.folder, (*self.inputs, self.held))
+        capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1), self.inputs)
         bounds = None if capture.bounds is None else capture.bounds.to(device)
-        offset_px = None
         for time in range(self.count):
-            frame = capture.read(time)
-            inputs = frame.select([name for name in self.inputs if name in frame.cameras.names])
-            if self.held not in frame.cameras.names or len(inputs.cameras) < 2 or inputs.mask is None:
-                continue
-            if offset_px is None and bool((inputs.mask > 0).any()):
-                offset_px = shared_offset(inputs.mask, inputs.cameras, capture.bounds).offset_px
-            moved = replace(frame, cameras=frame.cameras.moved(*(offset_px or (0.0, 0.0)))).to(device)
-            yield SceneFrame(moved.select(inputs.cameras.names), moved.select([self.held]), bounds)
+            frame = capture.read(time).to(device)
+            inputs = [name for name in self.inputs if name in frame.cameras.names]
+            if self.held in frame.cameras.names and len(inputs) >= 2:
+                yield SceneFrame(frame.select(inputs), frame.select([self.held]), bounds)
 
 
 def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) -> tuple[CaptureScene, ...]:
@@ -67,7 +60,7 @@ def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) ->
         CaptureError: the capture cannot be read, has no masks, or too few cameras.
         ValueError: `inputs` or `frames` is no such number.
     """
-    capture = _open(folder, None)
+    capture = open_masked(folder, held=1)
     names = capture.cameras.names
     if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
         raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
@@ -105,18 +98,6 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
         around = (turn - around) % turn
     order: Sequence[int] = around.argsort(stable=True).tolist()
     return tuple(cameras.names[order[i * len(order) // count]] for i in range(count))
-
-
-def _open(folder: Path, names: Sequence[str] | None) -> PlainCapture:
-    capture = open_capture(folder, names)
-    if not capture.has_masks:
-        raise CaptureError(
-            f"{folder}: expected a 'mask' for every camera, got none: the visual hull is carved from them, and the "
-            "truth cut out; segment the foreground and name the files in cameras.json"
-        )
-    if len(capture.cameras) < 3:
-        raise CaptureError(f"{folder}: expected at least 3 cameras, one to leave out, got {len(capture.cameras)}")
-    return capture
 
 
 def _fingerprint(folder: Path) -> str:

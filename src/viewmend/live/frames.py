@@ -8,13 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.live.clock import Span
 from viewmend.own_pages import to_own_pages
 from viewmend.views import MultiViewFrame
@@ -123,31 +121,6 @@ def _size(frame: MultiViewFrame) -> int:
     return frame.rgb.numel() + (0 if frame.mask is None else frame.mask.numel())
 
 
-def shrunk(frame: MultiViewFrame, max_side_px: int | None) -> MultiViewFrame:
-    """The frame with images (area averages) no larger than this; as it is if they are not, or without a limit."""
-    largest = int(frame.cameras.size_px.max()) if len(frame.cameras) else 0
-    if max_side_px is None or largest <= max_side_px:
-        return frame
-    sizes = (frame.cameras.size_px * (max_side_px / largest)).round().clamp(min=1).long().tolist()
-    cameras = concatenate_cameras([frame.cameras[n].resized(*size) for n, size in enumerate(sizes)])
-    width, height = cameras.max_size_px
-    rgb = torch.zeros(len(sizes), 3, height, width, dtype=torch.uint8)
-    mask = None if frame.mask is None else torch.zeros(len(sizes), height, width, dtype=torch.uint8)
-    for n, (w, h) in enumerate(sizes):
-        full_w, full_h = frame.cameras.size_px[n].tolist()
-        rgb[n, :, :h, :w] = _area(frame.rgb[n, :, :full_h, :full_w], w, h)
-        if mask is not None and frame.mask is not None:
-            mask[n, :h, :w] = _area(frame.mask[n, None, :full_h, :full_w], w, h)[0]
-    return replace(frame, cameras=cameras, rgb=rgb, mask=mask, depth=None)
-
-
-def _area(image: UInt8[Tensor, "channel height width"], width: int, height: int) -> UInt8[Tensor, "channel h w"]:
-    import cv2
-
-    small = cv2.resize(image.movedim(0, -1).numpy(), (width, height), interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(small).reshape(height, width, -1).movedim(-1, 0)
-
-
 class Supply:
     """What all supplies say of themselves."""
 
@@ -184,10 +157,9 @@ class ReadAhead(Supply):
         fps: float | None = None,
         made: bool = False,
         memory_mb: float = 1500.0,
-        max_side_px: int | None = None,
     ) -> None:
         self.changed: Callable[[], None] = lambda: None
-        self._open, self._fps, self._made, self._max_side_px = open_source, fps, made, max_side_px
+        self._open, self._fps, self._made = open_source, fps, made
         self._store = FrameStore(memory_mb, by_use=True)
         self._lock = threading.Condition()
         self._wanted = 0
@@ -245,7 +217,7 @@ class ReadAhead(Supply):
             if time is None:
                 self._lock.wait_for(lambda: self._stopped or self._next() is not None)
                 return
-        frame = shrunk(source.read(time), self._max_side_px)
+        frame = source.read(time)
         with self._lock:
             self._store.put(time, frame)
             if self._made:

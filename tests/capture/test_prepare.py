@@ -1,0 +1,66 @@
+"""Everybody's frames: aligned on the input cameras alone, and no larger than wanted."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reference.ball import BallCapture, camera_at, photograph, ring
+
+from viewmend.capture.prepare import prepare, reduced
+from viewmend.geometry.cameras import concatenate_cameras
+
+SHIFT_PX = 0.8
+
+
+class Shifted(BallCapture):
+    """A rig that states principal points beside the true ones; camera `c0` sees whatever a test wants."""
+
+    def __init__(self, spoiled: bool = False):
+        heights = (0.3, 0.0, 1.2, -0.8, 0.6, 1.4, -1.0)
+        self.true_cameras = concatenate_cameras(
+            [camera_at(51 * n, f"c{n}", size=96, height_m=height) for n, height in enumerate(heights)]
+        )
+        super().__init__(self.true_cameras.moved(-SHIFT_PX, 0.0))
+        self.spoiled = spoiled
+
+    def read(self, time):
+        frame = replace(photograph(self.true_cameras, time), cameras=self.cameras, depth=None)
+        if self.spoiled:
+            frame.rgb[0], frame.mask[0] = 200, 255
+        return frame
+
+
+def test_a_shift_of_all_images_is_undone_for_inputs_and_the_camera_left_out():
+    capture = Shifted()
+    prepared = prepare(capture, capture.cameras.names[1:])
+    moved = prepared.cameras.K[:, 0, 2] - capture.cameras.K[:, 0, 2]
+    assert moved.tolist() == pytest.approx([SHIFT_PX] * 7, abs=0.35)
+    assert torch.equal(prepared.read(1).cameras.K, prepared.cameras.K)
+    assert torch.equal(prepare(capture, align=False).cameras.K, capture.cameras.K)
+
+
+def test_what_the_camera_left_out_saw_does_not_move_the_inputs():
+    inputs = Shifted().cameras.names[1:]
+    clean, spoiled = (prepare(Shifted(spoiled), inputs).alignment for spoiled in (False, True))
+    assert clean == spoiled != prepare(Shifted(spoiled=True)).alignment
+
+
+def test_images_are_reduced_with_their_cameras_and_never_enlarged():
+    sizes = torch.tensor([[48, 48], [40, 48], [48, 30], [20, 24]])
+    cameras = replace(ring(4), size_px=sizes)
+    frame = replace(photograph(cameras), cameras=cameras)
+    small = reduced(frame, 24)
+    assert small.cameras.size_px.tolist() == [[24, 24], [20, 24], [24, 15], [20, 24]] and small.depth is None
+    assert int(small.rgb[1, :, :, 20:].max()) == 0 and int(small.mask[2, 15:].max()) == 0
+    assert torch.equal(small.rgb[3, :, :24, :20], frame.rgb[3, :, :24, :20])
+    like = photograph(small.cameras[0])
+    assert float((like.rgb[0].float() - small.rgb[0].float()).abs().mean()) < 5
+    assert reduced(frame, None) is frame and reduced(frame, 48) is frame
+    assert reduced(replace(frame, mask=None), 24).mask is None
+
+
+def test_a_reduced_capture_states_the_cameras_of_its_frames():
+    prepared = prepare(BallCapture(ring(6)), longest_px=32, align=False)
+    frame = prepared.read(0)
+    assert frame.rgb.shape == (6, 3, 32, 32) and prepared.cameras.max_size_px == (32, 32)
+    assert torch.equal(frame.cameras.K, prepared.cameras.K)
