@@ -1,17 +1,93 @@
-"""Fills the holes of free-viewpoint video, live."""
+"""Fills the holes of free-viewpoint video, live.
 
+`viewmend.__all__` is what others may build on; each name is imported when it is asked for, so that
+`import viewmend` alone stays instant.
+"""
+
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from viewmend.stream import Stream as Stream
+    from viewmend.capture.errors import CaptureError
+    from viewmend.capture.plain import open_capture
+    from viewmend.capture.prepare import prepare
+    from viewmend.geometry.bounds import Bounds
+    from viewmend.geometry.cameras import Cameras, pinhole
+    from viewmend.geometry.hull import HullConfig
+    from viewmend.geometry.rigid import look_at
+    from viewmend.inpainting.checkpoint import load_inpainter
+    from viewmend.inpainting.protocol import ViewInpainter
+    from viewmend.pipeline import DepthProvider, PipelineConfig, StageMs
+    from viewmend.rendering.error_rules import Evidence, error_rule
+    from viewmend.rendering.view import RenderConfig
+    from viewmend.stream import RenderQuality, Stream, StreamView
+    from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
-__all__ = ["Stream"]
+__version__ = "0.1.0"
+
+__all__ = [
+    "Bounds",
+    "Cameras",
+    "CaptureError",
+    "CompletedView",
+    "ContextViews",
+    "DepthProvider",
+    "Evidence",
+    "HullConfig",
+    "IncompleteView",
+    "MultiViewFrame",
+    "PipelineConfig",
+    "RenderConfig",
+    "RenderQuality",
+    "Silhouettes",
+    "StageMs",
+    "Stream",
+    "StreamView",
+    "ViewInpainter",
+    "__version__",
+    "error_rule",
+    "load_inpainter",
+    "look_at",
+    "open_capture",
+    "pinhole",
+    "prepare",
+]
+
+_ROOM = {
+    "Bounds": "geometry.bounds",
+    "Cameras": "geometry.cameras",
+    "CaptureError": "capture.errors",
+    "CompletedView": "views",
+    "ContextViews": "views",
+    "DepthProvider": "pipeline",
+    "Evidence": "rendering.error_rules",
+    "HullConfig": "geometry.hull",
+    "IncompleteView": "views",
+    "MultiViewFrame": "views",
+    "PipelineConfig": "pipeline",
+    "RenderConfig": "rendering.view",
+    "RenderQuality": "stream",
+    "Silhouettes": "views",
+    "StageMs": "pipeline",
+    "Stream": "stream",
+    "StreamView": "stream",
+    "ViewInpainter": "inpainting.protocol",
+    "error_rule": "rendering.error_rules",
+    "load_inpainter": "inpainting.checkpoint",
+    "look_at": "geometry.rigid",
+    "open_capture": "capture.plain",
+    "pinhole": "geometry.cameras",
+    "prepare": "capture.prepare",
+}
 
 
 def __getattr__(name: str) -> object:
-    """`viewmend.Stream`, imported when it is asked for: `import viewmend` alone stays instant."""
-    if name == "Stream":
-        from viewmend.stream import Stream
+    """The public name, from the room that defines it."""
+    if name not in _ROOM:
+        raise AttributeError(f"module 'viewmend' has no attribute '{name}'; viewmend.__all__ lists those that it has")
+    return getattr(import_module(f"viewmend.{_ROOM[name]}"), name)
 
-        return Stream
-    raise AttributeError(f"module 'viewmend' has no attribute '{name}'")
+
+def __dir__() -> list[str]:
+    """What `dir(viewmend)` shows."""
+    return __all__

@@ -15,6 +15,8 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from viewmend import __version__
+
 
 @dataclass(frozen=True)
 class Command:
@@ -49,9 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_overview())
         return 0 if arguments else 2
     if arguments[0] == "--version":
-        from importlib.metadata import version
-
-        print(f"viewmend {version('viewmend')}")
+        print(f"viewmend {__version__}")
         return 0
     by_name = {c.name: c for c in COMMANDS}
     command = by_name.get(" ".join(arguments[:2])) or by_name.get(arguments[0])

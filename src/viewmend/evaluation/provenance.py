@@ -4,10 +4,11 @@ import os
 import platform
 import subprocess
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import torch
+
+from viewmend import __version__
 
 
 @dataclass(frozen=True)
@@ -31,13 +32,9 @@ class Provenance:
 
 def provenance(device: str, threads: int, jobs: int) -> Provenance:
     """Of figures that are computed now."""
-    try:
-        own = version("viewmend")
-    except PackageNotFoundError:
-        own = "unknown"
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else _processor()
     load = round(os.getloadavg()[0], 1)
-    return Provenance(own, _commit(), platform.python_version(), torch.__version__, name, threads, jobs, load)
+    return Provenance(__version__, _commit(), platform.python_version(), torch.__version__, name, threads, jobs, load)
 
 
 def _processor() -> str:

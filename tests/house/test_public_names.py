@@ -1,0 +1,48 @@
+"""`viewmend.__all__`: what others may build on, seen alike by people, type checkers and an installed package."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import viewmend
+
+ROOT = Path(__file__).resolve().parents[2]
+TREE = ast.parse((ROOT / "src/viewmend/__init__.py").read_text())
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def test_dir_shows_the_public_names_and_each_can_be_had():
+    assert sorted(dir(viewmend)) == sorted(viewmend.__all__)
+    for name in viewmend.__all__:
+        assert getattr(viewmend, name) is not None
+
+
+def test_type_checkers_see_the_names_where_they_are_defined():
+    [block] = [n for n in TREE.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]
+    shown = {a.name: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    assert sorted({*shown, "__version__"}) == sorted(viewmend.__all__)
+    for name, module in shown.items():
+        value = getattr(viewmend, name)
+        assert value is getattr(import_module(module), name)
+        assert getattr(value, "__module__", module) == module, "import it from where it is defined"
+
+
+def test_an_unknown_name_says_where_to_look():
+    with pytest.raises(AttributeError, match="no attribute 'Steam'"):
+        viewmend.Steam  # noqa: B018
+
+
+def test_the_import_alone_is_instant():
+    check = "import sys, viewmend; dir(viewmend); print([m for m in ('torch', 'numpy', 'cv2') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_an_installed_package_is_typed_and_says_its_version():
+    assert "py.typed" in PROJECT["tool"]["setuptools"]["package-data"]["viewmend"]
+    assert (ROOT / "src/viewmend/py.typed").is_file()
+    assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "viewmend.__version__"}
