@@ -18,6 +18,7 @@ from viewmend.inpainting.ray_sampling import (
     OFFSETS,
     OUTLINE,
     PATCH,
+    RayFeatures,
     multi_scale_context,
     sample_along_rays,
     windows,
@@ -46,10 +47,15 @@ def test_following_equals_its_twin(rng):
     pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
     samples = sample_along_rays(incomplete, pixels, nearby)
     features, occupancy = follow_twin(incomplete, pixels, nearby, OFFSETS, NEAR, FAR, OUTLINE, PATCH)
-    assert 0 < samples.features[..., 8].mean() < 1, "some points are out of view"
-    assert torch.allclose(samples.features.double(), torch.from_numpy(features), atol=2e-3)
-    assert torch.allclose(samples.occupancy.double(), torch.from_numpy(occupancy), atol=2e-3)
-    assert 0.05 < (samples.occupancy[..., :2] < 0.9).float().mean() < 0.95
+    assert 0 < samples.features.in_view.mean() < 1, "some points are out of view"
+    assert torch.allclose(samples.features.stack().double(), torch.from_numpy(features), atol=2e-3)
+    assert torch.allclose(samples.consistency.stack().double(), torch.from_numpy(occupancy), atol=2e-3)
+    assert 0.05 < (samples.consistency.second < 0.9).float().mean() < 0.95
+    again = RayFeatures.unstack(samples.features.stack())
+    assert all(torch.equal(a, b) for a, b in zip(again, samples.features, strict=True))
+    alone = samples.features.stack()[:, OFFSETS.index(0.09)]
+    one = sample_along_rays(incomplete, pixels, nearby, offsets=(0.09,)).features
+    assert torch.allclose(one.stack()[:, 0], alone, atol=1e-6)
 
 
 def test_farther_surroundings_equal_their_twin(rng):
@@ -73,19 +79,18 @@ def test_without_silhouettes_the_nearby_masks_count():
     assert nearby.frame.mask is not None
     pixels = torch.nonzero(incomplete.error > 0)[::20]
     told = replace(incomplete, silhouettes=Silhouettes(nearby.frame.mask, nearby.frame.cameras))
-    assert torch.equal(
-        sample_along_rays(incomplete, pixels, nearby).occupancy, sample_along_rays(told, pixels, nearby).occupancy
-    )
+    without, with_them = (sample_along_rays(v, pixels, nearby).consistency.stack() for v in (incomplete, told))
+    assert torch.equal(without, with_them)
 
 
 def test_cameras_agree_on_the_colour_of_a_point_on_the_surface():
     incomplete = view(5)
     pixels = torch.tensor([[30, 40], [25, 33]])
-    on_surface = sample_along_rays(incomplete, pixels, context(5)).features[:, OFFSETS.index(0.0)]
-    truth = look(camera("novel"), 5)[0][:, pixels[:, 0], pixels[:, 1]].T
-    for seen in on_surface.unbind(1):
-        assert torch.allclose(seen[:, :3], truth, atol=0.05)
-        assert torch.allclose(seen[:, 4:6], torch.zeros(2, 2), atol=1e-4), "at the proxy, not behind it"
+    on_surface = sample_along_rays(incomplete, pixels, context(5), offsets=(0.0,)).features
+    truth = look(camera("novel"), 5)[0][:, pixels[:, 0], pixels[:, 1]].T[:, None, None]
+    assert torch.allclose(on_surface.colour, truth.expand_as(on_surface.colour), atol=0.05)
+    for behind in (on_surface.depth_difference, on_surface.coarse_depth_difference):
+        assert torch.allclose(behind, torch.zeros_like(behind), atol=1e-4), "at the proxy, not behind it"
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.001, 10.0])
@@ -101,7 +106,8 @@ def test_the_unit_of_length_does_not_matter(unit):
     other = replace(incomplete, camera=scaled(incomplete.camera), depth=incomplete.depth * unit)
     frame = replace(nearby.frame, cameras=scaled(nearby.frame.cameras))
     seen = sample_along_rays(other, pixels, replace(nearby, frame=frame, depth=nearby.depth * unit))
-    assert torch.allclose(seen.features, sample_along_rays(incomplete, pixels, nearby).features, atol=1e-3)
+    before = sample_along_rays(incomplete, pixels, nearby)
+    assert torch.allclose(seen.features.stack(), before.features.stack(), atol=1e-3)
 
 
 def test_windows_are_what_lies_around():

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from viewmend.baselines.framing import Window
 from viewmend.geometry.cameras import pixel_centers, project, unproject
+from viewmend.geometry.sampling import sample_bilinear
 from viewmend.views import ContextViews, IncompleteView
 
 
@@ -67,5 +67,5 @@ def camera_windows(
         scale, centre = torch.where(before, near, scale), torch.where(before, uv[:, 0], centre)
     offsets = pixel_centers(width, height, images.device) - extent.new_tensor([width / 2, height / 2])
     places = centre[:, None, None] + scale[:, None, None] * offsets
-    full = extent.new_tensor([images.shape[3], images.shape[2]])
-    return 2 * grid_sample(images, 2 * places / full - 1, align_corners=False) - 1
+    shown = sample_bilinear(images, places.flatten(1, 2)).movedim(-1, 1).unflatten(2, size)
+    return 2 * shown - 1

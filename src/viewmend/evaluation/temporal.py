@@ -3,11 +3,11 @@
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import interpolate, rasterize
+from viewmend.geometry.sampling import in_view, sample_bilinear
 
 VISIBLE_M = 0.02
 """A surface point was seen if it lay at most this much behind the depth of the pixel it fell into."""
@@ -26,13 +26,13 @@ def backward_flow(
     """
     raster = rasterize(now, camera)
     points = interpolate(before.vertices, now, camera, raster)[0]
-    height, width = depth_before.shape
-    uv, z = (x[0] for x in project(points.reshape(-1, 3), camera))
-    column, row = uv.floor().nan_to_num(-1, -1, -1).clamp(-1, max(height, width)).long().unbind(-1)
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    there = depth_before[row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    seen = (raster.triangle[0].flatten() >= 0) & inside & (there > 0) & ((z - there).abs() < VISIBLE_M)
-    return torch.where(seen[:, None], uv, torch.nan).view(height, width, 2)
+    uv, z = project(points.reshape(-1, 3), camera)
+    inside = (raster.triangle[0].flatten() >= 0) & in_view(uv, z, camera)[0]
+    uv, z = uv[0], z[0]
+    column, row = torch.where(inside[:, None], uv, 0.0).long().unbind(-1)
+    there = depth_before[row, column]
+    seen = inside & (there > 0) & ((z - there).abs() < VISIBLE_M)
+    return torch.where(seen[:, None], uv, torch.nan).view(*depth_before.shape, 2)
 
 
 def warp_error(
@@ -50,10 +50,8 @@ def warp_error(
     counted = pixels & backward_flow_px.isfinite().all(-1)
     if int(counted.sum()) < enough_px:
         return None
-    height, width = counted.shape
-    at = backward_flow_px[counted] * backward_flow_px.new_tensor([2 / width, 2 / height]) - 1
-    warped = F.grid_sample(before[None], at[None, None], padding_mode="border", align_corners=False)[0, :, 0]
-    return float((image[:, counted] - warped).abs().mean())
+    warped = sample_bilinear(before[None], backward_flow_px[counted][None], "border")[0]
+    return float((image[:, counted] - warped.T).abs().mean())
 
 
 def change(

@@ -3,9 +3,10 @@
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
-from torch.nn.functional import conv2d, grid_sample, pad
+from torch.nn.functional import conv2d, pad
 
 from viewmend.geometry.cameras import Cameras, project
+from viewmend.geometry.sampling import in_view, sample_bilinear
 
 NEAR_M = 1e-6
 
@@ -45,15 +46,10 @@ def carve(
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
     values = torch.ones(len(points), device=low.device)
     seen = torch.zeros(len(points), dtype=torch.int32, device=low.device)
-    rows, columns = soft.shape[1:]
-    reduced = torch.tensor([columns * pool, rows * pool], device=low.device)
     for view in range(len(cameras)):
         uv, z = project(points, cameras[view])
-        uv, z = uv[0], z[0]
-        sees = (z > NEAR_M) & (uv >= 0).all(-1) & (uv < cameras.size_px[view]).all(-1)
-        where = torch.where(sees[:, None], 2 * uv / reduced - 1, 0.0)
-        image = soft[view].float()[None, None] / 255
-        value = grid_sample(image, where[None, None], padding_mode="border", align_corners=False)[0, 0, 0]
+        sees = in_view(uv, z, cameras[view])[0]
+        value = sample_bilinear(soft[view].float()[None, None] / 255, uv / pool, "border")[0, :, 0]
         values = torch.where(sees, values.minimum(value), values)
         seen += sees
     return torch.where(seen >= needed, values, 0.0).view(*shape)

@@ -19,7 +19,8 @@ from viewmend.inpainting.ray_sampling import (
     CELLS,
     OFFSETS,
     RAY_CHANNELS,
-    RaySamples,
+    RayFeatures,
+    SilhouetteConsistency,
     multi_scale_context,
     sample_along_rays,
     windows,
@@ -29,9 +30,9 @@ from viewmend.views import ContextViews, IncompleteView
 RADIUS_PX = 5
 """How far a pixel looks around in the view."""
 WINDOW_CHANNELS = 8
-"""RGB, M, E of the view, and RGB of the smooth guess."""
+"""RGB, M, E of the view, and RGB of the coarse fill."""
 SHOWN_CHANNELS = 7
-"""What cameras that see a point agree about: RGB, and the means around."""
+"""What cameras that see a point agree about: colour, mean colour and mean coverage."""
 POINT_FEATURES = 16
 """What is kept of each point of a ray."""
 CONTRAST = 10.0
@@ -45,18 +46,18 @@ long, and a server that keeps a thousand of them has a heap full of holes."""
 
 
 class RayInputs(NamedTuple):
-    """All that the reader is told of some missing pixels."""
+    """All that the network is told of some missing pixels."""
 
     features: Float[Tensor, "pixel point view 14"]
-    """As in `RaySamples`,"""
-    occupancy: Float[Tensor, "pixel point 4"]
-    """and so is this."""
-    around: Float[Tensor, "pixel 8 11 11"]
-    """The view about each pixel."""
-    far: Float[Tensor, "place 12 11 11"]
-    """What lies farther around, for each place that differs,"""
+    """`RayFeatures`, stacked."""
+    consistency: Float[Tensor, "pixel point 4"]
+    """`SilhouetteConsistency`, stacked."""
+    window: Float[Tensor, "pixel 8 11 11"]
+    """The view about each pixel: RGB, M, E, and RGB of the coarse fill."""
+    surroundings: Float[Tensor, "place 12 11 11"]
+    """The `multi_scale_context` of each place that differs."""
     place: Int[Tensor, "pixel"]
-    """and at which of them each pixel is."""
+    """At which of these places each pixel is."""
 
     @staticmethod
     def cat(parts: Sequence["RayInputs"]) -> "RayInputs":
@@ -66,7 +67,7 @@ class RayInputs(NamedTuple):
         for part in parts:
             more = most - part.features.shape[2]
             whole.append(part._replace(features=F.pad(part.features, (0, 0, 0, more)), place=part.place + first))
-            first += len(part.far)
+            first += len(part.surroundings)
         return RayInputs(*(torch.cat(values) for values in zip(*whole, strict=True)))
 
 
@@ -130,48 +131,49 @@ class RayBlendNet(nn.Module):
     def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         size = max(1, len(told.place)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
-        far = torch.cat([self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.far.split(size)])
-        parts = (values.split(size) for values in (told.features, told.occupancy, told.around, far[told.place]))
+        far = [self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.surroundings.split(size)]
+        per_pixel = (told.features, told.consistency, told.window, torch.cat(far)[told.place])
+        parts = (values.split(size) for values in per_pixel)
         return torch.cat([self._mix(*part) for part in zip(*parts, strict=True)])
 
     def _mix(
         self,
-        seen: Float[Tensor, "pixel point view 14"],
-        occupancy: Float[Tensor, "pixel point 4"],
-        around: Float[Tensor, "pixel 8 11 11"],
+        features: Float[Tensor, "pixel point view 14"],
+        consistency: Float[Tensor, "pixel point 4"],
+        window: Float[Tensor, "pixel 8 11 11"],
         far: Float[Tensor, "pixel feature"],
     ) -> Float[Tensor, "pixel 3"]:
-        pixels = len(seen)
-        seen, occupancy, around, far = map(_rounded_up, (seen, occupancy, around, far))
-        colours, features = self._points(seen, occupancy)
-        hidden = self.head(torch.cat([features.flatten(1), self.around(around).flatten(1), far], 1))
-        candidate = F.pad(seen[..., 8].amax(2) > 0, (0, 2), value=True)
-        shares = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
-        guess = around[:, None, 5:, RADIUS_PX, RADIUS_PX]
-        return (shares[..., None] * torch.cat([colours, guess, 0 * guess], 1)).sum(1)[:pixels]
+        pixels = len(features)
+        features, consistency, window, far = map(_rounded_up, (features, consistency, window, far))
+        colours, points = self._points(features, consistency)
+        hidden = self.head(torch.cat([points.flatten(1), self.around(window).flatten(1), far], 1))
+        candidate = F.pad(RayFeatures.unstack(features).in_view.amax((2, 3)) > 0, (0, 2), value=True)
+        weights = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
+        coarse_fill = window[:, None, -3:, RADIUS_PX, RADIUS_PX]
+        return (weights[..., None] * torch.cat([colours, coarse_fill, 0 * coarse_fill], 1)).sum(1)[:pixels]
 
     def _points(
-        self, seen: Float[Tensor, "pixel point view 14"], occupancy: Float[Tensor, "pixel point 4"]
+        self, features: Float[Tensor, "pixel point view 14"], consistency: Float[Tensor, "pixel point 4"]
     ) -> tuple[Float[Tensor, "pixel point 3"], Float[Tensor, "pixel point feature"]]:
         """Each point's colour, by the cameras that seem to see it, and what speaks for it being there."""
-        inside = seen[..., 8:9]
-        shown, fine, cosine = torch.cat([seen[..., :3], seen[..., 10:]], -1), seen[..., 4:5], seen[..., 6:7]
+        seen, silhouettes = RayFeatures.unstack(features), SilhouetteConsistency.unstack(consistency)
+        shown = torch.cat([seen.colour, seen.mean_colour, seen.mean_coverage], -1)
         # A first opinion on who sees the point: not far behind the proxy, and from about where the view is.
-        prior = inside * (4 * cosine).exp() * (-4 * fine).sigmoid()
+        prior = seen.in_view * (4 * seen.viewing_cosine).exp() * (-4 * seen.depth_difference).sigmoid()
         prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
         mean = (prior * shown).sum(2, keepdim=True)
         variance = CONTRAST * (prior * (shown - mean) ** 2).sum(2, keepdim=True)
-        looked = self.look(seen)
+        looked = self.look(features)
         together = looked + (prior * looked).sum(2, keepdim=True)
-        occupied = occupancy[..., None, ::2].expand(*prior.shape[:-1], -1)
-        told = [seen, mean.expand_as(shown), variance.expand_as(shown), together, occupied, prior]
+        least = torch.cat([silhouettes.least, silhouettes.least_mean], -1)[:, :, None].expand(*prior.shape[:-1], -1)
+        told = [features, mean.expand_as(shown), variance.expand_as(shown), together, least, prior]
         compared = self.compare(torch.cat(told, -1))
         scores = self.trust(compared).float() + (prior + 1e-4).log()
-        trust = inside * scores.masked_fill(inside == 0, -1e4).softmax(2)
+        trust = seen.in_view * scores.masked_fill(seen.in_view == 0, -1e4).softmax(2)
         agreed = (trust * shown).sum(2)
         spread = CONTRAST * (trust * (shown - agreed[:, :, None]) ** 2).sum(2)
-        features = [(trust * compared).sum(2), agreed, spread, occupancy, (trust**2).sum(2)]
-        return agreed[..., :3], self.point(torch.cat(features, -1))
+        point = [(trust * compared).sum(2), agreed, spread, consistency, (trust**2).sum(2)]
+        return agreed[..., :3], self.point(torch.cat(point, -1))
 
 
 def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
@@ -185,20 +187,16 @@ def look_around(
     pixels: Int[Tensor, "pixel 2"],
     guess: Float[Tensor, "3 height width"] | None = None,
 ) -> RayInputs:
-    """All that the reader is told of these pixels (row, column): along their rays, and around them in the view.
+    """All that the network is told of these pixels (row, column): along their rays, and around them in the view.
 
-    guess: the view filled smoothly (`prefill.fill`), made where it is not given.
+    `guess` is the view with its holes filled by `coarse_fill.fill`; it is made where it is not given.
     """
     guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
     shown = torch.cat([view.rgb, view.mask[None], view.error[None], guess])
     if nearby is not None and len(pixels):
-        samples = sample_along_rays(view, pixels, nearby)
+        features, consistency = (values.stack() for values in sample_along_rays(view, pixels, nearby))
     else:
         shape = (len(pixels), len(OFFSETS))
-        samples = RaySamples(view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 4))
-    return RayInputs(
-        samples.features,
-        samples.occupancy,
-        windows(shown, pixels, RADIUS_PX),
-        *multi_scale_context(view, guess, pixels),
-    )
+        features, consistency = view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 4)
+    window = windows(shown, pixels, RADIUS_PX)
+    return RayInputs(features, consistency, window, *multi_scale_context(view, guess, pixels))

@@ -5,9 +5,8 @@ in the images: where a ray passes it, cameras that see it agree. So the ray is f
 of its points looked up in each camera (as in IBRNet, Wang et al., CVPR 2021, which renders whole views so).
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import product
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
@@ -15,39 +14,94 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project, unproject
+from viewmend.geometry.sampling import bilinear_taps, in_view, sample_bilinear
 from viewmend.inpainting.coarse_fill import pull_push
 from viewmend.views import ContextViews, IncompleteView, Silhouettes
 
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Where a ray is looked at: z-depth behind the proxy, in subject sizes."""
-RAY_CHANNELS = 14
-"""Features of one point in one camera."""
 NEAR, FAR = 0.03, 0.2
 """Subject sizes over which the fine and the coarse distance behind the proxy saturate."""
 OUTLINE = 0.06
-"""Side, in subject sizes, of the squares over which masks are averaged to tell how near their outline is,"""
+"""Side, in subject sizes, of the squares over which masks are averaged: this tells how near their outline is."""
 PATCH = 0.08
-"""of those over which colours are: single pixels agree by chance more easily,"""
+"""Side, in subject sizes, of the squares over which colours are averaged: single pixels agree by chance more easily."""
 CELLS = (0.03, 0.06)
-"""and of those in which a view's pixel is told of its farther surroundings."""
+"""Sides, in subject sizes, of the squares by which `multi_scale_context` shows a pixel its farther surroundings."""
 CELL_CHANNELS = 6
 """RGB of the smoothly filled view, M, E and depth."""
 CELLS_AROUND = 5
 """So many cells to each side."""
 
 
-@dataclass(frozen=True)
-class RaySamples:
-    """Points along the rays of some pixels, as each camera shows them."""
+class RayFeatures(NamedTuple):
+    """What each camera shows at the points along some rays: all 0 where a camera has the point not in view."""
 
-    features: Float[Tensor, "pixel point view 14"]
-    """RGB (background black), mask, how far behind the proxy as that camera sees it (fine and coarse, -1 to 1), cosine
-    between its ray and the pixel's, 1 for a camera that coloured the view, 1 where the camera has the point in view,
-    and means around: of the mask (where the outlines of two cameras meet, a hull is fattest), of the colours, and of
-    what the proxy covers (more than the mask where it is fat). All 0 for a point out of view."""
-    occupancy: Float[Tensor, "pixel point 4"]
-    """Least and second least mask of all cameras of the rig that have the point in view: 0 where one sees background
-    there, and where another does, too; 1 where there is no such camera. The same of the mask's means around."""
+    colour: Float[Tensor, "pixel point view 3"]
+    """RGB in [0, 1] before black."""
+    mask: Float[Tensor, "pixel point view 1"]
+    """The camera's mask, in [0, 1]."""
+    depth_difference: Float[Tensor, "pixel point view 1"]
+    """How far the point is behind the proxy as that camera sees it, -1 to 1; `NEAR` saturates it."""
+    coarse_depth_difference: Float[Tensor, "pixel point view 1"]
+    """The same, saturated by `FAR`."""
+    viewing_cosine: Float[Tensor, "pixel point view 1"]
+    """Cosine of the angle between the camera's ray and the pixel's."""
+    is_source: Float[Tensor, "pixel point view 1"]
+    """1 for a camera that coloured the view."""
+    in_view: Float[Tensor, "pixel point view 1"]
+    """1 where the camera has the point in view."""
+    mean_mask: Float[Tensor, "pixel point view 1"]
+    """The mask's mean around. A hull is fattest where the outlines of two cameras meet."""
+    mean_colour: Float[Tensor, "pixel point view 3"]
+    """The colours' mean around, before black."""
+    mean_coverage: Float[Tensor, "pixel point view 1"]
+    """The mean around of what the proxy covers: more than the mask where the proxy is fat."""
+
+    def stack(self) -> Float[Tensor, "pixel point view 14"]:
+        """All features, in the order of the fields: the networks' input."""
+        return torch.cat(self, -1)
+
+    @classmethod
+    def unstack(cls, stacked: Float[Tensor, "pixel point view 14"]) -> "RayFeatures":
+        """The fields as views of what `stack` gave; no value is copied."""
+        return cls(*stacked.split(FEATURE_CHANNELS, -1))
+
+
+FEATURE_CHANNELS = (3, 1, 1, 1, 1, 1, 1, 1, 3, 1)
+"""Channels of each field of `RayFeatures`."""
+RAY_CHANNELS = sum(FEATURE_CHANNELS)
+
+
+class SilhouetteConsistency(NamedTuple):
+    """What the masks of all cameras of the rig that have a point in view say of it; 1 where there is no such camera."""
+
+    least: Float[Tensor, "pixel point 1"]
+    """The smallest mask: 0 where one camera sees background."""
+    second: Float[Tensor, "pixel point 1"]
+    """The second smallest: 0 where another sees background, too."""
+    least_mean: Float[Tensor, "pixel point 1"]
+    """The smallest of the masks' means around."""
+    second_mean: Float[Tensor, "pixel point 1"]
+    """The second smallest of them."""
+
+    def stack(self) -> Float[Tensor, "pixel point 4"]:
+        """All four, in the order of the fields: the networks' input."""
+        return torch.cat(self, -1)
+
+    @classmethod
+    def unstack(cls, stacked: Float[Tensor, "pixel point 4"]) -> "SilhouetteConsistency":
+        """The fields as views of what `stack` gave; no value is copied."""
+        return cls(*stacked.split(1, -1))
+
+
+class RaySamples(NamedTuple):
+    """Points along the rays of some pixels."""
+
+    features: RayFeatures
+    """As each camera near the view shows them."""
+    consistency: SilhouetteConsistency
+    """As all silhouettes of the rig judge them."""
 
 
 def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
@@ -59,37 +113,51 @@ def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
     return (view.mask > 0).sum().clamp_min(1).sqrt() * view.depth[view.depth > 0].median() / f
 
 
-def sample_along_rays(view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews) -> RaySamples:
+def sample_along_rays(
+    view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews, offsets: Sequence[float] = OFFSETS
+) -> RaySamples:
     """Looks up the rays of these pixels (row, column) in every camera.
 
-    The view needs a depth somewhere; a pixel without takes it from around.
+    The view needs a depth somewhere; a pixel without takes it from around. `offsets` are z-depths behind the proxy, in
+    subject sizes.
     """
-    cameras, frame = nearby.frame.cameras, nearby.frame
+    cameras, shape = nearby.frame.cameras, (len(pixels), len(offsets))
     size_m = subject_size_m(view)
     index = tuple(pixels.unbind(1))
     depth = view.depth[index]
     if not bool((depth > 0).all()):
         depth = pull_push(view.depth[None], view.depth > 0)[0][index]
-    z = depth[:, None] + size_m * depth.new_tensor(OFFSETS)
-    uv = (pixels.flip(1) + 0.5).to(z)[:, None].expand(-1, len(OFFSETS), -1)
+    z = depth[:, None] + size_m * depth.new_tensor(offsets)
+    uv = (pixels.flip(1) + 0.5).to(z)[:, None].expand(-1, len(offsets), -1)
     points = unproject(uv.reshape(1, -1, 2), z.reshape(1, -1), view.camera)[0]
 
     at, z = project(points, cameras)
-    inside = (z > 0) & (at >= 0).all(-1) & (at < cameras.size_px[:, None]).all(-1)
-    seen = _seen(nearby, at) * inside[..., None]
-    coverage, surface_m = seen[..., 4], seen[..., 5] / seen[..., 4].clamp_min(0.05)
-    behind = torch.where(coverage > 0.3, (z - surface_m) / size_m, 0.0)
+    inside = in_view(at, z, cameras)[..., None].to(z)
     to_viewer = F.normalize(view.camera.centers[0] - points, dim=-1)
-    cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1)
-    chosen = z.new_tensor([name in view.source_views for name in cameras.names])[:, None].expand_as(z)
-    mask = frame.mask if frame.mask is not None else 255 * (nearby.depth > 0).to(torch.uint8)
-    place = torch.stack([(behind / NEAR).tanh(), (behind / FAR).tanh(), cosine, chosen, torch.ones_like(z)], -1)
-    around = _around(frame.rgb, mask, nearby.depth > 0, at)
-    features = torch.cat([seen[..., :4], torch.cat([place, around], -1) * inside[..., None]], -1).movedim(0, 1)
-    silhouettes = view.silhouettes or Silhouettes(mask, cameras)
-    occupancy = _silhouette_consistency(points, silhouettes)
-    shape = (len(pixels), len(OFFSETS))
-    return RaySamples(features.unflatten(0, shape), occupancy.unflatten(0, shape))
+    cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1, keepdim=True)
+    is_source = z.new_tensor([name in view.source_views for name in cameras.names])[:, None, None].expand_as(cosine)
+    mask = nearby.frame.mask if nearby.frame.mask is not None else 255 * (nearby.depth > 0).to(torch.uint8)
+
+    colour, own_mask, coverage, depth = _at_points(nearby, at).split((3, 1, 1, 1), -1)
+    behind = torch.where(coverage > 0.3, (z[..., None] - depth / coverage.clamp_min(0.05)) / size_m, 0.0)
+    mean_mask, mean_colour, mean_coverage = _means_at_points(nearby.frame.rgb, mask, nearby.depth > 0, at)
+    features = RayFeatures(
+        colour=colour,
+        mask=own_mask,
+        depth_difference=(behind / NEAR).tanh(),
+        coarse_depth_difference=(behind / FAR).tanh(),
+        viewing_cosine=cosine,
+        is_source=is_source,
+        in_view=inside,
+        mean_mask=mean_mask,
+        mean_colour=mean_colour,
+        mean_coverage=mean_coverage,
+    )
+    consistency = _silhouette_consistency(points, view.silhouettes or Silhouettes(mask, cameras))
+    return RaySamples(
+        RayFeatures(*((values * inside).movedim(0, 1).unflatten(0, shape) for values in features)),
+        SilhouetteConsistency(*consistency.unflatten(0, shape).split(1, -1)),
+    )
 
 
 def multi_scale_context(
@@ -129,67 +197,50 @@ def windows(
     return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
 
 
-def _seen(nearby: ContextViews, at: Float[Tensor, "view point 2"]) -> Float[Tensor, "view point 6"]:
-    """RGB before black, mask, whether the proxy is there and its depth, between pixel centres; zeros beyond.
-
-    Only four pixels a point are looked at: whole images would take longer to convert than to read.
-    """
-    frame = nearby.frame
+def _at_points(nearby: ContextViews, at: Float[Tensor, "view point 2"]) -> Float[Tensor, "view point 6"]:
+    """RGB before black, mask, whether the proxy is there and its depth, bilinearly; zeros beyond the image."""
+    frame, (height, width) = nearby.frame, nearby.depth.shape[1:]
     view = torch.arange(len(frame.cameras), device=at.device)[:, None]
-    seen = at.new_zeros(*at.shape[:2], 6)
-    for row, column, share in _corners(at, nearby.depth.shape[1:]):
-        depth = nearby.depth[view, row, column]
+    total = at.new_zeros(*at.shape[:2], 6)
+    for tap in bilinear_taps(at, width, height):
+        depth = nearby.depth[view, tap.row, tap.column]
         covered = (depth > 0).to(at)
-        mask = covered if frame.mask is None else frame.mask[view, row, column].to(at) / 255
-        rgb = frame.rgb[view, :, row, column].to(at) / 255 * mask[..., None]
-        seen += share[..., None] * torch.cat([rgb, torch.stack([mask, covered, depth], -1)], -1)
-    return seen
-
-
-def _corners(
-    at: Float[Tensor, "view point 2"], size: Sequence[int]
-) -> Iterator[tuple[Int[Tensor, "view point"], Int[Tensor, "view point"], Float[Tensor, "view point"]]]:
-    """Row, column and bilinear share of the four pixels around each place; a share of 0 for those beyond the image."""
-    height, width = size
-    at = at.clamp(-4, 4 * max(size)) - 0.5
-    first = at.floor()
-    right, below = (at - first).unbind(-1)
-    for down, across in product((0, 1), (0, 1)):
-        column, row = (first[..., 0] + across).long(), (first[..., 1] + down).long()
-        there = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        share = (right if across else 1 - right) * (below if down else 1 - below) * there
-        yield row.clamp(0, height - 1), column.clamp(0, width - 1), share
+        mask = covered if frame.mask is None else frame.mask[view, tap.row, tap.column].to(at) / 255
+        rgb = frame.rgb[view, :, tap.row, tap.column].to(at) / 255 * mask[..., None]
+        values = torch.cat([rgb, torch.stack([mask, covered, depth], -1)], -1)
+        total += (tap.weight * tap.inside)[..., None] * values
+    return total
 
 
 def _silhouette_consistency(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> Float[Tensor, "point 4"]:
     """The two smallest mask values at each point, and means around; a camera that has it not in view says 1."""
     cameras, mask = silhouettes.cameras, silhouettes.mask
     at, z = project(points, cameras)
-    inside = (z > 0) & (at >= 0).all(-1) & (at < cameras.size_px[:, None]).all(-1)
     view = torch.arange(len(cameras), device=mask.device)[:, None]
-    corners = _corners(at, mask.shape[1:])
-    value = sum((share * mask[view, row, column] for row, column, share in corners), torch.zeros_like(z)) / 255
+    value = torch.zeros_like(z)
+    for tap in bilinear_taps(at, mask.shape[2], mask.shape[1]):
+        value += tap.weight * tap.inside * mask[view, tap.row, tap.column]
     side = max(1, round(OUTLINE * _subject_px(mask)))
-    around = _between(_means(mask[:, None], side), at / side)[..., 0]
-    values = torch.where(inside, torch.stack([value, around]), 1.0)
+    mean = sample_bilinear(_means(mask[:, None], side), at / side)[..., 0]
+    values = torch.where(in_view(at, z, cameras), torch.stack([value / 255, mean]), 1.0)
     values = F.pad(values, (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
     return values.topk(2, dim=1, largest=False).values.flatten(0, 1).T
 
 
-def _around(
+def _means_at_points(
     rgb: UInt8[Tensor, "view 3 height width"],
     mask: UInt8[Tensor, "view height width"],
     covered: Bool[Tensor, "view height width"],
     at: Float[Tensor, "view point 2"],
-) -> Float[Tensor, "view point 5"]:
-    """Means around each place: of the mask, of RGB before black, and of what the proxy covers."""
+) -> tuple[Float[Tensor, "view point 1"], Float[Tensor, "view point 3"], Float[Tensor, "view point 1"]]:
+    """Means around each point of the mask, of RGB before black, and of what the proxy covers."""
     subject_px = _subject_px(mask)
-    side, half = (max(1, round(share * subject_px)) for share in (OUTLINE, PATCH / 2))
+    side, half = (max(1, round(size * subject_px)) for size in (OUTLINE, PATCH / 2))
     shapes = _means(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
     # Of colours every other row and column will do.
     colours = F.avg_pool2d(_padded(rgb[..., ::2, ::2].to(at) * mask[:, None, ::2, ::2], half), half) / 255**2
-    masked, proxy = _between(shapes, at / side).split(1, -1)
-    return torch.cat([masked, _between(colours, at / (2 * half)), proxy], -1)
+    mean_mask, mean_coverage = sample_bilinear(shapes, at / side).split(1, -1)
+    return mean_mask, sample_bilinear(colours, at / (2 * half)), mean_coverage
 
 
 def _subject_px(mask: UInt8[Tensor, "view height width"]) -> float:
@@ -208,12 +259,3 @@ def _padded(
 ) -> Shaped[Tensor, "view channel whole_height whole_width"]:
     """With zeros right and below, so that squares of this side cover the images."""
     return F.pad(images, (0, -images.shape[3] % side, 0, -images.shape[2] % side))
-
-
-def _between(
-    images: Float[Tensor, "view channel height width"], at: Float[Tensor, "view point 2"]
-) -> Float[Tensor, "view point channel"]:
-    """The images between pixel centres, zeros beyond."""
-    height, width = images.shape[2:]
-    grid = at.clamp(-4, 4 * max(height, width)) * 2 / at.new_tensor([width, height]) - 1
-    return F.grid_sample(images, grid[:, None], align_corners=False)[:, :, 0].movedim(1, -1)

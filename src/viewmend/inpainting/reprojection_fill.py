@@ -9,7 +9,7 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.protocol import Source, State
-from viewmend.inpainting.ray_sampling import NEAR, OFFSETS, sample_along_rays
+from viewmend.inpainting.ray_sampling import NEAR, sample_along_rays
 from viewmend.views import CompletedView, IncompleteView
 
 TOLERANCE = 0.02
@@ -45,12 +45,12 @@ class ReprojectionFill:
             seen = source(time, nearest if time == view.time else view.source_views) if len(left) else None
             if seen is None:
                 continue
-            point = sample_along_rays(view, left, seen).features[:, OFFSETS.index(0.0)]
-            rgb, mask, behind, cosine = point[..., :3], point[..., 3], point[..., 4], point[..., 6]
-            visible = (point[..., 8] > 0) & (mask > 0.5) & (behind.abs() < math.tanh(TOLERANCE / NEAR))
-            weight = visible * (FRONTAL_POWER * cosine).exp()
-            total = weight.sum(1, keepdim=True)
-            colour = (weight[..., None] * rgb).sum(1) / total.clamp_min(1e-9)
+            point = sample_along_rays(view, left, seen, offsets=(0.0,)).features
+            near = point.depth_difference.abs() < math.tanh(TOLERANCE / NEAR)
+            visible = (point.in_view > 0) & (point.mask > 0.5) & near
+            weight = visible * (FRONTAL_POWER * point.viewing_cosine).exp()
+            total = weight.sum(2)[:, 0]
+            colour = (weight * point.colour).sum(2)[:, 0] / total.clamp_min(1e-9)
             found = total[:, 0] > 0
             filled[tuple(left[found].unbind(1))] = colour[found]
             left = left[~found]

@@ -114,7 +114,7 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     u = (P[view, 0, 0] * x + P[view, 0, 1] * y + P[view, 0, 2] * w + P[view, 0, 3]) / z
     v = (P[view, 1, 0] * x + P[view, 1, 1] * y + P[view, 1, 2] * w + P[view, 1, 3]) / z
     width, height = sizes[view, 0], sizes[view, 1]
-    if not (0 <= u <= width and 0 <= v <= height):
+    if not (0 <= u < width and 0 <= v < height):
         return 0.0
 
     per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, GRAZING)

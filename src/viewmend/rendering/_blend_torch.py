@@ -6,6 +6,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import Cameras, project, unproject
+from viewmend.geometry.sampling import bilinear_taps, in_view
 from viewmend.rendering.blend_rule import GRAZING, Blend, BlendConfig
 from viewmend.views import ContextViews
 
@@ -56,37 +57,22 @@ def _sample(
 ) -> tuple[Float[Tensor, "point"], Float[Tensor, "3 point"]]:
     """Weight and colour of one camera at each surface point."""
     frame, camera = sources.frame, sources.frame.cameras[view]
-    uv, z = project(points, camera)
-    (u, v), z = uv[0].unbind(-1), z[0]
+    uv, z = (values[0] for values in project(points, camera))
     width, height = camera.size_px[0].tolist()
-    seen = (z > 0) & (u >= 0) & (v >= 0) & (u <= width) & (v <= height)
-
     to_camera = normalize(camera.centers[0] - points, dim=-1)
     facing = (normal * to_camera).sum(-1).clamp(0, 1)
     agreeing = (to_viewer * to_camera).sum(-1).clamp(0, 1)
 
     # Surface at this angle changes its depth by so much from one of the camera's pixels to the next.
     per_pixel = z / camera.K[0, 0, 0] * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
-    index, share = _taps(u, v, width, height)
-    around = sources.depth[view][index]
-    share = share * ((around == 0) | (z - around <= bias_m + config.slope_px * per_pixel))
-    if frame.mask is not None:
-        share = share * (frame.mask[view][index] / 255)
-    usable = share.sum(0)
+    usable, colour = torch.zeros_like(z), z.new_zeros(3, len(z))
+    for row, column, share, _ in bilinear_taps(uv, width, height):
+        depth = sources.depth[view, row, column]
+        share = share * ((depth == 0) | (z - depth <= bias_m + config.slope_px * per_pixel))
+        if frame.mask is not None:
+            share = share * (frame.mask[view, row, column] / 255)
+        usable = usable + share
+        colour = colour + share * frame.rgb[view, :, row, column]
+    seen = in_view(uv[None], z[None], camera)[0]
     weight = seen * usable * facing**config.normal_power * agreeing**config.view_power
-    colour = (frame.rgb[view][:, index[0], index[1]] * share).sum(1) / (255 * usable).clamp(min=1e-6)
-    return weight, colour
-
-
-def _taps(
-    u: Float[Tensor, "point"], v: Float[Tensor, "point"], width: int, height: int
-) -> tuple[tuple[Tensor, Tensor], Float[Tensor, "4 point"]]:
-    """Rows and columns of the four pixels around image coordinates, and their bilinear shares."""
-    x, y = u - 0.5, v - 0.5
-    left, top = x.floor(), y.floor()
-    right_share, bottom_share = x - left, y - top
-    columns = torch.stack([left, left + 1, left, left + 1]).clamp(0, width - 1).long()
-    rows = torch.stack([top, top, top + 1, top + 1]).clamp(0, height - 1).long()
-    horizontal = torch.stack([1 - right_share, right_share] * 2)
-    vertical = torch.stack([1 - bottom_share] * 2 + [bottom_share] * 2)
-    return (rows, columns), horizontal * vertical
+    return weight, colour / (255 * usable).clamp(min=1e-6)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.inpainting.ray_blend_net import RayInputs, look_around
-from viewmend.inpainting.ray_sampling import CELL_CHANNELS
+from viewmend.inpainting.ray_sampling import CELL_CHANNELS, RayFeatures
 from viewmend.training.losses import ImageLoss, mean_loss, pixel_loss
 from viewmend.training.objective import StepOutput
 from viewmend.training.plan import Recipe
@@ -31,7 +31,7 @@ class RayBatch:
     """What the cameras show along the rays of some missing pixels of a sample."""
 
     features: Float[Tensor, "pixel point view 14"]
-    """`RaySamples.features`, half precision."""
+    """`RayInputs.features`, half precision."""
     occupancy: Float[Tensor, "pixel point 4"]
     around: UInt8[Tensor, "pixel 8 11 11"]
     """The view about each pixel, in 255ths,"""
@@ -74,9 +74,9 @@ def ray_batch(sample: Sample, most_px: int, random: Random) -> RayBatch:
     seen = look_around(sample.view, sample.nearby, pixels)
     return RayBatch(
         seen.features.half(),
-        seen.occupancy.half(),
-        (255 * seen.around).round().to(torch.uint8),
-        (255 * seen.far).round().to(torch.uint8),
+        seen.consistency.half(),
+        (255 * seen.window).round().to(torch.uint8),
+        (255 * seen.surroundings).round().to(torch.uint8),
         seen.place,
         sample.truth[:, *pixels.unbind(1)].T.contiguous(),
     )
@@ -90,8 +90,9 @@ def varied(lookups: RayBatch) -> RayBatch:
     """
     channels, gain = torch.randperm(3), float(torch.empty(()).uniform_(DARKEST, 1))
     features, around, far = (values.clone() for values in (lookups.features, lookups.around, lookups.far))
-    for values, first in ((features, 0), (features, 10)):
-        values[..., first : first + 3] = gain * values[..., first + channels]
+    seen = RayFeatures.unstack(features)
+    for colour in (seen.colour, seen.mean_colour):
+        colour[...] = gain * colour[..., channels]
     for values, first in ((around, 0), (around, 5), (far, 0), (far, CELL_CHANNELS)):
         values[:, first : first + 3] = (gain * values[:, first + channels].float()).round().to(torch.uint8)
     flipped = [axis for axis in (2, 3) if bool(torch.rand(()) < 0.5)]
@@ -100,7 +101,7 @@ def varied(lookups: RayBatch) -> RayBatch:
         around, far = around.transpose(2, 3), far.transpose(2, 3)
     if bool(torch.rand(()) < BLINDED_SHARE) and features.numel():
         blind = torch.randperm(features.shape[2])[: int(torch.randint(1, MOST_BLIND + 1, ()))].to(features.device)
-        chosen = (features[:, :, blind, 7] > 0).flatten(0, 1).any(0)
+        chosen = (seen.is_source[:, :, blind] > 0).flatten(0, 1).any(0)[:, 0]
         features[:, :, blind[~chosen]] = 0
     truth = (gain * lookups.truth[:, channels].float()).round().to(torch.uint8)
     return RayBatch(features, lookups.occupancy, around, far, lookups.place, truth)

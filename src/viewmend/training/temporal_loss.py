@@ -14,10 +14,11 @@ the truth has a loss of zero. What moved in depth by more than the tolerance is 
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.geometry.reprojection import carry
+from viewmend.geometry.cameras import project, unproject
+from viewmend.geometry.sampling import bilinear_taps
 from viewmend.views import CompletedView
 
 TOLERANCE = 0.01
@@ -62,9 +63,13 @@ def temporal_change(
     view, past = now.view, before.view
     row, column = ((view.mask > COVERED) & (view.depth > 0)).nonzero(as_tuple=True)
     uv = torch.stack([column, row], -1).to(view.depth) + 0.5
-    carried, z = (part[0] for part in carry(uv[None], view.depth[row, column][None], view.camera, past.camera))
+    points = unproject(uv[None], view.depth[row, column][None], view.camera)[0]
+    carried, z = (values[0] for values in project(points, past.camera))
 
-    inside, rows, columns, share = _corners(carried, past.depth)
+    carried = (carried * STEPS_PER_PX).round() / STEPS_PER_PX
+    height, width = past.depth.shape
+    taps = zip(*bilinear_taps(carried, width, height), strict=True)
+    rows, columns, share, inside = (torch.stack(values) for values in taps)
     there = past.depth[rows, columns]
     one_surface = (there > 0) & (past.mask[rows, columns] > COVERED) & ((there - z).abs() <= tolerance * z)
     valid = ((inside & one_surface) | (share == 0)).all(0) & (z > 0)
@@ -75,19 +80,3 @@ def temporal_change(
         earlier, later = earlier - truth[0], later - truth[1]
     change = later[:, row, column] - (share * earlier[:, rows, columns]).sum(1)
     return (weight * change.abs().mean(0)).sum() / weight.sum().clamp_min(LEAST)
-
-
-def _corners(
-    uv_px: Float[Tensor, "point 2"], image: Float[Tensor, "height width"]
-) -> tuple[Tensor, Int[Tensor, "4 point"], Int[Tensor, "4 point"], Float[Tensor, "4 point"]]:
-    """The four pixels around each place: whether they are in the image, their rows and columns, bilinear shares."""
-    height, width = image.shape
-    place = ((uv_px - 0.5) * STEPS_PER_PX).round() / STEPS_PER_PX
-    first = place.floor()
-    right, below = (place - first).unbind(-1)
-    # What is far outside, or behind the camera, must not overflow as an integer.
-    left, top = (first[:, axis].clamp(-2, size).long() for axis, size in ((0, width), (1, height)))
-    columns, rows = torch.stack([left, left + 1, left, left + 1]), torch.stack([top, top, top + 1, top + 1])
-    share = torch.stack([(1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below])
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    return inside, rows.clamp(0, height - 1), columns.clamp(0, width - 1), share
