@@ -2,7 +2,7 @@
 
 import json
 import re
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta
@@ -90,6 +90,8 @@ def _explained(error: str, value: Any, kind: Any, next_step: str) -> str:
         text = f"expected keys among {', '.join(kind.__struct_fields__)}, got '{unknown[1][:40]}'"
     elif wanted := re.fullmatch(r"Expected (.*?)(, got [^,]*)?", error, re.DOTALL):
         text = f"expected {_in_plain_words(wanted[1])}, got {shown(got, 80)}"
+    elif error.startswith("Invalid value") and (tags := [part.__struct_config__.tag for part in get_args(kind)]):
+        text = f"expected {' or '.join(tags)}, got {shown(got, 80)}"
     elif re.match(r"Invalid |Number out of range", error):
         text = f"expected another value, got {shown(got, 80)}"
     return f"{place}{text}" if ";" in text else f"{place}{text}; {next_step}"

@@ -32,7 +32,7 @@ def test_the_first_view_is_between_two_cameras_as_far_as_they_are():
 def test_a_matrix_says_it_all():
     like = camera_at(77, "x")
     R, T = like.camera_from_world[0, :3, :3], like.camera_from_world[0, :3, 3]
-    asked = Camera(R=tuple(R.flatten().tolist()), T=tuple(T.tolist()), lens=(50.0, 60.0, None, 7.0))
+    asked = Camera(R=tuple(R.flatten().tolist()), T=tuple(T.tolist()), fx=50.0, fy=60.0, cy=7.0)
     camera = view_camera(asked, FRAME, (40, 30))
     assert torch.allclose(camera.camera_from_world, like.camera_from_world)
     assert camera.K[0].tolist() == [[50, 0, 20], [0, 60, 7], [0, 0, 1]]

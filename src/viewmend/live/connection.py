@@ -10,9 +10,8 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from viewmend.live.fields import ProtocolError
 from viewmend.live.guard import Patience, Rate
-from viewmend.live.protocol import MODES, VERSION, Ack, ClockChange, Hello, Limits, Look, Ping, parse
+from viewmend.live.protocol import MODES, VERSION, Ack, ClockChange, Hello, Limits, Look, Ping, ProtocolError, parse
 from viewmend.live.service import RenderService
 from viewmend.live.sessions import ViewerSession
 

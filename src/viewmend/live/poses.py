@@ -87,9 +87,9 @@ def view_camera(asked: Camera, frame: RigFrame, size_px: tuple[int, int], scale:
         distance_m = frame.distance_m if asked.distance is None else asked.distance
         eye = center + distance_m * (math.cos(elevation) * flat + math.sin(elevation) * frame.up)
         pose = look_at(eye, center, frame.up)
-    if asked.lens is not None:
-        fx, fy, cx, cy = asked.lens
-        K = [[fx, 0.0, width / 2 if cx is None else cx], [0.0, fy, height / 2 if cy is None else cy], [0.0, 0.0, 1.0]]
+    if asked.fx is not None:
+        cx, cy = width / 2 if asked.cx is None else asked.cx, height / 2 if asked.cy is None else asked.cy
+        K = [[asked.fx, 0.0, cx], [0.0, asked.fy or asked.fx, cy], [0.0, 0.0, 1.0]]
         camera = Cameras(("view",), torch.tensor([K]), pose[None], torch.tensor([[width, height]]))
     else:
         fov_rad = math.radians(frame.fov_y if asked.fov_y is None else asked.fov_y)

@@ -4,16 +4,44 @@ import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from viewmend.live.fields import Fields, ProtocolError, read_json
+import torch
+from msgspec import Meta, Struct
+from msgspec.structs import force_setattr
+
+from viewmend.geometry.rigid import is_rotation
+from viewmend.json_input import LARGEST_INTEGER, one_of, read_json, typed
 
 VERSION = 1
 MODES = ("rendered", "holes", "mended", "depth", "coverage")
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
-_LARGEST = 2**53
-"""The largest whole number that JavaScript counts exactly."""
+MAX_PARTS = 512
+
+Kind = TypeVar("Kind")
+Integer = Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
+Count = Annotated[int, Meta(ge=0, le=LARGEST_INTEGER)]
+ClientMs = Annotated[float, Meta(ge=-1e15, le=1e15)]
+Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
+Point = tuple[Metres, Metres, Metres]
+Rotation = Annotated[tuple[Annotated[float, Meta(ge=-1.001, le=1.001)], ...], Meta(min_length=9, max_length=9)]
+"""Row by row, world to camera."""
+Degrees = Annotated[float, Meta(ge=-1e6, le=1e6)]
+Elevation = Annotated[float, Meta(ge=-89.9, le=89.9)]
+Distance = Annotated[float, Meta(ge=0.02, le=1e3)]
+FieldOfView = Annotated[float, Meta(ge=2, le=150)]
+FocalLength = Annotated[float, Meta(ge=1, le=1e6)]
+PrincipalPoint = Annotated[float, Meta(ge=-1e5, le=1e5)]
+Side = Annotated[int, Meta(ge=16)]
+Mode = Annotated[str, one_of(*MODES)]
+TopK = Annotated[int, Meta(ge=1, le=1_000_000)]
+Quality = Annotated[int, Meta(ge=30, le=95)]
+ShortText = Annotated[str, Meta(max_length=40)]
+
+
+class ProtocolError(ValueError):
+    """A message that is not of the protocol. It says what was expected, what came, and the next step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,73 +54,97 @@ class Limits:
     messages_per_s: int = 120
     viewers: int = 8
 
+    def check_size(self, width: int, height: int, views: int = 1) -> None:
+        """Refuse pictures that are too large.
 
-@dataclass(frozen=True, kw_only=True)
-class Camera:
+        Raises:
+            ProtocolError: a side, or all views together, have too many pixels.
+        """
+        if max(width, height) > self.max_side_px:
+            raise ProtocolError(f"expected sides from 16 to {self.max_side_px}, got {width} x {height}; ask for fewer")
+        if width * height * views > self.max_pixels:
+            raise ProtocolError(f"expected at most {self.max_pixels} pixels, got {width} x {height}; ask for fewer")
+
+
+class Camera(Struct, frozen=True, kw_only=True):
     """A viewer's camera as it was asked for: a matrix or an orbit, and a lens."""
 
-    R: tuple[float, ...] | None = None
-    T: tuple[float, ...] | None = None
-    azimuth: float = 0.0
-    elevation: float = 0.0
-    distance: float | None = None
-    target: tuple[float, ...] | None = None
-    fov_y: float | None = None
-    lens: tuple[float, float, float | None, float | None] | None = None
-    """fx, fy, cx, cy in pixels of the size that was asked for; None for the middle."""
+    R: Rotation | None = None
+    T: Point | None = None
+    azimuth: Degrees = 0.0
+    elevation: Elevation = 0.0
+    distance: Distance | None = None
+    target: Point | None = None
+    fov_y: FieldOfView | None = None
+    fx: FocalLength | None = None
+    """In pixels of the size that was asked for, as fy, cx and cy are; by default fy is fx, and cx, cy the middle."""
+    fy: FocalLength | None = None
+    cx: PrincipalPoint | None = None
+    cy: PrincipalPoint | None = None
+
+    def __post_init__(self) -> None:
+        if (self.R is None) != (self.T is None):
+            raise ProtocolError("expected 'R' and 'T', got one of them; give both or an orbit")
+        if self.R is not None:
+            check_rotation(self.R)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Look:
+class Look(Struct, frozen=True, kw_only=True, tag="look"):
     """What to show from now on."""
 
-    id: int = 0
-    sent_ms: float = 0.0
-    eyes: tuple[Camera, ...] = (Camera(),)
-    width: int = 320
-    height: int = 320
-    modes: tuple[str, ...] = ("mended",)
-    top_k: int | None = None
-    scale: float = 1.0
+    id: Integer = 0
+    sent_ms: ClientMs = 0.0
+    camera: Camera = Camera()
+    eyes: Annotated[tuple[Camera, ...], Meta(min_length=1, max_length=2)] | None = None
+    """Left and right, instead of `camera`."""
+    width: Side = 320
+    height: Side = 320
+    modes: Annotated[tuple[Mode, ...], Meta(min_length=1, max_length=2)] = ("mended",)
+    top_k: TopK | None = None
+    scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
     moving: bool = False
     adaptive: bool = True
     depth: bool = False
-    codec: str = "jpeg"
+    codec: Annotated[str, one_of(*CODECS)] = "jpeg"
     key: bool = False
     """Begin video streams anew: the decoder has lost them."""
-    quality: int = 85
+    quality: Quality = 85
+
+    def __post_init__(self) -> None:
+        force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """One for each eye."""
+        return self.eyes or (self.camera,)
 
 
-@dataclass(frozen=True)
-class Hello:
+class Hello(Struct, frozen=True, tag="hello"):
     """A client's first words."""
 
-    version: int
-    codecs: tuple[str, ...]
+    version: Count
+    codecs: Annotated[tuple[ShortText, ...], Meta(max_length=8)] = ("jpeg",)
 
 
-@dataclass(frozen=True)
-class Ack:
+class Ack(Struct, frozen=True, tag="ack"):
     """A frame has arrived."""
 
-    frame: int
+    frame: Count
 
 
-@dataclass(frozen=True)
-class ClockChange:
+class ClockChange(Struct, frozen=True, tag="clock"):
     """What to do with a viewer's clock; None leaves it."""
 
     playing: bool | None = None
-    speed: float | None = None
-    seek: int | None = None
+    speed: Annotated[float, Meta(ge=0.05, le=4)] | None = None
+    seek: Integer | None = None
     live: bool = False
 
 
-@dataclass(frozen=True)
-class Ping:
+class Ping(Struct, frozen=True, tag="ping"):
     """Answered by a pong."""
 
-    sent_ms: float
+    sent_ms: ClientMs = 0.0
 
 
 Message = Hello | Look | Ack | ClockChange | Ping
@@ -106,84 +158,43 @@ def parse(text: str, limits: Limits) -> Message:
     """
     if len(text) > limits.max_message_bytes:
         raise ProtocolError(f"expected at most {limits.max_message_bytes} bytes, got {len(text)}; send less")
-    given = Fields(read_json(text))
-    kind = given.choice("type", ("hello", "look", "ack", "clock", "ping"))
-    if kind == "look":
-        return parse_look(given, limits)
-    if kind == "ack":
-        return Ack(given.whole("frame", 0, _LARGEST))
-    if kind == "hello":
-        codecs = given.texts("codecs", ("jpeg",), most=8, least=0)
-        return Hello(given.whole("version", 0, _LARGEST), tuple(c for c in CODECS if c in codecs))
-    if kind == "ping":
-        return Ping(given.number("sent_ms", -1e15, 1e15, 0.0))
-    seek = given.whole("seek", -_LARGEST, _LARGEST) if given.has("seek") else None
-    playing = given.flag("playing", False) if given.has("playing") else None
-    speed = given.number("speed", 0.05, 4.0) if given.has("speed") else None
-    return ClockChange(playing, speed, seek, given.flag("live", False))
+    message: Message = read_message(text, Message)
+    if isinstance(message, Look):
+        limits.check_size(message.width, message.height, len(message.cameras))
+    return message
 
 
-def parse_look(given: Fields, limits: Limits) -> Look:
-    """A look, from a message or a query."""
-    width, height = (given.whole(side, 16, limits.max_side_px, 320) for side in ("width", "height"))
-    eyes = tuple(parse_camera(Fields(eye)) for eye in given.items("eyes", 2)) if given.has("eyes") else ()
-    modes = given.texts("modes", ("mended",), most=2)
-    if width * height * max(1, len(eyes)) > limits.max_pixels:
-        raise ProtocolError(f"expected at most {limits.max_pixels} pixels, got {width} x {height}; ask for fewer")
-    if not modes or any(mode not in MODES for mode in modes):
-        raise ProtocolError(f"expected one or two modes among {MODES}, got {str(modes)[:60]}")
-    return Look(
-        id=given.whole("id", -_LARGEST, _LARGEST, 0),
-        sent_ms=given.number("sent_ms", -1e15, 1e15, 0.0),
-        eyes=eyes or (parse_camera(Fields(given.get("camera", {}))),),
-        width=width,
-        height=height,
-        modes=modes,
-        top_k=given.whole("top_k", 1, 1_000_000) if given.has("top_k") else None,
-        scale=given.number("scale", 0.1, 1.0, 1.0),
-        moving=given.flag("moving", False),
-        adaptive=given.flag("adaptive", True),
-        depth=given.flag("depth", False),
-        codec=given.choice("codec", CODECS, "jpeg"),
-        key=given.flag("key", False),
-        quality=given.whole("quality", 30, 95, 85),
-    )
+def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -> Kind:
+    """JSON text, or what was parsed of it, as `kind`; `strict` as in `json_input.typed`.
+
+    Raises:
+        ProtocolError: it does not fit.
+    """
+    try:
+        value = read_json(message) if isinstance(message, str | bytes) else message
+        return typed(value, kind, "see docs/live-protocol.md", strict)
+    except ValueError as error:
+        raise ProtocolError(str(error)[:300]) from None
 
 
-def parse_camera(given: Fields) -> Camera:
-    """A pose and a lens."""
-    pose: dict[str, Any] = {}
-    if given.has("R") or given.has("T"):
-        pose = {"R": given.numbers("R", 9, 1.001), "T": given.numbers("T", 3, 1e4)}
-        if not _is_rotation(pose["R"]):
-            raise ProtocolError("expected 'R' to be a rotation, world to camera, row by row; got another matrix")
-    else:
-        pose = {
-            "azimuth": given.number("azimuth", -1e6, 1e6, 0.0),
-            "elevation": given.number("elevation", -89.9, 89.9, 0.0),
-            "distance": given.number("distance", 0.02, 1e3) if given.has("distance") else None,
-            "target": given.numbers("target", 3, 1e4) if given.has("target") else None,
-        }
-    lens = None
-    if given.has("fx"):
-        fx = given.number("fx", 1.0, 1e6)
-        cx, cy = (given.number(key, -1e5, 1e5) if given.has(key) else None for key in ("cx", "cy"))
-        lens = (fx, given.number("fy", 1.0, 1e6, fx), cx, cy)
-    return Camera(**pose, lens=lens, fov_y=given.number("fov_y", 2.0, 150.0) if given.has("fov_y") else None)
+def check_rotation(R: Sequence[float]) -> None:
+    """Refuse nine numbers that are no rotation, row by row.
 
-
-def _is_rotation(R: Sequence[float]) -> bool:
-    rows = [R[0:3], R[3:6], R[6:9]]
-    dots = [sum(a * b for a, b in zip(rows[i], rows[j], strict=True)) - (i == j) for i in range(3) for j in range(3)]
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    return max(map(abs, dots)) < 1e-3 and determinant > 0
+    Raises:
+        ProtocolError: they are none.
+    """
+    if not bool(is_rotation(torch.tensor(R, dtype=torch.float64).view(3, 3))):
+        raise ProtocolError("expected 'R' as a rotation, world to camera, row by row, got another matrix; check signs")
 
 
 def pack(header: dict[str, Any], parts: Sequence[bytes]) -> bytes:
     """A binary message; `header["parts"]` or `header["images"]` say what the parts are, `bytes` how long each is."""
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
     return b"".join([MAGIC, struct.pack("<I", len(text)), text, *parts])
+
+
+class _Part(Struct, frozen=True):
+    bytes: Count
 
 
 def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tuple[dict[str, Any], list[bytes]]:
@@ -195,11 +206,12 @@ def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tupl
     if len(message) < 8 or message[:4] != MAGIC:
         raise ProtocolError(f"expected a message that begins with {MAGIC.decode()}, got {message[:4]!r}")
     start = 8 + struct.unpack("<I", message[4:8])[0]
-    header = Fields(read_json(message[8:start])) if start <= len(message) else None
-    if header is None:
+    if start > len(message):
         raise ProtocolError("expected a whole header, got a message that ends in it")
-    sizes = [Fields(part).whole("bytes", 0, len(message)) for part in header.items(listed, 512)]
+    header: dict[str, Any] = read_message(message[8:start], dict[str, Any])
+    parts: list[_Part] = read_message(header.get(listed), Annotated[list[_Part], Meta(max_length=MAX_PARTS)])
+    sizes = [part.bytes for part in parts]
     if start + sum(sizes) != len(message):
         raise ProtocolError(f"expected {start + sum(sizes)} bytes by the header, got {len(message)}")
     ends = [start + sum(sizes[: n + 1]) for n in range(len(sizes))]
-    return header.values, [message[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+    return header, [message[end - size : end] for size, end in zip(sizes, ends, strict=True)]

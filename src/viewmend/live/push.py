@@ -2,22 +2,25 @@
 
 import asyncio
 import json
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from msgspec import Meta, Struct
 from starlette.websockets import WebSocket
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, is_intrinsics
-from viewmend.geometry.rigid import is_rotation, rigid
-from viewmend.live.fields import Fields, ProtocolError, read_json
-from viewmend.live.protocol import VERSION, unpack
+from viewmend.geometry.rigid import rigid
+from viewmend.json_input import one_of
+from viewmend.live.protocol import VERSION, Point, ProtocolError, Rotation, check_rotation, read_message, unpack
 from viewmend.live.pushed import Pushed
 from viewmend.views import MultiViewFrame
 
-MOST_CAMERAS = 128
-MOST_PIXELS = 64_000_000
+MAX_CAMERAS = 128
+Side = Annotated[int, Meta(ge=8, le=16384)]
+MAX_PIXELS = 64_000_000
 """Of all cameras together."""
 SILENT_S = 30.0
 
@@ -53,47 +56,75 @@ async def _refuse(socket: WebSocket, code: int, message: str) -> None:
     await socket.close(code)
 
 
+class CameraEntry(Struct, frozen=True, kw_only=True):
+    """One camera of the message `rig`."""
+
+    name: Annotated[str, Meta(max_length=200)]
+    width: Side
+    height: Side
+    K: Annotated[tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...], Meta(min_length=9, max_length=9)]
+    R: Rotation
+    T: Point
+
+    def __post_init__(self) -> None:
+        check_rotation(self.R)
+        if not bool(is_intrinsics(torch.tensor(self.K).view(3, 3))):
+            raise ProtocolError(
+                "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0, got another"
+            )
+
+
+class Box(Struct, frozen=True):
+    """The volume of the subject."""
+
+    low: Point
+    high: Point
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise ProtocolError("expected low below high on every axis, got another order; swap them")
+
+
+class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
+    """The first message of a rig."""
+
+    version: int
+    name: Annotated[str, Meta(max_length=200)] = "live rig"
+    fps: Annotated[float, Meta(ge=0.1, le=240)] = 15.0
+    cameras: Annotated[tuple[CameraEntry, ...], Meta(min_length=1, max_length=MAX_CAMERAS)]
+    bounds: Box | None = None
+    up: Point | None = None
+
+    def __post_init__(self) -> None:
+        if self.version != VERSION:
+            raise ProtocolError(f"expected version {VERSION}, got {self.version}; update the client")
+        if len({camera.name for camera in self.cameras}) < len(self.cameras):
+            raise ProtocolError("expected cameras of different names, got one twice; rename it")
+        if self.up is not None and sum(x * x for x in self.up) < 1e-12:
+            raise ProtocolError("expected 'up' as a direction, got no length; leave it away")
+        if sum(camera.width * camera.height for camera in self.cameras) > MAX_PIXELS:
+            raise ProtocolError(f"expected at most {MAX_PIXELS} pixels in all; push smaller images")
+
+
+class ImagePart(Struct, frozen=True):
+    """One image of a frame's header."""
+
+    camera: str
+    kind: Annotated[str, one_of("rgb", "mask")]
+
+
 def _begin(text: str, supply: Pushed) -> Cameras:
     """The rig's cameras, from its first message.
 
     Raises:
         ProtocolError: it is none.
     """
-    given = Fields(read_json(text))
-    given.choice("type", ("rig",))
-    if given.whole("version", 0, 1000) != VERSION:
-        raise ProtocolError(f"expected version {VERSION}; update the client")
-    cameras = _cameras([Fields(camera) for camera in given.items("cameras", MOST_CAMERAS)])
-    bounds = None
-    if given.has("bounds"):
-        box = Fields(given.get("bounds", None))
-        bounds = Bounds(*(torch.tensor(box.numbers(corner, 3, 1e4)) for corner in ("low", "high")))
-        if not bool((bounds.low < bounds.high).all()):
-            raise ProtocolError("expected 'bounds' with low below high on every axis")
-    up = torch.tensor(given.numbers("up", 3, 1e4)) if given.has("up") else None
-    if up is not None and float(up.norm()) < 1e-6:
-        raise ProtocolError("expected 'up' as a direction, got no length; leave it away")
-    supply.begin(given.text("name", "live rig"), given.number("fps", 0.1, 240.0, 15.0), bounds, up)
-    return cameras
-
-
-def _cameras(given: list[Fields]) -> Cameras:
-    names = tuple(camera.text("name") for camera in given)
-    if len(set(names)) < len(names):
-        raise ProtocolError("expected cameras of different names")
-    R = torch.tensor([camera.numbers("R", 9, 1.001) for camera in given]).view(-1, 3, 3)
-    if not bool(is_rotation(R).all()):
-        raise ProtocolError("expected 'R' to be a rotation, world to camera, row by row; got another matrix")
-    K = torch.tensor([camera.numbers("K", 9, 1e6) for camera in given]).view(-1, 3, 3)
-    if not bool(is_intrinsics(K).all()):
-        raise ProtocolError(
-            "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0; got another matrix"
-        )
-    size = [(camera.whole("width", 8, 16384), camera.whole("height", 8, 16384)) for camera in given]
-    if sum(width * height for width, height in size) > MOST_PIXELS:
-        raise ProtocolError(f"expected at most {MOST_PIXELS} pixels in all; push smaller images")
-    T = torch.tensor([camera.numbers("T", 3, 1e4) for camera in given])
-    return Cameras(names, K, rigid(R, T), torch.tensor(size))
+    rig: RigMessage = read_message(text, RigMessage)
+    bounds = None if rig.bounds is None else Bounds(torch.tensor(rig.bounds.low), torch.tensor(rig.bounds.high))
+    supply.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up))
+    K, R, T = (torch.tensor([getattr(camera, key) for camera in rig.cameras]) for key in ("K", "R", "T"))
+    size_px = torch.tensor([(camera.width, camera.height) for camera in rig.cameras])
+    return Cameras(tuple(c.name for c in rig.cameras), K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
 
 
 def _frame(message: bytes, cameras: Cameras) -> MultiViewFrame:
@@ -104,10 +135,11 @@ def _frame(message: bytes, cameras: Cameras) -> MultiViewFrame:
     """
     header, parts = unpack(message, "images")
     images: dict[tuple[str, str], np.ndarray] = {}
-    for given, data in zip(header["images"], parts, strict=True):
-        entry = Fields(given)
-        name, kind = entry.choice("camera", cameras.names), entry.choice("kind", ("rgb", "mask"))
-        images[name, kind] = _decoded(data, name, kind, cameras)
+    listed: list[ImagePart] = read_message(header["images"], list[ImagePart])
+    for entry, data in zip(listed, parts, strict=True):
+        if entry.camera not in cameras.names:
+            raise ProtocolError(f"expected a camera among {list(cameras.names)}, got '{entry.camera[:40]}'")
+        images[entry.camera, entry.kind] = _decoded(data, entry.camera, entry.kind, cameras)
     there = [n for n in cameras.names if (n, "rgb") in images and (n, "mask") in images]
     if len(there) < 2:
         raise ProtocolError(f"expected image and mask of two cameras or more, got {len(there)}")

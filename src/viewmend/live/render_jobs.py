@@ -1,139 +1,153 @@
 """Views that are asked for over plain HTTP: single pictures, and camera paths as videos."""
 
-import io
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
-from dataclasses import dataclass
+from io import BytesIO
+from typing import Annotated, Generic, Literal, TypeVar
+
+from msgspec import Meta, Struct
 
 from viewmend.capture.video_writer import VideoWriter
-from viewmend.live.fields import Fields, ProtocolError
+from viewmend.live import protocol
 from viewmend.live.pictures import picture, to_jpeg
 from viewmend.live.poses import view_camera
-from viewmend.live.protocol import Camera, Limits, Look, parse_camera, parse_look
+from viewmend.live.protocol import Camera, Limits, ProtocolError, read_message
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.sessions import Scene
 from viewmend.stream import RenderQuality, Viewer
 
-MOST_POSES = 900
-_NUMBERS = ("azimuth", "elevation", "distance", "fov_y")
-_WHOLES = ("width", "height", "top_k", "quality")
+MAX_POSES = 900
+Result = TypeVar("Result")
 
 
-def parse_query(query: dict[str, str], limits: Limits) -> tuple[Look, int | None]:
-    """A picture from a query's words, and its time (None: the edge's).
+class ViewOptions(Struct, frozen=True, kw_only=True):
+    """What pictures and paths have in common."""
+
+    width: protocol.Side = 320
+    height: protocol.Side = 320
+    mode: protocol.Mode = "mended"
+    top_k: protocol.TopK | None = None
+
+
+class PictureQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The query of `GET /frame.jpg`."""
+
+    azimuth: protocol.Degrees = 0.0
+    elevation: protocol.Elevation = 0.0
+    distance: protocol.Distance | None = None
+    fov_y: protocol.FieldOfView | None = None
+    quality: protocol.Quality = 85
+    time: Literal["live"] | protocol.Count = "live"
+    token: str = ""
+
+    @property
+    def camera(self) -> Camera:
+        """Where the picture is taken from."""
+        return Camera(azimuth=self.azimuth, elevation=self.elevation, distance=self.distance, fov_y=self.fov_y)
+
+
+class PathBody(ViewOptions, frozen=True, kw_only=True):
+    """The body of `POST /path.mp4`."""
+
+    poses: Annotated[tuple[Camera, ...], Meta(min_length=1, max_length=MAX_POSES)]
+    times: Annotated[tuple[protocol.Count, ...], Meta(min_length=1, max_length=MAX_POSES)] | None = None
+    fps: Annotated[float, Meta(ge=1, le=120)] = 30.0
+
+    def __post_init__(self) -> None:
+        if self.times is not None and len(self.times) != len(self.poses):
+            raise ProtocolError(f"expected a time for each of {len(self.poses)} poses, got {len(self.times)}")
+
+
+def parse_query(query: dict[str, str], limits: Limits) -> PictureQuery:
+    """What the query of a picture asks for.
 
     Raises:
-        ProtocolError: a word is unknown, or a value none that can be.
+        ProtocolError: a key is unknown, a value does not fit, or the picture is too large.
     """
-    known = (*_NUMBERS, *_WHOLES, "mode", "time", "token")
-    unknown = [key for key in query if key not in known]
-    if unknown:
-        raise ProtocolError(f"expected words among {list(known)}, got '{unknown[0][:40]}'")
-    at = query.get("time", "live")
-    camera = {key: _number(key, query[key]) for key in _NUMBERS if key in query}
-    words: dict[str, object] = {key: _number(key, query[key]) for key in _WHOLES if key in query}
-    look = parse_look(Fields(words | {"camera": camera, "modes": [query.get("mode", "mended")]}), limits)
-    return look, None if at == "live" else Fields({"time": _number("time", at)}).whole("time", 0, 2**53)
+    asked: PictureQuery = read_message(query, PictureQuery, strict=False)
+    limits.check_size(asked.width, asked.height)
+    return asked
 
 
-def _number(key: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        raise ProtocolError(f"expected '{key}' as a number, got '{value[:40]}'") from None
+def parse_path(body: bytes, limits: Limits) -> PathBody:
+    """What the body of a request for a video asks for.
+
+    Raises:
+        ProtocolError: it does not fit, or the pictures are too large.
+    """
+    asked: PathBody = read_message(body, PathBody)
+    limits.check_size(asked.width, asked.height)
+    return asked
 
 
-class PictureJob:
-    """One picture with all that the model can do; `done` gets the JPEG."""
+class RenderJob(Generic[Result]):
+    """A session that ends when `done` has its result."""
 
-    def __init__(self, look: Look, time: int | None) -> None:
+    def __init__(self) -> None:
         self.viewer: Viewer | None = None
-        self.done: Future[tuple[bytes, RenderResult]] = Future()
-        self._look, self._time = look, time
+        self.done: Future[Result] = Future()
 
-    def due(self, now: float, scene: Scene) -> RenderRequest | None:
-        """Once, as soon as its frame is there."""
-        at = int(scene.span.clamp(scene.edge if self._time is None else self._time))
-        if self.done.done() or scene.span.end <= scene.span.first or not scene.present(at):
-            return None
-        look = self._look
-        cameras = tuple(view_camera(eye, scene.frame, (look.width, look.height)) for eye in look.eyes)
-        return RenderRequest(at, cameras, RenderQuality(mend=look.modes == ("mended",), top_k=look.top_k))
-
-    def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
-        """Done."""
-        image = to_jpeg(picture(rendered.completed[0], self._look.modes[0]), self._look.quality)
-        with suppress(InvalidStateError):  # nobody waits any more
-            self.done.set_result((image, rendered))
+    def finish(self, result: Result) -> None:
+        """Set the result, unless nobody waits any more."""
+        with suppress(InvalidStateError):
+            self.done.set_result(result)
 
     def fail(self, message: str) -> None:
-        """Done, badly."""
+        """Set a RuntimeError, unless nobody waits any more."""
         with suppress(InvalidStateError):
             self.done.set_exception(RuntimeError(message))
 
 
-@dataclass(frozen=True)
-class Path:
-    """A camera path to be rendered as a video."""
+class PictureJob(RenderJob[tuple[bytes, RenderResult]]):
+    """One picture with all that the model can do, as JPEG."""
 
-    poses: tuple[Camera, ...]
-    times: tuple[int, ...] | None
-    fps: float
-    look: Look
+    def __init__(self, asked: PictureQuery) -> None:
+        super().__init__()
+        self._asked = asked
 
+    def due(self, now: float, scene: Scene) -> RenderRequest | None:
+        """The picture, once its frame has been read."""
+        time = scene.edge if self._asked.time == "live" else self._asked.time
+        return None if self.done.done() else _request(self._asked, self._asked.camera, time, scene)
 
-def parse_path(given: Fields, limits: Limits) -> Path:
-    """The body of a request for a video.
-
-    Raises:
-        ProtocolError: it is none.
-    """
-    poses = tuple(parse_camera(Fields(pose)) for pose in given.items("poses", MOST_POSES))
-    times = None
-    if given.has("times"):
-        times = tuple(Fields({"time": t}).whole("time", 0, 2**53) for t in given.items("times", MOST_POSES))
-        if len(times) != len(poses):
-            raise ProtocolError(f"expected a time for each of {len(poses)} poses, got {len(times)}")
-    look = parse_look(Fields({**given.values, "modes": [given.get("mode", "mended")], "camera": None}), limits)
-    return Path(poses, times, given.number("fps", 1.0, 120.0, 30.0), look)
+    def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
+        """Encode the picture."""
+        image = picture(rendered.completed[0], self._asked.mode)
+        self.finish((to_jpeg(image, self._asked.quality), rendered))
 
 
-class PathJob:
-    """A camera path, one view a turn, encoded as it goes; `done` gets the MP4."""
+class PathJob(RenderJob[bytes]):
+    """A camera path, encoded view by view as MP4."""
 
-    def __init__(self, path: Path) -> None:
-        self.viewer: Viewer | None = None
-        self.done: Future[bytes] = Future()
-        self._path = path
-        self._times = path.times
+    def __init__(self, path: PathBody) -> None:
+        super().__init__()
+        self._path, self._times = path, path.times
         self._count = 0
-        self._mp4 = io.BytesIO()
+        self._mp4 = BytesIO()
         self._video = VideoWriter(self._mp4, path.fps)
 
     def due(self, now: float, scene: Scene) -> RenderRequest | None:
-        """The next pose."""
+        """The next pose, once its frame has been read."""
         if self.done.done() or scene.span.end <= scene.span.first:
             return None
-        if self._times is None:
+        if self._times is None:  # the edge as it is now
             self._times = (int(scene.span.clamp(scene.edge)),) * len(self._path.poses)
-        at = int(scene.span.clamp(self._times[self._count]))
-        if not scene.present(at):
-            return None
-        look = self._path.look
-        camera = view_camera(self._path.poses[self._count], scene.frame, (look.width, look.height))
-        return RenderRequest(at, (camera,), RenderQuality(mend=look.modes == ("mended",), top_k=look.top_k))
+        return _request(self._path, self._path.poses[self._count], self._times[self._count], scene)
 
     def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
-        """One more picture; the last one ends it."""
-        self.viewer = rendered.viewer
-        self._video.add(picture(rendered.completed[0], self._path.look.modes[0]))
+        """Encode one more view; the last one ends the job."""
+        self.viewer: Viewer | None = rendered.viewer
+        self._video.add(picture(rendered.completed[0], self._path.mode))
         self._count += 1
         if self._count == len(self._path.poses):
             self._video.close()
-            with suppress(InvalidStateError):
-                self.done.set_result(self._mp4.getvalue())
+            self.finish(self._mp4.getvalue())
 
-    def fail(self, message: str) -> None:
-        """Done, badly."""
-        with suppress(InvalidStateError):
-            self.done.set_exception(RuntimeError(message))
+
+def _request(asked: ViewOptions, pose: Camera, time: float | int, scene: Scene) -> RenderRequest | None:
+    """The view at the nearest time that there is; None while its frame is on its way."""
+    at = int(scene.span.clamp(time))
+    if scene.span.end <= scene.span.first or not scene.present(at):
+        return None
+    camera = view_camera(pose, scene.frame, (asked.width, asked.height))
+    return RenderRequest(at, (camera,), RenderQuality(mend=asked.mode == "mended", top_k=asked.top_k))

@@ -17,11 +17,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.capture.video_writer import can_write_mp4
 from viewmend.live.connection import SessionRegistry, ViewerConnection
-from viewmend.live.fields import Fields, ProtocolError, read_json
 from viewmend.live.guard import Guard
 from viewmend.live.metrics_text import metrics_text
 from viewmend.live.page_files import HEADERS, page_files
-from viewmend.live.protocol import Limits
+from viewmend.live.protocol import Limits, ProtocolError
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import Pushed
 from viewmend.live.render_jobs import PathJob, PictureJob, parse_path, parse_query
@@ -147,10 +146,10 @@ class LiveServer:
         return PlainTextResponse(metrics_text(self.lobby), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _picture(self, request: Request) -> Response:
-        look, at = parse_query(dict(request.query_params), self._config.limits)
+        asked = parse_query(dict(request.query_params), self._config.limits)
         if self._pictures >= PICTURES_AT_ONCE:
             return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
-        errand = PictureJob(look, at)
+        errand = PictureJob(asked)
         self._pictures += 1
         try:
             image, rendered = await self._wait(request, errand, errand.done, PICTURE_S)
@@ -173,7 +172,7 @@ class LiveServer:
             body = await _body(request)
             if body is None:
                 return _refusal(413, f"expected at most {BODY_BYTES} bytes")
-            errand = PathJob(parse_path(Fields(read_json(body)), self._config.limits))
+            errand = PathJob(parse_path(body, self._config.limits))
             video = await self._wait(request, errand, errand.done, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")

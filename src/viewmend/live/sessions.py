@@ -164,7 +164,7 @@ class ViewerSession:
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
         effort = RenderQuality(mend="mended" in look.modes, top_k=top_k, context_times=level.context_times)
         scale = look.scale * level.scale
-        cameras = tuple(view_camera(eye, frame, (look.width, look.height), scale) for eye in look.eyes)
+        cameras = tuple(view_camera(eye, frame, (look.width, look.height), scale) for eye in look.cameras)
         return RenderRequest(at, cameras, effort)
 
     def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
