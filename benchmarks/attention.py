@@ -15,11 +15,11 @@ from measure import write
 from torch import Tensor
 from visibility import FURTHER, NOW, RECENT
 
-from viewmend.evaluation.scenes import StudioScene, procedural_set
 from viewmend.inpainting import inpainter as steps
 from viewmend.inpainting import transformer
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.inpainter import Inpainter
+from viewmend.leave_one_out.studio_scenes import StudioScene, procedural_set
 from viewmend.metrics.image_quality import psnr
 from viewmend.pipeline import PipelineConfig, observe, view_of
 from viewmend.views import ContextViews

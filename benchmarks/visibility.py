@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float
 from measure import write
 from torch import Tensor
 
-from viewmend.evaluation.scenes import StudioScene, procedural_set
 from viewmend.evaluation.temporal import VISIBLE_M
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import Raster, interpolate, rasterize
+from viewmend.leave_one_out.studio_scenes import StudioScene, procedural_set
 from viewmend.pipeline import PipelineConfig, observe, view_of
 from viewmend.views import MultiViewFrame
 

@@ -7,7 +7,7 @@ import pytest
 from viewmend.evaluation.cells import Cell, CellKey
 from viewmend.evaluation.frame_scores import FrameScores
 from viewmend.evaluation.provenance import Provenance
-from viewmend.evaluation.scenes import StudioScene
+from viewmend.leave_one_out.studio_scenes import StudioScene
 from viewmend.studio.stage import StudioConfig
 
 ORIGIN = Provenance("0", "abc", "3", "2", "cpu", 1, 1, 0.0)

@@ -2,15 +2,18 @@
 
 import tarfile
 from dataclasses import replace
+from pathlib import Path
 from random import Random
 
 import pytest
 import torch
 
+from viewmend.capture.prepare import prepare, reduced
 from viewmend.geometry.hull import HullConfig
+from viewmend.leave_one_out.studio_scenes import P_SEEDS, Q_SEEDS
 from viewmend.rendering.view import RenderConfig
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.training.capture_scenes import CaptureScenes, MixedScenes, reduced
+from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
 from viewmend.training.replay import SampleReplay, samples_in_order
 from viewmend.training.sample_files import (
     ShardError,
@@ -21,7 +24,7 @@ from viewmend.training.sample_files import (
     write_shards,
 )
 from viewmend.training.samples import LeaveOneOut, Sample, widened
-from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, StudioScenes, random_stage
+from viewmend.training.scenes import StudioScenes, random_stage
 from viewmend.training.sources import scene_source
 
 
@@ -75,10 +78,25 @@ def test_a_clip_is_one_camera_at_consecutive_times(plan):
 def test_no_stage_takes_a_seed_that_is_kept_for_validation_or_tests(plan):
     random = Random(1)
     seeds = [random_stage(plan, random).seed for _ in range(300)]
-    assert max(seeds) < FIRST_VALIDATION_SEED and len(set(seeds)) > 250
-    source = scene_source(plan, "validation", validation=True)
-    assert isinstance(source, StudioScenes)
-    assert source.seeds == range(FIRST_VALIDATION_SEED, FIRST_TEST_SEED)
+    assert {*seeds} < {*range(9000)} and len(set(seeds)) > 250
+    kept = [random_stage(plan, random, "validation").seed for _ in range(300)]
+    assert {*kept} < {*range(9000, 10000)}
+    assert all(min(scenes) >= 10000 for scenes in (P_SEEDS, Q_SEEDS))
+    source = scene_source(replace(plan, shards=Path("any")), "validation", "validation")
+    assert isinstance(source, StudioScenes) and source.split == "validation"
+
+
+def test_training_refuses_what_is_kept_for_tests(plan, tmp_path):
+    with pytest.raises(ValueError, match="got those for tests"):
+        StudioScenes(plan, "0", "test")
+    other, kept = tmp_path / "train", tmp_path / "test"
+    for performers, motions in ((kept, other), (other, kept), (kept / "ann.glb", other)):
+        with pytest.raises(ValueError, match="not kept for tests, got a folder named 'test'"):
+            scene_source(replace(plan, performers=performers, motions=motions), "0")
+    for split in ("training", "validation"):
+        with pytest.raises(ValueError, match="not kept for tests"):
+            scene_source(replace(plan, captures=(kept / "wd",)), "0", split)
+    assert isinstance(scene_source(replace(plan, performers=other, motions=other), "0"), StudioScenes)
 
 
 def test_a_staged_plan_has_a_stage_behind_everyone_and_differs_in_nothing_else(plan):
@@ -177,6 +195,29 @@ def test_captures_are_scenes_whose_truth_is_the_camera_left_out(studio, plan):
         seen = reduced(studio.read(sample.view.time), 64).select([held])
         expected = (seen.rgb[0].float() * (seen.mask[0].float() / 255)).round().to(torch.uint8)
         assert torch.equal(sample.truth, expected)
+
+
+def test_a_capture_is_aligned_without_the_camera_that_is_left_out(plan):
+    class Looked(Studio):
+        """States principal points beside the true ones."""
+
+        @property
+        def cameras(self):
+            return super().cameras.moved(0.7, 0.0)
+
+        def read(self, time):
+            return replace(super().read(time), cameras=self.cameras)
+
+    capture = Looked(StudioConfig(seed=3, cameras=6, frames=2, size_px=96))
+    samples = CaptureScenes([capture], replace(plan, sizes_px=(96,)), "0").scene(0)
+    assert samples
+    for sample in samples:
+        held = sample.view.camera.names[0]
+        expected = prepare(capture, [n for n in capture.cameras.names if n != held]).cameras
+        assert torch.equal(sample.view.camera.K, expected.select([held]).K)
+        near = sample.context[0].frame.cameras
+        assert torch.equal(near.K, expected.select(near.names).K)
+    assert not torch.equal(expected.K, capture.cameras.K), "there is a shift to undo"
 
 
 def test_a_mix_takes_its_share_from_each(plan):

@@ -157,7 +157,7 @@ def _evaluate(options: Options, trained: "list[Trained]") -> "list[Cell]":
     from viewmend.cli.console import say, track
     from viewmend.evaluation.cells import CellStore
     from viewmend.evaluation.runner import run_evaluation
-    from viewmend.evaluation.scenes import procedural_set
+    from viewmend.leave_one_out.studio_scenes import procedural_set
 
     scenes = procedural_set(options.frames, options.size, "stage")[: options.scenes]
     methods = ("telea", *(str(one.folder) for one in trained))

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from viewmend.evaluation.cells import Cell, CellStore
     from viewmend.evaluation.report import Report
     from viewmend.evaluation.scene_run import RunSettings
-    from viewmend.evaluation.scenes import EvaluationScene
+    from viewmend.leave_one_out.scenes import LeaveOneOutScene
 
 POSITIVE = ("frames", "every", "scenes", "size", "jobs", "closest", "shown")
 
@@ -128,10 +128,10 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
     say(f"wrote {options.out}")
 
 
-def scenes_of(name: str, options: RunOptions) -> "list[EvaluationScene]":
+def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
     """The scenes of P, of Q, or of a capture."""
-    from viewmend.evaluation.capture_scenes import capture_set
-    from viewmend.evaluation.scenes import FRAMES, performer_set, procedural_set
+    from viewmend.leave_one_out.capture_scenes import capture_set
+    from viewmend.leave_one_out.studio_scenes import FRAMES, performer_set, procedural_set
 
     frames = options.frames or FRAMES
     part = slice(None, options.scenes and options.every * options.scenes, options.every)

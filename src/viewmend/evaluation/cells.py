@@ -19,8 +19,8 @@ from viewmend.evaluation.frame_scores import FrameScores
 from viewmend.evaluation.methods import identity, make_method
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
-from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.scorers import KINDS, Features
+from viewmend.leave_one_out.scenes import LeaveOneOutScene
 
 PROTOCOL = 1
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
@@ -167,7 +167,7 @@ class CellStore:
             return None
 
 
-def cell_keys(scene: EvaluationScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
+def cell_keys(scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.pipeline), settings.ssim]
     scene_digest = _digest([*rules, *settings.networks])
@@ -187,7 +187,7 @@ def method_identities(names: tuple[str, ...], settings: RunSettings) -> dict[str
 
 
 def to_cells(
-    scene: EvaluationScene,
+    scene: LeaveOneOutScene,
     run: SceneRun,
     keys: tuple[CellKey, ...],
     identities: dict[str, str],

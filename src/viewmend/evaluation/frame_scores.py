@@ -84,7 +84,7 @@ class TrueView:
     """In [0, 1], black where there is no subject."""
     mask: Bool[Tensor, "height width"]
     backward_flow_px: Float[Tensor, "height width 2"] | None
-    """See `temporal.backward_flow`."""
+    """See `leave_one_out.true_motion.backward_flow`."""
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
-from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.tasks import Task
+from viewmend.leave_one_out.scenes import LeaveOneOutScene
 
 ANSWER_S = 5.0
 """A cluster answers within this time."""
@@ -53,7 +53,7 @@ def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> It
             ray.shutdown()
 
 
-def _on_one_core(scene: EvaluationScene, methods: tuple[str, ...], settings: RunSettings) -> SceneRun:
+def _on_one_core(scene: LeaveOneOutScene, methods: tuple[str, ...], settings: RunSettings) -> SceneRun:
     import torch
 
     torch.set_num_threads(1)

@@ -15,12 +15,12 @@ from viewmend.evaluation.cells import Cell, CellKey, CellStore, cell_keys, metho
 from viewmend.evaluation.provenance import provenance
 from viewmend.evaluation.ray_cluster import run_on_ray
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
-from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.tasks import Task
+from viewmend.leave_one_out.scenes import LeaveOneOutScene
 
 
 def run_evaluation(
-    scenes: Sequence[EvaluationScene],
+    scenes: Sequence[LeaveOneOutScene],
     methods: tuple[str, ...],
     store: CellStore,
     settings: RunSettings | None = None,

@@ -13,9 +13,9 @@ from viewmend.contact_sheet import picture
 from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
 from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
 from viewmend.evaluation.methods import make_method
-from viewmend.evaluation.scenes import EvaluationScene
 from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
 from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.metrics.image_quality import SsimWindow
 from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe, view_of
 from viewmend.views import CompletedView, IncompleteView
@@ -82,7 +82,7 @@ class _Moment:
     """Whether no earlier hole was as large."""
 
 
-def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: RunSettings) -> SceneRun:
+def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: RunSettings) -> SceneRun:
     """Stream the held camera's view through the methods, one frame at a time, past frames only.
 
     A function of its arguments alone, which can all be pickled: processes and clusters call it. What goes wrong becomes
@@ -105,7 +105,7 @@ def evaluate_scene(scene: EvaluationScene, methods: Sequence[str], settings: Run
     return SceneRun(scene.name, runs, shown.pictures, shown.film(), shown.videos.features())
 
 
-def _moments(scene: EvaluationScene, settings: RunSettings) -> Iterator[_Moment]:
+def _moments(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Moment]:
     config, most, last = settings.pipeline, -1, None
     for frame in scene.frames(settings.device):
         camera = frame.truth.cameras

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from viewmend.evaluation.scenes import EvaluationScene
+from viewmend.leave_one_out.scenes import LeaveOneOutScene
 
 
 @dataclass(frozen=True)
 class Task:
     """One call of `evaluate_scene`: all the methods that a scene lacks."""
 
-    scene: EvaluationScene
+    scene: LeaveOneOutScene
     methods: tuple[str, ...]

@@ -2,36 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from random import Random
 
-import torch
-from torch.nn import functional as F
-
-from viewmend.capture.errors import CaptureError
-from viewmend.capture.plain import open_capture
+from viewmend.capture.prepare import PreparedCapture, prepare, reduced
 from viewmend.capture.source import CaptureSource
-from viewmend.geometry.alignment import shared_offset
-from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.geometry.cameras import Cameras
+from viewmend.leave_one_out.scenes import LeaveOneOutFrames
 from viewmend.training.plan import DataPlan
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import SceneSource, rig_samples
-from viewmend.views import MultiViewFrame
 
 
 class CaptureScenes:
-    """Moments of captures, reduced to the plan's sizes; principal points are aligned once, as `mend` does."""
+    """Moments of captures, reduced to the plan's sizes; each is aligned on the cameras that are not left out."""
 
     def __init__(self, captures: Sequence[CaptureSource], plan: DataPlan, seed: str) -> None:
-        """Look at the first frame of each.
-
-        Raises:
-            CaptureError: a capture has no masks, or fewer than three cameras.
-        """
         self.captures = captures
         self.plan = plan
         self.seed = seed
-        self._offsets_px = [_offset_px(capture) for capture in captures]
+        self._prepared: dict[tuple[int, str], PreparedCapture] = {}
 
     def scene(self, number: int) -> list[Sample]:
         """One moment of one capture with its past."""
@@ -41,15 +30,23 @@ class CaptureScenes:
         last = len(capture.frame_ids) - 1
         first = random.randint(0, max(0, last - max(self.plan.times)))
         size_px = random.choice(self.plan.sizes_px)
-        frames = {}
-        for time in sorted({min(first + offset, last) for offset in self.plan.times}):
-            frame = capture.read(time)
-            frame = replace(frame, cameras=frame.cameras.moved(*self._offsets_px[which]))
-            frames[time] = reduced(frame, size_px).to(self.plan.device)
+        times = sorted({min(first + offset, last) for offset in self.plan.times})
+        frames = {time: reduced(capture.read(time), size_px).to(self.plan.device) for time in times}
         # A camera that has no image at some of these times cannot be judged then.
-        always = [n for n in frames[max(frames)].cameras.names if all(n in f.cameras.names for f in frames.values())]
+        always = [n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())]
         frames = {time: frame.select(always) for time, frame in frames.items()}
-        return rig_samples(frames, lambda held, time: frames[time].select([held]), capture.bounds, self.plan, random)
+
+        def cameras(held: str) -> Cameras:
+            return replace(self._without(which, held), longest_px=size_px).cameras.to(self.plan.device)
+
+        return rig_samples(LeaveOneOutFrames(frames, capture.bounds, cameras), self.plan, random)
+
+    def _without(self, which: int, held: str) -> PreparedCapture:
+        """The capture, aligned when this camera is first left out."""
+        if (which, held) not in self._prepared:
+            capture = self.captures[which]
+            self._prepared[which, held] = prepare(capture, [n for n in capture.cameras.names if n != held])
+        return self._prepared[which, held]
 
 
 class MixedScenes:
@@ -65,43 +62,3 @@ class MixedScenes:
         """A scene of either."""
         source = self.first if Random(f"{self.seed}/which/{number}").random() < self.share else self.second
         return source.scene(number)
-
-
-def open_captures(folders: Sequence[Path]) -> list[CaptureSource]:
-    """The captures in these folders."""
-    return [open_capture(folder) for folder in folders]
-
-
-def reduced(frame: MultiViewFrame, longest_px: int) -> MultiViewFrame:
-    """The frame with every image reduced, not enlarged, to at most this length of its longer side."""
-    rgb, masks, cameras = [], [], []
-    assert frame.mask is not None, "what trains has masks"
-    for i, (width, height) in enumerate(frame.cameras.size_px.tolist()):
-        scale = min(1.0, longest_px / max(width, height))
-        size = max(1, round(height * scale)), max(1, round(width * scale))
-        image = torch.cat([frame.rgb[i, :, :height, :width], frame.mask[i : i + 1, :height, :width]]).float()
-        small = F.interpolate(image[None], size, mode="bilinear", antialias=True, align_corners=False)[0]
-        small = small.round().clamp(0, 255).to(torch.uint8)
-        rgb.append(small[:3])
-        masks.append(small[3])
-        cameras.append(frame.cameras[i].resized(size[1], size[0]))
-    together = concatenate_cameras(cameras)
-    width, height = together.max_size_px
-    pads = [(0, width - m.shape[1], 0, height - m.shape[0]) for m in masks]
-    return MultiViewFrame(
-        together,
-        torch.stack([F.pad(image, pad) for image, pad in zip(rgb, pads, strict=True)]),
-        torch.stack([F.pad(mask, pad) for mask, pad in zip(masks, pads, strict=True)]),
-        frame.time,
-    )
-
-
-def _offset_px(capture: CaptureSource) -> tuple[float, float]:
-    frame = capture.read(0)
-    if frame.mask is None or len(frame.cameras) < 3:
-        without = "without masks" if frame.mask is None else f"of {len(frame.cameras)} cameras"
-        raise CaptureError(
-            f"{capture.name}: expected a capture with masks and at least 3 cameras, one of which is left out in turn, "
-            f"got one {without}; segment the foreground, or film with more cameras"
-        )
-    return shared_offset(frame.mask, frame.cameras, capture.bounds).offset_px

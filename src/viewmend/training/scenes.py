@@ -1,12 +1,13 @@
 """Scenes, each a list of samples that follows from the plan, the seed and the scene's number alone."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from random import Random
 from typing import Protocol, TypeVar, runtime_checkable
 
-from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import HullConfig
+from viewmend.leave_one_out.scenes import LeaveOneOutFrames
+from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, Split, recordings
 from viewmend.rendering.view import RenderConfig
 from viewmend.studio.imperfections import Imperfections
 from viewmend.studio.stage import Studio, StudioConfig
@@ -14,21 +15,12 @@ from viewmend.training.plan import DataPlan
 from viewmend.training.samples import LeaveOneOut, Sample
 from viewmend.views import MultiViewFrame
 
-FIRST_VALIDATION_SEED = 9000
-"""Procedural seeds from here on are kept for validation,"""
-FIRST_TEST_SEED = 10000
-"""and from here on for tests and evaluation."""
-
 ROUGHEST = 2.5
 """Calibration of a rough stage is so many times as wrong at most."""
 WIDEST_PX = 10
 """By so much a hole is widened at most."""
 FEWEST_CAMERAS = 5
 """A rig of so many never misses one."""
-
-Truth = Callable[[str, int], MultiViewFrame]
-"""truth(name, time): what that camera, alone, should see at that time, with its mask."""
-
 
 Item = TypeVar("Item", covariant=True)
 
@@ -45,31 +37,37 @@ class SceneSource(Protocol[Item]):
 class StudioScenes:
     """Scenes of the studio, made on the fly."""
 
-    def __init__(self, plan: DataPlan, seed: str, seeds: range = range(FIRST_VALIDATION_SEED)) -> None:
-        """`seed` is of everything that is random but the performers, whose seeds are among `seeds`."""
+    def __init__(self, plan: DataPlan, seed: str, split: Split = "training") -> None:
+        """`seed` is of everything that is random but the performers, whose seeds are the split's.
+
+        Raises:
+            ValueError: the split, or the plan's people or motions, are kept for tests.
+        """
+        if split == "test":
+            raise ValueError("expected scenes for training or validation, got those for tests; take procedural_set")
+        recordings(split, [place for place in (plan.performers, plan.motions) if place is not None])
         self.plan = plan
         self.seed = seed
-        self.seeds = seeds
+        self.split: Split = split
 
     def scene(self, number: int) -> list[Sample]:
         """At each time some cameras of a random stage are left out in turn, and see the truth."""
         random = Random(f"{self.seed}/{number}")
-        studio = Studio(random_stage(self.plan, random, self.seeds))
-        frames = {time: studio.read(time) for time in self.plan.times}
+        studio = Studio(random_stage(self.plan, random, self.split))
 
         def truth(held: str, time: int) -> MultiViewFrame:
-            seen = studio.truth(studio.true_cameras.select([held]), time)
-            return replace(seen, cameras=studio.cameras.select([held]))
+            return studio.truth(studio.true_cameras.select([held]), time)
 
-        return rig_samples(frames, truth, None, self.plan, random)
+        frames = {time: studio.read(time) for time in self.plan.times}
+        return rig_samples(LeaveOneOutFrames(frames, None, lambda held: studio.cameras, truth), self.plan, random)
 
 
-def random_stage(plan: DataPlan, random: Random, seeds: range = range(FIRST_VALIDATION_SEED)) -> StudioConfig:
+def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> StudioConfig:
     """A stage as real ones differ: who performs, how many cameras in which rig, and what is wrong with them."""
     flawed = random.random() < plan.imperfect_share
     strength = random.random() if flawed else 0.0
     config = StudioConfig(
-        seed=random.choice(seeds),
+        seed=random.choice(PROCEDURAL_SEEDS[split]),
         cameras=random.randint(*plan.cameras),
         rig=random.choice(("ring", "dome")),
         frames=max(plan.times) + 1,
@@ -112,30 +110,27 @@ def _rougher(it: Imperfections, random: Random) -> Imperfections:
     )
 
 
-def rig_samples(
-    frames: Mapping[int, MultiViewFrame], truth: Truth, bounds: Bounds | None, plan: DataPlan, random: Random
-) -> list[Sample]:
+def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[Sample]:
     """Some cameras of a rig are left out in turn, each at some of the times.
 
     Args:
-        frames: what the rig saw, by time.
-        truth: of a camera that was left out.
-        bounds: the volume that may hold the subject, None to find it.
+        rig: what it saw.
         plan: how many cameras and times, and how views are rendered.
         random: which.
     """
-    frames = _with_dropouts(frames, plan.dropped_share, random)
-    times = sorted(frames)
-    ends = [t for t in times if all(t - back in frames for back in range(plan.clip))]
+    dropped = _dropouts(rig.frames, plan.dropped_share, random)
+    times = sorted(rig.frames)
+    ends = [t for t in times if all(t - back in rig.frames for back in range(plan.clip))]
     if not ends:
         raise ValueError(
             f"expected {plan.clip} consecutive times for clips, got {times}; leave --clip away, or use captures of "
             f"{max(plan.times) + 1} frames or more"
         )
-    names = frames[times[-1]].cameras.names
+    names = [n for n in rig.frames[times[-1]].cameras.names if n not in dropped.get(times[-1], ())]
     samples = []
     for held in random.sample(names, min(plan.held_cameras, len(names))):
-        rig = LeaveOneOut(frames, held, bounds, HullConfig(resolution=plan.hull_resolution))
+        hull = HullConfig(resolution=plan.hull_resolution)
+        others = LeaveOneOut(rig.inputs(held, dropped), held, rig.bounds, hull)
         for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
             reach = random.choice(plan.past)
             render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
@@ -145,20 +140,18 @@ def rig_samples(
                 past = [t for t in reversed(times) if t < time][:reach]
                 context = (time, *past) if plan.context else ()
                 least_px = plan.min_hole_px if time == end else 0
-                new = rig.sample(time, context, truth(held, time), render, least_px, cameras, wider_px)
+                new = others.sample(time, context, rig.truth(held, time), render, least_px, cameras, wider_px)
                 sample = new and replace(new, previous=sample)
             if sample is not None:
                 samples.append(sample)
     return samples
 
 
-def _with_dropouts(frames: Mapping[int, MultiViewFrame], share: float, random: Random) -> Mapping[int, MultiViewFrame]:
-    """The frames, a share of them without one or two of their cameras."""
-    if not share:
-        return frames
-    found = {}
-    for time, frame in frames.items():
+def _dropouts(frames: Mapping[int, MultiViewFrame], share: float, random: Random) -> dict[int, list[str]]:
+    """One or two cameras that have no frame, at a share of the times."""
+    dropped = {}
+    for time, frame in frames.items() if share else ():
         names = frame.cameras.names
         count = min(random.randint(1, 2), len(names) - FEWEST_CAMERAS) if random.random() < share else 0
-        found[time] = frame.without(random.sample(names, count)) if count > 0 else frame
-    return found
+        dropped[time] = random.sample(names, count) if count > 0 else []
+    return dropped

@@ -1,11 +1,13 @@
 """Where a run's scenes come from, by its plan."""
 
-from viewmend.training.capture_scenes import CaptureScenes, MixedScenes, open_captures
+from viewmend.capture.prepare import open_masked
+from viewmend.leave_one_out.splits import Split, recordings
+from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
 from viewmend.training.plan import DataPlan, Recipe
 from viewmend.training.ray_batches import RayBatch, RayBatchScenes
 from viewmend.training.sample_files import ShardScenes
 from viewmend.training.samples import Sample
-from viewmend.training.scenes import FIRST_TEST_SEED, FIRST_VALIDATION_SEED, SceneSource, StudioScenes
+from viewmend.training.scenes import SceneSource, StudioScenes
 
 
 def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayBatch]:
@@ -21,19 +23,19 @@ def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayBatch]
     return RayBatchScenes(scenes, seed, recipe.pixels)
 
 
-def scene_source(plan: DataPlan, seed: str, validation: bool = False) -> SceneSource[Sample]:
+def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneSource[Sample]:
     """Shards where they are given; else captures and the studio, as the plan shares them out.
 
-    validation: scenes of the seeds that are kept for it, whatever shards there are.
+    Scenes for validation are made, whatever shards there are.
 
     Raises:
         CaptureError, ShardError: what the plan names cannot be used.
+        ValueError: the plan names what is kept for tests.
     """
-    if plan.shards is not None and not validation:
+    if plan.shards is not None and split == "training":
         return ShardScenes(plan.shards, seed, (Sample,), plan.clip)
-    seeds = range(FIRST_VALIDATION_SEED, FIRST_TEST_SEED) if validation else range(FIRST_VALIDATION_SEED)
-    studio = StudioScenes(plan, seed, seeds)
+    studio = StudioScenes(plan, seed, split)
     if not plan.captures:
         return studio
-    real = CaptureScenes(open_captures(plan.captures), plan, seed)
-    return MixedScenes(real, studio, plan.captures_share, seed)
+    captures = [open_masked(folder, held=1) for folder in recordings(split, plan.captures)]
+    return MixedScenes(CaptureScenes(captures, plan, seed), studio, plan.captures_share, seed)

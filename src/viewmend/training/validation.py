@@ -68,7 +68,7 @@ class Validation:
     def _views(self) -> list[Sample]:
         # One view a scene and no clips: more scenes say more.
         plan = replace(self.recipe.data, held_cameras=1, targets_per_camera=1, clip=1, device="cpu")
-        scenes = scene_source(plan, "validation", validation=True)
+        scenes = scene_source(plan, "validation", "validation")
         samples = (sample for number in count() for sample in scenes.scene(number))
         return list(islice(samples, self.recipe.validation_views))
 

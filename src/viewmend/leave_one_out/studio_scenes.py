@@ -1,82 +1,32 @@
-"""What is evaluated: a rig's frames, and the truth of a camera that was left out; the fixed studio sets P and Q."""
+"""Scenes of the studio: the fixed sets P and Q."""
 
 import hashlib
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from viewmend.capture.errors import CaptureError
-from viewmend.evaluation.temporal import backward_flow
-from viewmend.geometry.bounds import Bounds
+from viewmend.leave_one_out.scenes import SceneFrame, without_held
+from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, TEST_FOLDER
+from viewmend.leave_one_out.true_motion import backward_flow
 from viewmend.studio.procedural import PerformerStyle, procedural_scene
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.views import MultiViewFrame
 
-FIRST_SEED = 10000
-"""Of set P; procedural seeds from here on were never trained on."""
-PROCEDURAL_SCENES = 30
+P_SEEDS = PROCEDURAL_SEEDS["test"][:30]
 RINGS = (12, 8)
 """Cameras of the two rigs, the left-out one among them: a usual ring, and a sparse one."""
 TEMPOS = ("calm", "dance", "fast")
-FIRST_PAIR_SEED = 20000
-"""Of set Q: of lights, rig and the part of the motion that is shown."""
+Q_SEEDS = PROCEDURAL_SEEDS["test"][10000:]
+"""Of lights, rig and the part of the motion that is shown."""
 FRAMES, SIZE_PX = 10, 512
 
 Background = Literal["black", "stage"]
 Tempo = Literal["calm", "dance", "fast"]
-
-
-@dataclass(frozen=True)
-class SceneFrame:
-    """One time of a scene."""
-
-    inputs: MultiViewFrame
-    """What the rig saw, without the camera that was left out."""
-    truth: MultiViewFrame
-    """What that camera saw (one view), with its mask."""
-    bounds: Bounds | None
-    """The volume that may hold the subject, None to find it."""
-    backward_flow_px: Float[Tensor, "height width 2"] | None = None
-    """Where in the previous true image each pixel's surface point was (`backward_flow`); None where nobody knows."""
-
-
-@runtime_checkable
-class EvaluationScene(Protocol):
-    """A stream with truth. Scenes can be pickled: they hold no frames, only how to get them."""
-
-    @property
-    def name(self) -> str:
-        """Unique among the scenes of an evaluation."""
-        ...
-
-    @property
-    def set(self) -> str:
-        """The set it belongs to: scores are averaged over it."""
-        ...
-
-    @property
-    def rig(self) -> str:
-        """Which cameras look, for tables by kind."""
-        ...
-
-    @property
-    def style(self) -> str:
-        """What happens, for tables by kind."""
-        ...
-
-    @property
-    def definition(self) -> str:
-        """All that its frames depend on, in words that are the same on every machine."""
-        ...
-
-    def frames(self, device: str) -> Iterator[SceneFrame]:
-        """Its frames in order of time, on a device."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,8 +69,7 @@ class StudioScene:
             if before is not None and before.depth is not None:
                 now, then = (studio.scene(t).mesh for t in (time, time - 1))
                 source = backward_flow(now, then, before.depth[0], truth.cameras)
-            inputs = replace(frame.without([self.held]), depth=None)  # the truth: no method may look
-            yield SceneFrame(inputs, truth, None, source)
+            yield SceneFrame(without_held(frame, self.held), truth, None, source)
             before = truth
 
 
@@ -133,8 +82,8 @@ def procedural_set(
     """
     name = "P" if background == "black" else f"P-{background}"
     scenes = []
-    for n in range(PROCEDURAL_SCENES):
-        seed, cameras, tempo = FIRST_SEED + n, RINGS[n % 2], TEMPOS[n % 3]
+    for n, seed in enumerate(P_SEEDS):
+        cameras, tempo = RINGS[n % 2], TEMPOS[n % 3]
         scenes.append(
             StudioScene(
                 name=f"{name}-{seed}",
@@ -163,15 +112,14 @@ def performer_set(
     Raises:
         CaptureError: there are no characters or no motions.
     """
-    people = _files((folder / "test", folder), (".glb", ".gltf"), "characters")
+    people = _files((folder / TEST_FOLDER, folder), (".glb", ".gltf"), "characters")
     clips = _files(
-        (motions,) if motions else (folder / "motions/test", folder / "motions", folder), (".bvh",), "motions"
+        (motions,) if motions else (folder / "motions" / TEST_FOLDER, folder / "motions", folder), (".bvh",), "motions"
     )
     sha256 = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*people, *clips)}
     scenes = []
-    for n, (person, clip) in enumerate((p, c) for p in people for c in clips):
+    for seed, (person, clip) in zip(Q_SEEDS, itertools.product(people, clips), strict=False):
         for cameras in RINGS:
-            seed = FIRST_PAIR_SEED + n
             config = StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px)
             scenes.append(
                 StudioScene(

@@ -10,8 +10,8 @@ import torch
 
 from viewmend.capture.plain_format import read_calibration
 from viewmend.capture.prepare import open_masked, prepare
-from viewmend.evaluation.scenes import SceneFrame
 from viewmend.geometry.cameras import Cameras
+from viewmend.leave_one_out.scenes import SceneFrame, without_held
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +42,9 @@ class CaptureScene:
         bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):
             frame = capture.read(time).to(device)
-            inputs = [name for name in self.inputs if name in frame.cameras.names]
-            if self.held in frame.cameras.names and len(inputs) >= 2:
-                yield SceneFrame(frame.select(inputs), frame.select([self.held]), bounds)
+            inputs = without_held(frame, self.held, self.inputs)
+            if self.held in frame.cameras.names and len(inputs.cameras) >= 2:
+                yield SceneFrame(inputs, frame.select([self.held]), bounds)
 
 
 def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) -> tuple[CaptureScene, ...]:
