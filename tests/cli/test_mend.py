@@ -139,13 +139,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, capsys, argu
     ("content", "message"),
     [
         ("{", "expected JSON"),
-        ("[]", "of finite 4x4 matrices"),
-        ("[[[1, 0], [0, 1]]]", "of finite 4x4 matrices"),
+        ("[]", "world_from_camera: expected a list that is not empty"),
+        ("[[[1, 0], [0, 1]]]", "world_from_camera[0]: expected a list of length 4"),
         (json.dumps([(2 * torch.eye(4)).tolist()]), "pose 0: expected a rotation"),
         (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 30}), "'height'"),
         (json.dumps([torch.eye(4).tolist()] * 3), "one for each of 2 frames, got 3"),
         (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "K": [[0] * 3] * 3}), "expected 'K' as"),
-        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 10**8, "height": 9}), "1 to 16384"),
+        (
+            json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 10**8, "height": 9}),
+            "width: expected a whole number <= 16384",
+        ),
         ("[" * 100_000, "expected JSON"),
     ],
 )

@@ -1,23 +1,27 @@
 """Where novel views are looked at from: orbits, and camera poses from a file."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta, Struct
 from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
 from viewmend.geometry.upright import upright
+from viewmend.json_input import Number, Triple, read_json, shown, typed
 from viewmend.studio.rigs import orbit
 
 FULL_TURN_GAP_RAD = math.radians(130)
 """A rig with a larger gap between neighbours does not stand all around: the orbit swings over what it sees."""
 STATIC_VIEWS = 60
-MOST_SIDE_PX = 16384
+Row4 = tuple[Number, Number, Number, Number]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+Pixels = Annotated[int, Meta(ge=1, le=16384)]
 FRAMES_PER_TURN = 150
 
 
@@ -75,6 +79,29 @@ def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int) -> list[
     return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * phase)) for phase in phases]
 
 
+class PathFile(Struct, frozen=True):
+    """A file of camera poses."""
+
+    world_from_camera: Annotated[tuple[Matrix4, ...], Meta(min_length=1)]
+    K: tuple[Triple, Triple, Triple] | None = None
+    width: Pixels | None = None
+    height: Pixels | None = None
+
+    def __post_init__(self) -> None:
+        poses = torch.tensor(self.world_from_camera)
+        good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
+        if not bool(good.all()):
+            raise ValueError(
+                f"pose {int((~good).nonzero()[0])}: expected a rotation above a last row of 0 0 0 1, got another "
+                "matrix; give rigid motions world_from_camera"
+            )
+        if self.K is not None and not bool(is_intrinsics(torch.tensor(self.K))):
+            expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
+            raise ValueError(f"expected 'K' as {expected}, got {shown(self.K)}; correct it")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("expected 'width' and 'height', got one of them; give both sides or none")
+
+
 def read_path(file: Path, like: Cameras) -> Cameras:
     """Camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
@@ -85,33 +112,17 @@ def read_path(file: Path, like: Cameras) -> Cameras:
         ValueError: the file does not hold that; says what and where.
     """
     try:
-        content = json.loads(file.read_text())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: expected JSON with camera poses, got {error}; correct the file") from error
+        content = read_json(file.read_bytes())
+        given: PathFile = typed(content if isinstance(content, dict) else {"world_from_camera": content}, PathFile)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
     except OSError as error:
         raise ValueError(f"{file}: expected a file with camera poses, got: {error.strerror}; check --path") from error
-    given = content if isinstance(content, dict) else {"world_from_camera": content}
-    poses = _matrices(file, given.get("world_from_camera"), "world_from_camera", (4, 4))
-    good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
-    if not bool(good.all()):
-        raise ValueError(
-            f"{file}: pose {int((~good).nonzero()[0])}: expected a rotation above a last row of 0 0 0 1, got another "
-            "matrix; give rigid motions world_from_camera"
-        )
-    first = like[0]
-    K, size = first.K[0].cpu(), first.size_px[0].cpu()
-    if "K" in given:
-        K = _matrices(file, [given["K"]], "K", (3, 3))[0]
-        if not bool(is_intrinsics(K)):
-            raise ValueError(
-                f"{file}: expected 'K' as [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0, got "
-                f"{given['K']}; correct it"
-            )
-    if "width" in given or "height" in given:
-        size = torch.tensor([_pixels(file, given, "width"), _pixels(file, given, "height")])
-    count = len(poses)
+    poses, first, count = torch.tensor(given.world_from_camera), like[0], len(given.world_from_camera)
+    K = first.K.cpu() if given.K is None else torch.tensor([given.K])
+    size = first.size_px.cpu() if given.width is None else torch.tensor([[given.width, given.height]])
     names = tuple(f"view{n:03d}" for n in range(count))
-    return Cameras(names, K.expand(count, 3, 3).clone(), invert_rigid(poses), size.expand(count, 2).clone())
+    return Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
 
 
 def paired(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:
@@ -127,24 +138,3 @@ def paired(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:
             f"expected one pose or one for each of {len(times)} frames, got {len(path)}; choose frames with --frames"
         )
     return [(time, path[n if len(path) > 1 else 0]) for n, time in enumerate(times)]
-
-
-def _matrices(file: Path, value: object, key: str, shape: tuple[int, int]) -> Float[Tensor, "pose row column"]:
-    try:
-        matrices = torch.tensor(value, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError):
-        matrices = torch.zeros(0)
-    if matrices.ndim != 3 or matrices.shape[1:] != shape or not len(matrices) or not bool(matrices.isfinite().all()):
-        raise ValueError(
-            f"{file}: expected '{key}' of finite {shape[0]}x{shape[1]} matrices, got {str(value)[:60]}; correct it"
-        )
-    return matrices
-
-
-def _pixels(file: Path, given: dict, key: str) -> int:
-    value = given.get(key)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 < value <= MOST_SIDE_PX:
-        raise ValueError(
-            f"{file}: expected '{key}' as a number of pixels from 1 to {MOST_SIDE_PX}, got {value!r}; give both sides"
-        )
-    return value
