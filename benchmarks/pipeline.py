@@ -7,7 +7,7 @@ from dataclasses import asdict
 import torch
 from measure import summarise, write
 
-from viewmend.inpainting.classical import Telea
+from viewmend.baselines.classical import Telea
 from viewmend.inpainting.config import small
 from viewmend.inpainting.inpainter import Inpainter
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe

@@ -6,11 +6,11 @@ import pytest
 import torch
 from reference.ball import camera_at, photograph, proxy, ring
 
+from viewmend.baselines.classical import Telea
+from viewmend.baselines.reprojection_fill import ReprojectionFill
 from viewmend.geometry.hull import HullConfig
-from viewmend.inpainting.classical import Telea
 from viewmend.inpainting.config import small
 from viewmend.inpainting.inpainter import Inpainter
-from viewmend.inpainting.reprojection_fill import ReprojectionFill
 from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
 from viewmend.stream import RenderQuality, Stream
 from viewmend.views import IncompleteView, MultiViewFrame

@@ -10,12 +10,12 @@ import pytest
 import torch
 from reference.ball import BallCapture, camera_at
 
+from viewmend.baselines.classical import Telea
 from viewmend.capture.plain_writer import write_capture
 from viewmend.capture.prepare import open_masked, prepare
 from viewmend.cli import main, serve
 from viewmend.contact_sheet import picture
 from viewmend.geometry.cameras import concatenate_cameras
-from viewmend.inpainting.classical import Telea
 from viewmend.live.renderer import Renderer, RenderRequest
 from viewmend.stream import RenderQuality
 

@@ -19,7 +19,7 @@ from viewmend.metrics.weights import PLACES_VARIABLE
 
 OWN = """
 from dataclasses import dataclass
-from viewmend.inpainting.classical import Telea
+from viewmend.baselines.classical import Telea
 @dataclass
 class Mine(Telea):
     device: str

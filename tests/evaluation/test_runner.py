@@ -13,11 +13,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from viewmend.baselines.classical import Telea
 from viewmend.evaluation import ray_cluster, scene_run
 from viewmend.evaluation.cells import CellStore
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
-from viewmend.inpainting.classical import Telea
 
 METHODS = ("telea", "unfilled")
 

@@ -6,21 +6,13 @@ import pytest
 import torch
 
 from viewmend.geometry.rigid import (
-    axis_angle_from_rotation,
-    interpolate_poses,
     invert_rigid,
     is_rotation,
     look_at,
-    rigid,
     rotation_from_axis_angle,
 )
 
 UP = torch.tensor([0.0, 1.0, 0.0])
-
-
-def pose(*axis_angle_and_center: float):
-    values = torch.tensor(axis_angle_and_center)
-    return rigid(rotation_from_axis_angle(values[:3]), values[3:])
 
 
 def test_looking_at_a_point():
@@ -39,29 +31,19 @@ def test_looking_nowhere_is_an_error(eye, up):
         look_at(torch.tensor(eye), torch.zeros(3), up)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 1e-3, 1.0, 3.0, math.pi - 8e-4, math.pi - 1e-4, math.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 1e-3, 1.0, 3.0, math.pi])
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0), (-0.48, 0.6, 0.64)])
-def test_axis_angle_round_trip(axis, angle):
-    rotation = rotation_from_axis_angle(torch.tensor(axis, dtype=torch.float64) * angle)
-    back = rotation_from_axis_angle(axis_angle_from_rotation(rotation))
-    torch.testing.assert_close(back, rotation, atol=2e-4 if angle > 3.1 else 1e-9, rtol=0)
+def test_an_axis_angle_keeps_its_axis_and_turns_by_its_angle(axis, angle):
+    axis = torch.tensor(axis, dtype=torch.float64)
+    rotation = rotation_from_axis_angle(axis * angle)
+    assert is_rotation(rotation)
+    torch.testing.assert_close(rotation @ axis, axis)
+    assert float(rotation.trace()) == pytest.approx(1 + 2 * math.cos(angle))
 
 
 def test_a_quarter_turn_about_z_takes_x_to_y():
     rotation = rotation_from_axis_angle(torch.tensor([0.0, 0.0, math.pi / 2]))
     torch.testing.assert_close(rotation @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
-
-
-def test_interpolation_meets_its_ends_and_turns_evenly():
-    a, b = pose(0.3, -0.2, 0.5, 1.0, 2.0, 3.0), pose(-0.4, 1.2, 0.1, -1.0, 0.0, 1.0)
-    torch.testing.assert_close(interpolate_poses(a, b, 0.0), a, atol=1e-6, rtol=0)
-    torch.testing.assert_close(interpolate_poses(a, b, 1.0), b, atol=1e-5, rtol=0)
-    half = interpolate_poses(a, b, 0.5)
-    torch.testing.assert_close(half[:3, 3], torch.tensor([0.0, 1.0, 2.0]))
-    first = axis_angle_from_rotation(a[:3, :3].T @ half[:3, :3])
-    second = axis_angle_from_rotation(half[:3, :3].T @ b[:3, :3])
-    torch.testing.assert_close(first, second, atol=1e-5, rtol=0)
-    assert is_rotation(half[:3, :3])
 
 
 def test_rotations_are_told_from_other_matrices():

@@ -5,7 +5,7 @@ import pytest
 import torch
 from inpainting.plates import Rig, context, tiny, view
 
-from viewmend.inpainting.classical import NearestColour, Telea
+from viewmend.baselines.classical import NearestColour, Telea
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.patches import any_in_patch
 

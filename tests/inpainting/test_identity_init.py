@@ -5,8 +5,8 @@ import math
 import torch
 from inpainting.plates import TINY, Rig, view
 
+from viewmend.baselines.classical import NearestColour
 from viewmend.inpainting import rope
-from viewmend.inpainting.classical import NearestColour
 from viewmend.inpainting.config import small
 from viewmend.inpainting.identity_init import analysis, synthesis
 from viewmend.inpainting.inpainter import Inpainter

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from reference.ball import BallCapture, ring
 
+from viewmend.baselines.classical import SmoothFill
 from viewmend.geometry.hull import HullConfig
-from viewmend.inpainting.classical import SmoothFill
 from viewmend.live.frames import ReadAhead
 from viewmend.live.listener import Server
 from viewmend.live.renderer import Renderer

@@ -245,7 +245,7 @@ def test_a_source_that_fails_is_said_and_recovers():
 
 
 def test_a_model_that_fails_shows_holes_and_recovers():
-    from viewmend.inpainting.classical import SmoothFill
+    from viewmend.baselines.classical import SmoothFill
 
     class Fragile(SmoothFill):
         broken = False

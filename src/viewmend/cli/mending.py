@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.baselines.classical import NearestColour, Telea
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.inpainting.classical import NearestColour, Telea
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.metrics.image_quality import mask_iou
 from viewmend.metrics.view_scores import ViewScores, score_view

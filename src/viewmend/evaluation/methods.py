@@ -14,12 +14,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from viewmend.baselines.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.baselines.published import is_baseline, make_baseline
+from viewmend.baselines.reprojection_fill import ReprojectionFill
 from viewmend.baselines.rgvi import make_rgvi
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
-from viewmend.inpainting.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.inpainting.protocol import ViewInpainter
-from viewmend.inpainting.reprojection_fill import ReprojectionFill
 from viewmend.metrics.weights import MissingWeightsError
 
 REFERENCE = "telea"

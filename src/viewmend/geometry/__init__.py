@@ -1,1 +1,1 @@
-"""Cameras, rigid motion, visual hull, surface, rasterisation, reprojection: pure functions on tensors."""
+"""Cameras, rigid motion, visual hull, surface, rasterisation, sampling: pure functions on tensors."""

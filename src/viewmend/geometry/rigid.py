@@ -58,28 +58,3 @@ def rotation_from_axis_angle(axis_angle_rad: Float[Tensor, "*batch 3"]) -> Float
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
     return torch.linalg.matrix_exp(skew)
-
-
-def axis_angle_from_rotation(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
-    """The axis-angle vector of R, angle in [0, pi] radians."""
-    skew = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    angle = torch.atan2(skew.norm(), R.trace() - 1)
-    if float(angle) < 1e-6:
-        return skew / 2
-    if float(torch.pi - angle) < 1e-3:
-        # Near half a turn the skew part vanishes: the axis is the column of R + 1 that is largest.
-        symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
-        axis = symmetric[:, int(symmetric.diagonal().argmax())]
-        sign = 1.0 if float(axis @ skew) >= 0 else -1.0
-        return sign * angle * axis / axis.norm()
-    return skew / skew.norm() * angle
-
-
-def interpolate_poses(
-    world_from_a: Float[Tensor, "4 4"], world_from_b: Float[Tensor, "4 4"], fraction: float
-) -> Float[Tensor, "4 4"]:
-    """The pose at `fraction` of the way from a (0) to b (1): shortest rotation, straight line of centres."""
-    turn = axis_angle_from_rotation(world_from_a[:3, :3].T @ world_from_b[:3, :3])
-    R = world_from_a[:3, :3] @ rotation_from_axis_angle(turn * fraction)
-    center = torch.lerp(world_from_a[:3, 3], world_from_b[:3, 3], fraction)
-    return rigid(R, center)

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.inpainting.classical import Telea
+from viewmend.baselines.classical import Telea
 from viewmend.inpainting.protocol import State
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.plan import Recipe

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from viewmend.baselines.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.geometry.cameras import Cameras
-from viewmend.inpainting.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
 from viewmend.inpainting.protocol import State, ViewInpainter
 from viewmend.views import IncompleteView
 

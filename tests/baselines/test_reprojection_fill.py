@@ -5,9 +5,9 @@ from dataclasses import replace
 import torch
 from inpainting.plates import Rig, camera, look, view
 
+from viewmend.baselines.reprojection_fill import ReprojectionFill
 from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.protocol import ViewInpainter
-from viewmend.inpainting.reprojection_fill import ReprojectionFill
 
 
 def test_it_finds_the_true_colours_where_a_camera_sees_the_surface():
