@@ -15,20 +15,21 @@ from measure import write
 from torch import Tensor
 from visibility import FURTHER, NOW, RECENT
 
-from viewmend.inpainting import inpainter as steps
+from viewmend.inpainting import patch_transformer as steps
 from viewmend.inpainting import transformer
-from viewmend.inpainting.checkpoint import load_inpainter
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.chain import Chain
+from viewmend.inpainting.checkpoint import load_network
+from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.protocol import RenderQuality
 from viewmend.leave_one_out.studio_scenes import StudioScene, procedural_set
 from viewmend.metrics.image_quality import psnr
-from viewmend.pipeline import PipelineConfig, observe, view_of
-from viewmend.views import ContextViews
+from viewmend.stream import Stream
 
 
 class Watched:
     """A model whose attention is written down while it completes one view."""
 
-    def __init__(self, model: Inpainter) -> None:
+    def __init__(self, model: Chain | PatchTransformer) -> None:
         self.model = model
         self.received: list[Tensor] = []
         self.kinds: dict[str, Tensor] = {}
@@ -70,24 +71,22 @@ class Watched:
 
 
 @torch.no_grad()
-def looked_at(scene: StudioScene, model: Inpainter) -> dict[str, float] | None:
+def looked_at(scene: StudioScene, model: Chain | PatchTransformer) -> dict[str, float] | None:
     """Shares and scores of one scene; None where hardly anything is missing."""
-    studio, config = scene.studio(), PipelineConfig()
+    studio, stream = scene.studio(), Stream(model)
     frames = {time: studio.read(time) for time in (NOW, *RECENT, *FURTHER)}
-    seen = {time: observe(frame.without([scene.held]), None, config) for time, frame in frames.items()}
+    for frame in frames.values():
+        stream.push(frame.without([scene.held]))
     truth = frames[NOW].select([scene.held])
-    view, _ = view_of(seen[NOW], truth.cameras, config)
+    view = stream.render(truth.cameras)
     holes = view.error > 0
     if int(holes.sum()) < 50:
         return None
 
-    def source(time: int, names: Sequence[str]) -> ContextViews | None:
-        return seen[time].context(names) if time in seen else None
-
     with Watched(model) as watched:
-        whole, _ = model.step(view, source, model.initial_state())
+        whole = stream.mend(view).completed
         shares = watched.shares()
-    alone, _ = model.step(view, lambda t, names: source(t, names) if t == NOW else None, model.initial_state())
+    alone = stream.mend(view, quality=RenderQuality(context_times=1)).completed
     assert truth.mask is not None, "the studio knows its masks"
     right = truth.rgb[0].float() / 255 * (truth.mask[0].float() / 255)
     scores = {"with the past, dB": psnr(whole.rgb, right, holes), "without, dB": psnr(alone.rgb, right, holes)}
@@ -102,7 +101,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=320)
     parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
     options = parser.parse_args()
-    model = load_inpainter(options.model).eval()
+    model = load_network(options.model)
     scenes = procedural_set(frames=NOW + 1, size_px=options.size)[: options.scenes]
     rows = [row for scene in scenes if (row := looked_at(scene, model)) is not None]
     if not rows:

@@ -25,15 +25,17 @@ import torch
 from measure import RESULTS, summarise, synchronise, write
 from torch import Tensor
 
+from viewmend.baselines.classical import Unfilled
 from viewmend.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
 from viewmend.baselines.framing import Canvas, Window, window_canvas, windows_over
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
 from viewmend.baselines.published import NETWORKS
+from viewmend.inpainting.chain import build
 from viewmend.inpainting.config import base, small
 from viewmend.inpainting.context import window_times
-from viewmend.inpainting.inpainter import Inpainter
-from viewmend.inpainting.protocol import Source, State, ViewInpainter
-from viewmend.pipeline import Observation, PipelineConfig, observe, view_of
+from viewmend.inpainting.network import set_compute_dtype
+from viewmend.inpainting.protocol import ContextProvider, State, ViewInpainter
+from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.views import IncompleteView
@@ -94,38 +96,39 @@ class Clocked:
         return found
 
 
-def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Source]:
-    """The views of a stream up to `NOW`, and the cameras around."""
-    config = PipelineConfig()
+def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], ContextProvider]:
+    """The views of a stream up to `NOW`, and the cameras around; what was encoded of `NOW` is never remembered."""
     studio = Studio(StudioConfig(seed=SEED, cameras=CAMERAS, frames=NOW + 1, size_px=size))
     assert studio.bounds is not None
     target = orbit([0.4], size, elevation_rad=0.25).to(device)
-    seen: list[Observation] = [
-        observe(studio.read(t).to(device), studio.bounds.to(device), config) for t in range(NOW + 1)
-    ]
-    views = [view_of(observation, target, config)[0] for observation in seen]
+    stream = Stream(Unfilled(), StreamConfig(memory_mb=None), studio.bounds)
+    seen = [stream.push(studio.read(t).to(device)) for t in range(NOW + 1)]
+    views = [stream.render(target, t) for t in range(NOW + 1)]
     for observation in seen:  # depths are the geometry's work
         observation.depth(observation.frame.cameras.names)
-    return views, lambda at, names: seen[at].context(names)
+    memory = [observation.encoded for observation in seen]
+    return views, ContextProvider(
+        lambda at, names: seen[at].context(names), memory=lambda at: {} if at == NOW else memory[at]
+    )
 
 
-def ours(name: str, views: list[IncompleteView], source: Source, device: str, precision: str):
+def ours(name: str, views: list[IncompleteView], context: ContextProvider, device: str, precision: str):
     torch.manual_seed(0)
-    inpainter = Inpainter(replace(OURS[name](), k_w=STEP)).to(device).eval()
-    inpainter.compute_dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
+    inpainter = build(replace(OURS[name](), k_w=STEP)).to(device).eval()
+    set_compute_dtype(inpainter, torch.bfloat16 if precision == "bfloat16" else torch.float32)
     state: State = inpainter.initial_state()
     for time_back in sorted(set(window_times(NOW, inpainter.config)) - {NOW}):
-        _, state = inpainter.step(views[time_back], source, state)
+        _, state = inpainter.step(views[time_back], context, state)
     return inpainter, state
 
 
-def baseline(name: str, memory: bool, framing: str, views: list[IncompleteView], source: Source, options):
+def baseline(name: str, memory: bool, framing: str, views: list[IncompleteView], context: ContextProvider, options):
     """The past of a baseline is one time's, as often as it is looked at: its values do not matter to its speed."""
     torch.manual_seed(0)
     network = NETWORKS[name]().to(options.device).eval()
     config = OnlineConfig(framing=framing, memory=memory, sampling=Sampling(step=STEP))  # pyright: ignore
     inpainter = FewWindows(network, config, options.windows)
-    _, first = inpainter.step(replace(views[NOW], time=NOW - 1), source, inpainter.initial_state())
+    _, first = inpainter.step(replace(views[NOW], time=NOW - 1), context, inpainter.initial_state())
     times = config.sampling.times(NOW)
     assert len(times) == 6
     frames = {t: frame for t in times for frame in first.frames.values()}
@@ -134,7 +137,7 @@ def baseline(name: str, memory: bool, framing: str, views: list[IncompleteView],
 
 
 def timed_steps(
-    inpainter: ViewInpainter, state: State, view: IncompleteView, source: Source, device: str, seconds: float
+    inpainter: ViewInpainter, state: State, view: IncompleteView, context: ContextProvider, device: str, seconds: float
 ) -> dict[str, float]:
     """Steps until the seconds are over; the first does not count, unless it took all of them. Ours: two or more."""
     taken: list[float] = []
@@ -144,7 +147,7 @@ def timed_steps(
     while (time.perf_counter() < end and len(taken) < 30) or len(taken) < (1 if few else 2):
         synchronise(device)
         start = time.perf_counter()
-        inpainter.step(view, source, state)
+        inpainter.step(view, context, state)
         synchronise(device)
         step_s = time.perf_counter() - start
         taken.append(1e3 * (step_s + (few.unmeasured_s() if few is not None else 0.0)))
@@ -179,7 +182,7 @@ def setting(view: IncompleteView) -> dict[str, object]:
 
 
 def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
-    views, source = stage(size, options.device)
+    views, context = stage(size, options.device)
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
@@ -187,15 +190,15 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
     wanted = [*product(options.networks, memories, options.framings)]
 
     def add(name: str, inpainter: ViewInpainter, state: State) -> None:
-        figures[name] = timed_steps(inpainter, state, views[NOW], source, options.device, options.seconds)
+        figures[name] = timed_steps(inpainter, state, views[NOW], context, options.device, options.seconds)
         print(f"{size[0]}x{size[1]} {name}: {figures[name]}", flush=True)
         done(result)
 
     with torch.inference_mode():
         for name in options.ours:
-            add(name, *ours(name, views, source, options.device, options.precision))
+            add(name, *ours(name, views, context, options.device, options.precision))
         for network, memory, framing in dict.fromkeys((RIVAL, *wanted)):
-            made = baseline(network, memory, framing, views, source, options)
+            made = baseline(network, memory, framing, views, context, options)
             add(f"{network}-{'om' if memory else 'o'}-{framing}", *made)
     result["fps_of_ours_over"] = ratios(figures)
     done(result)

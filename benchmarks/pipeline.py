@@ -7,10 +7,10 @@ from dataclasses import asdict
 import torch
 from measure import summarise, write
 
-from viewmend.baselines.classical import Telea
+from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.config import small
-from viewmend.inpainting.inpainter import Inpainter
-from viewmend.pipeline import PipelineConfig, StreamState, mend_view, observe
+from viewmend.inpainting.protocol import RenderQuality
+from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -18,25 +18,20 @@ SEED, WARM_UP = 10008, 3
 SIZES = ((320, 320), (512, 612))
 
 
-def stream(size: tuple[int, int], cameras: int, frames: int, device: str) -> dict[str, object]:
+def stage_times(size: tuple[int, int], cameras: int, frames: int, device: str) -> dict[str, object]:
     """Stage times over a stream of a procedural scene, `small` with random weights, a camera that stands still."""
-    config = PipelineConfig()
     studio = Studio(StudioConfig(seed=SEED, cameras=cameras, frames=frames, size_px=size))
     target = orbit([0.4], size, elevation_rad=0.25).to(device)
     torch.manual_seed(0)
-    inpainter = Inpainter(small()).to(device).eval()
-    alone = StreamState(Telea().initial_state())
-    bounds = studio.bounds
-    assert bounds is not None
-    bounds = bounds.to(device)
-    state, taken, second, holes = StreamState(inpainter.initial_state()), [], [], []
+    stream = Stream(Chain(small()).to(device).eval(), bounds=studio.bounds)
+    viewer, taken, second, holes = None, [], [], []
     for time in range(frames):
-        observation = observe(studio.read(time).to(device), bounds, config)
-        mended = mend_view(observation, target, state, inpainter, config)
-        state = mended.state
+        stream.push(studio.read(time).to(device))
+        mended = stream.view(target, viewer)
+        viewer = mended.viewer
         if time >= WARM_UP:
-            taken.append(asdict(mended.stage_ms))
-            second.append(mend_view(observation, target, alone, Telea(), config).stage_ms.rendering)
+            taken.append(asdict(mended.times))
+            second.append(stream.view(target, quality=RenderQuality(mend=False)).times.rendering)
             holes.append(int((mended.completed.view.error > 0).sum()))
     stages = {stage: summarise([t[stage] for t in taken]) for stage in taken[0]}
     return {
@@ -59,10 +54,10 @@ def main() -> None:
     options = parser.parse_args()
     figures = {}
     for size in SIZES:
-        figures[f"{size[0]}x{size[1]}"] = stream(size, options.cameras, options.frames, options.device)
+        figures[f"{size[0]}x{size[1]}"] = stage_times(size, options.cameras, options.frames, options.device)
         print(json.dumps(figures), flush=True)
     if options.write:
-        config = {"seed": SEED, "model": "small, random weights", "pipeline": asdict(PipelineConfig())}
+        config = {"seed": SEED, "model": "small, random weights", "pipeline": asdict(StreamConfig())}
         print(write("pipeline", options.device, config, figures))
 
 

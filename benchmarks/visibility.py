@@ -15,12 +15,13 @@ from jaxtyping import Bool, Float
 from measure import write
 from torch import Tensor
 
+from viewmend.baselines.classical import Unfilled
 from viewmend.evaluation.temporal import VISIBLE_M
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import Raster, interpolate, rasterize
 from viewmend.leave_one_out.studio_scenes import StudioScene, procedural_set
-from viewmend.pipeline import PipelineConfig, observe, view_of
+from viewmend.stream import Stream
 from viewmend.views import MultiViewFrame
 
 NOW = 30
@@ -51,8 +52,9 @@ def shares(scene: StudioScene) -> dict[str, float] | None:
     studio = scene.studio()
     frames = {time: studio.read(time) for time in (NOW, *RECENT, *FURTHER)}
     inputs, camera = frames[NOW].without([scene.held]), frames[NOW].cameras.select([scene.held])
-    config = PipelineConfig()
-    view, _ = view_of(observe(inputs, None, config), camera, config)
+    stream = Stream(Unfilled())
+    stream.push(inputs)
+    view = stream.render(camera)
     mesh = studio.scene(NOW).mesh
     raster = rasterize(mesh, camera)
     holes = view.error > 0

@@ -4,7 +4,7 @@
 
 `Afterimage` fills a hole with the colours that it saw at the same pixels in the last views, darker the longer ago, and
 with the mean colour of the view where it never saw any. It asks no camera; one that does asks
-`source(time, view.source_views)` for their images and the geometry's depth in them, for any
+`context(time, view.source_views)` for their images and the geometry's depth in them, for any
 `time` up to the view's own.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.views import CompletedView, IncompleteView
 
 
@@ -34,7 +34,7 @@ class Afterimage:
     def initial_state(self) -> Memory:
         return Memory()
 
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, Memory]:
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, Memory]:
         whole = (view.mask > 0) & (view.error == 0)
         mean = view.rgb[:, whole].mean(1) if bool(whole.any()) else view.rgb.new_zeros(3)
         fill, seen = mean[:, None, None].expand_as(view.rgb), torch.zeros_like(whole)

@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from viewmend.geometry.hull import HullConfig
     from viewmend.geometry.rigid import look_at
     from viewmend.inpainting.checkpoint import load_inpainter
-    from viewmend.inpainting.protocol import ViewInpainter
-    from viewmend.pipeline import DepthProvider, PipelineConfig, StageMs
+    from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
+    from viewmend.methods import make_method
+    from viewmend.observation import DepthProvider, Observation
     from viewmend.rendering.error_rules import Evidence, error_rule
     from viewmend.rendering.view import RenderConfig
-    from viewmend.stream import RenderQuality, Stream, StreamView
+    from viewmend.stream import Stream, StreamConfig, StreamView
+    from viewmend.timing import StageTimes
     from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 __version__ = "0.1.0"
@@ -30,24 +32,28 @@ __all__ = [
     "Cameras",
     "CaptureError",
     "CompletedView",
+    "ContextProvider",
     "ContextViews",
     "DepthProvider",
     "Evidence",
     "HullConfig",
     "IncompleteView",
     "MultiViewFrame",
-    "PipelineConfig",
+    "Observation",
     "RenderConfig",
     "RenderQuality",
     "Silhouettes",
-    "StageMs",
+    "StageTimes",
+    "State",
     "Stream",
+    "StreamConfig",
     "StreamView",
     "ViewInpainter",
     "__version__",
     "error_rule",
     "load_inpainter",
     "look_at",
+    "make_method",
     "open_capture",
     "pinhole",
     "prepare",
@@ -58,23 +64,27 @@ _ROOM = {
     "Cameras": "geometry.cameras",
     "CaptureError": "capture.errors",
     "CompletedView": "views",
+    "ContextProvider": "inpainting.protocol",
     "ContextViews": "views",
-    "DepthProvider": "pipeline",
+    "DepthProvider": "observation",
     "Evidence": "rendering.error_rules",
     "HullConfig": "geometry.hull",
     "IncompleteView": "views",
     "MultiViewFrame": "views",
-    "PipelineConfig": "pipeline",
+    "Observation": "observation",
     "RenderConfig": "rendering.view",
-    "RenderQuality": "stream",
+    "RenderQuality": "inpainting.protocol",
     "Silhouettes": "views",
-    "StageMs": "pipeline",
+    "StageTimes": "timing",
+    "State": "inpainting.protocol",
     "Stream": "stream",
+    "StreamConfig": "stream",
     "StreamView": "stream",
     "ViewInpainter": "inpainting.protocol",
     "error_rule": "rendering.error_rules",
     "load_inpainter": "inpainting.checkpoint",
     "look_at": "geometry.rigid",
+    "make_method": "methods",
     "open_capture": "capture.plain",
     "pinhole": "geometry.cameras",
     "prepare": "capture.prepare",

@@ -7,16 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from viewmend.baselines.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
+from viewmend.baselines.classical import NavierStokes, NearestColour, Telea, Unfilled
 from viewmend.geometry.cameras import Cameras
-from viewmend.inpainting.protocol import State, ViewInpainter
+from viewmend.inpainting.coarse_fill import SmoothFill
+from viewmend.inpainting.protocol import ContextProvider, State, ViewInpainter
 from viewmend.views import IncompleteView
 
 HEIGHT, WIDTH = 24, 30
 ALL = (Telea, NavierStokes, NearestColour, SmoothFill, Unfilled)
 
 
-def no_source(time, names):
+@ContextProvider
+def no_context(time, names):
     raise AssertionError("these know no cameras")
 
 
@@ -33,7 +35,7 @@ def view(rng):
 
 
 def filled(inpainter, view):
-    completed, state = inpainter.step(view, no_source, inpainter.initial_state())
+    completed, state = inpainter.step(view, no_context, inpainter.initial_state())
     assert state == State() and completed.view is view
     return completed.rgb
 

@@ -15,7 +15,7 @@ from viewmend.baselines.raft import Raft
 from viewmend.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, SeesTruth, make_rgvi
 from viewmend.baselines.rgvi_flow import dis_flow, disagreeing, pull
 from viewmend.geometry.cameras import Cameras
-from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.inpainting.protocol import ContextProvider, ViewInpainter
 from viewmend.metrics import weights
 from viewmend.metrics.weights import KnownWeights, WeightsError
 from viewmend.views import IncompleteView
@@ -55,14 +55,15 @@ def known_flow(image, other):
     return min(ways, key=lambda way: float((pull(other, way)[0] - image)[:, 60:-20, 20:-20].abs().mean()))
 
 
-def no_source(time, names):
+@ContextProvider
+def no_context(time, names):
     raise AssertionError("RGVI knows no cameras")
 
 
 def stream(inpainter, texture, times, hole=(slice(30, 50), slice(40, 60)), shown=True):
     state = inpainter.initial_state()
     for time in range(times):
-        completed, state = inpainter.step(view(at(texture, time), time, hole), no_source, state)
+        completed, state = inpainter.step(view(at(texture, time), time, hole), no_context, state)
         if shown:
             state = inpainter.shown(state, at(texture, time))
     return completed, state
@@ -157,7 +158,7 @@ def test_a_view_of_another_size_starts_anew(texture):
     small = view(at(texture, 2), 2)
     rgb, weights = small.rgb[:, :64], small.weights[:, :64]
     part = IncompleteView(small.camera, rgb, small.mask[:64], small.error[:64], small.depth[:64], (), weights, 2)
-    completed, state = Rgvi().step(part, no_source, state)
+    completed, state = Rgvi().step(part, no_context, state)
     assert isinstance(state, RgviState) and len(state.past) == 1 and completed.rgb.shape == (3, 64, SIZE)
 
 

@@ -105,12 +105,12 @@ def test_real_capture_in_figures_and_in_words(shared, capsys, tmp_path):
 
 @pytest.fixture
 def model(tmp_path):
+    from viewmend.inpainting.chain import build
     from viewmend.inpainting.checkpoint import save_inpainter
     from viewmend.inpainting.config import InpainterConfig
-    from viewmend.inpainting.inpainter import Inpainter
 
     config = InpainterConfig(widths=(8,) * 9, dim=32, heads=2, blocks=1)
-    save_inpainter(Inpainter(config), tmp_path / "model", "# Tiny\nTrained on nothing.")
+    save_inpainter(build(config), tmp_path / "model", "# Tiny\nTrained on nothing.")
     return tmp_path / "model"
 
 

@@ -8,13 +8,13 @@ import pytest
 
 from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
+from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
 from viewmend.inpainting.config import small as small_model
-from viewmend.inpainting.inpainter import Inpainter
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.sample_files import read_shard
 
-MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, rays=3)
+MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
 BRIEF = ("--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0")
 
 
@@ -28,7 +28,7 @@ def capture(tmp_path_factory):
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models") / "tiny"
-    save_inpainter(Inpainter(MODEL), folder, "# tiny\n")
+    save_inpainter(build(MODEL), folder, "# tiny\n")
     return folder
 
 

@@ -6,7 +6,6 @@ import json
 import pytest
 
 from viewmend import cli
-from viewmend.evaluation.methods import BASELINES
 from viewmend.evaluation.paper_tables import (
     OURS,
     TABLE_1,
@@ -19,6 +18,7 @@ from viewmend.evaluation.paper_tables import (
 )
 from viewmend.evaluation.report import make_report
 from viewmend.evaluation.scene_run import RunSettings
+from viewmend.methods import BASELINES
 from viewmend.metrics.weights import PLACES_VARIABLE
 
 

@@ -106,15 +106,15 @@ def test_damaged_pictures_do_not_matter(whole, copied):
 
 
 class FailsLater(Telea):
-    def step(self, view, source, state):
+    def step(self, view, context, state):
         if view.time:
             raise RuntimeError("no\nmore")
-        return super().step(view, source, state)
+        return super().step(view, context, state)
 
 
 class Paints(Telea):
-    def step(self, view, source, state):
-        completed, state = super().step(view, source, state)
+    def step(self, view, context, state):
+        completed, state = super().step(view, context, state)
         return replace(completed, rgb=completed.rgb + 0.1), state
 
 

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 
 from viewmend import cli
-from viewmend.evaluation.methods import make_method
 from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.methods import make_method
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "new_method.py"
 

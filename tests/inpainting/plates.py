@@ -5,8 +5,11 @@ from dataclasses import replace
 import torch
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers
+from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.config import InpainterConfig
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.context import ContextFrame
+from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.protocol import ContextProvider
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
 
 FOCAL_PX, DISTANCE_M = 60.0, 2.0
@@ -25,23 +28,33 @@ TINY = InpainterConfig(
     k_w=4,
     rope_unit="patch",
     rope_values=True,
-    colour_path=True,
-    prefill=True,
-    rays=3,
+    colour_skip=True,
+    coarse_fill="rays",
+    num_ray_views=3,
 )
-PLAIN = {"rope_unit": "image", "rope_values": False, "colour_path": False, "prefill": False, "rays": 0}
+PLAIN = {"rope_unit": "image", "rope_values": False, "colour_skip": False, "coarse_fill": "none"}
 """Changes that leave the paper's model."""
 
 
-def tiny(seed: int = 0, **changes) -> Inpainter:
+def tiny(seed: int = 0, **changes) -> Chain | PatchTransformer:
     """An untrained inpainter whose every weight matters (a fresh one ignores many)."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    net = Inpainter(replace(TINY, **changes)).eval()
+    net = build(replace(TINY, **changes)).eval()
     with torch.no_grad():
         for parameter in net.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=generator)
     return net
+
+
+def patches(net: Chain | PatchTransformer) -> PatchTransformer:
+    """The patch transformer of a network, or within it."""
+    return net.patches if isinstance(net, Chain) else net
+
+
+def encode(net: Chain | PatchTransformer, views: ContextViews) -> tuple[ContextFrame, ...]:
+    """The frames of one time."""
+    return patches(net).encode_contexts([views])[0]
 
 
 def camera(name: str, width: int = WIDTH, height: int = HEIGHT) -> Cameras:
@@ -85,14 +98,15 @@ def view(time: int, hole: tuple[int, int, int, int] | None = (20, 40, 30, 55), *
     return IncompleteView(at, rgb * (1 - error), mask, error, mask * DISTANCE_M, NAMES, weights, time)
 
 
-class Rig:
-    """A source that counts what it is asked; frames from `start` on, some cameras silent at some times."""
+class Rig(ContextProvider):
+    """A provider that counts what it is asked; frames from `start` on, some cameras silent at some times."""
 
     def __init__(self, start: int = 0, silent: frozenset[tuple[str, int]] = frozenset(), **size) -> None:
+        super().__init__(self._look)
         self.start, self.silent, self.size = start, silent, size
         self.asked: list[tuple[int, tuple[str, ...]]] = []
 
-    def __call__(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
+    def _look(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
         self.asked.append((time, names))
         there = tuple(name for name in names if (name, time) not in self.silent)
         return context(time, there, **self.size) if there and time >= self.start else None

@@ -118,12 +118,11 @@ def test_values_turn_by_distinct_waves():
     "changes",
     [
         {},
-        {"attention_scale": "head"},
         {"rope_unit": "image"},
         {"rope_values": False},
         {"rope": False, "rope_values": False},
     ],
-    ids=["ours", "head", "image", "scores-only", "none"],
+    ids=["ours", "image", "scores-only", "none"],
 )
 @pytest.mark.parametrize(("top_k", "grad"), [(None, True), (2, False), (2, True), (100, False)])
 def test_the_transformer_equals_its_twin(changes, top_k, grad, rng):

@@ -8,18 +8,21 @@ from inspect import signature
 import pytest
 import torch
 from inpainting.plates import Rig, tiny, view
+from safetensors.torch import load_file, save_file
 
 from viewmend import atomic_writes
 from viewmend.inpainting import checkpoint
+from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.checkpoint import (
     DamagedCheckpointError,
     MismatchedCheckpointError,
     MissingCheckpointError,
     load_inpainter,
+    load_network,
     save_inpainter,
 )
 from viewmend.inpainting.config import InpainterConfig, paper, small
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
 
 
 @pytest.fixture
@@ -43,7 +46,7 @@ def test_the_config_is_what_huggingface_hubs_mixin_hands_to_init(saved):
     """The mixin stores a dataclass argument named `config` as its fields, and ignores other keys."""
     values = json.loads((saved / "config.json").read_text())
     values.pop("viewmend_format")
-    assert list(signature(Inpainter.__init__).parameters) == ["self", "config"]
+    assert list(signature(Chain.__init__).parameters) == ["self", "config"]
     values["widths"] = tuple(values["widths"])
     assert InpainterConfig(**values) == tiny().config
 
@@ -94,11 +97,44 @@ def test_a_config_of_another_version(saved):
 def test_a_config_from_before_a_switch_was_added(saved):
     before = load_inpainter(saved)
     values = json.loads((saved / "config.json").read_text())
-    assert values.pop("steady") == InpainterConfig().steady == 0
+    assert values.pop("temporal_accumulation") == InpainterConfig().temporal_accumulation == 0
     (saved / "config.json").write_text(json.dumps(values))
     after = load_inpainter(saved)
     assert after.config == before.config
     assert all(torch.equal(a, b) for a, b in zip(after.parameters(), before.parameters(), strict=True))
+
+
+def test_a_model_of_format_1_loads_as_it_was(saved):
+    """Of the time when one network had switches; so is the shipped `small`."""
+    before = load_network(saved)
+    values = json.loads((saved / "config.json").read_text()) | {"viewmend_format": 1}
+    for new, old in (("colour_skip", "colour_path"), ("num_ray_views", "rays")):
+        values[old] = values.pop(new)
+    assert values.pop("coarse_fill") == "rays"
+    values |= {"prefill": True, "steady": 0.7, "grid": "relative", "attention_scale": "model"}
+    values.pop("temporal_accumulation")
+    (saved / "config.json").write_text(json.dumps(values))
+    weights = load_file(saved / "model.safetensors")
+    renamed = {
+        n.replace("coarse.", "ray_reader.", 1) if n.startswith("coarse.") else n.removeprefix("patches."): w
+        for n, w in weights.items()
+    }
+    save_file(renamed, saved / "model.safetensors")
+    after = load_inpainter(saved)
+    assert isinstance(after, TemporalAccumulation) and after.weight == 0.7
+    assert after.inner.config == replace(before.config, temporal_accumulation=0.7)
+    assert all(torch.equal(a, b) for a, b in zip(after.inner.parameters(), before.parameters(), strict=True))
+    for gone in ({"grid": "absolute"}, {"attention_scale": "head"}):
+        (saved / "config.json").write_text(json.dumps(values | gone))
+        with pytest.raises(MismatchedCheckpointError, match=f"expected {next(iter(gone))}"):
+            load_inpainter(saved)
+
+
+def test_the_precision_is_that_of_every_network(saved):
+    net = load_inpainter(saved, precision="bfloat16")
+    assert {net.compute_dtype, net.patches.compute_dtype, net.coarse.compute_dtype} == {torch.bfloat16}
+    with pytest.raises(ValueError, match="float32 or bfloat16, got 'float16'"):
+        load_inpainter(saved, precision="float16")
 
 
 def test_nothing_half_written(saved, monkeypatch):
@@ -124,7 +160,10 @@ def test_shipped_models_are_found_by_name(saved, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"dim": 100}, {"widths": (8,) * 8}, {"widths": (8,) * 8 + (9,)}, {"top_k": 0}, {"n_c": -1}, {"blocks": 0}],
+    [
+        *({"dim": 100}, {"widths": (8,) * 8}, {"widths": (8,) * 8 + (9,)}, {"top_k": 0}, {"n_c": -1}, {"blocks": 0}),
+        *({"temporal_accumulation": 1.0}, {"num_ray_views": 0}),
+    ],
 )
 def test_impossible_configs(changes):
     with pytest.raises(ValueError, match="expected"):

@@ -1,14 +1,15 @@
-"""The window of time, and what the cache keeps of it."""
+"""The window of time, and what is remembered of it."""
 
 from dataclasses import replace
 
-import pytest
-from hypothesis import given, settings
+import torch
+from hypothesis import given
 from hypothesis import strategies as st
-from inpainting.plates import NAMES, Rig, context, tiny, view
+from inpainting.plates import NAMES, Rig, tiny, view
 
 from viewmend.inpainting.config import paper
-from viewmend.inpainting.context import ContextCache, window_times
+from viewmend.inpainting.context import window_times
+from viewmend.inpainting.protocol import REMEMBERED_TIMES, ContextProvider, RenderQuality
 
 
 def test_the_papers_window():
@@ -18,70 +19,67 @@ def test_the_papers_window():
     assert len(window_times(1000, paper())) == 7
 
 
-def test_the_absolute_grid():
-    config = replace(paper(), grid="absolute")
-    assert window_times(100, config) == (100, 99, 98, 97, 90, 80, 70)
-    assert window_times(104, config) == (104, 103, 102, 101, 100, 90, 80)
-    assert window_times(102, config) == (102, 101, 100, 99, 90, 80, 70)
-    assert window_times(3, config) == (3, 2, 1, 0)
-
-
 @given(
-    grid=st.sampled_from(["relative", "absolute"]),
     n_c=st.integers(0, 4),
     n_w=st.integers(0, 4),
     k_w=st.integers(1, 12),
     time=st.integers(0, 90),
 )
-def test_windows_are_causal_and_short(grid, n_c, n_w, k_w, time):
-    config = replace(paper(), grid=grid, n_c=n_c, n_w=n_w, k_w=k_w)
+def test_windows_are_causal_and_short(n_c, n_w, k_w, time):
+    config = replace(paper(), n_c=n_c, n_w=n_w, k_w=k_w)
     times = window_times(time, config)
     assert times[0] == time and min(times) >= 0
     assert list(times) == sorted(set(times), reverse=True)
     assert len(times) <= 1 + n_c + n_w
 
 
-@given(
-    grid=st.sampled_from(["relative", "absolute"]),
-    n_c=st.integers(0, 4),
-    n_w=st.integers(0, 4),
-    k_w=st.integers(1, 12),
-)
-@settings(max_examples=30, deadline=None)
-def test_nothing_is_dropped_that_a_later_step_wants(grid, n_c, n_w, k_w):
-    """A stream that shows every time asks for every time once."""
-    config = replace(paper(), grid=grid, n_c=n_c, n_w=n_w, k_w=k_w)
-    frame = FRAME[0]
-    cache = ContextCache()
-    for time in range(60):
-        missing = [t for t in window_times(time, config) if cache.missing(("left",), t)]
-        assert missing == [time]
-        cache = cache.add([replace(frame, time=time)], time, config)
-        limit = max(k_w * n_w, n_c, 1) + 1 if grid == "relative" else 1 + n_c + n_w
-        assert len(cache.frames) <= limit
-
-
-FRAME = tiny().encode_context(context(0, ("left",)))
-
-
 def test_only_what_is_missing_is_asked_for():
     net, rig = tiny(), Rig()
-    _, state = net.step(view(8), rig, net.initial_state())
-    assert rig.asked == [(t, NAMES) for t in window_times(8, net.config)]
+    context = rig
+    _, state = net.step(view(8), context, net.initial_state())
+    assert rig.asked == [(8, NAMES), *((t, NAMES) for t in window_times(8, net.config))], "for rays, then for patches"
     rig.asked.clear()
     other = replace(view(8), source_views=("left", "third"))
-    _, state = net.step(other, rig, state)
-    now, *past = rig.asked
-    assert now == (8, ("third", "left")), "what is cached is asked for where rays are read"
-    assert past == [(t, ("third",)) for t in window_times(8, net.config)[1:]]
+    _, state = net.step(other, context, state)
+    assert rig.asked == [(8, ("left", "third")), *((t, ("third",)) for t in window_times(8, net.config))]
     rig.asked.clear()
-    net.step(view(9), rig, state)
-    assert rig.asked == [(9, NAMES), (5, NAMES), (1, NAMES)]
+    net.step(view(9), context, state)
+    assert rig.asked == [(9, NAMES), (9, NAMES), (5, NAMES), (1, NAMES)]
 
 
-def test_a_cache_is_a_value():
-    cache = ContextCache()
-    more = cache.add(FRAME, 0, paper())
-    assert not cache.frames and len(more.frames) == 1
-    with pytest.raises(TypeError):
-        more.frames["left", 9] = FRAME[0]
+def test_a_providers_own_memory_is_bounded_and_of_the_latest():
+    context, encoded = Rig(), []
+
+    def encode(many):
+        encoded.extend(views.frame.time for views in many)
+        return [[(name, views.frame.time) for name in views.frame.cameras.names] for views in many]
+
+    for time in range(3 * REMEMBERED_TIMES):
+        frames = context.encoded((time, time - 30) if time >= 30 else (time,), ("left",), encode)
+        assert frames == [("left", t) for t in ((time, time - 30) if time >= 30 else (time,))]
+    assert encoded == list(range(3 * REMEMBERED_TIMES)), "each was encoded once"
+    context.encoded((0,), ("left",), encode)
+    assert encoded[-1] == 0, "the oldest was forgotten"
+
+
+def test_excluded_cameras_are_never_seen():
+    rig = Rig()
+    context = ContextProvider(rig, exclude=("left",))
+    assert context(3, NAMES).frame.cameras.names == ("right",) and context(3, ("left",)) is None
+    assert context.encoded((3,), NAMES, lambda many: [v.frame.cameras.names for v in many]) == ["right"]
+    shared = {"left": "seen by another"}
+    context = ContextProvider(rig, exclude=("left",), memory=lambda time: shared)
+    assert context.encoded((3,), ("left",), lambda many: []) == []
+
+
+def test_less_quality_looks_at_less_of_the_window():
+    net = tiny()
+    for count, times in ((None, window_times(8, net.config)), (2, (8, 7)), (1, (8,))):
+        rig = Rig()
+        net.step(view(8), ContextProvider(rig, RenderQuality(context_times=count)), net.initial_state())
+        assert [time for time, _ in rig.asked[1:]] == list(times)
+    rig = Rig()
+    completed, _ = net.step(view(8), ContextProvider(rig, RenderQuality(context_times=0)), net.initial_state())
+    assert [time for time, _ in rig.asked] == [8], "for rays alone"
+    coarse, _ = net.coarse.step(view(8), Rig(), net.initial_state())
+    assert torch.equal(completed.rgb, coarse.rgb)

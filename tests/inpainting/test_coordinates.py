@@ -3,7 +3,20 @@
 from dataclasses import replace
 
 import torch
-from inpainting.plates import DISTANCE_M, FOCAL_PX, HEIGHT, NAMES, OFFSETS_M, WIDTH, camera, context, tiny, view
+from inpainting.plates import (
+    DISTANCE_M,
+    FOCAL_PX,
+    HEIGHT,
+    NAMES,
+    OFFSETS_M,
+    WIDTH,
+    camera,
+    context,
+    encode,
+    patches,
+    tiny,
+    view,
+)
 
 from viewmend.inpainting.assembly import Target, assemble
 from viewmend.inpainting.coordinates import patch_depths, relative_depth, reproject
@@ -20,7 +33,7 @@ def test_a_centre_without_depth_takes_the_median_of_the_foreground():
 
 
 def test_a_context_patch_lands_where_the_plate_is_seen():
-    frames = tiny().encode_context(context(0))
+    frames = encode(tiny(), context(0))
     for frame in frames:
         uv, counts = reproject(frame.points_world, frame.valid, camera("novel"))
         shift_px = (OFFSETS_M[frame.name] - OFFSETS_M["novel"]) * FOCAL_PX / DISTANCE_M
@@ -50,7 +63,7 @@ def carried(past_geometry, past_depth):
     net = tiny(past_geometry=past_geometry)
     then = context(2)
     then = replace(then, depth=then.depth / DISTANCE_M * past_depth)
-    past, now = net.encode_context(then)[0], net.encode_context(context(5))[0]
+    past, now = encode(net, then)[0], encode(net, context(5))[0]
     none = torch.zeros(0, 64)
     target = Target(
         view=view(5),
@@ -82,7 +95,7 @@ def test_a_patch_without_depth_is_dropped():
 def test_the_views_own_complete_patches_join_the_context_where_they_are():
     net, incomplete = tiny(), view(5)
     with torch.no_grad():
-        (target,) = net._encode_targets([incomplete], [None])
+        (target,) = patches(net)._encode_targets([incomplete], [incomplete.rgb])
     batch = assemble([target], [[]], [torch.zeros(4, 2, int((~target.incomplete).sum()), 64)], net.config)
     centres = (target.places[:, [2, 1]] * 16 + 14) / torch.tensor([WIDTH, HEIGHT])
     assert torch.allclose(batch.at.uvs[0, :, :2], centres[target.incomplete])

@@ -34,7 +34,7 @@ def test_a_prediction_covers_the_incomplete_patches():
 
 def test_views_and_contexts_must_pair_up():
     with pytest.raises(ValueError, match="one context per view"):
-        tiny().predict([view(0)], [])
+        tiny()([view(0)], [])
 
 
 @pytest.mark.parametrize("fill", [Telea(), NearestColour()])

@@ -7,9 +7,9 @@ from inpainting.plates import TINY, Rig, view
 
 from viewmend.baselines.classical import NearestColour
 from viewmend.inpainting import rope
+from viewmend.inpainting.chain import build
 from viewmend.inpainting.config import small
 from viewmend.inpainting.identity_init import analysis, synthesis
-from viewmend.inpainting.inpainter import Inpainter
 
 
 def test_waves_explain_smooth_cells(rng):
@@ -35,7 +35,7 @@ def test_turned_waves_are_a_shifted_picture():
 def test_an_untrained_model_beats_the_nearest_colour():
     """On a patterned plate whose hole the other cameras see, before any training."""
     torch.manual_seed(0)
-    net = Inpainter(small()).eval()
+    net = build(small()).eval()
     size = {"width": 180, "height": 150}
     incomplete = view(0, (55, 100, 70, 110), **size)
     truth = view(0, None, **size).rgb
@@ -45,4 +45,4 @@ def test_an_untrained_model_beats_the_nearest_colour():
         for fill in (net, NearestColour())
     ]
     assert errors[0] < errors[1]
-    assert TINY.colour_path
+    assert TINY.colour_skip

@@ -7,7 +7,14 @@ import numpy as np
 import torch
 from inpainting.plates import Rig, tiny, view
 
-from viewmend.inpainting.temporal_accumulation import SAME_COLOUR, SAME_PLACE, STALE, LastView, steadied
+from viewmend.inpainting.temporal_accumulation import (
+    SAME_COLOUR,
+    SAME_PLACE,
+    STALE,
+    LastView,
+    TemporalAccumulation,
+    accumulate,
+)
 from viewmend.views import CompletedView
 
 
@@ -27,7 +34,7 @@ def moved(last: LastView, metres: float) -> LastView:
     return replace(last, camera=replace(last.camera, camera_from_world=pose))
 
 
-def twin(now: CompletedView, last: LastView, share: float) -> np.ndarray:
+def twin(now: CompletedView, last: LastView, weight: float) -> np.ndarray:
     """Pixel by pixel."""
     rgb, z, e = now.rgb.double().numpy().copy(), now.view.depth.double().numpy(), now.view.error.double().numpy()
     K, pose = (x[0].double().numpy() for x in (now.view.camera.K, now.view.camera.camera_from_world))
@@ -50,14 +57,14 @@ def twin(now: CompletedView, last: LastView, share: float) -> np.ndarray:
         corners = old[:, top : top + 2, left : left + 2]
         colour = np.einsum("cij,i,j->c", corners, [1 - b, b], [1 - a, a])
         difference = ((colour - rgb[:, row, column]) ** 2).mean() / SAME_COLOUR**2
-        carried = share * np.exp(-difference) * e[row, column]
+        carried = weight * np.exp(-difference) * e[row, column]
         rgb[:, row, column] += carried * (colour - rgb[:, row, column])
     return rgb
 
 
-def test_steadying_equals_its_twin(rng):
+def test_accumulation_equals_its_twin(rng):
     now, last = completed(rng), moved(LastView.of(completed(rng, time=4)), 0.013)
-    steady = steadied(now, last, 0.7)
+    steady = accumulate(now, last, 0.7)
     assert np.abs(steady.rgb.double().numpy() - twin(now, last, 0.7)).max() < 1e-4
     filled = now.view.error > 0
     assert 0.3 < float(((steady.rgb != now.rgb).any(0) & filled).sum() / filled.sum()) <= 1
@@ -68,21 +75,21 @@ def test_what_differs_is_old_coarse_or_comes_later_stays_as_it_is(rng):
     now = completed(rng)
     last = LastView.of(completed(rng, time=4))
     other = replace(last, rgb=1 - last.rgb.round())
-    assert torch.allclose(steadied(now, other, 0.7).rgb, now.rgb, atol=1e-6), "another colour"
+    assert torch.allclose(accumulate(now, other, 0.7).rgb, now.rgb, atol=1e-6), "another colour"
     away = replace(last, depth=1.1 * last.depth)
     height, width = last.depth.shape
     half = last.camera.resized(width // 2, height // 2)
     coarse = replace(last, camera=half, rgb=last.rgb[:, ::2, ::2], depth=last.depth[::2, ::2])
     for ignored in (None, replace(last, time=5 - STALE - 1), replace(last, time=6), away, coarse):
-        assert torch.equal(steadied(now, ignored, 0.7).rgb, now.rgb)
-    assert torch.equal(steadied(now, last, 0.0).rgb, now.rgb)
+        assert torch.equal(accumulate(now, ignored, 0.7).rgb, now.rgb)
+    assert torch.equal(accumulate(now, last, 0.0).rgb, now.rgb)
 
 
 def test_a_stream_of_noise_becomes_calmer(rng):
     last, calm, noisy = None, [], []
     for time in range(4, 12):
         now = completed(rng, time)
-        shown = steadied(now, last, 0.7)
+        shown = accumulate(now, last, 0.7)
         last = LastView.of(shown)
         calm.append(shown.rgb)
         noisy.append(now.rgb)
@@ -91,13 +98,13 @@ def test_a_stream_of_noise_becomes_calmer(rng):
     assert change[0] < 0.7 * change[1]
 
 
-def test_steps_carry_the_last_view_where_the_model_is_steady():
-    for steady in (0.0, 0.7):
-        net, rig = tiny(steady=steady), Rig()
-        first, state = net.step(view(4), rig, net.initial_state())
-        assert (state.last is not None) == bool(steady)
-        fresh, _ = net.step(view(5), rig, replace(state, last=None))
-        second, after = net.step(view(5), rig, state)
-        expected = steadied(fresh, LastView.of(first), steady)
-        assert torch.allclose(second.rgb, expected.rgb, atol=1e-6)
-        assert (after.last is not None and torch.equal(after.last.rgb, second.rgb)) == bool(steady)
+def test_steps_carry_the_last_view():
+    net, rig = TemporalAccumulation(tiny(), 0.7), Rig()
+    first, state = net.step(view(4), rig, net.initial_state())
+    assert torch.equal(state.last.rgb, first.rgb)
+    fresh, _ = net.step(view(5), rig, replace(state, last=None))
+    second, after = net.step(view(5), rig, state)
+    expected = accumulate(fresh, LastView.of(first), 0.7)
+    assert not torch.equal(fresh.rgb, second.rgb)
+    assert torch.allclose(second.rgb, expected.rgb, atol=1e-6)
+    assert torch.equal(after.last.rgb, second.rgb)

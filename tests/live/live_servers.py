@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 from reference.ball import BallCapture, ring
 
-from viewmend.baselines.classical import SmoothFill
 from viewmend.geometry.hull import HullConfig
+from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.live.frames import ReadAhead
 from viewmend.live.listener import Server
 from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
-from viewmend.pipeline import PipelineConfig
+from viewmend.stream import StreamConfig
 
 CAMERAS = ring(12)[[0, 1, 2, 4, 7, 9]]
-PIPELINE = PipelineConfig(hull=HullConfig(resolution=32))
+PIPELINE = StreamConfig(hull=HullConfig(resolution=32))
 
 
 @dataclass

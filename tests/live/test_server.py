@@ -245,15 +245,15 @@ def test_a_source_that_fails_is_said_and_recovers():
 
 
 def test_a_model_that_fails_shows_holes_and_recovers():
-    from viewmend.baselines.classical import SmoothFill
+    from viewmend.inpainting.coarse_fill import SmoothFill
 
     class Fragile(SmoothFill):
         broken = False
 
-        def step(self, view, source, state):
+        def step(self, view, context, state):
             if self.broken:
                 raise RuntimeError("out of memory")
-            return super().step(view, source, state)
+            return super().step(view, context, state)
 
     model = Fragile()
     with running(inpainter=model) as server, Client(server.ws) as viewer:

@@ -6,14 +6,14 @@ import pytest
 import torch
 from reference.ball import ring
 
-from viewmend.inpainting.protocol import State
+from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live.clock import Span
 from viewmend.live.frames import Rig, SourceStatus
 from viewmend.live.poses import rig_frame, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
-from viewmend.stream import RenderQuality, Viewer
+from viewmend.timing import StageTimes
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
 CAMERA = view_camera(Camera(), FRAME, (16, 16))
@@ -44,9 +44,9 @@ class Drawing(Renderer):
         return True
 
     def render(self, ask, viewer):
-        if ask.effort.top_k == 13:
+        if ask.quality.top_k == 13:
             raise RuntimeError("bad luck")
-        return RenderResult(ask.time, (), Viewer(State()), 0.0, 0.0, 0.0, 0.0)
+        return RenderResult(ask.time, (), State(), StageTimes())
 
 
 class Eager:

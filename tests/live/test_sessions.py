@@ -11,7 +11,7 @@ from viewmend.live.poses import rig_frame
 from viewmend.live.protocol import ClockChange, Look, unpack
 from viewmend.live.renderer import RenderResult
 from viewmend.live.sessions import MOVING, REFINEMENTS, Scene, ViewerSession
-from viewmend.stream import Viewer
+from viewmend.timing import StageTimes
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
 SPAN = Span(0, 20, 20, 10.0)
@@ -87,11 +87,11 @@ def test_a_moving_view_is_small_and_a_still_one_full():
     desk.pause()
     desk.look(id=1, moving=True, width=200, height=100)
     ask = desk.due()
-    assert desk.size(ask) == (100, 50) and ask.effort.context_times == MOVING.context_times
+    assert desk.size(ask) == (100, 50) and ask.quality.context_times == MOVING.context_times
     assert desk.due(1.0) is None, "a moving view is not refined"
     desk.look(id=2, width=200, height=100)
     ask = desk.due()
-    assert desk.size(ask) == (200, 100) and ask.effort.context_times == 7
+    assert desk.size(ask) == (200, 100) and ask.quality.context_times == 7
     assert desk.due(1.0) is None, "nothing better follows"
     desk.look(id=3, moving=True, adaptive=False, width=200, height=100)
     assert desk.size(desk.due()) == (200, 100)
@@ -102,15 +102,15 @@ def test_a_still_view_is_refined_in_two_steps():
     desk.pause()
     desk.look(id=1, scale=0.5, top_k=100)
     first = desk.due()
-    assert desk.size(first)[0] < 160 and first.effort.top_k == 100
+    assert desk.size(first)[0] < 160 and first.quality.top_k == 100
     (soon, sharp), (later, _) = REFINEMENTS
     assert desk.due(soon / 2) is None
     better = desk.due(soon)
-    assert desk.size(better) == (160, 160) and better.effort.context_times == sharp.context_times == 0
+    assert desk.size(better) == (160, 160) and better.quality.context_times == sharp.context_times == 0
     assert not desk.seat._full and desk.due(0.1) is None
     best = desk.due(later)
-    assert best.effort.context_times == FULL.context_times and desk.seat._full
-    assert best.effort.top_k == 100 and desk.due(1.0) is None
+    assert best.quality.context_times == FULL.context_times and desk.seat._full
+    assert best.quality.top_k == 100 and desk.due(1.0) is None
 
 
 def test_budgets_are_shared_among_a_crowd():
@@ -142,9 +142,9 @@ def test_what_failed_is_said_and_not_tried_again_before_something_changes():
 def test_rendering_without_mending_costs_no_filling():
     desk = Desk()
     desk.look(id=1, modes=("rendered", "holes"))
-    assert not desk.due().effort.mend
+    assert not desk.due().quality.mend
     desk.look(id=2, modes=("rendered", "mended"))
-    assert desk.due().effort.mend
+    assert desk.due().quality.mend
 
 
 @pytest.mark.parametrize("mode", ["mended", "depth"])
@@ -152,7 +152,10 @@ def test_frames_say_what_they_are(ball_view, mode):
     desk = Desk()
     desk.look(id=5, sent_ms=12.5, modes=(mode,), depth=True)
     ask = desk.due()
-    desk.seat.show(ask, RenderResult(0, (ball_view,), Viewer(State()), 3.0, 2.0, 4.0, 5.0))
+    desk.seat.show(
+        ask,
+        RenderResult(0, (ball_view,), State(), StageTimes(geometry=3.0, context=2.0, rendering=4.0, inpainting=5.0)),
+    )
     header, parts = unpack(desk.sent[0])
     assert (header["look"], header["sent_ms"], header["frame"], header["full"]) == (5, 12.5, 0, True)
     assert [part["kind"] for part in header["parts"]] == ["image", "depth"] and parts[0][:2] == b"\xff\xd8"

@@ -34,7 +34,7 @@ def transformer_twin(net, tokens, uvs, steps, context_tokens, context_uvs, conte
     """One sample, section 6 as it is written: P [query dim], R [key dim], their coordinates [. 3]."""
     config = net.config
     heads, head_dim = config.heads, config.dim // config.heads
-    scale = 1 / math.sqrt(config.dim if config.attention_scale == "model" else head_dim)
+    scale = 1 / math.sqrt(config.dim)
     turn = lambda where: (where[:, None] * net.score_frequencies).sum(0)  # noqa: E731
     if config.rope_unit == "patch":
         twenty = torch.tensor([20.0, 20.0, 1.0])

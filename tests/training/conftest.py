@@ -20,7 +20,7 @@ PLAN = DataPlan(
     rays=3,
     hull_resolution=48,
 )
-MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, rays=3)
+MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.chain import build
 from viewmend.training.loop import train
 from viewmend.training.losses import image_loss
 from viewmend.training.ray_batches import RayBatch, RayBatchScenes, RaysObjective, varied
@@ -18,13 +18,13 @@ EVERY_PX = 10**6
 
 def test_they_cost_what_the_fill_of_the_whole_sample_costs(tiny):
     torch.manual_seed(0)
-    model, source = Inpainter(tiny.model), StudioScenes(tiny.data, "0")
+    model, source = build(tiny.model), StudioScenes(tiny.data, "0")
     samples = source.scene(0)
     lookups = RayBatchScenes(source, "0", EVERY_PX).scene(0)
     assert len(samples) == len(lookups) > 1
     with torch.no_grad():
         outcome = RaysObjective(model, tiny)(lookups)
-        filled = model.prefill([s.view for s in samples], [s.nearby for s in samples])
+        filled = model.coarse([s.view for s in samples], [s.nearby for s in samples])
     nowhere = [torch.zeros_like(s.view.error) for s in samples]
     missing = [(s.view.error > 0).float() for s in samples]
     expected = image_loss(filled, nowhere, missing, [s.truth.float() / 255 for s in samples])

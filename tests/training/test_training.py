@@ -15,8 +15,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from viewmend.inpainting.checkpoint import load_inpainter
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.chain import build
+from viewmend.inpainting.checkpoint import load_network
 from viewmend.training import loop
 from viewmend.training.loop import Run, train
 from viewmend.training.plan import DataPlan, LossWeights
@@ -48,11 +48,11 @@ def test_a_short_run_trains_its_part_and_writes_a_model_that_loads_and_a_log(par
     reported = []
     train(recipe, tmp_path, report=reported.append)
     assert [entry["step"] for entry in log_of(tmp_path)] == [1, 2, 3] == [entry.step for entry in reported]
-    inpainter = load_inpainter(tmp_path)
+    inpainter = load_network(tmp_path)
     assert inpainter.config == recipe.model
     torch.manual_seed(recipe.seed)
-    untrained = Inpainter(recipe.model).state_dict()
-    moved = {n.startswith("ray_reader.") for n, w in inpainter.state_dict().items() if not torch.equal(w, untrained[n])}
+    untrained = build(recipe.model).state_dict()
+    moved = {n.startswith("coarse.") for n, w in inpainter.state_dict().items() if not torch.equal(w, untrained[n])}
     assert moved == {"all": {True, False}, "rays": {True}, "patches": {False}}[part]
     assert "tiny" in (tmp_path / "README.md").read_text()
 
@@ -119,7 +119,7 @@ def test_a_finished_run_makes_its_model_again(tiny, tmp_path):
 def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_its_batch(tiny, tmp_path, monkeypatch):
     def broken(recipe, start):
         model = made(recipe, start)
-        model.decoder.linear.weight.data.fill_(torch.nan)
+        model.patches.decoder.linear.weight.data.fill_(torch.nan)
         return model
 
     made = loop._model
@@ -200,9 +200,11 @@ def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, 
 def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
     for name, make in RECIPES.items():
         recipe = make(plan)
-        assert recipe.name == name and recipe.data.rays == recipe.model.rays
+        assert recipe.name == name and recipe.data.rays == (
+            recipe.model.num_ray_views if recipe.model.coarse_fill == "rays" else 0
+        )
     assert small(plan).part == "patches" and small_rays(plan).part == "rays"
-    parameters = sum(p.numel() for p in Inpainter(RECIPES["base"](plan).model).parameters())
+    parameters = sum(p.numel() for p in build(RECIPES["base"](plan).model).parameters())
     assert parameters < 40e6
     assert RECIPES["paper"](plan).loss == LossWeights(adversarial=0.01), "the paper's objective, exactly"
 

@@ -7,19 +7,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.inpainting.coarse_fill import fill
-from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.views import CompletedView, IncompleteView
 
 
 class ViewFill(Protocol):
-    """A `ViewInpainter` that looks at the view alone; `source` is never asked, nothing is remembered."""
+    """A `ViewInpainter` that looks at the view alone; `context` is never asked, nothing is remembered."""
 
     def initial_state(self) -> State:
         """Nothing to remember."""
         return State()
 
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The view with its holes filled; one without holes comes back as it is."""
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
@@ -55,14 +54,6 @@ class NavierStokes(ViewFill):
         import cv2
 
         return _opencv(view, self.radius_px, cv2.INPAINT_NS)
-
-
-class SmoothFill(ViewFill):
-    """The coarse fill that our model falls back to (`coarse_fill.fill`), on its own."""
-
-    def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
-        """From the colours around each hole."""
-        return fill(view.rgb, view.error > 0, view.mask > 0)
 
 
 class Unfilled(ViewFill):

@@ -12,7 +12,7 @@ from viewmend.baselines.camera_windows import aim, camera_windows, foreground
 from viewmend.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
 from viewmend.baselines.framing import Canvas, Window, resized, resized_canvas, stitch, window_canvas, windows_over
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 
@@ -71,14 +71,14 @@ class OnlineInpainter:
         return OnlineState()
 
     @torch.inference_mode()
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, OnlineState]:
-        """The completed view; `source` is asked in the variant mul alone."""
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, OnlineState]:
+        """The completed view; `context` is asked in the variant mul alone."""
         canvas = self._canvas(view)
         state = self._past(state, view.time, canvas)
         completed, slots = view.rgb, state.slots
         windows = self._windows_with_holes(view, canvas)
         if windows:
-            look = _Looker(self.config, view, source, {view.time: canvas.image, **state.frames})
+            look = _Looker(self.config, view, context, {view.time: canvas.image, **state.frames})
             run = self._remembering if self.config.memory else self._at_once
             pieces, slots = run(windows, look, state)
             filled = self._fitted(stitch(pieces, windows, state.canvas_px, self.config.overlap_px), view)
@@ -151,9 +151,9 @@ class _Looker:
     """Frames of a window at a time, the cameras' with them; images of a time are fetched once for all windows."""
 
     def __init__(
-        self, config: OnlineConfig, view: IncompleteView, source: Source, frames: Mapping[int, Tensor]
+        self, config: OnlineConfig, view: IncompleteView, context: ContextProvider, frames: Mapping[int, Tensor]
     ) -> None:
-        self.config, self.view, self.source, self.frames = config, view, source, frames
+        self.config, self.view, self.context, self.frames = config, view, context, frames
         self.seen: dict[int, tuple[ContextViews, Tensor] | None] = {}
 
     def __call__(self, window: Window, time: int) -> Frames:
@@ -162,7 +162,7 @@ class _Looker:
         if self.config.framing != "mul":
             return own
         if time not in self.seen:
-            views = self.source(time, self.view.source_views) if self.view.source_views else None
+            views = self.context(time, self.view.source_views) if self.view.source_views else None
             self.seen[time] = None if views is None else (views, foreground(views))
         seen = self.seen[time]
         if seen is None:

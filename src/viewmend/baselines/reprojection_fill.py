@@ -8,7 +8,7 @@ from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.inpainting.ray_sampling import NEAR, sample_along_rays
 from viewmend.views import CompletedView, IncompleteView
 
@@ -33,7 +33,7 @@ class ReprojectionFill:
         """Nothing to remember."""
         return State()
 
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """Fills from the cameras' images; a view without holes comes back at once."""
         missing = view.error > 0
         if not bool(missing.any()):
@@ -42,7 +42,7 @@ class ReprojectionFill:
         left = torch.nonzero(missing & (view.depth > 0).any())
         nearest = view.closest_views(self.cameras)
         for time in window_times(view.time, self.config):
-            seen = source(time, nearest if time == view.time else view.source_views) if len(left) else None
+            seen = context(time, nearest if time == view.time else view.source_views) if len(left) else None
             if seen is None:
                 continue
             point = sample_along_rays(view, left, seen, offsets=(0.0,)).features

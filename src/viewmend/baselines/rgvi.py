@@ -21,7 +21,7 @@ from viewmend.baselines.raft import load_raft
 from viewmend.baselines.rgvi_flow import FlowMap, Image, dis_flow, disagreeing, pull
 from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.metrics.weights import find_weights, known_weights
 from viewmend.views import CompletedView, IncompleteView
 
@@ -82,8 +82,8 @@ class Rgvi:
         """Nothing seen yet."""
         return RgviState()
 
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
-        """Fills from the past along flow, the rest from the view alone; `source` is never asked."""
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+        """Fills from the past along flow, the rest from the view alone; `context` is never asked."""
         assert isinstance(state, RgviState), "the state of another inpainter"
         past = state.past if not state.past or state.past[0].shape == view.rgb.shape else ()
         missing, subject = view.error > 0, view.mask > 0

@@ -10,7 +10,7 @@ from torch.nn.functional import interpolate
 from viewmend.baselines.dstt import DSTT
 from viewmend.baselines.token_transformer import NATIVE_PX, MemorySlot
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.protocol import Source, State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.views import CompletedView, IncompleteView
 
 SLOTS = 6
@@ -39,8 +39,8 @@ class RiftCast:
         return RiftCastState()
 
     @torch.inference_mode()
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, RiftCastState]:
-        """The completed view; `source` is never asked. Views without holes go through the network too."""
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, RiftCastState]:
+        """The completed view; `context` is never asked. Views without holes go through the network too."""
         slots = state.slots if isinstance(state, RiftCastState) else ()
         small = _area_resized(torch.cat([view.rgb, view.error[None]]), NATIVE_PX)
         frame = (2 * small[:3] - 1) * (1 - small[3])

@@ -144,13 +144,11 @@ def _train_one(job: "tuple[Recipe, Path]") -> None:
 
 def _with_top_k(source: Path, target: Path, top_k: int) -> None:
     """The same model that prunes its context to `top_k` tokens."""
-    from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
-    from viewmend.inpainting.inpainter import Inpainter
+    from viewmend.inpainting.checkpoint import load_network, save_inpainter
 
-    model = load_inpainter(source)
-    pruning = Inpainter(replace(model.config, top_k=top_k))
-    pruning.load_state_dict(model.state_dict())
-    save_inpainter(pruning, target, f"# {target.name}\n\n{source.name} with top_k {top_k}.\n")
+    model = load_network(source)
+    model.config = replace(model.config, top_k=top_k)
+    save_inpainter(model, target, f"# {target.name}\n\n{source.name} with top_k {top_k}.\n")
 
 
 def _evaluate(options: Options, trained: "list[Trained]") -> "list[Cell]":

@@ -53,7 +53,7 @@ def run(options: Options) -> int:
     from viewmend.cli.mending import Mender, load_named
     from viewmend.studio.stage import Studio, StudioConfig
 
-    inpainter = load_named(options.model, None, "cpu")
+    inpainter = load_named(options.model, "cpu")
     config = StudioConfig(
         seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=FPS
     )

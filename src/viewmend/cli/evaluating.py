@@ -82,10 +82,10 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evalua
     _check(options, sets)
     from viewmend.cli.console import say, track
     from viewmend.evaluation.cells import CellStore
-    from viewmend.evaluation.methods import method_names, split_missing
     from viewmend.evaluation.report import make_report
     from viewmend.evaluation.runner import run_evaluation
     from viewmend.evaluation.scorers import available_networks
+    from viewmend.methods import method_names, split_missing
 
     if options.weights is not None:
         _look_first_in(options.weights)
@@ -149,13 +149,13 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
 
 def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
     from viewmend.evaluation.scene_run import RunSettings
-    from viewmend.pipeline import PipelineConfig
     from viewmend.rendering.view import RenderConfig
+    from viewmend.stream import StreamConfig
 
     return RunSettings(
         device=options.device,
         precision=options.precision,
-        pipeline=PipelineConfig(render=RenderConfig(cameras=options.closest)),
+        stream=StreamConfig(render=RenderConfig(cameras=options.closest), memory_mb=None),
         ssim=options.ssim,
         networks=networks,
     )

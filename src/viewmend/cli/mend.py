@@ -39,7 +39,8 @@ class Options:
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
     model: str | None = None
-    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
+    """What fills the holes: a shipped model's name or a model's folder, or any method that `viewmend evaluate` takes
+    ('telea', 'reprojection', 'dstt-o-mul', FILE.py:NAME)."""
     top_k: int | None = None
     """Context tokens that survive pruning: fewer is faster. All by default."""
     frames: str | None = None
@@ -67,15 +68,18 @@ def run(options: Options) -> int:
     from viewmend.cli.mend_output import MendOutput
     from viewmend.cli.mend_summary import MendSummary
     from viewmend.cli.mending import Mender, load_named
+    from viewmend.inpainting.protocol import RenderQuality
 
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = _times(options.frames, len(opened.frame_ids))
-    inpainter = load_named(options.model, options.top_k, options.device)
+    if options.top_k is not None and options.top_k < 1:
+        raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; leave it away to keep all")
+    inpainter = load_named(options.model, options.device)
     inputs = [name for name in opened.cameras.names if name not in held]
     capture = prepare(opened, inputs, align=options.align, first=times[0])
     say_alignment(capture.alignment)
-    mender = Mender(inpainter, options.context, capture.bounds, held)
+    mender = Mender(inpainter, options.context, capture.bounds, held, RenderQuality(top_k=options.top_k))
     summary = MendSummary()
     views = _views(options, capture, times)
     with MendOutput(options.out, fps=capture.fps or 15.0) as output:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from viewmend.cli.mending import MendStep, Scores
 from viewmend.metrics.view_scores import ViewScores, mean_over_frames
-from viewmend.pipeline import StageMs
+from viewmend.timing import StageTimes
 
 Fill = Literal["unfilled", "telea", "ours"]
 Metric = Literal["psnr_whole", "psnr_valid", "psnr_holes", "psnr_holes_fg"]
@@ -20,7 +20,7 @@ class MendSummary:
         self._hull_px = self._holes_px = 0
         self._scores: list[Scores] = []
         self._iou: dict[str, list[float]] = {}
-        self._stages: list[StageMs] = []
+        self._stages: list[StageTimes] = []
 
     def add(self, step: MendStep) -> None:
         """Count one more view."""
@@ -32,7 +32,7 @@ class MendSummary:
             self._scores.append(step.scores)
         for name, iou in step.hull_iou.items():
             self._iou.setdefault(name, []).append(iou)
-        self._stages.append(step.stage_ms)
+        self._stages.append(step.times)
 
     def as_json(self) -> dict[str, object]:
         """The scores; null where there are no such pixels, or no truth. Times are medians, milliseconds."""

@@ -1,19 +1,21 @@
 """One stream of mended views, with what a command shows and scores of it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.baselines.classical import NearestColour, Telea
+from viewmend.baselines.classical import Telea
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
 from viewmend.metrics.image_quality import mask_iou
 from viewmend.metrics.view_scores import ViewScores, score_view
-from viewmend.pipeline import Observation, PipelineConfig, StageMs, StreamState, mend_view, observe
+from viewmend.observation import Observation
 from viewmend.rendering.view import RenderConfig
+from viewmend.stream import Stream, StreamConfig
+from viewmend.timing import StageTimes
 from viewmend.views import CompletedView, MultiViewFrame
 
 
@@ -39,19 +41,25 @@ class MendStep:
     """None without truth."""
     hull_iou: dict[str, float]
     """The hull's silhouette against the mask, for each input camera and the truth."""
-    stage_ms: StageMs
+    times: StageTimes
 
 
 class Mender:
-    """Runs the pipeline over a stream of frames, and judges what comes out."""
+    """Runs one viewer's stream over frames, and judges what comes out."""
 
-    def __init__(self, inpainter: ViewInpainter, context: int, bounds: Bounds | None, exclude: Sequence[str] = ()):
-        self.inpainter = inpainter
-        self.config = PipelineConfig(render=RenderConfig(cameras=context))
-        self.bounds = bounds
-        self.exclude = exclude
-        self._state: StreamState | None = None
-        self._observation: Observation | None = None
+    def __init__(
+        self,
+        inpainter: ViewInpainter,
+        context: int = 3,
+        bounds: Bounds | None = None,
+        exclude: Sequence[str] = (),
+        quality: RenderQuality | None = None,
+    ):
+        self._config = StreamConfig(render=RenderConfig(cameras=context), memory_mb=None)
+        self._stream = Stream(inpainter, self._config, bounds)
+        self._exclude = exclude
+        self._quality = quality
+        self._viewer: State | None = None
 
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
         """The next view of the stream; the same frame may be looked at many times.
@@ -61,23 +69,21 @@ class Mender:
             target: the novel view's camera.
             truth: what a camera there saw (one view), used for scores alone.
         """
-        bounds = None if self.bounds is None else self.bounds.to(frame.rgb.device)
-        state = self._state or StreamState(self.inpainter.initial_state())
-        if self._state is None:
+        if self._viewer is None:
             # Once unseen, so that what is compiled at first use is in no time that is shown.
-            warm = observe(frame, bounds, self.config)
-            mend_view(warm, target, state, self.inpainter, self.config, self.exclude)
-        if self._observation is None or self._observation.frame.time != frame.time:
-            self._observation = observe(frame, bounds, self.config)
-        mended = mend_view(self._observation, target, state, self.inpainter, self.config, self.exclude)
-        self._state = mended.state
-        iou = _hull_iou(self._observation)
+            warm = Stream(self._stream.inpainter, self._config, self._stream.bounds)
+            warm.push(frame)
+            warm.view(target, quality=self._quality, exclude=self._exclude)
+        observation = self._stream.push(frame)
+        mended = self._stream.view(target, self._viewer, frame.time, self._quality, self._exclude)
+        self._viewer = mended.viewer
+        iou = _hull_iou(observation)
         if truth is None:
-            return MendStep(frame, mended.completed, None, None, iou, mended.stage_ms)
+            return MendStep(frame, mended.completed, None, None, iou, mended.times)
         image, scores = _judge(mended.completed, truth)
         if scores.ours.hull_iou is not None:
             iou[truth.cameras.names[0]] = scores.ours.hull_iou
-        return MendStep(frame, mended.completed, image, scores, iou, mended.stage_ms)
+        return MendStep(frame, mended.completed, image, scores, iou, mended.times)
 
 
 def _judge(completed: CompletedView, truth: MultiViewFrame) -> tuple[Float[Tensor, "3 height width"], Scores]:
@@ -88,7 +94,7 @@ def _judge(completed: CompletedView, truth: MultiViewFrame) -> tuple[Float[Tenso
     mask = truth.mask[0, :height, :width]
     image = truth.rgb[0, :, :height, :width] / 255 * (mask / 255)
     baseline = Telea()
-    filled, _ = baseline.step(view, lambda time, names: None, baseline.initial_state())
+    filled, _ = baseline.step(view, ContextProvider(lambda *_: None), baseline.initial_state())
     unfilled, telea, ours = (score_view(view, rgb, image, mask > 127) for rgb in (view.rgb, filled.rgb, completed.rgb))
     return image, Scores(unfilled, telea, ours)
 
@@ -101,28 +107,17 @@ def _hull_iou(observation: Observation) -> dict[str, float]:
     return {name: score for name, score in zip(frame.cameras.names, scores, strict=True) if score is not None}
 
 
-def load_named(name: str | None, top_k: int | None, device: str) -> ViewInpainter:
-    """The inpainter of this name or folder; without a name the model that is shipped, else Telea.
+def load_named(name: str | None, device: str) -> ViewInpainter:
+    """The method of this name (`methods.make_method`); without a name the model that is shipped, else Telea.
 
     Raises:
         ValueError: there is none, it is damaged, or the device is not there.
     """
     from viewmend.cli.checks import check_device
     from viewmend.cli.console import say
-    from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
+    from viewmend.methods import default_method, make_method
 
     check_device(device)
-    if name is None:
-        shipped = shipped_models()
-        if not shipped:
-            say("no model is shipped with this version: the holes are filled by OpenCV's Telea")
-            return Telea()
-        name = "small" if "small" in shipped else shipped[0]
-    if name in ("telea", "nearest"):
-        return Telea() if name == "telea" else NearestColour()
-    inpainter = load_inpainter(name, device)
-    if top_k is not None:
-        if top_k < 1:
-            raise ValueError(f"expected --top-k of at least 1 token, got {top_k}; leave it away to keep all")
-        inpainter.config = replace(inpainter.config, top_k=top_k)
-    return inpainter
+    if name is None and (name := default_method()) == "telea":
+        say("no model is shipped with this version: the holes are filled by OpenCV's Telea")
+    return make_method(name, device)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from viewmend.inpainting.checkpoint import CARD, SHIPPED, load_inpainter
+from viewmend.inpainting.checkpoint import CARD, SHIPPED, load_network
 
 
 @dataclass(frozen=True)
@@ -24,14 +24,14 @@ def describe_model(name_or_path: str) -> ModelDescription:
     Raises:
         CheckpointError: there is no such model, or it cannot be loaded.
     """
-    inpainter = load_inpainter(name_or_path)
+    network = load_network(name_or_path)
     folder = Path(name_or_path) if Path(name_or_path).is_dir() else SHIPPED / name_or_path
     card = folder / CARD
     return ModelDescription(
         kind="model",
         path=str(folder),
-        parameters=sum(parameter.numel() for parameter in inpainter.parameters()),
-        config=inpainter.config.to_dict(),
+        parameters=sum(parameter.numel() for parameter in network.parameters()),
+        config=network.config.to_dict(),
         card=card.read_text(encoding="utf-8") if card.is_file() else None,
     )
 

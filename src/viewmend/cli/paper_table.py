@@ -38,9 +38,9 @@ class Options(RunOptions):
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.evaluating import evaluate, write_report
-    from viewmend.evaluation.methods import method_names
     from viewmend.evaluation.paper_tables import NO_FIGURES, OURS, TABLES, PaperRow, ablation_models, paper_grid
     from viewmend.evaluation.report_markdown import written
+    from viewmend.methods import method_names
 
     sets = options.sets or (("P", "Q") if options.performers else ("P",))
     rows = list(TABLES[options.table])

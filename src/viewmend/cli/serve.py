@@ -79,8 +79,8 @@ def run(options: Options) -> int:
     from viewmend.live.renderer import Renderer
     from viewmend.live.server import LiveServer, ServerConfig
     from viewmend.live.service import RenderService
-    from viewmend.pipeline import PipelineConfig
     from viewmend.rendering.view import RenderConfig
+    from viewmend.stream import StreamConfig
 
     set_up()
     config = ServerConfig(
@@ -92,9 +92,9 @@ def run(options: Options) -> int:
         limits=Limits(viewers=options.viewers),
     )
     supply = _supply(options)
-    inpainter = load_named(options.model, None, options.device)
-    pipeline = PipelineConfig(render=RenderConfig(cameras=options.context))
-    renderer = Renderer(supply, inpainter, pipeline, options.device, memory_mb=options.memory_mb / 2)
+    inpainter = load_named(options.model, options.device)
+    stream = StreamConfig(render=RenderConfig(cameras=options.context), memory_mb=options.memory_mb / 2)
+    renderer = Renderer(supply, inpainter, stream, options.device)
     server = Server(LiveServer(RenderService(renderer, supply), config), config, pushes=options.source == "live")
     with server.bound() as address:
         say(f"open {address}/{token_query(options.token)}   (Ctrl-C stops it)")

@@ -88,14 +88,14 @@ def run(options: Options) -> int:
     import torch
 
     from viewmend.cli.console import say
-    from viewmend.inpainting.inpainter import Inpainter
-    from viewmend.training.loop import fitting_weights, train
+    from viewmend.inpainting.chain import build
+    from viewmend.training.loop import NETWORKS, fitting_weights, train
 
     start, kind = _start(options)
     recipe = chosen_recipe(options, start)
-    if isinstance(start, Inpainter):
+    if isinstance(start, NETWORKS):
         with torch.device("meta"):
-            wanted = Inpainter(recipe.model)
+            wanted = build(recipe.model)
         fitting, count = len(fitting_weights(wanted, start)), len(wanted.state_dict())
         if 0 < fitting < count:
             say(f"{fitting} of {count} tensors begin as {options.start or 'small'} has them, the others at random")
@@ -112,13 +112,13 @@ def run(options: Options) -> int:
 def _start(options: Options) -> "tuple[nn.Module | None, type[Run]]":
     """What to begin with, and what kind of run it is."""
     from viewmend.baselines.published import NETWORKS, load_baseline
-    from viewmend.inpainting.checkpoint import load_inpainter
+    from viewmend.inpainting.checkpoint import load_network
     from viewmend.training.baseline_run import BaselineRun
     from viewmend.training.loop import Run
 
     name = options.start or ("small" if options.recipe in ("small", "finetune") else None)
     if options.recipe not in NETWORKS:
-        return load_inpainter(name) if name is not None else None, Run
+        return load_network(name) if name is not None else None, Run
     weights = "" if name == "pretrained" else f"@{name}"
     return load_baseline(options.recipe, weights) if name is not None else None, BaselineRun
 
@@ -131,10 +131,10 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     """
     from viewmend.baselines.published import NETWORKS
     from viewmend.cli.checks import check_device, check_people
-    from viewmend.inpainting.inpainter import Inpainter
     from viewmend.training.baseline_run import baseline_recipe
+    from viewmend.training.loop import NETWORKS as OURS
     from viewmend.training.plan import DataPlan
-    from viewmend.training.recipes import RECIPES
+    from viewmend.training.recipes import RECIPES, for_model
 
     networks = {name: partial(baseline_recipe, name, started=start is not None) for name in NETWORKS}
     recipes = RECIPES | networks
@@ -160,8 +160,8 @@ def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
     )
     recipe = recipes[options.recipe](data)
     recipe = replace(recipe, data=replace(recipe.data, cameras=options.cameras or recipe.data.cameras))
-    if options.recipe == "finetune" and isinstance(start, Inpainter):
-        recipe = replace(recipe, model=start.config, data=replace(recipe.data, rays=start.config.rays))
+    if options.recipe == "finetune" and isinstance(start, OURS):
+        recipe = replace(recipe, model=start.config, data=for_model(start.config, recipe.data))
     loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
     own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "bfloat16", "part", "checkpoint_every")
     values = {n: getattr(options, n) for n in (*own, "validate_every", "varied", "size_px")}

@@ -9,8 +9,8 @@ import torch
 
 from viewmend.evaluation.cells import Cell
 from viewmend.evaluation.frame_scores import Scores
-from viewmend.evaluation.methods import REFERENCE
 from viewmend.evaluation.scorers import KINDS
+from viewmend.methods import REFERENCE
 from viewmend.metrics.vfid import frechet_distance
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 

@@ -16,11 +16,11 @@ from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import read_rgb, write_image
 from viewmend.evaluation.film import FILM_FRAMES, Picture, frames_of
 from viewmend.evaluation.frame_scores import FrameScores
-from viewmend.evaluation.methods import identity, make_method
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scorers import KINDS, Features
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
+from viewmend.methods import identity, make_method
 
 PROTOCOL = 1
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
@@ -169,7 +169,7 @@ class CellStore:
 
 def cell_keys(scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
-    rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.pipeline), settings.ssim]
+    rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
     scene_digest = _digest([*rules, *settings.networks])
     return tuple(
         CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 from viewmend.evaluation.averages import CellScores, Table, average_cell, tables, tables_by_kind
 from viewmend.evaluation.cells import PROTOCOL, Cell
-from viewmend.evaluation.methods import REFERENCE
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import SLOW_MS, RunSettings
+from viewmend.methods import REFERENCE
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 
 RULES = (

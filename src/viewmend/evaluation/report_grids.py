@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from viewmend.evaluation.averages import MeanScores, Row, Table
-from viewmend.evaluation.methods import PRIVILEGED, REFERENCE
 from viewmend.evaluation.report import Report
+from viewmend.methods import PRIVILEGED, REFERENCE
 
 COLUMNS = (
     ("holes, dB", "psnr_holes", 1, 2),
@@ -41,7 +41,7 @@ def setting_lines(report: Report) -> list[str]:
     settings = report.settings
     lines = [
         f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
-        f"{settings.pipeline.render.cameras} closest cameras; SSIM {settings.ssim}."
+        f"{settings.stream.render.cameras} closest cameras; SSIM {settings.ssim}."
     ]
     return lines + [
         f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "

@@ -1,7 +1,6 @@
 """A report as Markdown tables."""
 
 from viewmend.evaluation.averages import Table
-from viewmend.evaluation.methods import REFERENCE
 from viewmend.evaluation.report import RULES, Report
 from viewmend.evaluation.report_grids import (
     Grid,
@@ -13,6 +12,7 @@ from viewmend.evaluation.report_grids import (
     scenes_grid,
     setting_lines,
 )
+from viewmend.methods import REFERENCE
 
 
 def markdown(report: Report) -> str:

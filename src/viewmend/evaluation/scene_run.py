@@ -8,17 +8,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.baselines.classical import Unfilled
 from viewmend.baselines.rgvi import SeesTruth
 from viewmend.contact_sheet import picture
 from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
 from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
-from viewmend.evaluation.methods import make_method
 from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
-from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.inpainting.protocol import State, ViewInpainter
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
+from viewmend.methods import make_method
 from viewmend.metrics.image_quality import SsimWindow
-from viewmend.pipeline import Observation, PipelineConfig, StreamState, complete_view, observe, view_of
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.observation import Observation
+from viewmend.stream import Stream, StreamConfig, StreamView
+from viewmend.views import IncompleteView
 
 SLOW_MS = 10_000.0
 """A stream's first step that takes so long is not run again: what is compiled in it is little of that."""
@@ -31,7 +33,7 @@ class RunSettings:
     device: str = "cpu"
     precision: str = "float32"
     """Of our networks: float32, or bfloat16 by autocast."""
-    pipeline: PipelineConfig = field(default_factory=PipelineConfig)
+    stream: StreamConfig = field(default_factory=lambda: StreamConfig(memory_mb=None))
     """Hull and renderer, the same for every method."""
     ssim: SsimWindow = "gaussian"
     """Over which windows SSIM is taken."""
@@ -106,12 +108,11 @@ def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: Ru
 
 
 def _moments(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Moment]:
-    config, most, last = settings.pipeline, -1, None
+    most, last, stream = -1, None, Stream(Unfilled(), settings.stream)
     for frame in scene.frames(settings.device):
-        camera = frame.truth.cameras
-        observation = observe(frame.inputs, frame.bounds, config)
-        chosen = () if last is None else last.view.source_views
-        view, _ = view_of(observation, camera, config, chosen)
+        stream.bounds = frame.bounds
+        observation = stream.push(frame.inputs)
+        view = stream.render(frame.truth.cameras)
         holes = int((view.error > 0).sum())
         last = _Moment(observation, view, true_view(frame.truth, frame.backward_flow_px), last, holes > most)
         yield last
@@ -155,7 +156,8 @@ class _Stream:
         self._scorers = scorers
         self._error: str | None = None
         self._inpainter: ViewInpainter | None = None
-        self._state: StreamState | None = None
+        self._stream: Stream | None = None
+        self._viewer: State | None = None
         self._last: Float[Tensor, "3 height width"] | None = None
         self._scores: list[FrameScores] = []
         self._picture: Picture | None = None
@@ -172,30 +174,34 @@ class _Stream:
             self._error = _said(error)
 
     def _step(self, moment: _Moment) -> None:
-        view, config = moment.view, self.settings.pipeline
-        if self._inpainter is None or self._state is None:
-            self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
-            self._state = StreamState(self._inpainter.initial_state())
-        # Depths that other methods asked for would be free for this one, and times depend on the list of methods.
-        mended = complete_view(view, moment.observation.with_own_cache(), self._state, self._inpainter, config)
-        if not self._scores and mended.stage_ms.inpainting < SLOW_MS:
-            mended = complete_view(view, moment.observation.with_own_cache(), self._state, self._inpainter, config)
+        view = moment.view
+        mended = self._mend(moment)
+        if not self._scores and mended.times.inpainting < SLOW_MS:
+            mended = self._mend(moment)
         rgb, before = mended.completed.rgb, None
         _check(rgb, view)
         if moment.before is not None and self._last is not None:
             before = Before(self._last, moment.before.truth.rgb, moment.before.view.error)
-        completed = CompletedView(view, rgb)
-        self._scores.append(score_frame(completed, moment.truth, before, mended.stage_ms.inpainting, self._scorers))
+        ms = mended.times.context + mended.times.inpainting
+        self._scores.append(score_frame(mended.completed, moment.truth, before, ms, self._scorers))
         self._videos.add(rgb, view.error > 0)
         if len(self._frames) < FILM_FRAMES:
             self._frames.append(picture(rgb))
-        self._state, self._last = mended.state, rgb
+        self._viewer, self._last = mended.viewer, rgb
         if isinstance(self._inpainter, SeesTruth):
-            self._state = replace(
-                mended.state, inpainter=self._inpainter.shown(mended.state.inpainter, moment.truth.rgb)
-            )
+            self._viewer = self._inpainter.shown(mended.viewer, moment.truth.rgb)
         if moment.largest:
             self._picture = picture(rgb)
+
+    def _mend(self, moment: _Moment) -> StreamView:
+        """The view, by a stream of the method's own, so that it pays for what it asks for beyond the rendering."""
+        if self._inpainter is None:
+            self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
+        if self._stream is None or not self._scores:
+            self._stream = Stream(self._inpainter, self.settings.stream)
+        observation = self._stream.push(moment.observation.frame, moment.observation.proxy)
+        observation.depths.update(moment.observation.depths)
+        return self._stream.mend(moment.view, self._viewer)
 
     def run(self, box: Box | None) -> MethodRun:
         """What came out; `box` is what its film shows."""

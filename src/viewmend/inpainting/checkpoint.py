@@ -7,11 +7,15 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from viewmend.atomic_writes import write_atomically, write_tensors
+from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.config import InpainterConfig
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.network import set_compute_dtype
+from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
 
-FORMAT = 1
-"""Grows when an older program could no longer read what is written."""
+FORMAT = 2
+"""Grows when an older program could no longer read what is written. Format 1, of one network with switches, is read."""
+PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 SHIPPED = Path(__file__).parents[1] / "weights"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 
@@ -37,18 +41,39 @@ def shipped_models() -> tuple[str, ...]:
     return tuple(sorted(p.parent.name for p in SHIPPED.glob(f"*/{WEIGHTS}")))
 
 
-def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu") -> Inpainter:
-    """The inpainter in this folder, or the shipped one of this name, ready to infer.
+def load_inpainter(
+    name_or_path: str | Path, device: torch.device | str = "cpu", precision: str = "float32"
+) -> Chain | PatchTransformer | TemporalAccumulation:
+    """The inpainter in this folder, or the shipped one of this name, ready for `Stream`.
+
+    Args:
+        name_or_path: a name of `shipped_models()`, or a folder that `save_inpainter` wrote.
+        device: where it computes.
+        precision: what its layers compute in: float32, or bfloat16 by autocast.
 
     Raises:
         MissingCheckpointError: there is no such folder or name, or a file of it is missing.
         DamagedCheckpointError: a file is unreadable or cut short.
         MismatchedCheckpointError: weights and config do not belong together.
+        ValueError: no such precision.
     """
+    if precision not in PRECISIONS:
+        raise ValueError(f"expected --precision float32 or bfloat16, got '{precision}'")
+    network = load_network(name_or_path, device)
+    set_compute_dtype(network, PRECISIONS[precision])
+    weight = network.config.temporal_accumulation
+    return TemporalAccumulation(network, weight) if weight else network
+
+
+def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -> Chain | PatchTransformer:
+    """The networks alone, without temporal accumulation, in evaluation mode. Raises as `load_inpainter` does."""
     folder = _folder(name_or_path)
-    inpainter = Inpainter(_read_config(folder / CONFIG))
+    version, config = _read_config(folder / CONFIG)
+    network = build(config)
     weights = _read_weights(folder / WEIGHTS, str(device))
-    expected = inpainter.state_dict()
+    if version == 1 and isinstance(network, Chain):
+        weights = {_renamed(key): weight for key, weight in weights.items()}
+    expected = network.state_dict()
     missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
     reshaped = [
         f"{key} {tuple(weights[key].shape)} for {tuple(expected[key].shape)}"
@@ -60,21 +85,27 @@ def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu")
             f"{folder / WEIGHTS}: expected the weights of {CONFIG} beside it, got missing {missing[:3]}, "
             f"unknown {unknown[:3]}, of another shape {reshaped[:3]}; use the {CONFIG} that was saved with them"
         )
-    inpainter.load_state_dict(weights)
-    return inpainter.to(device).eval()
+    network.load_state_dict(weights)
+    return network.to(device).eval()
 
 
-def save_inpainter(inpainter: Inpainter, folder: str | Path, card: str) -> None:
+def save_inpainter(network: Chain | PatchTransformer, folder: str | Path, card: str) -> None:
     """Writes the three files; each is whole or not there, also when the machine stops halfway.
 
     `card` is the model card in Markdown: what trained the model and what it scores.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"viewmend_format": FORMAT} | inpainter.config.to_dict()
+    config = {"viewmend_format": FORMAT} | network.config.to_dict()
     write_atomically(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
     write_atomically(folder / CARD, lambda path: path.write_text(card))
-    write_tensors(folder / WEIGHTS, inpainter.state_dict(), {"format": "pt"})
+    write_tensors(folder / WEIGHTS, network.state_dict(), {"format": "pt"})
+
+
+def _renamed(key: str) -> str:
+    """A weight of format 1 by its name within a `Chain`."""
+    reader = "ray_reader."
+    return f"coarse.{key.removeprefix(reader)}" if key.startswith(reader) else f"patches.{key}"
 
 
 def _folder(name_or_path: str | Path) -> Path:
@@ -93,18 +124,18 @@ def _folder(name_or_path: str | Path) -> Path:
     return folder
 
 
-def _read_config(path: Path) -> InpainterConfig:
+def _read_config(path: Path) -> tuple[int, InpainterConfig]:
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise DamagedCheckpointError(f"{path}: expected JSON, got {error}; copy the file again") from error
     version = values.pop("viewmend_format", None) if isinstance(values, dict) else None
-    if version != FORMAT:
+    if version not in (1, FORMAT):
         raise MismatchedCheckpointError(
-            f"{path}: expected viewmend_format {FORMAT}, got {version}; use the version of viewmend that wrote it"
+            f"{path}: expected viewmend_format 1 or {FORMAT}, got {version}; use the version of viewmend that wrote it"
         )
     try:
-        return InpainterConfig.from_dict(values)
+        return version, InpainterConfig.from_dict(values)
     except (TypeError, ValueError) as error:
         raise MismatchedCheckpointError(f"{path}: {error}") from error
 

@@ -1,16 +1,67 @@
-"""A first guess for the holes, from the colours around them. Ours."""
+"""Coarse fills: what holes are filled with before the patch transformer; here, smoothly from around them. Ours."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.inpainting.decoder import blend
+from viewmend.inpainting.network import Network
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
+from viewmend.views import CompletedView, ContextViews, IncompleteView
+
+MARGIN_PX = 8
 REACH_PX = 2
 """How far the edge of a hole is from what it is filled from."""
 THIN_PX = 2 * REACH_PX + 1
 """A hole is thin where no square of this side fits in."""
+
+
+class CoarseFill(Network):
+    """A fill of whole images that keeps known pixels; on its own, an inpainter without a state."""
+
+    num_ray_views = 0
+    """Cameras at the view's own time that it looks at."""
+
+    def forward(
+        self, views: Sequence[IncompleteView], ray_views: Sequence[ContextViews | None]
+    ) -> list[Float[Tensor, "3 _h _w"]]:
+        """The views' images with all missing pixels filled; known pixels stay bit for bit."""
+        raise NotImplementedError
+
+    def ray_views(self, view: IncompleteView, context: ContextProvider) -> ContextViews | None:
+        """The source views and the closest others, at the view's own time; None where it looks at none."""
+        names = view.closest_views(self.num_ray_views)
+        return context(view.time, names) if names else None
+
+    def crop_margin_px(self, quality: RenderQuality) -> int:
+        """More than a fill looks around itself: a crop's border does to it what the black of the view would."""
+        return MARGIN_PX
+
+    def initial_state(self) -> State:
+        """The state before the first view of a stream."""
+        return State()
+
+    @torch.no_grad()
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+        """The view with its holes filled; a view without holes comes back at once."""
+        if not bool((view.error > 0).any()):
+            return CompletedView(view, view.rgb), state
+        filled = self([view], [self.ray_views(view, context)])[0].float()
+        return CompletedView(view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask))), state
+
+
+class SmoothFill(CoarseFill):
+    """`fill` on its own: from the surroundings, no camera is looked at."""
+
+    def forward(
+        self, views: Sequence[IncompleteView], ray_views: Sequence[ContextViews | None]
+    ) -> list[Float[Tensor, "3 _h _w"]]:
+        """The views' images with all missing pixels filled; known pixels stay bit for bit."""
+        return [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
 
 
 def fill(

@@ -38,20 +38,18 @@ class InpainterConfig:
     rope_values: bool = False
     """Rotate values by the offset between context patch and query as well, so that what is copied knows how far
     it must shift. Ours."""
-    colour_path: bool = False
+    colour_skip: bool = False
     """Let patches carry their colours at 1/4 besides their features, as waves that start out as a copy. Ours."""
-    prefill: bool = False
-    """Fill the holes smoothly from their surroundings first: the encoder is shown the fill instead of black, the
-    decoder the view's own pixels, and it decides pixel by pixel how much of the fill to replace. Ours."""
-    rays: int = 0
-    """Read that first fill from this many cameras at the view's own time, pixel by pixel along its ray: the chosen
-    ones, then the closest others. 0: fill from the surroundings alone. Ours."""
-    steady: float = 0.0
-    """How much of a stream's last fill, carried by the proxy, is kept where the new one hardly differs. Ours."""
+    coarse_fill: Literal["none", "smooth", "rays"] = "none"
+    """What fills the holes before the patch transformer: nothing (the paper's), a smooth fill from the surroundings, or
+    `RayBlendNet`. The encoder is shown the coarse fill instead of black, the decoder the view's own pixels, and it
+    decides pixel by pixel how much of the fill to replace. Ours."""
+    num_ray_views: int = 8
+    """Cameras at the view's own time that `RayBlendNet` looks at: the source views, then the closest others."""
+    temporal_accumulation: float = 0.0
+    """Weight of a stream's last fill, carried by the proxy, where the new one hardly differs; 0 to below 1. Ours."""
     top_k: int | None = None
     """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
-    attention_scale: Literal["model", "head"] = "model"
-    """Scores are divided by the root of D ("model", the paper's formula) or of a head's channels."""
     context_cameras: int | None = None
     """How many cameras are context, whatever number coloured the view; None: those that did."""
     past_geometry: Literal["own", "current"] = "own"
@@ -62,14 +60,14 @@ class InpainterConfig:
     """Frames further back."""
     k_w: int = 10
     """Spacing of the frames further back."""
-    grid: Literal["relative", "absolute"] = "relative"
-    """Frames further back are t - k_w j (the paper's), or multiples of k_w (fewer to remember)."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
-        positive = {n: getattr(self, n) for n in ("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w")}
+        positive = {
+            n: getattr(self, n) for n in ("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w", "num_ray_views")
+        }
         wrong = [f"{n} = {v}" for n, v in positive.items() if v < 1]
-        wrong += [f"{n} = {getattr(self, n)}" for n in ("n_c", "n_w", "rays") if getattr(self, n) < 0]
+        wrong += [f"{n} = {getattr(self, n)}" for n in ("n_c", "n_w") if getattr(self, n) < 0]
         if wrong:
             raise ValueError(f"expected positive sizes, got {', '.join(wrong)}")
         if self.dim % (16 * self.heads):
@@ -79,10 +77,10 @@ class InpainterConfig:
             )
         if len(self.widths) != len(ENCODER_GROUPS) or any(w % 8 for w in self.widths):
             raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
-        if not 0 <= self.steady < 1:
-            raise ValueError(f"expected steady from 0 to below 1, got {self.steady}")
-        if self.rays and not self.prefill:
-            raise ValueError(f"expected prefill with rays (they make the fill), got rays {self.rays} without")
+        if not 0 <= self.temporal_accumulation < 1:
+            raise ValueError(f"expected temporal_accumulation from 0 to below 1, got {self.temporal_accumulation}")
+        if self.coarse_fill not in ("none", "smooth", "rays"):
+            raise ValueError(f"expected coarse_fill none, smooth or rays, got '{self.coarse_fill}'")
         for name in ("top_k", "context_cameras"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"expected {name} of at least 1 or none, got {value}")
@@ -95,7 +93,7 @@ class InpainterConfig:
     @property
     def patch_channels(self) -> int:
         """Channels of the map that is cut into patches."""
-        return self.widths[-1] + self.in_channels * self.colour_path
+        return self.widths[-1] + self.in_channels * self.colour_skip
 
     @property
     def total_blocks(self) -> int:
@@ -115,18 +113,39 @@ class InpainterConfig:
     def from_dict(cls, values: dict[str, Any]) -> "InpainterConfig":
         """Inverse of `to_dict`; what a config does not name yet has its default, which is as it was before.
 
+        Names of earlier versions (`prefill`, `rays`, `steady`, `colour_path`) are read as what they are called now.
+
         Raises:
             ValueError: a key is unknown, or a value is impossible.
         """
+        values = _renamed(values)
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise ValueError(
                 f"expected the keys of InpainterConfig, unknown {unknown}; was this written by a newer version?"
             )
-        values = dict(values)
         if "widths" in values:
             values["widths"] = tuple(values["widths"])
         return cls(**values)
+
+
+def _renamed(values: dict[str, Any]) -> dict[str, Any]:
+    """The values by the names of today.
+
+    Raises:
+        ValueError: a switch that is gone was not at its default.
+    """
+    values = dict(values)
+    for name, only in (("attention_scale", "model"), ("grid", "relative")):
+        if values.pop(name, only) != only:
+            raise ValueError(f"expected {name} '{only}', the only one left, got another; train the model anew")
+    for old, new in (("colour_path", "colour_skip"), ("steady", "temporal_accumulation")):
+        if old in values:
+            values[new] = values.pop(old)
+    rays = values.pop("rays", 0)
+    if values.pop("prefill", False):
+        values |= {"coarse_fill": "rays", "num_ray_views": rays} if rays else {"coarse_fill": "smooth"}
+    return values
 
 
 def paper() -> InpainterConfig:
@@ -145,13 +164,14 @@ def small() -> InpainterConfig:
         heads=4,
         rope_unit="patch",
         rope_values=True,
-        colour_path=True,
-        prefill=True,
-        rays=8,
-        steady=0.7,
+        colour_skip=True,
+        coarse_fill="rays",
+        temporal_accumulation=0.7,
     )
 
 
 def base() -> InpainterConfig:
     """The paper's widths with all of our additions, 35 M parameters: for a data-centre GPU."""
-    return InpainterConfig(rope_unit="patch", rope_values=True, colour_path=True, prefill=True, rays=8, steady=0.7)
+    return InpainterConfig(
+        rope_unit="patch", rope_values=True, colour_skip=True, coarse_fill="rays", temporal_accumulation=0.7
+    )

@@ -1,8 +1,6 @@
 """What an inpainter remembers of the input cameras (sections 2 and 9)."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -52,47 +50,11 @@ class ContextFrame:
         return unproject(self.uv_px[None], z[None], self.camera)[0], z > 0
 
 
-@dataclass(frozen=True)
-class ContextCache:
-    """The frames that a stream may still need. A value: `add` gives a new one."""
-
-    frames: Mapping[tuple[str, int], ContextFrame] = field(default_factory=lambda: MappingProxyType({}))
-    """By camera name and time."""
-
-    def add(self, frames: Iterable[ContextFrame], time: int, config: InpainterConfig) -> "ContextCache":
-        """The cache at `time` with these frames, without those that no later view can ask for, nor later ones."""
-        merged = dict(self.frames) | {(f.name, f.time): f for f in frames}
-        kept = {key: f for key, f in merged.items() if _still_wanted(f.time, time, config)}
-        return ContextCache(MappingProxyType(kept))
-
-    def find(self, names: Sequence[str], times: Sequence[int]) -> tuple[ContextFrame, ...]:
-        """The frames at hand of these cameras and times, in that order."""
-        keys = [(name, time) for time in times for name in names]
-        return tuple(self.frames[key] for key in keys if key in self.frames)
-
-    def missing(self, names: Sequence[str], time: int) -> tuple[str, ...]:
-        """The cameras whose frame at `time` is not at hand."""
-        return tuple(name for name in names if (name, time) not in self.frames)
-
-
 def window_times(time: int, config: InpainterConfig) -> tuple[int, ...]:
-    """The times whose frames are the context of a view at `time`, latest first; none before 0.
+    """The times whose frames are the context of a view at `time`, latest first; none before 0 (section 2).
 
-    `time` itself, the n_c before it, and n_w further back: time - k_w j, or the latest multiples of k_w before
-    those n_c ("absolute").
+    `time` itself, the n_c before it, and t - k_w j for j from 1 to n_w.
     """
     near = range(time, time - config.n_c - 1, -1)
-    if config.grid == "relative":
-        far = [time - config.k_w * j for j in range(1, config.n_w + 1)]
-    else:
-        latest = (time - config.n_c - 1) // config.k_w
-        far = [config.k_w * (latest - j) for j in range(config.n_w)]
+    far = (time - config.k_w * j for j in range(1, config.n_w + 1))
     return tuple(sorted({t for t in (*near, *far) if t >= 0}, reverse=True))
-
-
-def _still_wanted(frame_time: int, time: int, config: InpainterConfig) -> bool:
-    """Whether a view at `time` or later may ask for a frame of `frame_time`."""
-    age = time - frame_time
-    if config.grid == "relative":
-        return 0 <= age <= config.window
-    return frame_time in window_times(time, config)

@@ -20,7 +20,7 @@ class Decoder(nn.Module):
         C = config.widths[-1]
         self.norm = nn.LayerNorm(config.dim)
         self.features = C
-        self.linear = nn.Linear(config.dim, (C + 3 * config.colour_path) * PATCH_CELLS**2)
+        self.linear = nn.Linear(config.dim, (C + 3 * config.colour_skip) * PATCH_CELLS**2)
         self.layers = nn.Sequential(
             nn.LeakyReLU(SLOPE),
             nn.ConvTranspose2d(C, C, 4, 2, 1),
@@ -28,23 +28,23 @@ class Decoder(nn.Module):
             nn.ConvTranspose2d(C, C // 2, 4, 2, 1),
             nn.LeakyReLU(SLOPE),
         )
-        self.prefill = config.prefill
-        self.mix = _mix(C // 2 + config.in_channels, C // 2) if config.prefill else None
-        self.last = last = nn.Conv2d(C // 2, 3 + config.prefill, 3, 1, 1)
+        self.refines = config.coarse_fill != "none"
+        self.mix = _mix(C // 2 + config.in_channels, C // 2) if self.refines else None
+        self.last = last = nn.Conv2d(C // 2, 3 + self.refines, 3, 1, 1)
         for layer in (*self.layers, self.last):
             if isinstance(layer, nn.ConvTranspose2d):
                 # Each output pixel sees a quarter of the 4 x 4 kernel's taps.
                 nn.init.normal_(layer.weight, 0, (2 / (layer.in_channels * 4)) ** 0.5)
             if isinstance(layer, nn.ConvTranspose2d | nn.Conv2d) and layer.bias is not None:
                 nn.init.zeros_(layer.bias)
-        if config.colour_path:
+        if config.colour_skip:
             # Detail starts small upon the colours that are copied.
             last.weight.data.mul_(0.1)
 
     def forward(
         self, tokens: Float[Tensor, "patch dim"], pixels: Float[Tensor, "patch channel 28 28"]
     ) -> Float[Tensor, "patch output 28 28"]:
-        """RGB patches, about [0, 1] but not clamped; with `prefill` a fourth channel, 0 to 1: how much they replace.
+        """RGB patches, about [0, 1] but not clamped; upon a coarse fill also how much of it they replace, 0 to 1.
 
         `pixels` is what the encoder was shown of the patches; the paper's decoder does not look at it.
         """
@@ -56,7 +56,7 @@ class Decoder(nn.Module):
         rgb = out[:, :3]
         if cells.shape[1] > self.features:
             rgb = rgb + nn.functional.interpolate(cells[:, self.features :], size=PATCH_PX, mode="bilinear")
-        return torch.cat([rgb, (out[:, 3:] + KEEP).sigmoid()], 1) if self.prefill else rgb
+        return torch.cat([rgb, (out[:, 3:] + KEEP).sigmoid()], 1) if self.refines else rgb
 
 
 def _mix(features: int, width: int) -> nn.Sequential:

@@ -79,7 +79,7 @@ class Tokeniser(nn.Module):
         super().__init__()
         self.encoder = Encoder(config)
         self.linear = nn.Linear(config.patch_channels * PATCH_CELLS**2, config.dim)
-        self.colour_path = config.colour_path
+        self.colour_skip = config.colour_skip
         self.norm = nn.LayerNorm(config.dim)
 
     def forward(self, stacks: Sequence[Images]) -> Float[Tensor, "patch dim"]:
@@ -108,6 +108,6 @@ class Tokeniser(nn.Module):
             places.append(torch.cat([torch.full_like(local[:, :1], number), local], 1))
         batch = torch.stack(windows)
         features = self.encoder(batch)
-        if self.colour_path:
+        if self.colour_skip:
             features = torch.cat([features, nn.functional.avg_pool2d(batch, CELL_PX).to(features)], 1)
         return split(features, torch.cat(places), PATCH_CELLS, STEP_CELLS)

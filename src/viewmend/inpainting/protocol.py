@@ -1,25 +1,103 @@
 """What every inpainter of views obeys, ours and the baselines: state is passed, not hidden."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
-from viewmend.inpainting.context import ContextCache
-from viewmend.inpainting.temporal_accumulation import LastView
+from viewmend.own_pages import to_own_pages
+from viewmend.timing import ms_since, now_s
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
-Source = Callable[[int, tuple[str, ...]], ContextViews | None]
-"""source(time, names): these cameras at that time with the proxy's depth; fewer where some have no frame, None where
+ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]
+"""views(time, names): these cameras at that time with the proxy's depth; fewer where some have no frame, None where
 none has."""
+Memory = dict[str, Any]
+"""What was encoded of one time, by camera name."""
+REMEMBERED_TIMES = 34
+"""Times that a provider with a memory of its own keeps: the view's own, and k_w n_w + n_c before it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderQuality:
+    """How much work one view may cost; the default is all that the model was trained with."""
+
+    mend: bool = True
+    """False leaves the holes as they are rendered."""
+    top_k: int | None = None
+    """Context tokens that survive pruning; None takes the model's own."""
+    context_times: int | None = None
+    """How many times of the window are context, the latest first (1: the view's own alone); None takes all. With 0
+    no camera image is encoded: a model with a coarse fill shows that alone, others have but the view's own patches."""
+
+
+class ContextProvider:
+    """What the cameras saw, for an inpainter to ask for; and what was encoded of it, for later views to find.
+
+    `provider(time, names)` gives these cameras at that time, or None. Whoever runs one stream by `step` alone makes one
+    provider for all of its views; `viewmend.Stream` makes one for each view, upon a memory that all viewers share.
+    """
+
+    def __init__(
+        self,
+        views: ViewsAt,
+        quality: RenderQuality | None = None,
+        exclude: Sequence[str] = (),
+        memory: Callable[[int], Memory] | None = None,
+    ) -> None:
+        """Provide views.
+
+        Args:
+            views: what the cameras saw, by time and names.
+            quality: what the view may cost.
+            exclude: names of cameras that nobody may look at.
+            memory: what was encoded of a time; by default the provider remembers the times about the last one itself.
+        """
+        self.quality = quality or RenderQuality()
+        self.encoding_ms = 0.0
+        """What `encoded` took so far."""
+        self._views = views
+        self._exclude = frozenset(exclude)
+        self._own: dict[int, Memory] = {}
+        self._memory = memory or self._remembered
+
+    def __call__(self, time: int, names: Sequence[str]) -> ContextViews | None:
+        """These cameras at this time; fewer where some have no frame or are excluded, None where none is left."""
+        names = tuple(name for name in names if name not in self._exclude)
+        return self._views(time, names) if names else None
+
+    def encoded(
+        self,
+        times: Sequence[int],
+        names: Sequence[str],
+        encode: Callable[[list[ContextViews]], Sequence[Sequence[Any]]],
+    ) -> list[Any]:
+        """What `encode` made of each of these cameras at each of these times, as far as they have frames.
+
+        `encode` is called once, with all that no view needed before; it gives one result per camera of each element.
+        """
+        names = [name for name in names if name not in self._exclude]
+        memories = {time: self._memory(time) for time in times}
+        absent = [self(time, [n for n in names if n not in memory]) for time, memory in memories.items()]
+        fresh = [views for views in absent if views is not None and len(views.frame.cameras)]
+        if fresh:
+            device = fresh[0].depth.device
+            start = now_s(device)
+            for views, results in zip(fresh, encode(fresh), strict=True):
+                pairs = zip(views.frame.cameras.names, results, strict=True)
+                memories[views.frame.time].update({name: to_own_pages(result) for name, result in pairs})
+            self.encoding_ms += ms_since(start, device)
+        return [memory[name] for memory in memories.values() for name in names if name in memory]
+
+    def _remembered(self, time: int) -> Memory:
+        memory = self._own.setdefault(time, {})
+        if len(self._own) > REMEMBERED_TIMES:
+            del self._own[max(self._own, key=lambda other: abs(other - time))]
+        return memory
 
 
 @dataclass(frozen=True)
 class State:
-    """What a stream carries from one step to the next; a fresh one starts a stream. Never changed in place."""
-
-    cache: ContextCache = field(default_factory=ContextCache)
-    last: LastView | None = None
-    """The last view, where `steady` looks at it."""
+    """What an inpainter carries from one view of a stream to the next: of its own kind, never changed in place."""
 
 
 @runtime_checkable
@@ -30,9 +108,18 @@ class ViewInpainter(Protocol):
         """The state before the first view of a stream."""
         ...
 
-    def step(self, view: IncompleteView, source: Source, state: State) -> tuple[CompletedView, State]:
+    def step(self, view: IncompleteView, context: ContextProvider, state: Any, /) -> tuple[CompletedView, State]:
         """The completed view and the state for the next; only pixels with E > 0 may change.
 
-        `source` is asked for no time later than the view's own.
+        `context` is asked for no time later than the view's own. `state` is what this inpainter gave before.
         """
         ...
+
+
+def crop_margin_px(inpainter: ViewInpainter, quality: RenderQuality) -> int | None:
+    """How far around the subject a view matters to what fills it, pixels; None where the whole view does.
+
+    An inpainter tells by a method of this name; one without is given whole views.
+    """
+    own = getattr(inpainter, "crop_margin_px", None)
+    return None if own is None else own(quality)

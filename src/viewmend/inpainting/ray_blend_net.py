@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.inpainting.coarse_fill import fill
+from viewmend.inpainting.coarse_fill import CoarseFill, fill
 from viewmend.inpainting.ray_sampling import (
     CELL_CHANNELS,
     CELLS,
@@ -71,11 +71,12 @@ class RayInputs(NamedTuple):
         return RayInputs(*(torch.cat(values) for values in zip(*whole, strict=True)))
 
 
-class RayBlendNet(nn.Module):
+class RayBlendNet(CoarseFill):
     """Weighs the candidates of each missing pixel."""
 
-    def __init__(self, width: int = 32) -> None:
+    def __init__(self, num_ray_views: int = 8, width: int = 32) -> None:
         super().__init__()
+        self.num_ray_views = num_ray_views
         points = len(OFFSETS)
         self.look = nn.Sequential(nn.Linear(RAY_CHANNELS, width), nn.GELU())
         self.compare = nn.Sequential(
@@ -107,21 +108,20 @@ class RayBlendNet(nn.Module):
     def forward(
         self,
         views: Sequence[IncompleteView],
-        nearby: Sequence[ContextViews | None],
+        ray_views: Sequence[ContextViews | None],
         pixels: Sequence[Int[Tensor, "_pixel 2"]] | None = None,
     ) -> list[Float[Tensor, "3 _h _w"]]:
         """The views' images with all missing pixels filled; known pixels stay bit for bit.
 
         Args:
             views: of any sizes.
-            nearby: cameras at each view's own time; None where there are none, then the surroundings decide alone.
+            ray_views: cameras at each view's own time; None where there are none, then the surroundings decide alone.
             pixels: read these (row, column) alone, and keep the smooth guess elsewhere; None for all that are missing.
         """
         guesses = [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
         if pixels is None:
             pixels = [torch.nonzero((view.error > 0) & (view.depth > 0).any()) for view in views]
-        with torch.autocast(guesses[0].device.type, enabled=False):  # coordinates stay float32
-            seen = [look_around(*own) for own in zip(views, nearby, pixels, guesses, strict=True)]
+        seen = [look_around(*own) for own in zip(views, ray_views, pixels, guesses, strict=True)]
         read = self.mix(RayInputs.cat(seen)).split([len(p) for p in pixels])
         return [
             guess.movedim(0, -1).index_put(tuple(at.unbind(1)), rgb).movedim(-1, 0)
@@ -131,10 +131,11 @@ class RayBlendNet(nn.Module):
     def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         size = max(1, len(told.place)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
-        far = [self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.surroundings.split(size)]
-        per_pixel = (told.features, told.consistency, told.window, torch.cat(far)[told.place])
-        parts = (values.split(size) for values in per_pixel)
-        return torch.cat([self._mix(*part) for part in zip(*parts, strict=True)])
+        with self.autocast():
+            far = [self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in told.surroundings.split(size)]
+            per_pixel = (told.features, told.consistency, told.window, torch.cat(far)[told.place])
+            parts = (values.split(size) for values in per_pixel)
+            return torch.cat([self._mix(*part) for part in zip(*parts, strict=True)])
 
     def _mix(
         self,

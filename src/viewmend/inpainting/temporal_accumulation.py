@@ -8,11 +8,12 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project, unproject
-from viewmend.views import CompletedView
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, crop_margin_px
+from viewmend.views import CompletedView, IncompleteView
 
 STALE = 3
 """Views of more than so many frames ago are not looked at."""
@@ -40,16 +41,51 @@ class LastView:
         return cls(view.camera, completed.rgb, view.depth, view.time)
 
 
-def steadied(completed: CompletedView, last: LastView | None, share: float) -> CompletedView:
+@dataclass(frozen=True)
+class AccumulationState(State):
+    """The inner inpainter's state, and the stream's last view."""
+
+    inner: State
+    last: LastView | None = None
+
+
+class TemporalAccumulation(nn.Module):
+    """An inpainter whose fills are averaged with those of its stream's last view, where both agree."""
+
+    def __init__(self, inner: ViewInpainter, weight: float) -> None:
+        """Wrap `inner`; `weight`, in [0, 1), is that of a carried fill that agrees."""
+        super().__init__()
+        self.inner, self.weight = inner, weight
+        self.config = getattr(inner, "config", None)
+
+    def crop_margin_px(self, quality: RenderQuality) -> int | None:
+        """The inner inpainter's."""
+        return crop_margin_px(self.inner, quality)
+
+    def initial_state(self) -> AccumulationState:
+        """The state before the first view of a stream."""
+        return AccumulationState(self.inner.initial_state())
+
+    @torch.no_grad()
+    def step(
+        self, view: IncompleteView, context: ContextProvider, state: AccumulationState
+    ) -> tuple[CompletedView, AccumulationState]:
+        """The inner inpainter's view, accumulated."""
+        completed, inner = self.inner.step(view, context, state.inner)
+        shown = accumulate(completed, state.last, self.weight)
+        return shown, AccumulationState(inner, LastView.of(shown))
+
+
+def accumulate(completed: CompletedView, last: LastView | None, weight: float) -> CompletedView:
     """The view, its fill averaged with what `last` showed at the same points; known pixels stay bit for bit.
 
     Args:
         completed: of any camera and size.
         last: the stream's last view; None for its first.
-        share: of a carried fill that agrees, in [0, 1); 0 leaves the view as it is.
+        weight: of a carried fill that agrees, in [0, 1); 0 leaves the view as it is.
     """
     view = completed.view
-    if not share or last is None or not 0 <= view.time - last.time <= STALE:
+    if not weight or last is None or not 0 <= view.time - last.time <= STALE:
         return completed
     if float(last.camera.K[0, 0, 0]) < COARSE * float(view.camera.K[0, 0, 0]):
         return completed
@@ -64,6 +100,6 @@ def steadied(completed: CompletedView, last: LastView | None, share: float) -> C
     now = completed.rgb.movedim(0, -1)[index]
     agree = (-(((before - now) / SAME_COLOUR) ** 2).mean(1)).exp()
     same = (z > 0) & (there > 0) & ((there - z).abs() < SAME_PLACE * z)
-    carried = (share * agree * same * view.error[index])[:, None]
+    carried = (weight * agree * same * view.error[index])[:, None]
     rgb = completed.rgb.movedim(0, -1).index_put(index, torch.lerp(now, before, carried)).movedim(-1, 0)
     return CompletedView(view, rgb)

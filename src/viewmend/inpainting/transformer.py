@@ -58,7 +58,7 @@ class Transformer(nn.Module):
         super().__init__()
         self.config = config
         head_dim = config.dim // config.heads
-        self.scale = (config.dim if config.attention_scale == "model" else head_dim) ** -0.5
+        self.scale = config.dim**-0.5
         self.keys_values = nn.Linear(config.dim, config.total_blocks * 2 * config.dim)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.total_blocks))
         self.register_buffer("score_frequencies", rope.score_frequencies(head_dim), persistent=False)

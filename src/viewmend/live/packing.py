@@ -1,7 +1,7 @@
 """RenderResult views as the binary messages that are sent."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from viewmend.live.pictures import COLOURS, Picture, depth_stride, pack_depth, picture, to_jpeg
@@ -57,13 +57,7 @@ def frame_message(
             part, packed = _depth_part(eye, completed)
             parts.append(part)
             data.append(packed)
-    stage_ms = {
-        "geometry": rendered.geometry_ms,
-        "context": rendered.context_ms,
-        "rendering": rendered.rendering_ms,
-        "inpainting": rendered.inpainting_ms,
-        "encode": 1000 * (time.perf_counter() - start),
-    }
+    stage_ms = asdict(rendered.times) | {"encode": 1000 * (time.perf_counter() - start)}
     stage_ms |= {"wait": info.wait_ms, "total": info.wait_ms + sum(stage_ms.values())}
     first = rendered.completed[0].view
     keys = ("K", "R", "T")
@@ -79,8 +73,8 @@ def frame_message(
         "chosen": list(first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(hole_fraction(rendered.completed[0]), 5),
-        "top_k": ask.effort.top_k,
-        "context_times": ask.effort.context_times,
+        "top_k": ask.quality.top_k,
+        "context_times": ask.quality.context_times,
         "stage_ms": {stage: round(ms, 2) for stage, ms in stage_ms.items()},
         "dropped": info.dropped,
         "parts": parts,

@@ -8,13 +8,13 @@ from typing import Annotated, Generic, Literal, TypeVar
 from msgspec import Meta, Struct
 
 from viewmend.capture.video_writer import VideoWriter
+from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live import protocol
 from viewmend.live.pictures import picture, to_jpeg
 from viewmend.live.poses import view_camera
 from viewmend.live.protocol import Camera, Limits, ProtocolError, read_message
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.sessions import Scene
-from viewmend.stream import RenderQuality, Viewer
 
 MAX_POSES = 900
 Result = TypeVar("Result")
@@ -84,7 +84,7 @@ class RenderJob(Generic[Result]):
     """A session that ends when `done` has its result."""
 
     def __init__(self) -> None:
-        self.viewer: Viewer | None = None
+        self.viewer: State | None = None
         self.done: Future[Result] = Future()
 
     def finish(self, result: Result) -> None:
@@ -136,7 +136,7 @@ class PathJob(RenderJob[bytes]):
 
     def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
-        self.viewer: Viewer | None = rendered.viewer
+        self.viewer: State | None = rendered.viewer
         self._video.add(picture(rendered.completed[0], self._path.mode))
         self._count += 1
         if self._count == len(self._path.poses):

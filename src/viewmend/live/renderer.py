@@ -1,20 +1,17 @@
 """From asks to views: the stream, its rig, and what went wrong, without threads and sockets."""
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.inpainting.inpainter import Inpainter
-from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter
 from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
-from viewmend.live.window import window_of
-from viewmend.pipeline import Observation, PipelineConfig
-from viewmend.stream import RenderQuality, Stream, StreamView, Viewer
-from viewmend.views import CompletedView
+from viewmend.stream import Stream, StreamConfig, StreamView
+from viewmend.timing import StageTimes
+from viewmend.views import CompletedView, MultiViewFrame
 
 WARM_PX = 64
 
@@ -25,7 +22,7 @@ class RenderRequest:
 
     time: int
     cameras: tuple[Cameras, ...]
-    effort: RenderQuality
+    quality: RenderQuality
 
 
 @dataclass(frozen=True)
@@ -34,13 +31,10 @@ class RenderResult:
 
     time: int
     completed: tuple[CompletedView, ...]
-    viewer: Viewer
-    geometry_ms: float
-    """0 where another viewer has paid for it."""
-    context_ms: float
-    """Likewise: encoding camera images."""
-    rendering_ms: float
-    inpainting_ms: float
+    viewer: State
+    """To ask for the next views with."""
+    times: StageTimes
+    """Of all eyes; geometry and context are 0 where another viewer has paid for them."""
 
 
 class NotThereError(Exception):
@@ -54,15 +48,13 @@ class Renderer:
         self,
         supply: FrameSupply,
         inpainter: ViewInpainter,
-        config: PipelineConfig | None = None,
+        config: StreamConfig | None = None,
         device: str = "cpu",
-        memory_mb: float = 1500.0,
     ) -> None:
         self._supply = supply
         self._inpainter = inpainter
-        self._config = config or PipelineConfig()
+        self._config = config or StreamConfig()
         self._device = device
-        self._memory_mb = memory_mb
         self._rig: Rig | None = None
         self._stream: Stream | None = None
         self.frame: RigFrame | None = None
@@ -89,8 +81,8 @@ class Renderer:
         if rig is None or self.is_of(rig):
             return False
         bounds = rig.bounds
-        stream = Stream(self._inpainter, self._config, bounds, self._memory_mb)
-        observation = self._observe(stream, time)[0]
+        stream = Stream(self._inpainter, self._config, bounds)
+        observation = stream.push(self._read(time))
         proxy = observation.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
@@ -103,7 +95,7 @@ class Renderer:
         self._rig, self._stream, self.frame = rig, stream, frame
         return True
 
-    def render(self, ask: RenderRequest, viewer: Viewer | None) -> RenderResult:
+    def render(self, ask: RenderRequest, viewer: State | None) -> RenderResult:
         """The views of all eyes, from one state.
 
         Raises:
@@ -112,53 +104,28 @@ class Renderer:
         """
         if self._stream is None:
             raise NotThereError
-        _, geometry_ms = self._observe(self._stream, ask.time)
+        self._stream.push(self._read(ask.time))
         before = viewer or self._stream.viewer()
-        views = [self._view(self._stream, c.to(self._device), before, ask.time, ask.effort) for c in ask.cameras]
-        return RenderResult(
-            ask.time,
-            tuple(view.completed for view in views),
-            views[0].viewer,
-            geometry_ms,
-            sum(view.encoding_ms for view in views),
-            sum(view.stage_ms.rendering for view in views),
-            sum(view.stage_ms.inpainting for view in views),
-        )
+        views = [self._view(self._stream, c.to(self._device), before, ask.time, ask.quality) for c in ask.cameras]
+        completed = tuple(view.completed for view in views)
+        return RenderResult(ask.time, completed, views[0].viewer, sum((v.times for v in views), StageTimes()))
 
-    def _observe(self, stream: Stream, at: int) -> tuple[Observation, float]:
-        """The time's observation, and the milliseconds that are paid for it now."""
+    def _read(self, at: int) -> MultiViewFrame:
         frame = self._supply.read(at)
         if frame is None:
             raise NotThereError
-        start = time.perf_counter()
-        known = at in stream.times
-        observation = stream.push(frame.to(self._device))
-        return observation, 0.0 if known else 1000 * (time.perf_counter() - start)
+        return frame.to(self._device)
 
-    def _view(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: RenderQuality) -> StreamView:
+    def _view(self, stream: Stream, camera: Cameras, viewer: State, at: int, quality: RenderQuality) -> StreamView:
         """The view; with its holes where the model fails."""
         try:
-            view = self._windowed(stream, camera, viewer, at, effort)
+            view = stream.view(camera, viewer, at, quality)
         except Exception as error:
-            if not effort.mend:
+            if not quality.mend:
                 raise
-            view = self._windowed(stream, camera, viewer, at, replace(effort, mend=False))
+            view = stream.view(camera, viewer, at, replace(quality, mend=False))
             self.model_error = f"{type(error).__name__}: {error}"[:400]
         else:
-            if effort.mend:
+            if quality.mend:
                 self.model_error = None
         return view
-
-    def _windowed(self, stream: Stream, camera: Cameras, viewer: Viewer, at: int, effort: RenderQuality) -> StreamView:
-        """The view, of which only the subject's surroundings are worked on where that changes nothing.
-
-        With context it would: patches lie on a grid from the view's corner.
-        """
-        fills = isinstance(self._inpainter, Inpainter) and self._inpainter.config.prefill
-        proxy = stream.observation(at).proxy
-        local = not effort.mend or (fills and effort.context_times == 0)
-        window = window_of(proxy.mesh.vertices, camera) if local and isinstance(proxy, GeometryProxy) else None
-        if window is None:
-            return stream.view(camera, viewer, at, effort)
-        view = stream.view(window.of(camera), viewer, at, effort)
-        return replace(view, completed=window.widened(view.completed, camera))

@@ -158,7 +158,7 @@ class LiveServer:
         finally:
             self._pictures -= 1
         stages = ("geometry", "context", "rendering", "inpainting")
-        timing = ", ".join(f"{stage};dur={getattr(rendered, f'{stage}_ms'):.1f}" for stage in stages)
+        timing = ", ".join(f"{stage};dur={getattr(rendered.times, stage):.1f}" for stage in stages)
         headers = {"Server-Timing": timing, "X-Viewmend-Time": str(rendered.time), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
 

@@ -145,8 +145,8 @@ class RenderService:
             seat.fail(self.error)
             return True
         self.error = None
-        self.counts.update({"frames": 1, "shared": int(rendered.geometry_ms == 0)})
-        taken = [*(getattr(rendered, f"{stage}_ms") for stage in STAGES[:-1]), encode_ms]
+        self.counts.update({"frames": 1, "shared": int(rendered.times.geometry == 0)})
+        taken = [*(getattr(rendered.times, stage) for stage in STAGES[:-1]), encode_ms]
         self.counts.update({f"{stage}_us": round(1000 * ms) for stage, ms in zip(STAGES, taken, strict=True)})
         return True
 

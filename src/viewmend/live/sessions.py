@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any, Protocol, runtime_checkable
 
+from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live.budget import FULL, Budget, FrameMs, Level
 from viewmend.live.clock import Clock, Span
 from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
 from viewmend.live.protocol import ClockChange, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
-from viewmend.stream import RenderQuality, Viewer
 
 REFINEMENTS = ((0.25, Level(1.0, 0, None)), (0.8, FULL))
 """What a view is rendered with once it has been still for so many seconds: sharp first, since whoever moves on waits
@@ -40,7 +40,7 @@ class Scene:
 class Session(Protocol):
     """Somebody who wants views; all calls come from the render thread, under the service's lock but for `show`."""
 
-    viewer: Viewer | None
+    viewer: State | None
 
     def due(self, now: float, scene: Scene) -> RenderRequest | None:
         """The view that is wanted now."""
@@ -82,7 +82,7 @@ class ViewerSession:
             complain: called with what went wrong, likewise.
             budget_ms: milliseconds that a view may take when alone; None without a limit.
         """
-        self.viewer: Viewer | None = None
+        self.viewer: State | None = None
         self.clock = Clock()
         self.buffering = False
         self.dropped = 0
@@ -162,10 +162,10 @@ class ViewerSession:
     def _ask(self, look: Look, at: int, frame: RigFrame) -> RenderRequest:
         level = self._level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
-        effort = RenderQuality(mend="mended" in look.modes, top_k=top_k, context_times=level.context_times)
+        quality = RenderQuality(mend="mended" in look.modes, top_k=top_k, context_times=level.context_times)
         scale = look.scale * level.scale
         cameras = tuple(view_camera(eye, frame, (look.width, look.height), scale) for eye in look.cameras)
-        return RenderRequest(at, cameras, effort)
+        return RenderRequest(at, cameras, quality)
 
     def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
         """Encode and send a frame, and learn from what it took."""
@@ -177,10 +177,10 @@ class ViewerSession:
         info = FrameInfo(next(self._numbers), self._full, max(0.0, self._wait_ms), self.dropped, key)
         message, stage_ms = frame_message(look, ask, rendered, info, self._encoders)
         now = time.monotonic()
-        self.recent.append(Shown(now, stage_ms, len(message), rendered.geometry_ms == 0))
+        self.recent.append(Shown(now, stage_ms, len(message), rendered.times.geometry == 0))
         if self.budget is not None:
             pixels = stage_ms["rendering"] + stage_ms["encode"]
-            filling = stage_ms["inpainting"] if ask.effort.mend else None
+            filling = stage_ms["inpainting"] if ask.quality.mend else None
             context = stage_ms["context"] if filling is not None and self._level.context_times else None
             self.budget.record(self._level, FrameMs(stage_ms["geometry"], pixels, filling, context))
         self.in_flight, self.in_flight_since = info.frame, now

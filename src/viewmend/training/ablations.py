@@ -37,7 +37,7 @@ def ablation(name: str, data: DataPlan) -> Recipe:
     Holes are large: rigs of few cameras, views that miss much. The window is t, t - 1 and t - 10. A stage stands behind
     the people: before black, colours alone would tell the background, and masks be worth nothing.
     """
-    model = replace(small_model(), prefill=False, rays=0, n_c=1, n_w=1)
+    model = replace(small_model(), coarse_fill="none", n_c=1, n_w=1)
     few = replace(data, cameras=(5, 9), sizes_px=(192,), min_hole_px=250, context_cameras=(3,), context_weights=(1,))
     few = replace(few, imperfect_share=0.0, staged=True)
     return Recipe(

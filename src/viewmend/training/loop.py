@@ -11,8 +11,10 @@ from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.checkpoint import save_inpainter
-from viewmend.inpainting.inpainter import Inpainter
+from viewmend.inpainting.network import set_compute_dtype
+from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.training.adversary import Adversary
 from viewmend.training.logs import Log, LossTerms, Progress
 from viewmend.training.model_card import model_card
@@ -28,6 +30,7 @@ from viewmend.training.schedule import Schedule, learning_rate_factor
 from viewmend.training.sources import training_source
 from viewmend.training.validation import Validation
 
+NETWORKS = (Chain, PatchTransformer)
 OWN_FILES = ("model.safetensors", "config.json", "README.md")
 """What a run writes besides its log and itself, and another may have lying there."""
 
@@ -135,13 +138,16 @@ class Run:
         return self.average.module
 
     def _make_model(self, start: nn.Module | None) -> nn.Module:
-        assert start is None or isinstance(start, Inpainter)
+        assert start is None or isinstance(start, NETWORKS)
         return _model(self.recipe, start)
 
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
         """A module whose call on a batch of samples is an `StepOutput`."""
-        assert isinstance(self.model, Inpainter)
-        return (RaysObjective if self.recipe.part == "rays" else Objective)(self.model, self.recipe)
+        assert isinstance(self.model, NETWORKS)
+        if self.recipe.part == "rays":
+            assert isinstance(self.model, Chain), "recipes that train rays have a model that reads them"
+            return RaysObjective(self.model, self.recipe)
+        return Objective(self.model, self.recipe)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         recipe = self.recipe
@@ -158,7 +164,7 @@ class Run:
         return adversary.judge(batch, outcome.completed, share)
 
     def _write_model(self) -> None:
-        assert isinstance(self.averaged, Inpainter)
+        assert isinstance(self.averaged, NETWORKS)
         save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
 
     def _step(self, step: int, batches: list[list[Sample | RayBatch]]) -> LossTerms:
@@ -232,9 +238,9 @@ class Run:
             self._write_model()
 
 
-def _model(recipe: Recipe, start: Inpainter | None) -> Inpainter:
+def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | PatchTransformer:
     """The recipe's model with those weights of `start` whose name and shape it has; its part is ready to learn."""
-    model = Inpainter(recipe.model).train()
+    model = build(recipe.model).train()
     if start is not None:
         fitting = fitting_weights(model, start)
         if not fitting:
@@ -244,15 +250,17 @@ def _model(recipe: Recipe, start: Inpainter | None) -> Inpainter:
             )
         model.load_state_dict(model.state_dict() | fitting)
     for name, parameter in model.named_parameters():
-        parameter.requires_grad_(recipe.part == "all" or name.startswith("ray_reader.") == (recipe.part == "rays"))
-    model.compute_dtype = torch.bfloat16 if recipe.bfloat16 else torch.float32
+        parameter.requires_grad_(recipe.part == "all" or name.startswith("coarse.") == (recipe.part == "rays"))
+    set_compute_dtype(model, torch.bfloat16 if recipe.bfloat16 else torch.float32)
     return model
 
 
 def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tensor]:
-    """Those weights of `start` whose name and shape `model` has."""
-    own = model.state_dict()
-    return {n: w for n, w in start.state_dict().items() if n in own and own[n].shape == w.shape}
+    """Those weights of `start` whose name and shape `model` has, with or without a coarse fill before the patches."""
+    own, theirs = model.state_dict(), start.state_dict()
+    inner = {name.removeprefix("patches."): weight for name, weight in theirs.items()}
+    found = {f"patches.{name}": weight for name, weight in theirs.items()} | inner | theirs
+    return {n: w for n, w in found.items() if n in own and own[n].shape == w.shape}
 
 
 def _costs(outcome: StepOutput, total: torch.Tensor, adversarial: float, discriminator: float) -> LossTerms:

@@ -6,7 +6,8 @@ from itertools import pairwise
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from viewmend.inpainting.inpainter import Inpainter, Prediction
+from viewmend.inpainting.chain import Chain
+from viewmend.inpainting.patch_transformer import PatchTransformer, Prediction
 from viewmend.training.losses import ImageLoss, image_loss
 from viewmend.training.perceptual_loss import load_vgg16, perceptual_loss
 from viewmend.training.plan import Recipe
@@ -31,7 +32,7 @@ class StepOutput:
 class Objective(nn.Module):
     """L without L_adv, of a batch of samples of any sizes."""
 
-    def __init__(self, model: Inpainter, recipe: Recipe) -> None:
+    def __init__(self, model: Chain | PatchTransformer, recipe: Recipe) -> None:
         super().__init__()
         self.model = model
         self.recipe = recipe
@@ -42,7 +43,7 @@ class Objective(nn.Module):
         weights = self.recipe.loss
         views = [sample for last in batch for sample in last.clip]
         predictions = self.model(
-            [s.view for s in views], [list(s.context) for s in views], nearby=[s.nearby for s in views]
+            [s.view for s in views], [list(s.context) for s in views], ray_views=[s.nearby for s in views]
         )
         image = patches_loss(predictions, views)
         completed = tuple(p.completed for p in predictions)

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from viewmend.inpainting.inpainter import Inpainter
-from viewmend.inpainting.ray_blend_net import RayInputs, look_around
+from viewmend.inpainting.chain import Chain
+from viewmend.inpainting.ray_blend_net import RayBlendNet, RayInputs, look_around
 from viewmend.inpainting.ray_sampling import CELL_CHANNELS, RayFeatures
 from viewmend.training.losses import ImageLoss, mean_loss, pixel_loss
 from viewmend.training.objective import StepOutput
@@ -110,7 +110,7 @@ def varied(lookups: RayBatch) -> RayBatch:
 class RaysObjective(nn.Module):
     """L_in, and the logarithmic error, of what the ray reader makes of the pixels of a batch."""
 
-    def __init__(self, model: Inpainter, recipe: Recipe) -> None:
+    def __init__(self, model: Chain, recipe: Recipe) -> None:
         super().__init__()
         self.model = model
         self.recipe = recipe
@@ -122,10 +122,9 @@ class RaysObjective(nn.Module):
         return StepOutput(loss, zero, zero, weights.image * loss.inside + weights.log_error * loss.log_error, ())
 
 
-def rays_loss(model: Inpainter, batch: Sequence[RayBatch]) -> ImageLoss:
+def rays_loss(model: Chain, batch: Sequence[RayBatch]) -> ImageLoss:
     """`image_loss` over the looked-up pixels alone: nothing is outside."""
-    assert model.ray_reader is not None, "recipes that train rays have a model that reads them"
+    assert isinstance(model.coarse, RayBlendNet), "recipes that train rays have a model that reads them"
     told = RayInputs.cat([lookups.inputs() for lookups in batch])
-    with model.autocast():
-        colours = model.ray_reader.mix(told).float().split([len(b.truth) for b in batch])
+    colours = model.coarse.mix(told).float().split([len(b.truth) for b in batch])
     return mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])

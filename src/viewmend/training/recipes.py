@@ -15,7 +15,7 @@ def small(data: DataPlan) -> Recipe:
     return Recipe(
         name="small",
         model=small_model(),
-        data=_for(small_model(), data),
+        data=for_model(small_model(), data),
         loss=LossWeights(log_error=0.5),
         steps=1500,
         minutes=40.0,
@@ -34,7 +34,7 @@ def small_rays(data: DataPlan) -> Recipe:
     return replace(
         small(data),
         name="small_rays",
-        data=_for(small_model(), dense, sizes_px=(224, 320, 416, 576)),
+        data=for_model(small_model(), dense, sizes_px=(224, 320, 416, 576)),
         part="rays",
         loss=LossWeights(log_error=2.0),
         steps=10_000,
@@ -53,7 +53,7 @@ def paper(data: DataPlan) -> Recipe:
     return Recipe(
         name="paper",
         model=paper_model(),
-        data=_for(paper_model(), data, sizes_px=(320, 512)),
+        data=for_model(paper_model(), data, sizes_px=(320, 512)),
         loss=LossWeights(adversarial=0.01),
         steps=200_000,
         batch=8,
@@ -71,7 +71,7 @@ def base(data: DataPlan) -> Recipe:
         paper(data),
         name="base",
         model=base_model(),
-        data=_for(base_model(), data, sizes_px=(256, 320, 384)),
+        data=for_model(base_model(), data, sizes_px=(256, 320, 384)),
         loss=LossWeights(log_error=0.5),
         steps=20_000,
         batch=16,
@@ -96,9 +96,11 @@ def finetune(data: DataPlan) -> Recipe:
     )
 
 
-def _for(model: InpainterConfig, data: DataPlan, sizes_px: tuple[int, ...] | None = None) -> DataPlan:
+def for_model(model: InpainterConfig, data: DataPlan, sizes_px: tuple[int, ...] | None = None) -> DataPlan:
     """The data that this model can use."""
-    return replace(data, rays=model.rays, sizes_px=sizes_px or data.sizes_px)
+    return replace(
+        data, rays=model.num_ray_views if model.coarse_fill == "rays" else 0, sizes_px=sizes_px or data.sizes_px
+    )
 
 
 RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.baselines.classical import Telea
-from viewmend.inpainting.protocol import State
+from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
@@ -56,10 +56,10 @@ class Validation:
         ours, fills, shown = [], [], []
         for sample in self._samples:
             on_device = sample.to(device)
-            made = model([on_device.view], [list(on_device.context)], nearby=[on_device.nearby])[0]
+            made = model([on_device.view], [list(on_device.context)], ray_views=[on_device.nearby])[0]
             completed = made.completed.float().cpu()
             ours.append(_score(completed, sample))
-            fills.append(_score(torch.where(sample.view.error > 0, made.filled.float().cpu(), completed), sample))
+            fills.append(_score(torch.where(sample.view.error > 0, made.coarse.float().cpu(), completed), sample))
             shown.append(torch.cat([sample.view.rgb, completed, sample.truth / 255], 2))
         model.train(training)
         _write(self.folder / f"validation-{step:06d}.png", shown[:SHOWN])
@@ -74,7 +74,7 @@ class Validation:
 
 
 def _telea(sample: Sample) -> Float[Tensor, "3 height width"]:
-    return Telea().step(sample.view, lambda *_: None, State())[0].rgb
+    return Telea().step(sample.view, ContextProvider(lambda *_: None), State())[0].rgb
 
 
 def _score(rgb: Float[Tensor, "3 height width"], sample: Sample) -> float:

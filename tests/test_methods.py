@@ -5,7 +5,8 @@ import json
 import pytest
 
 from viewmend import cli
-from viewmend.evaluation.methods import (
+from viewmend.inpainting.checkpoint import shipped_models
+from viewmend.methods import (
     BASELINES,
     METHODS,
     MethodMissing,
@@ -14,7 +15,6 @@ from viewmend.evaluation.methods import (
     method_names,
     split_missing,
 )
-from viewmend.inpainting.checkpoint import shipped_models
 from viewmend.metrics.weights import PLACES_VARIABLE
 
 OWN = """

@@ -1,4 +1,4 @@
-"""The methods of an evaluation, by name: an entry of `METHODS`, a baseline, a class in a file, or a model's folder."""
+"""All inpainters by name, for every command: entries of `METHODS`, baselines, classes in files, models' folders."""
 
 import hashlib
 import importlib.util
@@ -14,11 +14,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from viewmend.baselines.classical import NavierStokes, NearestColour, SmoothFill, Telea, Unfilled
+from viewmend.baselines.classical import NavierStokes, NearestColour, Telea, Unfilled
 from viewmend.baselines.published import is_baseline, make_baseline
 from viewmend.baselines.reprojection_fill import ReprojectionFill
 from viewmend.baselines.rgvi import make_rgvi
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
+from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.metrics.weights import MissingWeightsError
 
@@ -107,9 +108,13 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
             f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
             f"'{name}'; see --methods"
         )
-    inpainter = load_inpainter(name, device)
-    inpainter.compute_dtype = torch.bfloat16 if precision == "bfloat16" else torch.float32
-    return inpainter
+    return load_inpainter(name, device, precision)
+
+
+def default_method() -> str:
+    """The model that is shipped, `small` among several; where none is, OpenCV's Telea."""
+    shipped = (*shipped_models(), "telea")
+    return "small" if "small" in shipped else shipped[0]
 
 
 def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[str, ...], dict[str, str]]:

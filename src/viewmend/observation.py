@@ -1,0 +1,99 @@
+"""One time of a stream, with its geometry proxy: what does not depend on a view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import GeometryProxy, reconstruct
+from viewmend.inpainting.protocol import Memory
+from viewmend.own_pages import to_own_pages
+from viewmend.timing import ms_since, now_s
+from viewmend.views import ContextViews, MultiViewFrame
+
+
+@runtime_checkable
+class DepthProvider(Protocol):
+    """All that an inpainter asks of G[t]; `GeometryProxy` is one, a renderer's own geometry may be another."""
+
+    def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
+        """z-depth of the surface in each camera, metres; 0 where there is none."""
+        ...
+
+
+@dataclass
+class Observation:
+    """What the cameras saw at one time, and what was computed of it; all viewers of that time share it."""
+
+    frame: MultiViewFrame
+    proxy: GeometryProxy | DepthProvider
+    """G[t]; rendering needs a `GeometryProxy`, filling does not."""
+    geometry_ms: float = 0.0
+    """What the proxy took, until the first view has paid for it."""
+    encoded: Memory = field(default_factory=dict, repr=False)
+    """What the inpainter encoded of the images, by camera name."""
+    depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False)
+    """The proxy's depth in the cameras that were asked for, by name."""
+
+    def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
+        """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered once only."""
+        new = [name for name in names if name not in self.depths]
+        if new:
+            rendered = self.proxy.depth(self.frame.cameras.select(new))
+            right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
+            if right or below:
+                rendered = F.pad(rendered, (0, right, 0, below))  # padded as the images are
+            self.depths.update(zip(new, to_own_pages(rendered), strict=True))
+        width, height = self.frame.cameras.select(names).max_size_px
+        return torch.stack([self.depths[name][:height, :width] for name in names])  # as `frame.select` cuts images
+
+    def context(self, names: Sequence[str]) -> ContextViews | None:
+        """What an inpainter may see of these cameras; those without a frame are left out, None if all are."""
+        there = [name for name in names if name in self.frame.cameras.names]
+        return ContextViews(self.frame.select(there), self.depth(there)) if there else None
+
+    def pay_geometry(self) -> float:
+        """The milliseconds of the proxy, for the first who asks; 0 afterwards."""
+        ms, self.geometry_ms = self.geometry_ms, 0.0
+        return ms
+
+    @property
+    def size(self) -> int:
+        """Bytes, without what is too small to count."""
+        tensors: list[Tensor | None] = [self.frame.rgb, self.frame.mask, *self.depths.values()]
+        if isinstance(self.proxy, GeometryProxy):
+            tensors += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
+        for encoded in self.encoded.values():
+            tensors += [value for value in getattr(encoded, "__dict__", {}).values() if isinstance(value, Tensor)]
+        return sum(t.numel() * t.element_size() for t in tensors if t is not None)
+
+
+def observe(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig) -> Observation:
+    """Reconstruct the geometry proxy of one time.
+
+    Args:
+        frame: what the cameras saw; leave a camera out of everything with `frame.without`.
+        bounds: the volume that may hold the subject; None to find it from the masks.
+        config: how the hull is carved.
+
+    Raises:
+        ValueError: the frame has no masks, no foreground, or a single camera.
+    """
+    if frame.mask is None:
+        raise ValueError(
+            "expected a capture with masks, got one without: the visual hull is carved from them; segment the "
+            "foreground and name the files as each camera's 'mask'"
+        )
+    device = frame.rgb.device
+    start = now_s(device)
+    proxy = to_own_pages(
+        reconstruct(frame.mask, frame.cameras, bounds if bounds is None else bounds.to(device), config)
+    )
+    return Observation(frame, proxy, ms_since(start, device))

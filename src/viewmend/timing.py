@@ -1,0 +1,36 @@
+"""Milliseconds of the stages that a view goes through."""
+
+import time
+from dataclasses import dataclass
+
+import torch
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageTimes:
+    """Milliseconds of each stage of one view, the device's work included."""
+
+    geometry: float = 0.0
+    """Masks to geometry proxy. The first view of a time pays for it, the others have 0."""
+    context: float = 0.0
+    """Camera images to encoded context. The first view that needs an image pays for it."""
+    rendering: float = 0.0
+    """Proxy and images to the incomplete view."""
+    inpainting: float = 0.0
+    """Incomplete to completed view, without `context`."""
+
+    def __add__(self, other: "StageTimes") -> "StageTimes":
+        """The stages of both views."""
+        return StageTimes(**{name: ms + getattr(other, name) for name, ms in vars(self).items()})
+
+
+def now_s(device: torch.device) -> float:
+    """Seconds, once the device has done what was asked of it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def ms_since(start: float, device: torch.device) -> float:
+    """Milliseconds since `now_s` gave `start`."""
+    return 1000 * (now_s(device) - start)
