@@ -18,7 +18,7 @@ def test_the_demo_renders_mends_and_scores(tmp_path, capsys):
     assert report["frames"] == 3 and 0 < report["hole_fraction"] < 1
     assert report["ours"] == report["telea"]
     assert report["telea"]["psnr_holes_fg"] > report["unfilled"]["psnr_holes_fg"] + 1
-    assert set(report["stage_ms"]) == {"geometry", "rendering", "inpainting"}
+    assert set(report["stage_ms"]) == {"geometry", "context", "rendering", "inpainting"}
     assert {f.name for f in (tmp_path / "a").iterdir()} == {"demo.mp4", "contact_sheet.png"}
     video = cv2.VideoCapture(str(tmp_path / "a" / "demo.mp4"))
     read, panel = video.read()
