@@ -33,7 +33,7 @@ VIEWERS = (1, 2, 4, 8)
 def served(size: tuple[int, int], budget_ms: float | None, device: str):
     """The address of a server whose frames are all made."""
     config = StudioConfig(seed=SEED, cameras=CAMERAS, frames=FRAMES, size_px=size, fps=FPS)
-    supply = ReadAhead(lambda: Studio(config), made=True)
+    supply = ReadAhead(lambda: Studio(config), generated=True)
     renderer = Renderer(supply, load_inpainter("small", device), device=device)
     service, settings = RenderService(renderer, supply), ServerConfig(port=0, budget_ms=budget_ms)
     server = Server(LiveServer(service, settings), settings, pushes=False)

@@ -58,7 +58,7 @@ def test_what_is_wanted_is_read_first_with_what_follows(reading):
 
 def test_what_is_made_can_be_asked_for_as_far_as_it_is(reading):
     source = Slow(5)
-    supply = reading(source, made=True, fps=7.0)
+    supply = reading(source, generated=True, fps=7.0)
     wait_until(lambda: supply.rig is not None)
     assert supply.span.end == 0 and supply.status.state == "loading"
     read(source, supply, 3)

@@ -20,7 +20,7 @@ from viewmend.live.client import Client
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import pack
 from viewmend.live.publisher import Publisher
-from viewmend.live.pushed import Pushed
+from viewmend.live.pushed import PushedFrames
 
 BOUNDS = Bounds(torch.full((3,), -0.6), torch.full((3,), 0.6))
 UP = torch.tensor([0.0, 1.0, 0.0])
@@ -31,7 +31,7 @@ def publisher(server, cameras=CAMERAS, **options):
 
 
 def test_what_is_pushed_is_seen_at_the_edge_and_can_be_sought():
-    with running(Pushed(), pushes=True, ready=False) as server:
+    with running(PushedFrames(), pushes=True, ready=False) as server:
         assert json.loads(get(f"{server.url}/health")[2])["status"] == "loading"
         with Client(server.ws) as viewer, publisher(server) as rig:
             assert [rig.push(photograph(CAMERAS)) for _ in range(3)] == [0, 1, 2]
@@ -49,7 +49,7 @@ def test_what_is_pushed_is_seen_at_the_edge_and_can_be_sought():
 
 
 def test_a_rig_that_goes_is_missed_and_another_one_may_come():
-    with running(Pushed(), pushes=True, ready=False) as server, Client(server.ws) as viewer:
+    with running(PushedFrames(), pushes=True, ready=False) as server, Client(server.ws) as viewer:
         with publisher(server) as rig:
             rig.push(photograph(CAMERAS))
             viewer.frame(viewer.look(width=32, height=32))
@@ -92,7 +92,7 @@ def rig_message(**changes):
     ],
 )
 def test_rigs_that_cannot_be_are_refused(message):
-    with running(Pushed(), pushes=True, ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
+    with running(PushedFrames(), pushes=True, ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
         bad.send(message)
         answer = json.loads(bad.recv(timeout=10))
         assert answer["type"] == "error" and "expected" in answer["message"] and closing(bad) == 4400
@@ -123,7 +123,7 @@ HUGE_PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + CHUNK + struct.pack(">
     ],
 )
 def test_frames_that_cannot_be_end_the_rig_and_nothing_else(message):
-    with running(Pushed(), pushes=True, ready=False) as server:
+    with running(PushedFrames(), pushes=True, ready=False) as server:
         with connect(f"{server.ws}/push", **SOON) as bad:
             bad.send(rig_message())
             assert json.loads(bad.recv(timeout=10))["type"] == "taken"
@@ -136,7 +136,7 @@ def test_frames_that_cannot_be_end_the_rig_and_nothing_else(message):
 
 
 def test_an_empty_stage_is_said_and_passes():
-    with running(Pushed(), pushes=True, ready=False) as server, Client(server.ws) as viewer:
+    with running(PushedFrames(), pushes=True, ready=False) as server, Client(server.ws) as viewer:
         frame = photograph(CAMERAS)
         with publisher(server) as rig:
             rig.push(frame)
@@ -150,7 +150,7 @@ def test_an_empty_stage_is_said_and_passes():
 def test_frames_without_masks_are_refused_where_they_are_pushed():
     frame = replace(photograph(CAMERAS), mask=None)
     with (
-        running(Pushed(), pushes=True, ready=False) as server,
+        running(PushedFrames(), pushes=True, ready=False) as server,
         publisher(server) as rig,
         pytest.raises(ValueError, match="expected a frame with masks"),
     ):
@@ -158,7 +158,7 @@ def test_frames_without_masks_are_refused_where_they_are_pushed():
 
 
 def test_memory_of_a_live_rig_is_bounded():
-    supply = Pushed(memory_mb=0.3)
+    supply = PushedFrames(memory_mb=0.3)
     supply.begin("x", 10.0, None, None)
     for _ in range(20):
         supply.push(photograph(CAMERAS))

@@ -8,7 +8,7 @@ from reference.ball import ring
 
 from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live.clock import Span
-from viewmend.live.frames import Rig, SourceStatus
+from viewmend.live.frames import FrameSupply, Rig, SourceStatus
 from viewmend.live.poses import rig_frame, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
@@ -19,19 +19,15 @@ FRAME = rig_frame(ring(4), torch.zeros(3), None)
 CAMERA = view_camera(Camera(), FRAME, (16, 16))
 
 
-class Supply:
+class Supply(FrameSupply):
     """Ten frames that are all there."""
 
-    changed = staticmethod(lambda: None)
-    status, rig, span = SourceStatus("ready"), Rig("x", None, None), Span(0, 10, 10, 10.0)
+    def __init__(self):
+        super().__init__(Span(0, 10, 10, 10.0))
+        self.status, self.rig = SourceStatus("ready"), Rig("x", None, None)
 
     def read(self, time):
         return object()
-
-    def start(self):
-        pass
-
-    stop = start
 
 
 class Drawing(Renderer):

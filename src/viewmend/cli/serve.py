@@ -117,13 +117,13 @@ def _check(options: Options) -> None:
 
 def _supply(options: Options) -> "FrameSupply":
     from viewmend.live.frames import ReadAhead
-    from viewmend.live.pushed import Pushed
+    from viewmend.live.pushed import PushedFrames
 
     memory_mb = options.memory_mb / 2
     if options.source == "live":
-        return Pushed(options.fps, memory_mb)
+        return PushedFrames(options.fps, memory_mb)
     made = options.source == "studio"
-    return ReadAhead(_studio(options) if made else _capture(options), options.fps, made=made, memory_mb=memory_mb)
+    return ReadAhead(_studio(options) if made else _capture(options), options.fps, generated=made, memory_mb=memory_mb)
 
 
 def _studio(options: Options) -> "Callable[[], CaptureSource]":

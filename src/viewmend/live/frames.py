@@ -1,12 +1,12 @@
-"""Frames at hand: read or made ahead on a thread of their own, or pushed as they happen."""
+"""Frames of a recording, read or generated ahead on a thread of their own, and what all supplies of frames share."""
 
 import contextlib
 import os
 import threading
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -31,59 +31,50 @@ class Rig:
     bounds: Bounds | None
     up: Float[Tensor, "3"] | None
     number: int = 0
-    """Another one means: another rig, another stream."""
+    """Tells a rig from the one that was connected before."""
 
 
 @dataclass(frozen=True)
 class SourceStatus:
-    """How a source is."""
+    """Whether a source works."""
 
     state: str = "loading"
-    """loading, ready or failing."""
+    """One of loading, ready and failing."""
     error: str | None = None
     """For people."""
 
 
-@runtime_checkable
-class FrameSupply(Protocol):
-    """Where the service takes frames from; `read` never waits."""
+class FrameSupply(ABC):
+    """Where the service takes frames from."""
 
-    changed: Callable[[], None]
-    """Called, on any thread, when there is more to see."""
-
-    @property
-    def status(self) -> SourceStatus:
-        """How the source is."""
-        ...
-
-    @property
-    def rig(self) -> Rig | None:
+    def __init__(self, span: Span) -> None:
+        self.changed: Callable[[], None] = lambda: None
+        """Called, on any thread, when there is more to see."""
+        self.status = SourceStatus()
+        self.rig: Rig | None = None
         """What is known of the cameras; None before the source is open."""
-        ...
-
-    @property
-    def span(self) -> Span:
+        self.span = span
         """The times that can be asked for."""
-        ...
 
+    @abstractmethod
     def read(self, time: int) -> MultiViewFrame | None:
-        """The frame; None while it is on its way."""
-        ...
+        """The frame; None while it is not there. It never waits."""
 
-    def start(self) -> None:
-        """Begin to read."""
-        ...
+    def start(self) -> None:  # noqa: B027
+        """Begin to read; nothing to do where frames come by themselves."""
 
-    def stop(self) -> None:
+    def stop(self) -> None:  # noqa: B027
         """End, and let go of threads."""
-        ...
 
 
-class FrameStore:
-    """Frames by time; the oldest go first when there are too many bytes, or those that were asked for longest ago."""
+class FrameCache:
+    """Frames by time, bounded by bytes.
 
-    def __init__(self, memory_mb: float, by_use: bool) -> None:
-        self._by_use = by_use
+    The oldest are dropped first, or with `by_last_use` those that were asked for longest ago.
+    """
+
+    def __init__(self, memory_mb: float, by_last_use: bool) -> None:
+        self._by_last_use = by_last_use
         self._limit = 1e6 * memory_mb
         self._frames: OrderedDict[int, MultiViewFrame] = OrderedDict()
         self._bytes = 0
@@ -101,7 +92,7 @@ class FrameStore:
 
     def get(self, time: int) -> MultiViewFrame | None:
         """The frame, None where it is not at hand."""
-        if self._by_use and time in self._frames:
+        if self._by_last_use and time in self._frames:
             self._frames.move_to_end(time)
         return self._frames.get(time)
 
@@ -121,50 +112,25 @@ def _size(frame: MultiViewFrame) -> int:
     return frame.rgb.numel() + (0 if frame.mask is None else frame.mask.numel())
 
 
-class Supply:
-    """What all supplies say of themselves."""
+class ReadAhead(FrameSupply):
+    """A recording, read on a thread of low priority: the frame that was asked for, and the next ones.
 
-    _status: SourceStatus
-    _rig: Rig | None
-    _span: Span
-
-    @property
-    def status(self) -> SourceStatus:
-        """How the source is."""
-        return self._status
-
-    @property
-    def rig(self) -> Rig | None:
-        """What is known of the cameras; None before the source is open."""
-        return self._rig
-
-    @property
-    def span(self) -> Span:
-        """The times that can be asked for."""
-        return self._span
-
-
-class ReadAhead(Supply):
-    """A recording: what is asked for and the frames after it are read first, then the rest while there is room.
-
-    `made` is for sources whose frames are made one after the other (the studio): only those can be asked for that are
-    there. The thread's priority is below that of all others.
+    The frames of a `generated` source are made one after the other (the studio); only those that are there can be
+    asked for.
     """
 
     def __init__(
         self,
         open_source: Callable[[], CaptureSource],
         fps: float | None = None,
-        made: bool = False,
+        generated: bool = False,
         memory_mb: float = 1500.0,
     ) -> None:
-        self.changed: Callable[[], None] = lambda: None
-        self._open, self._fps, self._made = open_source, fps, made
-        self._store = FrameStore(memory_mb, by_use=True)
+        super().__init__(Span())
+        self._open, self._fps, self._generated = open_source, fps, generated
+        self._cache = FrameCache(memory_mb, by_last_use=True)
         self._lock = threading.Condition()
         self._wanted = 0
-        self._status, self._span = SourceStatus(), Span()
-        self._rig: Rig | None = None
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="frames", daemon=True)
 
@@ -186,7 +152,7 @@ class ReadAhead(Supply):
             if self._wanted != time:
                 self._wanted = time
                 self._lock.notify_all()
-            return self._store.get(time)
+            return self._cache.get(time)
 
     def _run(self) -> None:
         with contextlib.suppress(OSError, AttributeError):  # Linux counts a thread as a process here
@@ -198,7 +164,7 @@ class ReadAhead(Supply):
                     source = self._opened()
                 self._step(source)
             except Exception as error:  # whatever a source does wrong, it is said, and tried again
-                self._status = replace(self._status, state="failing", error=f"{type(error).__name__}: {error}"[:400])
+                self.status = replace(self.status, state="failing", error=f"{type(error).__name__}: {error}"[:400])
                 self.changed()
                 with self._lock:
                     self._lock.wait_for(lambda: self._stopped, RETRY_S)
@@ -207,8 +173,8 @@ class ReadAhead(Supply):
         source = self._open()
         total = len(source.frame_ids)
         fps = (self._fps or source.fps or 0.0) if total > 1 else 0.0
-        self._span = Span(0, 0 if self._made else total, total, fps)
-        self._rig = Rig(source.name, source.bounds, source.up)
+        self.span = Span(0, 0 if self._generated else total, total, fps)
+        self.rig = Rig(source.name, source.bounds, source.up)
         return source
 
     def _step(self, source: CaptureSource) -> None:
@@ -219,16 +185,16 @@ class ReadAhead(Supply):
                 return
         frame = source.read(time)
         with self._lock:
-            self._store.put(time, frame)
-            if self._made:
-                self._span = replace(self._span, end=max(self._span.end, time + 1))
-            self._status = replace(self._status, state="ready", error=None)
+            self._cache.put(time, frame)
+            if self._generated:
+                self.span = replace(self.span, end=max(self.span.end, time + 1))
+            self.status = replace(self.status, state="ready", error=None)
         self.changed()
 
     def _next(self) -> int | None:
         """The time to read next."""
-        total = self._span.total or 0
-        if self._made and self._span.end < total:
-            return self._span.end
-        soon = [(self._wanted + n) % max(1, total) for n in range(min(AHEAD + 1, total, self._store.room))]
-        return next((time for time in soon if time not in self._store), None)
+        total = self.span.total or 0
+        if self._generated and self.span.end < total:
+            return self.span.end
+        soon = [(self._wanted + n) % max(1, total) for n in range(min(AHEAD + 1, total, self._cache.room))]
+        return next((time for time in soon if time not in self._cache), None)

@@ -15,7 +15,7 @@ from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import rigid
 from viewmend.json_input import one_of
 from viewmend.live.protocol import VERSION, Point, ProtocolError, Rotation, check_rotation, read_message, unpack
-from viewmend.live.pushed import Pushed
+from viewmend.live.pushed import PushedFrames
 from viewmend.views import MultiViewFrame
 
 MAX_CAMERAS = 128
@@ -25,7 +25,7 @@ MAX_PIXELS = 64_000_000
 SILENT_S = 30.0
 
 
-async def receive_rig(socket: WebSocket, supply: Pushed) -> None:
+async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
     """Take in a rig and its frames until it goes."""
     cameras: Cameras | None = None
     while True:
@@ -113,7 +113,7 @@ class ImagePart(Struct, frozen=True):
     kind: Annotated[str, one_of("rgb", "mask")]
 
 
-def _begin(text: str, supply: Pushed) -> Cameras:
+def _begin(text: str, supply: PushedFrames) -> Cameras:
     """The rig's cameras, from its first message.
 
     Raises:

@@ -22,7 +22,7 @@ from viewmend.live.metrics_text import metrics_text
 from viewmend.live.page_files import HEADERS, page_files
 from viewmend.live.protocol import Limits, ProtocolError
 from viewmend.live.push import receive_rig
-from viewmend.live.pushed import Pushed
+from viewmend.live.pushed import PushedFrames
 from viewmend.live.render_jobs import PathJob, PictureJob, parse_path, parse_query
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
@@ -215,7 +215,7 @@ class LiveServer:
         supply = self._service.supply
         if not await self._welcome(socket):
             return
-        if not isinstance(supply, Pushed) or self._pushing:
+        if not isinstance(supply, PushedFrames) or self._pushing:
             why = (
                 "another rig is pushing"
                 if self._pushing
