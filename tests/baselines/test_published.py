@@ -8,11 +8,11 @@ from safetensors.torch import save_file
 
 from viewmend.baselines.dstt import DSTT
 from viewmend.baselines.e2fgvi import E2FGVIHQ
-from viewmend.baselines.official_checkpoint import OfficialCheckpointError
 from viewmend.baselines.online import OnlineInpainter
 from viewmend.baselines.published import NETWORKS, is_baseline, make_baseline
 from viewmend.baselines.riftcast import RiftCast
 from viewmend.metrics.weights import PLACES_VARIABLE, MissingWeightsError
+from viewmend.weight_files import WeightsError
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +70,9 @@ def test_without_weights_nothing_is_made(name, tmp_path):
 
 
 def test_another_networks_weights_are_refused(weights):
-    with pytest.raises(OfficialCheckpointError, match="the 243 tensors of E2FGVI, got 244"):
+    with pytest.raises(WeightsError, match="the 243 tensors of E2FGVI, got 244"):
         make_baseline(f"e2fgvi-o-def@{weights / 'E2FGVI-HQ-CVPR22.pth'}")
-    with pytest.raises(OfficialCheckpointError, match="found none; check the path"):
+    with pytest.raises(WeightsError, match="found none; check the path"):
         make_baseline(f"dstt-o-def@{weights / 'absent'}")
 
 

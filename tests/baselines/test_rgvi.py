@@ -17,8 +17,9 @@ from viewmend.baselines.rgvi_flow import dis_flow, disagreeing, pull
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.protocol import ContextProvider, ViewInpainter
 from viewmend.metrics import weights
-from viewmend.metrics.weights import KnownWeights, WeightsError
+from viewmend.metrics.weights import KnownWeights
 from viewmend.views import IncompleteView
+from viewmend.weight_files import WeightsError
 
 SIZE = 96
 MOTION = (3, 2)

@@ -6,7 +6,8 @@ from reference.lpips_twin import lpips_twin
 
 from viewmend.metrics import weights as weights_module
 from viewmend.metrics.lpips import Lpips, load_lpips
-from viewmend.metrics.weights import KnownWeights, MissingWeightsError, WeightsError
+from viewmend.metrics.weights import KnownWeights, MissingWeightsError
+from viewmend.weight_files import WeightsError
 
 
 def random_weights(network, rng):
@@ -68,7 +69,7 @@ def test_images_without_features_have_no_score(files, backbone, least):
 
 def test_no_other_network_takes_its_place(files, tmp_path):
     torch.save(files["vgg"][0], tmp_path / "alexnet.pth")
-    with pytest.raises(WeightsError, match=r"alexnet.pth: expected Features's tensors"):
+    with pytest.raises(WeightsError, match=r"alexnet.pth: expected the 10 tensors of Features"):
         load_lpips("alex")
     (tmp_path / "lpips-vgg.pth").unlink()
     with pytest.raises(MissingWeightsError, match=r"lpips-vgg.pth .*in one of .*VIEWMEND_WEIGHTS"):

@@ -1,23 +1,19 @@
-"""Weights are found, checked and loaded strictly."""
+"""Weights of known networks are found and checked."""
 
 import hashlib
 
 import pytest
-import torch
-from safetensors.torch import save_file
-from torch import nn
 
 from viewmend.metrics.weights import (
     KNOWN,
     KnownWeights,
     MissingWeightsError,
-    WeightsError,
     checked_weights,
-    fill_network,
     find_weights,
     known_weights,
     places,
 )
+from viewmend.weight_files import WeightsError
 
 
 @pytest.fixture
@@ -71,33 +67,3 @@ def test_what_is_known_has_a_hash_and_a_source():
     assert known_weights("i3d").files[0] == "rgb_imagenet.pt"
     with pytest.raises(ValueError, match="expected weights among alexnet"):
         known_weights("resnet")
-
-
-class Evil:
-    def __reduce__(self):
-        return print, ("never",)
-
-
-def test_files_load_strictly_and_run_nothing(tmp_path, capsys):
-    network, right = nn.Linear(3, 2), {"weight": torch.ones(2, 3), "bias": torch.ones(2)}
-    path = tmp_path / "w.pth"
-    torch.save(right | {"head.weight": torch.ones(1)}, path)
-    fill_network(network, path, spare=("head.",))
-    assert network.weight.eq(1).all() and not network.weight.requires_grad
-    save_file(right, tmp_path / "w.safetensors")
-    fill_network(network, tmp_path / "w.safetensors")
-    whole = path.read_bytes()
-    for wrong, said in (
-        (right | {"more": torch.ones(1)}, "more is none of its"),
-        ({"weight": right["weight"]}, "bias is missing"),
-        (right | {"bias": torch.ones(3)}, r"bias is \(3,\), not \(2,\)"),
-        ([1], "of other things"),
-        (Evil(), "do not read"),
-    ):
-        torch.save(wrong, path)
-        with pytest.raises(WeightsError, match=said):
-            fill_network(network, path)
-    path.write_bytes(whole[:-30])
-    with pytest.raises(WeightsError, match="do not read"):
-        fill_network(network, path)
-    assert "never" not in capsys.readouterr().out

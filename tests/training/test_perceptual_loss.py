@@ -155,8 +155,8 @@ OTHERS = {
     "another width": (changed(features__0__weight=torch.zeros(32, 3, 3, 3)), r"\(32, 3, 3, 3\), not \(64, 3, 3, 3\)"),
     "another head": (changed(classifier__6__weight=torch.zeros(10, 4096)), r"\(10, 4096\), not \(1000, 4096\)"),
     "nothing": ({}, "features.0.weight is missing; .* and 23 more"),
-    "nested": ({"state_dict": empty_weights()}, "expected tensors by name"),
-    "a list": ([torch.zeros(3)], "expected tensors by name, got list"),
+    "nested": ({"state_dict": empty_weights()}, "expected a dictionary of tensors"),
+    "a list": ([torch.zeros(3)], "expected a dictionary of tensors.*got list"),
 }
 
 

@@ -16,11 +16,11 @@ from viewmend.baselines.clips import Sampling
 from viewmend.baselines.dstt import DSTT
 from viewmend.baselines.e2fgvi import E2FGVI, E2FGVIHQ
 from viewmend.baselines.fuseformer import FuseFormer
-from viewmend.baselines.official_checkpoint import load_official
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter
 from viewmend.baselines.riftcast import RiftCast
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.metrics.weights import KnownWeights, checked_weights, known_weights
+from viewmend.weight_files import load_weights
 
 NETWORKS: dict[str, Callable[[], DSTT | FuseFormer | E2FGVI]] = {
     "dstt": DSTT,
@@ -48,7 +48,7 @@ def make_baseline(name: str, device: torch.device | str = "cpu") -> ViewInpainte
 
     Raises:
         MissingWeightsError: its weights are nowhere.
-        ValueError: no such name; or the weights are damaged or another network's (`OfficialCheckpointError`).
+        ValueError: no such name; or the weights are damaged or another network's (`WeightsError`).
     """
     if found := _NAME.fullmatch(name):
         network = load_baseline(found["network"], found["weights"] or "", device)
@@ -69,7 +69,7 @@ def load_baseline(network: str, weights: str = "", device: torch.device | str = 
         path = path / TRAINED if path.is_dir() else path
     else:
         path = checked_weights(finetuned_weights(network) if weights else known_weights(network))
-    return load_official(NETWORKS[network](), path, device)
+    return load_weights(NETWORKS[network](), path, device)
 
 
 def finetuned_weights(network: str) -> KnownWeights:

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.baselines.rgvi_flow import FlowMap, Image
-from viewmend.metrics.weights import checked_weights, fill_network, known_weights
+from viewmend.metrics.weights import checked_weights, known_weights
+from viewmend.weight_files import load_weights
 
 WIDTHS = (64, 64, 96, 128, 256)
 """Channels of an encoder's first layer, of its three pairs of blocks, and of its features."""
@@ -72,9 +73,7 @@ def load_raft(device: torch.device | str = "cpu") -> Raft:
         MissingWeightsError: their file is nowhere.
         WeightsError: it is damaged or another.
     """
-    network = Raft()
-    fill_network(network, checked_weights(known_weights("raft")))
-    return network.to(device)
+    return load_weights(Raft(), checked_weights(known_weights("raft")), device).requires_grad_(False)
 
 
 def correlations(

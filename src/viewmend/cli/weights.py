@@ -73,18 +73,19 @@ def _checked(path: Path, name: str | None) -> dict[str, str]:
 
 def _loaded(name: str, path: Path) -> dict[str, str]:
     """What loading says of a published network's file, whose hash nobody published."""
-    from viewmend.baselines.official_checkpoint import OfficialCheckpointError, load_official
     from viewmend.baselines.published import NETWORKS
+    from viewmend.weight_files import WeightsError, load_weights
 
     try:
-        load_official(NETWORKS[name](), path)
-    except OfficialCheckpointError as error:
+        load_weights(NETWORKS[name](), path)
+    except WeightsError as error:
         return {"status": "wrong", "said": str(error)}
     return {"status": "right by all names and shapes"}
 
 
 def _line(name: str, path: Path | None) -> dict[str, str]:
-    from viewmend.metrics.weights import WeightsError, known_weights, stated_hashes, verify_weights
+    from viewmend.metrics.weights import known_weights, stated_hashes, verify_weights
+    from viewmend.weight_files import WeightsError
 
     known, status, said = known_weights(name), "missing", ""
     if path is not None:

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from viewmend.metrics.weights import checked_weights, fill_network, known_weights
+from viewmend.metrics.weights import checked_weights, known_weights
+from viewmend.weight_files import load_weights
 
 Backbone = Literal["alex", "vgg"]
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -100,9 +101,9 @@ def load_lpips(backbone: Backbone, device: torch.device | str = "cpu") -> Lpips:
     """
     metric = Lpips(backbone)
     layers, heads = (checked_weights(known_weights(name)) for name in FILES[backbone])
-    fill_network(metric.network, layers, spare=("classifier.",))
-    fill_network(metric.heads, heads)
-    return metric.to(device)
+    load_weights(metric.network, layers, spare=("classifier.",))
+    load_weights(metric.heads, heads)
+    return metric.to(device).requires_grad_(False)
 
 
 def _alexnet() -> nn.Sequential:

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.metrics.i3d import UNUSED, I3d
-from viewmend.metrics.weights import checked_weights, fill_network, known_weights
+from viewmend.metrics.weights import checked_weights, known_weights
+from viewmend.weight_files import load_weights
 
 Mode = Literal["eval", "train"]
 MODES: tuple[Mode, ...] = ("eval", "train")
@@ -28,9 +29,7 @@ def load_i3d(device: torch.device | str = "cpu") -> I3d:
         MissingWeightsError: its file is nowhere.
         WeightsError: the file is damaged or another than it should be.
     """
-    network = I3d()
-    fill_network(network, checked_weights(known_weights("i3d")), spare=UNUSED)
-    return network.to(device)
+    return load_weights(I3d(), checked_weights(known_weights("i3d")), device, spare=UNUSED).requires_grad_(False)
 
 
 @torch.no_grad()

@@ -2,20 +2,15 @@
 
 import hashlib
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file
-from torch import Tensor, nn
+
+from viewmend.weight_files import MismatchedWeightsError, WeightsError
 
 PLACES_VARIABLE = "VIEWMEND_WEIGHTS"
 """Folders to look in first, separated as PATH is."""
-
-
-class WeightsError(ValueError):
-    """A file of weights is damaged, or another than it should be: what was expected, what came, the next step."""
 
 
 class MissingWeightsError(WeightsError):
@@ -133,7 +128,7 @@ def checked_weights(known: KnownWeights) -> Path:
 
     Raises:
         MissingWeightsError: it is nowhere.
-        WeightsError: it is another file than the one that was published.
+        MismatchedWeightsError: it is another file than the one that was published.
     """
     path = find_weights(known)
     if path is None:
@@ -147,10 +142,10 @@ def checked_weights(known: KnownWeights) -> Path:
 
 
 def verify_weights(path: Path, known: KnownWeights) -> None:
-    """Check the file's hash, where one was published; WeightsError if it is another's."""
+    """Check the file's hash, where one was published; MismatchedWeightsError if it is another's."""
     if not verified(path, known):
         sha256, git_sha1 = hashes(path)
-        raise WeightsError(
+        raise MismatchedWeightsError(
             f"{path}: expected {known.what} ({stated_hashes(known)}), got a file of {path.stat().st_size} bytes with "
             f"SHA-256 {sha256}, git name {git_sha1}; it is damaged or another version, get it from {known.source}"
         )
@@ -166,45 +161,6 @@ def hashes(path: Path) -> tuple[str, str]:
     """A file's SHA-256, and its name in git."""
     data = path.read_bytes()
     return hashlib.sha256(data).hexdigest(), hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
-
-
-def load_tensors(path: Path) -> dict[str, Tensor]:
-    """The tensors in a .safetensors file or in torch's own format, read without unpickling anything else.
-
-    Raises:
-        WeightsError: it cannot be read, or holds other things than tensors by name.
-    """
-    try:
-        found = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
-    except Exception as error:  # damaged files raise almost anything
-        raise WeightsError(
-            f"{path}: expected a whole file of tensors, got {path.stat().st_size} bytes that do not read "
-            f"({type(error).__name__}); get it again"
-        ) from error
-    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
-        raise WeightsError(f"{path}: expected tensors by name, got {type(found).__name__} of other things")
-    return found
-
-
-def fill_network(network: nn.Module, path: Path, spare: Sequence[str] = ()) -> None:
-    """Load a network's weights strictly: all its keys and shapes, and no keys but those that begin with `spare`.
-
-    Raises:
-        WeightsError: the file cannot be read or is another network's.
-    """
-    tensors, own = load_tensors(path), network.state_dict()
-    wrong = [f"{key} is missing" for key in own if key not in tensors and not key.endswith("num_batches_tracked")]
-    for key, tensor in tensors.items():
-        if key in own and own[key].shape != tensor.shape:
-            wrong.append(f"{key} is {tuple(tensor.shape)}, not {tuple(own[key].shape)}")
-        elif key not in own and not key.startswith(tuple(spare)):
-            wrong.append(f"{key} is none of its")
-    if wrong:
-        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        name = type(network).__name__
-        raise WeightsError(f"{path}: expected {name}'s tensors, got another network's: {'; '.join(wrong[:3])}{more}")
-    network.load_state_dict({key: tensors[key].float() for key in own if key in tensors}, strict=False)
-    network.requires_grad_(False).eval()
 
 
 def stated_hashes(known: KnownWeights) -> str:

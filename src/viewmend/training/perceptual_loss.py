@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d
 
 from viewmend.inpainting.patches import crop
 from viewmend.metrics.lpips import DEVIATION, MEAN, vgg16_layers
-from viewmend.metrics.weights import WeightsError, load_tensors
+from viewmend.weight_files import WeightsError, read_weights
 
 SEEN_BLOCKS = 4
 """Features are taken after the last ReLU of the first blocks: relu1_2, relu2_2, relu3_3, relu4_3."""
@@ -142,6 +142,6 @@ def _read(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise PerceptualWeightsError(f"expected the weights of torchvision's vgg16 at {path}, got no such file; {NEXT}")
     try:
-        return load_tensors(path)
+        return read_weights(path)
     except WeightsError as error:
         raise PerceptualWeightsError(f"{error}; {NEXT}") from error

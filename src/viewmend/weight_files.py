@@ -1,0 +1,95 @@
+"""Weights of networks, read from files strictly: nothing in a file is run, and every name and shape must be right."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+WRAPPER = "netG"
+"""Checkpoints of a GAN's generator may be {"netG": weights}; all others are the weights themselves."""
+COUNTER = "num_batches_tracked"
+"""Files from before batch norms counted their batches lack these entries, which inference does not need."""
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class WeightsError(ValueError):
+    """Weights that cannot be loaded: which file, what was expected, what came, the next step."""
+
+
+class DamagedWeightsError(WeightsError):
+    """A file that cannot be read, or is cut short."""
+
+
+class MismatchedWeightsError(WeightsError):
+    """A file of other things than weights, or of another network's weights."""
+
+
+def load_weights(
+    network: Network, path: str | Path, device: torch.device | str = "cpu", spare: Sequence[str] = ()
+) -> Network:
+    """The network with the weights of this file, on `device` and ready to infer.
+
+    Args:
+        network: what the weights belong to. It is changed, and returned.
+        path: a .safetensors file, or torch's own format, which is read with `weights_only=True`.
+        device: where the network computes.
+        spare: beginnings of names that the file may have besides the network's own.
+
+    Raises:
+        DamagedWeightsError: the file is missing, unreadable or cut short.
+        MismatchedWeightsError: a tensor is missing, unknown or of another shape.
+    """
+    path, weights, own = Path(path), read_weights(path), network.state_dict()
+    weights = {key: value for key, value in weights.items() if key in own or not key.startswith(tuple(spare))}
+    reshaped = [
+        f"{key} {tuple(value.shape)} for {tuple(own[key].shape)}"
+        for key, value in sorted(weights.items())
+        if key in own and value.shape != own[key].shape
+    ]
+    wrong = {
+        "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),
+        "unknown": sorted(weights.keys() - own.keys()),
+        "of another shape": reshaped,
+    }
+    if any(wrong.values()):
+        counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
+        name = type(network).__name__
+        raise MismatchedWeightsError(
+            f"{path}: expected the {len(own)} tensors of {name}, got {len(weights)}: {counts}; give the weights that "
+            f"belong to {name}"
+        )
+    network.load_state_dict(weights, strict=False)
+    return network.to(device).eval()
+
+
+def read_weights(path: str | Path) -> dict[str, Tensor]:
+    """The tensors of a file by name, on the CPU, out of their wrapper.
+
+    Raises:
+        DamagedWeightsError: the file is missing, unreadable or cut short.
+        MismatchedWeightsError: it holds other things than tensors.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DamagedWeightsError(f"{path}: expected a file of weights, found none; check the path")
+    try:
+        found = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+    except Exception as error:  # damaged files raise almost anything
+        said = f"{type(error).__name__}: {' '.join(str(error).split()).split('. ')[0][:120]}"
+        raise DamagedWeightsError(
+            f"{path}: expected a whole file of tensors alone, got {path.stat().st_size} bytes that do not read "
+            f"({said}); get the file again"
+        ) from error
+    if isinstance(found, dict) and isinstance(found.get(WRAPPER), dict):
+        found = found[WRAPPER]
+    if not isinstance(found, dict) or not all(isinstance(k, str) and isinstance(v, Tensor) for k, v in found.items()):
+        kind = f"a dictionary of {list(found)[:4]}" if isinstance(found, dict) else type(found).__name__
+        raise MismatchedWeightsError(
+            f"{path}: expected a dictionary of tensors, plain or under '{WRAPPER}', got {kind}; give the "
+            "network's weights"
+        )
+    return found
