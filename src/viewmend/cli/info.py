@@ -1,5 +1,6 @@
 """`viewmend info`: what a capture or a model is, and whether a calibration is right."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,7 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
-    from viewmend.cli.capture_description import CaptureDescription
+    from viewmend.capture.description import CameraDescription, CaptureDescription
+    from viewmend.inpainting.description import ModelDescription
+
+DOUBTFUL_IOU = 0.8
+"""Below this, a calibration or a mask is wrong more often than not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,17 +33,17 @@ def run(options: Options) -> int:
     """Run the command; the exit code."""
     from dataclasses import asdict
 
-    from viewmend.cli import capture_description, model_description
     from viewmend.cli.console import print_json
+    from viewmend.inpainting.description import describe_model
 
     if _is_model(options.target):
         if options.out is not None:
             raise ValueError(f"expected --out with a capture, got the model {options.target}; leave --out away")
-        model = model_description.describe_model(options.target)
-        description, lines = asdict(model), model_description.in_words(model)
+        model = describe_model(options.target)
+        description, lines = asdict(model), _model_in_words(model)
     else:
         capture = _look_at_capture(options)
-        description, lines = asdict(capture), capture_description.in_words(capture)
+        description, lines = asdict(capture), _capture_in_words(capture)
     if options.json:
         print_json(description)
     else:
@@ -61,10 +66,10 @@ def _is_model(target: str) -> bool:
 
 
 def _look_at_capture(options: Options) -> "CaptureDescription":
+    from viewmend.capture.calibration_check import check_calibration, check_picture
+    from viewmend.capture.description import describe_capture
     from viewmend.capture.images import write_image
     from viewmend.capture.plain import open_capture
-    from viewmend.cli.calibration_check import check_calibration, check_picture
-    from viewmend.cli.capture_description import describe_capture
     from viewmend.cli.console import busy, say
 
     capture = open_capture(options.target)
@@ -78,3 +83,70 @@ def _look_at_capture(options: Options) -> "CaptureDescription":
             write_image(options.out, check_picture(check, capture.up))
         say(f"wrote {options.out}")
     return describe_capture(capture, check)
+
+
+def _model_in_words(model: "ModelDescription") -> list[str]:
+    width = max(len(key) for key in model.config)
+    lines = [f"{model.path}: an inpainting model of {model.parameters / 1e6:.2f} million parameters", ""]
+    lines += [f"  {key:<{width}}  {value}" for key, value in model.config.items()]
+    return [*lines, "", model.card.strip() if model.card else "There is no model card: what trained it is not known."]
+
+
+def _capture_in_words(capture: "CaptureDescription") -> list[str]:
+    sizes = sorted({(camera.width, camera.height) for camera in capture.cameras})
+    fps = "unknown fps" if capture.fps is None else f"{capture.fps:g} fps"
+    bounds, iou = capture.bounds_m, capture.hull_iou_mean
+    lines = [
+        f"{capture.name}: a capture of {len(capture.cameras)} cameras",
+        f"  images    {', '.join(f'{w} x {h}' for w, h in sizes)}",
+        f"  frames    {_frames(capture)}{'' if capture.frames == 1 else ', ' + fps}",
+        f"  masks     {'yes' if capture.masks else 'none'}; depth {'yes' if capture.depth else 'none'}",
+        f"  gaps      {_gaps(capture)}",
+        f"  unit      {capture.metres_per_unit:g} m; all lengths below are metres",
+        f"  up        {'unknown' if capture.up is None else _numbers(capture.up, 3)}",
+        f"  bounds    {'none given' if bounds is None else f'{_numbers(bounds[0])} to {_numbers(bounds[1])}'}",
+        f"  rig       {_extent(capture.rig_extent_m)}; cameras at {capture.camera_distance_m[0]:.3g} to "
+        f"{capture.camera_distance_m[1]:.3g} from the middle",
+    ]
+    if iou is not None:
+        subject = capture.subject_extent_m
+        found = "nothing: the masks agree on no point of space" if subject is None else _extent(subject)
+        lines.append(f"  subject   {found} (visual hull of frame '{capture.checked_frame}')")
+        lines.append(f"  hull IoU  mean {iou:.3f}, lowest {capture.hull_iou_min:.3f}{_verdict(iou)}")
+    lines.append("")
+    names = max(len(camera.name) for camera in capture.cameras)
+    lines += [f"  {camera.name:<{names}}  {_camera(camera)}" for camera in capture.cameras]
+    return lines
+
+
+def _frames(capture: "CaptureDescription") -> str:
+    if capture.frames == 1:
+        return f"1 ('{capture.first_frame}'), static"
+    return f"{capture.frames}, '{capture.first_frame}' to '{capture.last_frame}'"
+
+
+def _gaps(capture: "CaptureDescription") -> str:
+    if not capture.gaps:
+        return "none"
+    first = ", ".join(f"{camera} at '{frame}'" for camera, frame in capture.gaps[:3])
+    return f"{len(capture.gaps)}: {first}{', ...' if len(capture.gaps) > 3 else ''}"
+
+
+def _verdict(iou: float) -> str:
+    if iou >= DOUBTFUL_IOU:
+        return ""
+    return "; low: check axes, units, K, distortion and the masks in the picture of --out"
+
+
+def _camera(camera: "CameraDescription") -> str:
+    iou = "" if camera.hull_iou is None else f"  IoU {camera.hull_iou:.3f}"
+    size = f"{camera.width} x {camera.height}"
+    return f"{size:<12} focal {camera.focal_px[0]:7.1f} px  {camera.fov_x_deg:5.1f} deg wide{iou}"
+
+
+def _numbers(values: Sequence[float], digits: int = 2) -> str:
+    return f"({', '.join(f'{value:.{digits}f}' for value in values)})"
+
+
+def _extent(values: Sequence[float]) -> str:
+    return " x ".join(f"{value:.3g}" for value in values)

@@ -54,6 +54,11 @@ class Options:
     """Write the scores as one JSON object to standard output and nothing else there."""
 
 
+STATIC_VIEWS = 60
+"""Of an orbit around a capture of one frame."""
+FRAMES_PER_TURN = 150
+
+
 def run(options: Options) -> int:
     """Run the command; the exit code."""
     if (options.leave_out is None) == (options.path is None):
@@ -125,15 +130,13 @@ def _times(frames: str | None, count: int) -> range:
 
 
 def _count(options: Options, capture: "CaptureSource", times: range) -> int:
-    from viewmend.cli.novel_paths import STATIC_VIEWS
-
     return STATIC_VIEWS if options.path == "orbit" and len(capture.frame_ids) == 1 else len(times)
 
 
 def _views(options: Options, capture: "CaptureSource", times: range) -> "Iterator[tuple[MultiViewFrame, Cameras]]":
     """Each frame with the novel view's camera, in order of time."""
+    from viewmend.capture.camera_path import paired, read_path
     from viewmend.capture.prefetch import prefetch
-    from viewmend.cli.novel_paths import paired, read_path
 
     if options.leave_out is not None:
         plan = [(time, capture.cameras.select([options.leave_out])) for time in times]
@@ -150,7 +153,8 @@ def _views(options: Options, capture: "CaptureSource", times: range) -> "Iterato
 
 
 def _orbit(capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
-    from viewmend.cli.novel_paths import FRAMES_PER_TURN, STATIC_VIEWS, orbit_around, paired
+    from viewmend.capture.camera_path import paired
+    from viewmend.geometry.orbit import orbit_around
     from viewmend.geometry.proxy import reconstruct
 
     first = capture.read(times[0])

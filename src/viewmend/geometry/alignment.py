@@ -8,7 +8,7 @@ that makes hull and masks agree best undoes it.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
@@ -60,12 +60,9 @@ def shared_offset(
 
     def iou(x: float, y: float) -> float:
         moved = cameras.moved(x, y)
-        proxy = reconstruct(mask, moved, box, config)
-        silhouette = proxy.depth(moved) > 0
-        inside = mask[:, : silhouette.shape[1], : silhouette.shape[2]] > 127
-        either = (silhouette | inside).sum((1, 2))
-        shares = (silhouette & inside).sum((1, 2)) / either.clamp_min(1)
-        return float(shares[either > 0].mean()) if bool(either.any()) else 0.0
+        silhouettes = reconstruct(mask, moved, box, config).depth(moved) > 0
+        agreed = silhouette_iou(silhouettes, mask)
+        return float(agreed.nanmean().nan_to_num(0.0))
 
     before = iou(0.0, 0.0)
     x, after_x = _peak(lambda x: iou(x, 0.0), before)
@@ -73,6 +70,17 @@ def shared_offset(
     if after - before < WORTH_MOVING or after < LEAST_IOU:
         return Alignment((0.0, 0.0), before, before)
     return Alignment((x, y), before, after)
+
+
+def silhouette_iou(
+    silhouettes: Bool[Tensor, "view height width"], mask: UInt8[Tensor, "view _height _width"]
+) -> Float[Tensor, "view"]:
+    """Intersection over union of the hull's silhouettes and the masks; NaN where both are empty.
+
+    Masks may be padded further right and below.
+    """
+    inside = mask[:, : silhouettes.shape[1], : silhouettes.shape[2]] > 127
+    return (silhouettes & inside).sum((1, 2)) / (silhouettes | inside).sum((1, 2))
 
 
 def _peak(value: Callable[[float], float], middle: float) -> tuple[float, float]:

@@ -21,3 +21,10 @@ def upright(cameras: Cameras) -> Float[Tensor, "3"]:
         normal = torch.linalg.svd(cameras.centers - cameras.centers.mean(0)).Vh[2]
         mean = normal if float(normal @ mean) >= 0 else -normal
     return mean / mean.norm()
+
+
+def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Where azimuth 0 and azimuth 90 degrees are, unit vectors in the world: +z and +x where `up` (unit) is +y."""
+    ahead = up.new_tensor([0.0, 0.0, 1.0] if abs(float(up[2])) < 0.9 else [1.0, 0.0, 0.0])
+    front = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
+    return front, torch.linalg.cross(up, front)

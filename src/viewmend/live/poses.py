@@ -11,7 +11,7 @@ from torch import Tensor
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, pinhole
 from viewmend.geometry.rigid import look_at, rigid
-from viewmend.geometry.upright import upright
+from viewmend.geometry.upright import horizontal_axes, upright
 from viewmend.live.protocol import Camera
 
 
@@ -41,7 +41,7 @@ class RigFrame:
 
 
 def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> RigFrame:
-    """Axes about the subject: as `studio.rigs.orbit` counts azimuths.
+    """Axes about the subject: as `geometry.orbit` counts azimuths.
 
     The first view is halfway between the first camera and its neighbour, as far and as high as the cameras on average,
     and shows as much as they do.
@@ -53,9 +53,7 @@ def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3
     """
     cameras = cameras.to("cpu")
     center, up = center.cpu().float(), upright(cameras) if up is None else (up / up.norm()).cpu().float()
-    ahead = torch.tensor([0.0, 0.0, 1.0]) if abs(float(up[2])) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
-    front = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
-    side = torch.linalg.cross(up, front)
+    front, side = horizontal_axes(up)
     offsets = cameras.centers - center
     distance = offsets.norm(dim=-1)
     azimuths = torch.rad2deg(torch.atan2(offsets @ side, offsets @ front))

@@ -9,6 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
+from viewmend.geometry.orbit import fov_y_showing
+from viewmend.geometry.orbit import orbit as orbit_of
 from viewmend.geometry.rigid import invert_rigid, look_at, rigid, rotation_from_axis_angle
 
 SUBJECT_CENTER_M = (0.0, 0.95, 0.0)
@@ -99,22 +101,15 @@ def orbit(
     up: Float[Tensor, "3"] | None = None,
     visible_m: float = VISIBLE_M,
 ) -> Cameras:
-    """Novel cameras on a circle around `center` (the subject's middle), one for each azimuth.
+    """Novel cameras on a circle around `center`, by default the middle of who stands on the stage.
 
-    Azimuth 0 is in front of the stage (+z) and azimuths grow towards +x; in worlds with another `up` azimuth 0 is
-    some fixed horizontal direction.
+    On the stage azimuth 0 is in front (+z), and azimuths grow towards +x.
     """
     center = torch.tensor(SUBJECT_CENTER_M) if center is None else center
-    up = torch.tensor([0.0, 1.0, 0.0]) if up is None else up / up.norm()
-    ahead = torch.tensor([0.0, 0.0, 1.0]) if abs(float(up[2])) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
-    front = torch.nn.functional.normalize(ahead - (ahead @ up) * up, dim=0)
-    side = torch.linalg.cross(up, front)
-    views = []
-    for n, azimuth in enumerate(azimuths_rad):
-        flat = math.cos(azimuth) * front + math.sin(azimuth) * side
-        eye = center + radius_m * (math.cos(elevation_rad) * flat + math.sin(elevation_rad) * up)
-        views.append(pinhole(_fov_y(size_px, visible_m, radius_m), *size_px, look_at(eye, center, up), f"orbit{n:03d}"))
-    return concatenate_cameras(views)
+    up = torch.tensor([0.0, 1.0, 0.0]) if up is None else up
+    return orbit_of(
+        azimuths_rad, size_px, radius_m=radius_m, elevation_rad=elevation_rad, center=center, up=up, visible_m=visible_m
+    )
 
 
 def _stand(
@@ -131,15 +126,9 @@ def _stand(
         top = up if float((eye - center)[[0, 2]].norm()) > 0.05 else torch.tensor([0.0, 0.0, -1.0])
         pose = look_at(eye, center + 0.02 * off[n, 1], top)
         pose[:3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, 0.01 * float(off[n, 2, 0])])) @ pose[:3]
-        fov = _fov_y(size_px, visible_m, float((eye - center).norm()) * (1 + 0.01 * float(off[n, 2, 1])))
+        fov = fov_y_showing(size_px, visible_m, float((eye - center).norm()) * (1 + 0.01 * float(off[n, 2, 1])))
         views.append(pinhole(fov, *size_px, pose, f"cam{n:02d}"))
     return concatenate_cameras(views)
-
-
-def _fov_y(size_px: tuple[int, int], visible_m: float, distance_m: float) -> float:
-    """Vertical field of view of an image whose shorter side holds `visible_m` at a distance."""
-    width, height = size_px
-    return 2 * math.atan(visible_m / 2 / distance_m * height / min(width, height))
 
 
 def _positive(count: int) -> int:

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.contact_sheet import Tile, contact_sheet, in_rows, picture
+from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import project
 from viewmend.geometry.hull import bounds_from_cameras
@@ -49,10 +50,8 @@ def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> Calibrati
     if frame.mask is None:
         return CalibrationCheck(frame, bounds or bounds_from_cameras(frame.cameras), None, None, {})
     proxy = reconstruct(frame.mask, frame.cameras, bounds)
-    covered, foreground = proxy.depth(frame.cameras) > 0, frame.mask > 127
-    both, either = (covered & foreground).sum((1, 2)), (covered | foreground).sum((1, 2))
-    # Where both are empty, they agree.
-    iou = torch.where(either > 0, both / either.clamp(min=1), 1.0).tolist()
+    covered = proxy.depth(frame.cameras) > 0
+    iou = silhouette_iou(covered, frame.mask).nan_to_num(1.0).tolist()  # where both are empty, they agree
     scores = dict(zip(frame.cameras.names, iou, strict=True))
     return CalibrationCheck(frame, bounds or proxy.bounds, proxy, covered.float(), scores)
 

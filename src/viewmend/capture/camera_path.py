@@ -1,82 +1,19 @@
-"""Where novel views are looked at from: orbits, and camera poses from a file."""
+"""Camera poses from a file, and which frame is looked at from which."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import torch
-from jaxtyping import Float
 from msgspec import Meta, Struct
-from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
-from viewmend.geometry.upright import upright
 from viewmend.json_input import Number, Triple, read_json, shown, typed
-from viewmend.studio.rigs import orbit
 
-FULL_TURN_GAP_RAD = math.radians(130)
-"""A rig with a larger gap between neighbours does not stand all around: the orbit swings over what it sees."""
-STATIC_VIEWS = 60
 Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Pixels = Annotated[int, Meta(ge=1, le=16384)]
-FRAMES_PER_TURN = 150
-
-
-def orbit_around(
-    center: Float[Tensor, "3"], cameras: Cameras, up: Float[Tensor, "3"] | None, views: int, frames_per_turn: int
-) -> Cameras:
-    """Novel cameras on a circle about `center`, as far and as high as the rig's cameras on average.
-
-    A rig all around is circled once every `frames_per_turn` views; for a rig on one side the path swings from its one
-    end to the other and back. Images are as large, and show as much, as the first camera's.
-
-    Args:
-        center: the subject's middle, metres.
-        cameras: the rig.
-        up: the world's up; by default the mean of the images' up directions or, where these disagree (images partly
-            upside down), the normal of the plane that the cameras lie in.
-        views: how many cameras to give.
-        frames_per_turn: length of a whole turn, or of a swing there and back.
-    """
-    up = upright(cameras) if up is None else up.to(center) / up.norm()
-    offsets = cameras.centers - center
-    distance = offsets.norm(dim=-1)
-    elevation = torch.asin((offsets @ up / distance).clamp(-1, 1)).mean()
-    azimuths = _swing(_azimuths(offsets, up), views, frames_per_turn)
-    width, height = (int(side) for side in cameras.size_px[0].tolist())
-    visible_m = min(width, height) / float(cameras.K[0, 1, 1]) * float(distance.mean())
-    return orbit(
-        azimuths,
-        (width, height),
-        radius_m=float(distance.mean()),
-        elevation_rad=float(elevation),
-        center=center.cpu(),
-        up=up.cpu(),
-        visible_m=visible_m,
-    )
-
-
-def _azimuths(offsets: Float[Tensor, "view 3"], up: Float[Tensor, "3"]) -> list[float]:
-    """Azimuths of the cameras as `orbit` counts them, radians."""
-    axes = orbit([0.0, math.pi / 2], (2, 2), radius_m=1.0, elevation_rad=0.0, center=torch.zeros(3), up=up.cpu())
-    front, side = axes.centers.to(offsets)
-    return torch.atan2(offsets @ side, offsets @ front).tolist()
-
-
-def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int) -> list[float]:
-    """Azimuths of a path over the rig's own, beginning in the middle of its widest gap's far end."""
-    ordered = sorted(a % (2 * math.pi) for a in azimuths)
-    gaps = [(after - before) % (2 * math.pi) for before, after in zip(ordered, [*ordered[1:], ordered[0]], strict=True)]
-    widest = max(range(len(gaps)), key=lambda n: gaps[n])
-    start = ordered[(widest + 1) % len(ordered)]
-    phases = [view / frames_per_turn for view in range(views)]
-    if len(ordered) > 1 and gaps[widest] < FULL_TURN_GAP_RAD:
-        return [start + 2 * math.pi * phase for phase in phases]
-    arc = (2 * math.pi - gaps[widest]) % (2 * math.pi) if len(ordered) > 1 else math.pi / 6
-    return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * phase)) for phase in phases]
 
 
 class PathFile(Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""An inpainting model in figures and in words."""
+"""An inpainting model in figures."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,11 +34,3 @@ def describe_model(name_or_path: str) -> ModelDescription:
         config=network.config.to_dict(),
         card=card.read_text(encoding="utf-8") if card.is_file() else None,
     )
-
-
-def in_words(model: ModelDescription) -> list[str]:
-    """The same for people, line by line."""
-    width = max(len(key) for key in model.config)
-    lines = [f"{model.path}: an inpainting model of {model.parameters / 1e6:.2f} million parameters", ""]
-    lines += [f"  {key:<{width}}  {value}" for key, value in model.config.items()]
-    return [*lines, "", model.card.strip() if model.card else "There is no model card: what trained it is not known."]

@@ -1,14 +1,10 @@
-"""A capture in figures, for programs, and in words."""
+"""A capture in figures."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
+from viewmend.capture.calibration_check import CalibrationCheck
 from viewmend.capture.plain import PlainCapture
-from viewmend.cli.calibration_check import CalibrationCheck
-
-DOUBTFUL_IOU = 0.8
-"""Below this, a calibration or a mask is wrong more often than not."""
 
 
 @dataclass(frozen=True)
@@ -102,64 +98,3 @@ def _describe_camera(capture: PlainCapture, check: CalibrationCheck, view: int) 
         center_m=tuple(camera.centers[0].tolist()),
         hull_iou=check.iou.get(camera.names[0]),
     )
-
-
-def in_words(capture: CaptureDescription) -> list[str]:
-    """The same for people, line by line."""
-    sizes = sorted({(camera.width, camera.height) for camera in capture.cameras})
-    fps = "unknown fps" if capture.fps is None else f"{capture.fps:g} fps"
-    bounds, iou = capture.bounds_m, capture.hull_iou_mean
-    lines = [
-        f"{capture.name}: a capture of {len(capture.cameras)} cameras",
-        f"  images    {', '.join(f'{w} x {h}' for w, h in sizes)}",
-        f"  frames    {_frames(capture)}{'' if capture.frames == 1 else ', ' + fps}",
-        f"  masks     {'yes' if capture.masks else 'none'}; depth {'yes' if capture.depth else 'none'}",
-        f"  gaps      {_gaps(capture)}",
-        f"  unit      {capture.metres_per_unit:g} m; all lengths below are metres",
-        f"  up        {'unknown' if capture.up is None else _numbers(capture.up, 3)}",
-        f"  bounds    {'none given' if bounds is None else f'{_numbers(bounds[0])} to {_numbers(bounds[1])}'}",
-        f"  rig       {_extent(capture.rig_extent_m)}; cameras at {capture.camera_distance_m[0]:.3g} to "
-        f"{capture.camera_distance_m[1]:.3g} from the middle",
-    ]
-    if iou is not None:
-        subject = capture.subject_extent_m
-        found = "nothing: the masks agree on no point of space" if subject is None else _extent(subject)
-        lines.append(f"  subject   {found} (visual hull of frame '{capture.checked_frame}')")
-        lines.append(f"  hull IoU  mean {iou:.3f}, lowest {capture.hull_iou_min:.3f}{_verdict(iou)}")
-    lines.append("")
-    names = max(len(camera.name) for camera in capture.cameras)
-    lines += [f"  {camera.name:<{names}}  {_camera(camera)}" for camera in capture.cameras]
-    return lines
-
-
-def _frames(capture: CaptureDescription) -> str:
-    if capture.frames == 1:
-        return f"1 ('{capture.first_frame}'), static"
-    return f"{capture.frames}, '{capture.first_frame}' to '{capture.last_frame}'"
-
-
-def _gaps(capture: CaptureDescription) -> str:
-    if not capture.gaps:
-        return "none"
-    first = ", ".join(f"{camera} at '{frame}'" for camera, frame in capture.gaps[:3])
-    return f"{len(capture.gaps)}: {first}{', ...' if len(capture.gaps) > 3 else ''}"
-
-
-def _verdict(iou: float) -> str:
-    if iou >= DOUBTFUL_IOU:
-        return ""
-    return "; low: check axes, units, K, distortion and the masks in the picture of --out"
-
-
-def _camera(camera: CameraDescription) -> str:
-    iou = "" if camera.hull_iou is None else f"  IoU {camera.hull_iou:.3f}"
-    size = f"{camera.width} x {camera.height}"
-    return f"{size:<12} focal {camera.focal_px[0]:7.1f} px  {camera.fov_x_deg:5.1f} deg wide{iou}"
-
-
-def _numbers(values: Sequence[float], digits: int = 2) -> str:
-    return f"({', '.join(f'{value:.{digits}f}' for value in values)})"
-
-
-def _extent(values: Sequence[float]) -> str:
-    return " x ".join(f"{value:.3g}" for value in values)

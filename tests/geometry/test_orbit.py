@@ -6,8 +6,8 @@ import pytest
 import torch
 from reference.ball import camera_at
 
-from viewmend.cli.novel_paths import orbit_around
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
+from viewmend.geometry.orbit import orbit_around
 
 CENTER = torch.tensor([0.1, 0.0, -0.1])
 

@@ -1,0 +1,101 @@
+"""Novel views on a circle around the subject."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
+from viewmend.geometry.rigid import look_at
+from viewmend.geometry.upright import horizontal_axes, upright
+
+FULL_TURN_GAP_RAD = math.radians(130)
+"""A rig with a larger gap between neighbours does not stand all around: the orbit swings over what it sees."""
+
+
+def orbit(
+    azimuths_rad: Sequence[float],
+    size_px: tuple[int, int],
+    *,
+    radius_m: float,
+    elevation_rad: float,
+    center: Float[Tensor, "3"],
+    up: Float[Tensor, "3"],
+    visible_m: float,
+) -> Cameras:
+    """Novel cameras on a circle around `center`, one for each azimuth.
+
+    Args:
+        azimuths_rad: as `horizontal_axes` counts them.
+        size_px: width and height of the images.
+        radius_m: distance from the centre.
+        elevation_rad: above the horizon.
+        center: the subject's middle, metres.
+        up: the world's up.
+        visible_m: what the shorter side of an image shows at the centre.
+    """
+    up = up / up.norm()
+    front, side = horizontal_axes(up)
+    fov_y = fov_y_showing(size_px, visible_m, radius_m)
+    views = []
+    for n, azimuth in enumerate(azimuths_rad):
+        flat = math.cos(azimuth) * front + math.sin(azimuth) * side
+        eye = center + radius_m * (math.cos(elevation_rad) * flat + math.sin(elevation_rad) * up)
+        views.append(pinhole(fov_y, *size_px, look_at(eye, center, up), f"orbit{n:03d}"))
+    return concatenate_cameras(views)
+
+
+def fov_y_showing(size_px: tuple[int, int], visible_m: float, distance_m: float) -> float:
+    """Vertical field of view (radians) of an image whose shorter side shows `visible_m` at a distance."""
+    width, height = size_px
+    return 2 * math.atan(visible_m / 2 / distance_m * height / min(width, height))
+
+
+def orbit_around(
+    center: Float[Tensor, "3"], cameras: Cameras, up: Float[Tensor, "3"] | None, views: int, frames_per_turn: int
+) -> Cameras:
+    """Novel cameras on a circle about `center`, as far and as high as the rig's cameras on average.
+
+    A rig all around is circled once every `frames_per_turn` views; for a rig on one side the path swings from its one
+    end to the other and back. Images are as large, and show as much, as the first camera's.
+
+    Args:
+        center: the subject's middle, metres.
+        cameras: the rig.
+        up: the world's up; by default the mean of the images' up directions or, where these disagree (images partly
+            upside down), the normal of the plane that the cameras lie in.
+        views: how many cameras to give.
+        frames_per_turn: length of a whole turn, or of a swing there and back.
+    """
+    up = upright(cameras) if up is None else up.to(center) / up.norm()
+    offsets = cameras.centers - center
+    distance = offsets.norm(dim=-1)
+    elevation = torch.asin((offsets @ up / distance).clamp(-1, 1)).mean()
+    front, side = horizontal_axes(up)
+    azimuths = _swing(torch.atan2(offsets @ side, offsets @ front).tolist(), views, frames_per_turn)
+    width, height = (int(side) for side in cameras.size_px[0].tolist())
+    visible_m = min(width, height) / float(cameras.K[0, 1, 1]) * float(distance.mean())
+    return orbit(
+        azimuths,
+        (width, height),
+        radius_m=float(distance.mean()),
+        elevation_rad=float(elevation),
+        center=center.cpu(),
+        up=up.cpu(),
+        visible_m=visible_m,
+    )
+
+
+def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int) -> list[float]:
+    """Azimuths of a path over the rig's own, beginning in the middle of its widest gap's far end."""
+    ordered = sorted(a % (2 * math.pi) for a in azimuths)
+    gaps = [(after - before) % (2 * math.pi) for before, after in zip(ordered, [*ordered[1:], ordered[0]], strict=True)]
+    widest = max(range(len(gaps)), key=lambda n: gaps[n])
+    start = ordered[(widest + 1) % len(ordered)]
+    phases = [view / frames_per_turn for view in range(views)]
+    if len(ordered) > 1 and gaps[widest] < FULL_TURN_GAP_RAD:
+        return [start + 2 * math.pi * phase for phase in phases]
+    arc = (2 * math.pi - gaps[widest]) % (2 * math.pi) if len(ordered) > 1 else math.pi / 6
+    return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * phase)) for phase in phases]
