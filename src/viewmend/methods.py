@@ -4,7 +4,7 @@ import hashlib
 import importlib.util
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from functools import partial
 from inspect import signature
@@ -14,18 +14,11 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from viewmend.baselines.classical import NavierStokes, NearestColour, Telea, Unfilled
-from viewmend.baselines.published import is_baseline, make_baseline
-from viewmend.baselines.reprojection_fill import ReprojectionFill
-from viewmend.baselines.rgvi import make_rgvi
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
-from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.protocol import ViewInpainter
-from viewmend.metrics.weights import MissingWeightsError
 
 REFERENCE = "telea"
 """Tables show how much better than this one every other is."""
-
 PRIVILEGED = ("rgvi",)
 """See more than others may: their rows say so."""
 
@@ -34,24 +27,16 @@ class MethodMissing(ValueError):  # noqa: N818
     """A known method whose weights are not here: its row is n/a, and this is the reason."""
 
 
-@dataclass(frozen=True)
-class Method:
-    """How to make an inpainter."""
-
-    name: str
-    make: Callable[[str], ViewInpainter]
-    """From the device. Import what is heavy in there."""
-
-
-METHODS: tuple[Method, ...] = (
-    Method("telea", lambda device: Telea()),
-    Method("navier-stokes", lambda device: NavierStokes()),
-    Method("nearest", lambda device: NearestColour()),
-    Method("smooth", lambda device: SmoothFill()),
-    Method("reprojection", lambda device: ReprojectionFill()),
-    Method("unfilled", lambda device: Unfilled()),
-    Method("rgvi", make_rgvi),
-)
+METHODS: dict[str, str] = {
+    "telea": "viewmend.baselines.classical:Telea",
+    "navier-stokes": "viewmend.baselines.classical:NavierStokes",
+    "nearest": "viewmend.baselines.classical:NearestColour",
+    "smooth": "viewmend.inpainting.coarse_fill:SmoothFill",
+    "reprojection": "viewmend.baselines.reprojection_fill:ReprojectionFill",
+    "unfilled": "viewmend.baselines.classical:Unfilled",
+    "rgvi": "viewmend.baselines.rgvi:make_rgvi",
+}
+"""MODULE:NAME of each, which is called with the device if it takes one; a module is imported when it is asked for."""
 BASELINES = tuple(
     f"{network}-o-{framing}{weights}"
     for network in ("dstt", "fuseformer", "e2fgvi")
@@ -67,7 +52,7 @@ def method_names(selection: str) -> tuple[str, ...]:
     Raises:
         ValueError: no name is there.
     """
-    groups = {"all": (*shipped_models(), *(m.name for m in METHODS)), "baselines": BASELINES}
+    groups = {"all": (*shipped_models(), *METHODS), "baselines": BASELINES}
     names = [
         name for part in selection.split(",") if part.strip() for name in groups.get(part.strip(), (part.strip(),))
     ]
@@ -85,16 +70,12 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
         MethodMissing: its weights are not here.
         ValueError: there is none, or it cannot be loaded (`CheckpointError`); no such precision.
     """
-    if precision not in ("float32", "bfloat16"):
-        raise ValueError(f"expected --precision float32 or bfloat16, got '{precision}'")
-    for method in METHODS:
-        if method.name == name:
-            return method.make(device)
-    if is_baseline(name):
-        try:
-            return make_baseline(name, device)
-        except MissingWeightsError as error:
-            raise MethodMissing(str(error)) from error
+    if name in METHODS:
+        module, _, made = METHODS[name].partition(":")
+        make = getattr(importlib.import_module(module), made)
+        return make(device) if "device" in signature(make).parameters else make()
+    if name in shipped_models() or Path(name).is_dir():
+        return load_inpainter(name, device, precision)
     if ".py:" in name:
         make = _from_file(name)
         try:
@@ -102,13 +83,19 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
         except TypeError as error:
             raise ValueError(f"{name}: expected something to call with the device ('{device}'), got {error}") from error
         return make(device)
-    if name not in shipped_models() and not Path(name).is_dir():
-        known = ", ".join([*shipped_models(), *(m.name for m in METHODS)])
-        raise ValueError(
-            f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
-            f"'{name}'; see --methods"
-        )
-    return load_inpainter(name, device, precision)
+    from viewmend.baselines.published import is_baseline, make_baseline
+    from viewmend.metrics.weights import MissingWeightsError
+
+    if is_baseline(name):
+        try:
+            return make_baseline(name, device)
+        except MissingWeightsError as error:
+            raise MethodMissing(str(error)) from error
+    known = ", ".join([*shipped_models(), *METHODS])
+    raise ValueError(
+        f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
+        f"'{name}'; see --methods"
+    )
 
 
 def default_method() -> str:
