@@ -16,7 +16,7 @@ from websockets.sync.client import connect
 
 from viewmend.live import connection, listener
 from viewmend.live.client import Client
-from viewmend.live.guard import Guard, Patience, Rate
+from viewmend.live.guard import FaultLimit, Guard, RateLimit
 from viewmend.live.protocol import Limits
 
 SOON = {"max_size": None, "compression": None}
@@ -62,7 +62,7 @@ def malformed(chance: random.Random):
 
 
 def test_thousands_of_malformed_messages_change_nothing(monkeypatch):
-    monkeypatch.setattr(connection.Patience, "ends", lambda self: False)
+    monkeypatch.setattr(connection.FaultLimit, "exceeded", lambda self: False)
     chance = random.Random(0)
     with running(limits=CALM) as server:
         with connect(f"{server.ws}/ws", **SOON) as bad:
@@ -72,7 +72,7 @@ def test_thousands_of_malformed_messages_change_nothing(monkeypatch):
             for _ in range(4000):
                 bad.send(malformed(chance))
             assert still_serves(server)
-        wait_until(lambda: not server.live.lobby.seats)
+        wait_until(lambda: not server.live.registry.sessions)
         assert still_serves(server) and get(f"{server.url}/health")[0] == 200
 
 
@@ -116,11 +116,11 @@ def test_who_reads_nothing_gets_nothing_more_and_is_shown_out(monkeypatch):
     with running() as server, connect(f"{server.ws}/ws", **SOON) as slow:
         greet(slow)
         slow.send(json.dumps({"type": "look", "width": 64, "height": 64}))
-        wait_until(lambda: server.live.lobby.seats[0].in_flight is not None)
-        first = server.live.lobby.seats[0].in_flight
+        wait_until(lambda: server.live.registry.sessions[0].in_flight is not None)
+        first = server.live.registry.sessions[0].in_flight
         assert still_serves(server)
-        assert server.live.lobby.seats[0].in_flight == first, "a second frame was sent"
-        wait_until(lambda: not server.live.lobby.seats)
+        assert server.live.registry.sessions[0].in_flight == first, "a second frame was sent"
+        wait_until(lambda: not server.live.registry.sessions)
         assert closing(slow) == 4408
 
 
@@ -147,7 +147,7 @@ def test_disconnects_in_the_middle_of_a_frame():
             viewer.look(width=64, height=64, camera={"azimuth": float(number)})
             time.sleep(0.003 * number)
             viewer._socket.socket.close()
-        wait_until(lambda: not server.live.lobby.seats, 20)
+        wait_until(lambda: not server.live.registry.sessions, 20)
         assert still_serves(server)
         wait_until(lambda: not server.service._seats)
 
@@ -241,11 +241,11 @@ def test_a_taken_port_is_said():
 def test_rates_and_patience(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    rate = Rate(10)
+    rate = RateLimit(10)
     assert sum(rate.allows() for _ in range(100)) in (19, 20)
     now[0] += 0.5
     assert sum(rate.allows() for _ in range(100)) in (4, 5, 6)
-    patience = Patience(3, 10.0)
-    assert [patience.ends() for _ in range(3)] == [False, False, True]
+    patience = FaultLimit(3, 10.0)
+    assert [patience.exceeded() for _ in range(3)] == [False, False, True]
     now[0] += 20
-    assert not patience.ends()
+    assert not patience.exceeded()

@@ -163,7 +163,7 @@ def test_too_many_viewers_are_turned_away():
     with running(ready=False) as server:
         with Client(server.ws):
             pass
-        wait_until(lambda: not server.live.lobby.seats)
+        wait_until(lambda: not server.live.registry.sessions)
 
 
 def test_a_path_becomes_a_video(ball):

@@ -88,7 +88,7 @@ def frame_of(viewer):
 
 
 def test_codecs_that_are_not_there_are_refused(ball, monkeypatch):
-    monkeypatch.setitem(ball.live.lobby.about, "codecs", ["jpeg"])
+    monkeypatch.setitem(ball.live.registry.about, "codecs", ["jpeg"])
     with connect(f"{ball.ws}/ws", **SOON) as viewer:
         assert greet(viewer)["codecs"] == ["jpeg"]
         viewer.send(json.dumps({"type": "look", "codec": "vp9"}))

@@ -1,4 +1,4 @@
-"""One viewer's WebSocket: three tasks, and a seat in the service."""
+"""One viewer's WebSocket: one task reads, one writes, one sends states and statistics."""
 
 import asyncio
 import contextlib
@@ -10,8 +10,20 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from viewmend.live.guard import Patience, Rate
-from viewmend.live.protocol import MODES, VERSION, Ack, ClockChange, Hello, Limits, Look, Ping, ProtocolError, parse
+from viewmend.live.guard import FaultLimit, RateLimit
+from viewmend.live.protocol import (
+    MODES,
+    VERSION,
+    Ack,
+    ClockChange,
+    Hello,
+    Limits,
+    Look,
+    Ping,
+    ProtocolError,
+    error_json,
+    parse,
+)
 from viewmend.live.service import RenderService
 from viewmend.live.sessions import ViewerSession
 
@@ -22,14 +34,14 @@ TICK_S = 0.1
 
 @dataclass
 class SessionRegistry:
-    """What all viewers' connections share."""
+    """The sessions of all viewers, and what their connections share."""
 
     service: RenderService
     limits: Limits
     budget_ms: float | None
     about: dict[str, Any]
     """Of the message `welcome`: model, codecs, export, token_needed, server."""
-    seats: list[ViewerSession] = field(default_factory=list)
+    sessions: list[ViewerSession] = field(default_factory=list)
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
 
     def source_json(self) -> dict[str, Any]:
@@ -50,50 +62,58 @@ class SessionRegistry:
 
 
 class ClosingError(Exception):
-    """The connection is to end with this code."""
+    """Ends a connection with this close code."""
 
     def __init__(self, code: int, message: str) -> None:
         super().__init__(message)
         self.code = code
 
 
-class ViewerConnection:
-    """Reads what a viewer says and writes what it should know, whatever the other side does."""
+async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
+    """Say why a socket ends, and end it."""
+    await socket.send_text(json.dumps(error_json(code, message, fatal=True)))
+    await socket.close(code)
 
-    def __init__(self, socket: WebSocket, lobby: SessionRegistry) -> None:
+
+class ViewerConnection:
+    """Reads a viewer's messages, and sends it frames, states and errors."""
+
+    def __init__(self, socket: WebSocket, registry: SessionRegistry) -> None:
         self._socket = socket
-        self._lobby = lobby
-        self._service = lobby.service
+        self._registry = registry
+        self._service = registry.service
         self._loop = asyncio.get_running_loop()
-        self._news = asyncio.Event()
-        self._notes: dict[str, dict[str, Any]] = {}
+        self._wake_writer = asyncio.Event()
+        self._pending: dict[str, dict[str, Any]] = {}
         self._frame: bytes | None = None
-        self._patience = Patience()
-        self._rate = Rate(lobby.limits.messages_per_s)
-        self._seat = ViewerSession(self._deliver, self._complain, lobby.budget_ms)
+        self._faults = FaultLimit()
+        self._rate = RateLimit(registry.limits.messages_per_s)
+        self._session = ViewerSession(self._deliver, self._report_error, registry.budget_ms)
 
     async def run(self) -> None:
         """Serve an accepted socket until it ends."""
         try:
-            if len(self._lobby.seats) >= self._lobby.limits.viewers:
-                raise ClosingError(4503, f"expected at most {self._lobby.limits.viewers} viewers; try again later")
-            self._lobby.seats.append(self._seat)
-            await self._greet()
-            self._service.join(self._seat)
+            if len(self._registry.sessions) >= self._registry.limits.viewers:
+                raise ClosingError(4503, f"expected at most {self._registry.limits.viewers} viewers; try again later")
+            self._registry.sessions.append(self._session)
+            await self._handshake()
+            self._service.join(self._session)
             await self._serve()
         except ClosingError as closed:
-            await self._close(closed.code, str(closed))
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
+                async with asyncio.timeout(2):
+                    await close_with_error(self._socket, closed.code, str(closed))
         except (WebSocketDisconnect, RuntimeError):  # gone, maybe in the middle of a frame
             pass
         finally:
-            self._service.leave(self._seat)
-            if self._seat in self._lobby.seats:
-                self._lobby.seats.remove(self._seat)
+            self._service.leave(self._session)
+            if self._session in self._registry.sessions:
+                self._registry.sessions.remove(self._session)
 
-    async def _greet(self) -> None:
+    async def _handshake(self) -> None:
         try:
             async with asyncio.timeout(HELLO_S):
-                hello = parse(await self._receive(), self._lobby.limits)
+                hello = parse(await self._receive(), self._registry.limits)
         except TimeoutError:
             raise ClosingError(4408, f"expected a hello within {HELLO_S:g} s; reconnect") from None
         except ProtocolError as error:
@@ -105,17 +125,17 @@ class ViewerConnection:
         welcome = {
             "type": "welcome",
             "version": VERSION,
-            "viewer": next(self._lobby.numbers),
+            "viewer": next(self._registry.numbers),
             "modes": MODES,
-            "budget_ms": self._lobby.budget_ms,
-            "limits": asdict(self._lobby.limits),
-            **self._lobby.about,
+            "budget_ms": self._registry.budget_ms,
+            "limits": asdict(self._registry.limits),
+            **self._registry.about,
         }
-        welcome["codecs"] = [codec for codec in self._lobby.about["codecs"] if codec in ("jpeg", *hello.codecs)]
+        welcome["codecs"] = [codec for codec in self._registry.about["codecs"] if codec in ("jpeg", *hello.codecs)]
         await self._socket.send_text(json.dumps(welcome))
 
     async def _serve(self) -> None:
-        tasks = [asyncio.create_task(work()) for work in (self._read, self._write, self._tick)]
+        tasks = [asyncio.create_task(work()) for work in (self._read, self._write, self._send_status)]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -141,88 +161,80 @@ class ViewerConnection:
                 text = await self._receive()
                 if not self._rate.allows():
                     await asyncio.sleep(0.05)  # reads no further: the flood dams itself up
-                    self._fault(4429, f"expected at most {self._lobby.limits.messages_per_s} messages a second")
+                    self._fault(4429, f"expected at most {self._registry.limits.messages_per_s} messages a second")
                     continue
-                self._obey(parse(text, self._lobby.limits))
+                self._handle(parse(text, self._registry.limits))
             except ProtocolError as error:
                 self._fault(4400, str(error))
 
     def _fault(self, code: int, message: str) -> None:
-        if self._patience.ends():
+        if self._faults.exceeded():
             raise ClosingError(code, message)
-        self._note({"type": "error", "code": code, "message": message, "fatal": False})
+        self._send_soon(error_json(code, message, fatal=False))
 
-    def _obey(self, message: Hello | Look | Ack | ClockChange | Ping) -> None:
+    def _handle(self, message: Hello | Look | Ack | ClockChange | Ping) -> None:
         if isinstance(message, Ping):
             now_ms = round(1000 * time.monotonic(), 2)
-            self._note({"type": "pong", "sent_ms": message.sent_ms, "server_ms": now_ms})
+            self._send_soon({"type": "pong", "sent_ms": message.sent_ms, "server_ms": now_ms})
             return
         if isinstance(message, Hello):
             raise ProtocolError("expected one hello, got another")
-        if isinstance(message, Look) and message.codec not in self._lobby.about["codecs"]:
-            raise ProtocolError(f"expected a codec among {self._lobby.about['codecs']}, got '{message.codec}'")
+        if isinstance(message, Look) and message.codec not in self._registry.about["codecs"]:
+            raise ProtocolError(f"expected a codec among {self._registry.about['codecs']}, got '{message.codec}'")
         with self._service.lock:
             if isinstance(message, Look):
-                self._seat.look(message)
+                self._session.look(message)
             elif isinstance(message, Ack):
-                self._seat.ack(message.frame)
+                self._session.ack(message.frame)
             else:
-                self._seat.change(message, self._service.supply.span)
+                self._session.change(message, self._service.supply.span)
             self._service.lock.notify_all()
 
     async def _write(self) -> None:
         while True:
-            await self._news.wait()
-            self._news.clear()
-            while self._notes or self._frame is not None:
-                while self._notes:
-                    await self._socket.send_text(json.dumps(self._notes.pop(next(iter(self._notes)))))
+            await self._wake_writer.wait()
+            self._wake_writer.clear()
+            while self._pending or self._frame is not None:
+                while self._pending:
+                    await self._socket.send_text(json.dumps(self._pending.pop(next(iter(self._pending)))))
                 if self._frame is not None:
                     frame, self._frame = self._frame, None
                     await self._socket.send_bytes(frame)
 
-    async def _tick(self) -> None:
-        """Rig, state and statistics when it is time, and the end of those who do not answer."""
+    async def _send_status(self) -> None:
+        """Send rig, state and statistics when they are due, and end a connection that does not answer."""
         rig, last, state_at, stats_at = None, None, 0.0, time.monotonic()
         while True:
             now = time.monotonic()
             if self._service.ready and self._service.renderer.rig_json is not rig:
                 rig = self._service.renderer.rig_json
-                self._note({"type": "rig"} | (rig or {}))
-            source = self._lobby.source_json()
-            own = self._seat.state_json(self._service.supply.span, self._service.edge)
-            essence = (source, {key: own[key] for key in own if key not in ("time", "behind")})
-            if essence != last or now - state_at >= 0.5:
-                last, state_at = essence, now
-                self._note({"type": "state"} | source | own)
+                self._send_soon({"type": "rig"} | (rig or {}))
+            source = self._registry.source_json()
+            own = self._session.state_json(self._service.supply.span, self._service.edge)
+            shown = (source, {key: own[key] for key in own if key not in ("time", "behind")})
+            if shown != last or now - state_at >= 0.5:
+                last, state_at = shown, now
+                self._send_soon({"type": "state"} | source | own)
             if now - stats_at >= 1:
                 stats_at = now
-                self._note(self._seat.stats_json(len(self._lobby.seats)))
-            if self._seat.in_flight is not None and now - self._seat.in_flight_since > ACK_S:
+                self._send_soon(self._session.stats_json(len(self._registry.sessions)))
+            if self._session.in_flight is not None and now - self._session.in_flight_since > ACK_S:
                 raise ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect")
             await asyncio.sleep(TICK_S)
 
-    def _note(self, note: dict[str, Any]) -> None:
-        """Send this, instead of one of its type that is still waiting."""
-        self._notes[note["type"]] = note
-        self._news.set()
+    def _send_soon(self, message: dict[str, Any]) -> None:
+        """Queue a message, in place of one of its type that is still waiting."""
+        self._pending[message["type"]] = message
+        self._wake_writer.set()
 
     def _deliver(self, message: bytes) -> None:
         def put() -> None:
             self._frame = message
-            self._news.set()
+            self._wake_writer.set()
 
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(put)
 
-    def _complain(self, message: str) -> None:
-        note = {"type": "error", "code": "render", "message": message, "fatal": False}
+    def _report_error(self, message: str) -> None:
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._note, note)
-
-    async def _close(self, code: int, message: str) -> None:
-        note = {"type": "error", "code": code, "message": message, "fatal": True}
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
-            async with asyncio.timeout(2):
-                await self._socket.send_text(json.dumps(note))
-                await self._socket.close(code)
+            self._loop.call_soon_threadsafe(self._send_soon, error_json("render", message, fatal=False))

@@ -39,7 +39,7 @@ class Guard:
         self._local = is_loopback(host)
         self.token = token
 
-    def stranger(self, connection: HTTPConnection) -> str | None:
+    def foreign_origin(self, connection: HTTPConnection) -> str | None:
         """Why a request comes from a page that is not ours; None if it does not.
 
         A page elsewhere has another `Origin`, or shows our pictures as its own; one that made its own name resolve to
@@ -72,15 +72,15 @@ def _name(host: str) -> str:
     return host[1:].split("]")[0] if host.startswith("[") else host.rsplit(":", 1)[0]
 
 
-class Rate:
-    """So many events a second on average, twice as many at once."""
+class RateLimit:
+    """A token bucket: so many events a second on average, twice as many at once."""
 
     def __init__(self, per_s: float | int) -> None:
         self._per_s = per_s
         self._left, self._at = 2 * per_s, time.monotonic()
 
     def allows(self) -> bool:
-        """Whether one more is within it."""
+        """Take a token for one more event; whether there was one."""
         now = time.monotonic()
         self._left = min(2 * self._per_s, self._left + (now - self._at) * self._per_s)
         self._at = now
@@ -88,14 +88,14 @@ class Rate:
         return self._left >= 1
 
 
-class Patience:
-    """Ends after so many faults in so many seconds."""
+class FaultLimit:
+    """How many faults in how many seconds are too many."""
 
     def __init__(self, faults: int = 20, within_s: float = 10.0) -> None:
         self._at: deque[float] = deque(maxlen=faults)
         self._within_s = within_s
 
-    def ends(self) -> bool:
-        """One more fault; whether it was one too many."""
+    def exceeded(self) -> bool:
+        """Count one more fault; whether that is too many."""
         self._at.append(time.monotonic())
         return len(self._at) == self._at.maxlen and self._at[-1] - self._at[0] < self._within_s

@@ -5,15 +5,15 @@ from viewmend.live.memory import resident_bytes
 from viewmend.live.service import STAGES
 
 
-def metrics_text(lobby: SessionRegistry) -> str:
+def metrics_text(registry: SessionRegistry) -> str:
     """Everything that is counted."""
-    service = lobby.service
+    service = registry.service
     counts = dict(service.counts)
-    dropped = sum(seat.dropped for seat in list(lobby.seats))
+    dropped = sum(session.dropped for session in list(registry.sessions))
     ready = int(service.ready and service.supply.status.state == "ready")
     lines = [
         *_metric("viewmend_up", "gauge", "1 while views can be rendered.", {"": ready}),
-        *_metric("viewmend_viewers", "gauge", "Viewers connected.", {"": len(lobby.seats)}),
+        *_metric("viewmend_viewers", "gauge", "Viewers connected.", {"": len(registry.sessions)}),
         *_metric("viewmend_frames_total", "counter", "Views rendered.", {"": counts["frames"]}),
         *_metric("viewmend_shared_total", "counter", "Views of an already known time.", {"": counts["shared"]}),
         *_metric("viewmend_dropped", "gauge", "Looks of present viewers replaced before rendered.", {"": dropped}),

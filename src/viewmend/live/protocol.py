@@ -177,6 +177,11 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
         raise ProtocolError(str(error)[:300]) from None
 
 
+def error_json(code: int | str, message: str, fatal: bool) -> dict[str, Any]:
+    """The message `error`; `fatal` where the socket is closed next."""
+    return {"type": "error", "code": code, "message": message, "fatal": fatal}
+
+
 def check_rotation(R: Sequence[float]) -> None:
     """Refuse nine numbers that are no rotation, row by row.
 

@@ -14,6 +14,7 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import rigid
 from viewmend.json_input import one_of
+from viewmend.live.connection import close_with_error
 from viewmend.live.protocol import VERSION, Point, ProtocolError, Rotation, check_rotation, read_message, unpack
 from viewmend.live.pushed import PushedFrames
 from viewmend.views import MultiViewFrame
@@ -33,7 +34,7 @@ async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
             async with asyncio.timeout(SILENT_S):
                 message = await socket.receive()
         except TimeoutError:
-            await _refuse(socket, 4408, f"expected a frame within {SILENT_S:g} s; reconnect")
+            await close_with_error(socket, 4408, f"expected a frame within {SILENT_S:g} s; reconnect")
             return
         if message["type"] == "websocket.disconnect":
             return
@@ -46,14 +47,9 @@ async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
             frame = await asyncio.to_thread(_frame, message.get("bytes") or b"", cameras)
             number = supply.push(frame)
         except ValueError as error:
-            await _refuse(socket, 4400, str(error))
+            await close_with_error(socket, 4400, str(error))
             return
         await socket.send_text(json.dumps({"type": "taken", "frame": number}))
-
-
-async def _refuse(socket: WebSocket, code: int, message: str) -> None:
-    await socket.send_text(json.dumps({"type": "error", "code": code, "message": message, "fatal": True}))
-    await socket.close(code)
 
 
 class CameraEntry(Struct, frozen=True, kw_only=True):

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import json
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from concurrent.futures import Future
@@ -16,7 +15,7 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.capture.video_writer import can_write_mp4
-from viewmend.live.connection import SessionRegistry, ViewerConnection
+from viewmend.live.connection import SessionRegistry, ViewerConnection, close_with_error
 from viewmend.live.guard import Guard
 from viewmend.live.metrics_text import metrics_text
 from viewmend.live.page_files import HEADERS, page_files
@@ -65,7 +64,7 @@ class LiveServer:
             "export": can_write_mp4(),
             "token_needed": bool(config.token),
         }
-        self.lobby = SessionRegistry(service, config.limits, config.budget_ms, about)
+        self.registry = SessionRegistry(service, config.limits, config.budget_ms, about)
 
     def app(self) -> Starlette:
         """The ASGI application; its lifespan starts and stops the service."""
@@ -93,16 +92,16 @@ class LiveServer:
         """A route for which no token is needed: the page holds no secret."""
 
         async def checked(request: Request) -> Response:
-            stranger = self._guard.stranger(request)
-            return _refusal(403, stranger) if stranger else answer(request)
+            foreign = self._guard.foreign_origin(request)
+            return _refusal(403, foreign) if foreign else answer(request)
 
         return checked
 
     def _guarded(self, answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
         async def checked(request: Request) -> Response:
-            stranger = self._guard.stranger(request)
-            if stranger:
-                return _refusal(403, stranger)
+            foreign = self._guard.foreign_origin(request)
+            if foreign:
+                return _refusal(403, foreign)
             if self._guard.lacks_token(request):
                 return _refusal(401, "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN")
             try:
@@ -125,7 +124,7 @@ class LiveServer:
         return Response(file.content, media_type=file.media_type, headers=HEADERS)
 
     async def _health(self, request: Request) -> Response:
-        source = self.lobby.source_json()
+        source = self.registry.source_json()
         error = source["error"] or source["model_error"]
         state = self._service.supply.status.state
         failing = state == "failing" or (error is not None and state != "loading")
@@ -137,22 +136,22 @@ class LiveServer:
             "name": None if rig is None else rig.name,
             "model": self._config.model,
             "error": error,
-            "viewers": len(self.lobby.seats),
+            "viewers": len(self.registry.sessions),
             "version": self._version,
         }
         return JSONResponse(health, 503 if failing else 200)
 
     async def _metrics(self, request: Request) -> Response:
-        return PlainTextResponse(metrics_text(self.lobby), media_type="text/plain; version=0.0.4; charset=utf-8")
+        return PlainTextResponse(metrics_text(self.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _picture(self, request: Request) -> Response:
         asked = parse_query(dict(request.query_params), self._config.limits)
         if self._pictures >= PICTURES_AT_ONCE:
             return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
-        errand = PictureJob(asked)
+        job = PictureJob(asked)
         self._pictures += 1
         try:
-            image, rendered = await self._wait(request, errand, errand.done, PICTURE_S)
+            image, rendered = await self._wait(request, job, job.done, PICTURE_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the frame did not come in time; see /health")
         finally:
@@ -172,17 +171,17 @@ class LiveServer:
             body = await _body(request)
             if body is None:
                 return _refusal(413, f"expected at most {BODY_BYTES} bytes")
-            errand = PathJob(parse_path(body, self._config.limits))
-            video = await self._wait(request, errand, errand.done, EXPORT_S)
+            job = PathJob(parse_path(body, self._config.limits))
+            video = await self._wait(request, job, job.done, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
         finally:
             self._exporting = False
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
-    async def _wait(self, request: Request, errand: PictureJob | PathJob, done: Future, limit_s: float):
-        """The errand's result; it is given up when the client goes."""
-        self._service.join(errand)
+    async def _wait(self, request: Request, job: PictureJob | PathJob, done: Future, limit_s: float):
+        """The job's result. A job is given up when its client goes."""
+        self._service.join(job)
         end, waiting = time.monotonic() + limit_s, asyncio.wrap_future(done)
         try:
             while not waiting.done():
@@ -191,25 +190,23 @@ class LiveServer:
                     raise TimeoutError
             return waiting.result()
         finally:
-            self._service.leave(errand)
+            self._service.leave(job)
             done.cancel()
 
     async def _welcome(self, socket: WebSocket) -> bool:
-        """Accept a socket, or refuse it: strangers at the door, those without the token with a word."""
-        if self._guard.stranger(socket):
+        """Accept a socket. One of a foreign page is closed without a word, one without the token with an error."""
+        if self._guard.foreign_origin(socket):
             await socket.close()
             return False
         await socket.accept()
         if self._guard.lacks_token(socket):
-            note = {"type": "error", "code": 4401, "message": "expected ?token=TOKEN", "fatal": True}
-            await socket.send_text(json.dumps(note))
-            await socket.close(4401)
+            await close_with_error(socket, 4401, "expected ?token=TOKEN")
             return False
         return True
 
     async def _viewer(self, socket: WebSocket) -> None:
         if await self._welcome(socket):
-            await ViewerConnection(socket, self.lobby).run()
+            await ViewerConnection(socket, self.registry).run()
 
     async def _push(self, socket: WebSocket) -> None:
         supply = self._service.supply
@@ -221,8 +218,7 @@ class LiveServer:
                 if self._pushing
                 else "this server shows a recording; start viewmend serve live"
             )
-            await socket.send_text(json.dumps({"type": "error", "code": 4409, "message": why, "fatal": True}))
-            await socket.close(4409)
+            await close_with_error(socket, 4409, why)
             return
         self._pushing = True
         try:
