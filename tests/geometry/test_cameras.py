@@ -4,7 +4,6 @@ import pytest
 import torch
 from geometry.solids import camera_at, dome
 
-from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras, pinhole, pixel_centers, project, unproject
 
 
@@ -83,10 +82,3 @@ def test_centers_are_where_the_cameras_stand():
     uv = torch.full((2, 1, 2), 7.0)
     at_zero = unproject(uv, torch.zeros(2, 1), cameras)
     torch.testing.assert_close(at_zero[:, 0], cameras.centers)
-
-
-def test_bounds_grow_about_their_center():
-    bounds = Bounds(torch.tensor([0.0, 1.0, 2.0]), torch.tensor([2.0, 5.0, 4.0]))
-    grown = bounds.grown(0.5)
-    torch.testing.assert_close(grown.center, bounds.center)
-    torch.testing.assert_close(grown.size_m, bounds.size_m * 1.5)

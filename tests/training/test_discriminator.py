@@ -4,7 +4,7 @@ import pytest
 import torch
 from reference.discriminator_twin import judge_twin
 
-from viewmend.training.discriminator import DiscriminatorConfig, build_discriminator, t_patchgan
+from viewmend.training.discriminator import DiscriminatorConfig, build_discriminator
 
 KINDS = ("image", "clip")
 SHAPES = {"image": ((3, 21, 18), (3, 16, 30)), "clip": ((3, 3, 21, 18), (3, 2, 16, 30))}
@@ -89,7 +89,7 @@ def test_a_call_takes_one_step_of_power_iteration_in_training_and_none_otherwise
 
 
 def test_t_patchgan_is_the_published_network():
-    net = build_discriminator(t_patchgan())
+    net = build_discriminator(DiscriminatorConfig(kind="clip", width=32, layers=6))
     assert sum(p.numel() for p in net.parameters()) == 4_461_728
     with torch.no_grad():
         (logits,) = net(list(torch.rand(1, 3, 1, 240, 432)))

@@ -24,11 +24,6 @@ class Bounds:
         """Edge lengths, metres."""
         return self.high - self.low
 
-    def grown(self, fraction: float) -> "Bounds":
-        """The box with every side longer by `fraction` of its length, about the same centre."""
-        margin = self.size_m * (fraction / 2)
-        return Bounds(self.low - margin, self.high + margin)
-
     def to(self, device: torch.device | str) -> "Bounds":
         """The same box on `device`."""
         return replace(self, low=self.low.to(device), high=self.high.to(device))

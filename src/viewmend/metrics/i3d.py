@@ -27,7 +27,6 @@ POOL_BEFORE: dict[str, tuple[Triple, Triple]] = {
     "Mixed_5b": ((2, 2, 2), (2, 2, 2)),
 }
 """Kernel and stride of the pooling before a layer."""
-FEATURES = 1024
 UNUSED = ("logits.",)
 """Keys of a whole file that nothing here needs."""
 

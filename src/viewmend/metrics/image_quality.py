@@ -36,25 +36,6 @@ def psnr(
     return min(MAX_PSNR_DB, -10 * math.log10(max(float(chosen.mean()), 1e-30)))
 
 
-def ssim(
-    image: Float[Tensor, "channel height width"],
-    truth: Float[Tensor, "channel height width"],
-    pixels: Bool[Tensor, "height width"] | None = None,
-    window: SsimWindow = "gaussian",
-) -> float | None:
-    """Structural similarity (Wang et al. 2004), in [-1, 1]: the mean of `ssim_map`.
-
-    With `pixels` both images are blackened outside them first, then compared as a whole: the paper's SSIM in the holes.
-    No pixels, or an image smaller than the window, give None.
-    """
-    if pixels is not None:
-        if not bool(pixels.any()):
-            return None
-        image, truth = image * pixels, truth * pixels
-    similarity = ssim_map(image, truth, window)
-    return None if similarity is None else float(similarity.mean())
-
-
 def ssim_map(
     image: Float[Tensor, "channel height width"],
     truth: Float[Tensor, "channel height width"],

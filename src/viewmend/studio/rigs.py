@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -11,7 +10,7 @@ from torch import Tensor
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
 from viewmend.geometry.orbit import fov_y_showing
 from viewmend.geometry.orbit import orbit as orbit_of
-from viewmend.geometry.rigid import invert_rigid, look_at, rigid, rotation_from_axis_angle
+from viewmend.geometry.rigid import look_at, rotation_from_axis_angle
 
 SUBJECT_CENTER_M = (0.0, 0.95, 0.0)
 """What rigs look at: the middle of a standing person at the stage's centre."""
@@ -63,32 +62,6 @@ def dome_rig(
     around = (1 - y * y).sqrt()
     eyes = radius_m * torch.stack([around * angle.sin(), y, around * angle.cos()], -1) + torch.tensor(SUBJECT_CENTER_M)
     return _stand(eyes, size_px, visible_m, jitter, seed)
-
-
-def staged_rig(
-    cameras: Cameras, center: Float[Tensor, "3"] | None = None, up: Float[Tensor, "3"] | None = None
-) -> Cameras:
-    """A real rig moved onto the stage: its `center` comes to the subject's middle, its `up` to +y. Metres stay metres.
-
-    Args:
-        cameras: any calibration in metres.
-        center: what the rig looks at, in its world; by default the point nearest to all optical axes.
-        up: its world's up; by default the mean of the images' up directions.
-    """
-    axes = cameras.camera_from_world[:, 2, :3]
-    across = torch.eye(3, device=axes.device) - axes[:, :, None] * axes[:, None]
-    total = across.sum(0) + 1e-6 * torch.eye(3, device=axes.device)
-    nearest: Tensor = torch.linalg.solve(total, (across @ cameras.centers[..., None])[..., 0].sum(0))
-    center = nearest if center is None else center
-    up = -cameras.camera_from_world[:, 1, :3].mean(0) if up is None else up
-    y = up / up.norm()
-    sideways = torch.eye(3, device=y.device)[int(y.abs().argmin())]
-    x = torch.linalg.cross(y, sideways)
-    x = x / x.norm()
-    stage_from_world = torch.stack([x, y, torch.linalg.cross(x, y)])
-    middle = torch.tensor(SUBJECT_CENTER_M, device=y.device)
-    world_from_stage = invert_rigid(rigid(stage_from_world, middle - stage_from_world @ center))
-    return replace(cameras, camera_from_world=cameras.camera_from_world @ world_from_stage)
 
 
 def orbit(

@@ -16,9 +16,6 @@ from torch.nn.functional import softplus
 
 from viewmend.training.discriminator import Discriminator
 
-LAMBDA_ADV = 0.01
-"""Weight of the term beside L_in + L_out."""
-
 Objective = Literal["gan", "nonsaturating", "hinge"]
 """The paper's; the same with -log D(Fhat) for the inpainter (Goodfellow et al. 2014), whose gradient does not fade
 where the discriminator is sure; the hinge (Miyato et al. 2018), with which the baselines were trained."""

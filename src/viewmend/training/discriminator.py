@@ -44,11 +44,6 @@ class DiscriminatorConfig:
         return (3, *(self.width * 2 ** min(layer, 2) for layer in range(self.layers)))
 
 
-def t_patchgan() -> DiscriminatorConfig:
-    """The discriminator that DSTT, FuseFormer, E2FGVI and ProPainter were trained against: 4,461,728 parameters."""
-    return DiscriminatorConfig(kind="clip", width=32, layers=6)
-
-
 class _PatchDiscriminator(nn.Module):
     """Convolutions from images in [0, 1] to a map of logits; there is nothing in it that mixes images of a batch."""
 

@@ -1,6 +1,6 @@
 """Head, face and hair: one surface of rings with features, painted; hair is the same surface, thicker."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -184,8 +184,3 @@ def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_
     arch = 0.585 + 0.012 * face[6] + 0.018 * np.cos((x - 0.05) / 0.2 * 1.5)
     brow = 1 - ((y - arch) / (0.017 - 0.006 * f)) ** 2 - ((x - 0.02) / 0.21) ** 4
     return np.clip(blend(image, 0.75 * hair_rgb, 0.85 * crisp(brow, 0.7)), 0, 1)
-
-
-def thickened(head: Head, thickness: float) -> Head:
-    """The head under a layer this thick (head heights)."""
-    return replace(head, thickness=thickness)
