@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from viewmend.geometry.rigid import look_at
     from viewmend.inpainting.checkpoint import load_inpainter
     from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
+    from viewmend.live.client import Client
+    from viewmend.live.publisher import Publisher
     from viewmend.methods import make_method
     from viewmend.observation import DepthProvider, Observation
     from viewmend.rendering.error_rules import Evidence, error_rule
@@ -31,6 +33,7 @@ __all__ = [
     "Bounds",
     "Cameras",
     "CaptureError",
+    "Client",
     "CompletedView",
     "ContextProvider",
     "ContextViews",
@@ -40,6 +43,7 @@ __all__ = [
     "IncompleteView",
     "MultiViewFrame",
     "Observation",
+    "Publisher",
     "RenderConfig",
     "RenderQuality",
     "Silhouettes",
@@ -63,6 +67,7 @@ _ROOM = {
     "Bounds": "geometry.bounds",
     "Cameras": "geometry.cameras",
     "CaptureError": "capture.errors",
+    "Client": "live.client",
     "CompletedView": "views",
     "ContextProvider": "inpainting.protocol",
     "ContextViews": "views",
@@ -72,6 +77,7 @@ _ROOM = {
     "IncompleteView": "views",
     "MultiViewFrame": "views",
     "Observation": "observation",
+    "Publisher": "live.publisher",
     "RenderConfig": "rendering.view",
     "RenderQuality": "inpainting.protocol",
     "Silhouettes": "views",
