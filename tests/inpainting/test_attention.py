@@ -82,7 +82,7 @@ def test_no_key_gives_zeros(qkv):
 def test_rotation_equals_the_loop(rng):
     x, angle = torch.randn(3, 8, generator=rng), torch.randn(3, 4, generator=rng)
     slow = torch.stack([rotate_twin(a, b) for a, b in zip(x, angle, strict=True)])
-    assert torch.allclose(rope.rotate(x, angle), slow, atol=1e-6)
+    assert torch.allclose(rope.rotate(x, rope.cos_sin(angle)), slow, atol=1e-6)
 
 
 @pytest.mark.parametrize("frequencies", [rope.score_frequencies(32), rope.value_frequencies(32)])
@@ -91,7 +91,10 @@ def test_rotated_scores_depend_on_differences_only(frequencies, rng):
     at, there, shift = torch.rand(3, 50, 3, generator=rng) * 2 - 0.5
 
     def score(a, b):
-        return (rope.rotate(q, rope.angles(a, frequencies)) * rope.rotate(k, rope.angles(b, frequencies))).sum(-1)
+        return (
+            rope.rotate(q, rope.cos_sin(rope.angles(a, frequencies)))
+            * rope.rotate(k, rope.cos_sin(rope.angles(b, frequencies)))
+        ).sum(-1)
 
     assert torch.allclose(score(at, there), score(at + shift, there + shift), atol=1e-3)
     assert not torch.allclose(score(at, there), score(at, there + shift), atol=1e-1)
@@ -184,8 +187,8 @@ def test_an_untrained_model_looks_at_what_lands_near(block):
     query = torch.tensor([[0.45, 0.55, 0.0]])
     K = net.project_context(R)[block, 0].unflatten(1, (4, 32)).transpose(0, 1)
     Q = net.blocks[block].query(P[:1]).unflatten(1, (4, 32)).transpose(0, 1)
-    Q = rope.rotate(Q, rope.angles(query, net.score_frequencies))
-    K = rope.rotate(K, rope.angles(places, net.score_frequencies))
+    Q = rope.rotate(Q, rope.cos_sin(rope.angles(query, net.score_frequencies)))
+    K = rope.rotate(K, rope.cos_sin(rope.angles(places, net.score_frequencies)))
     weights = ((Q @ K.mT)[:, 0] * net.scale).softmax(-1)
     near = (places - query)[:, :2].norm(dim=1) < 1.5 * 16 / 320
     assert (weights[:, near].sum(1) > 0.5).all()

@@ -26,7 +26,7 @@ def test_turned_waves_are_a_shifted_picture():
     pattern = lambda x: 0.5 + 0.3 * torch.cos(2 * math.pi * x / 40 - 0.4)  # noqa: E731
     seen = pattern(x)[None].expand(7, 7).flatten()
     value = analysis(32) @ seen
-    turned = rope.rotate(value, rope.angles(torch.tensor([offset_px / 16, 0.0, 0.0]), f))
+    turned = rope.rotate(value, rope.cos_sin(rope.angles(torch.tensor([offset_px / 16, 0.0, 0.0]), f)))
     arrived = (synthesis(32) @ turned).unflatten(0, (7, 7))[3]
     assert torch.allclose(arrived, pattern(x - offset_px), atol=0.05)
     assert not torch.allclose(arrived, pattern(x), atol=0.1)

@@ -59,17 +59,15 @@ def angles(
     return (coordinates[..., None] * frequencies).sum(-2)
 
 
+def cos_sin(angle: Float[Tensor, "*batch pair"]) -> Float[Tensor, "2 *batch pair"]:
+    """Cosine and sine of angles in radians, for `rotate`."""
+    return torch.stack([angle.cos(), angle.sin()])
+
+
 def rotate(
-    x: Float[Tensor, "*batch channel"], angle: Float[Tensor, "*#batch channel/2"]
-) -> Float[Tensor, "*batch channel"]:
-    """Pairs (i, i + channel / 2) of x turned by these angles, in x's own precision."""
-    return turn(x, torch.stack([angle.cos(), angle.sin()]))
-
-
-def turn(
     x: Float[Tensor, "*batch channel"], cos_sin: Float[Tensor, "2 *#batch channel/2"]
 ) -> Float[Tensor, "*batch channel"]:
-    """`rotate` by angles whose cosine and sine are at hand."""
+    """Pairs (i, i + channel / 2) of x rotated by the angles of `cos_sin`, in x's own precision."""
     cos, sin = cos_sin.to(x.dtype)
     first, second = x.chunk(2, -1)
     return torch.cat([first * cos - second * sin, second * cos + first * sin], -1)

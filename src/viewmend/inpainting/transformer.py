@@ -105,7 +105,7 @@ class Transformer(nn.Module):
         top_k: int | None,
     ) -> Float[Tensor, "sample query dim"]:
         """The input tokens after all blocks; only they change."""
-        turn = _Turns(self, at, context_at)
+        rotations = _Rotations(self, at, context_at)
         count = keys_values.shape[3]
         prune = top_k is not None and top_k < count
         for first in range(0, self.config.total_blocks, self.config.blocks):
@@ -116,27 +116,27 @@ class Transformer(nn.Module):
                 assert isinstance(block, Block)
                 KV = rearrange(keys_values[number], "two b n (h c) -> two b h n c", h=self.config.heads)
                 Q = rearrange(block.query(block.norm_query(tokens)), "b n (h c) -> b h n c", h=self.config.heads)
-                Q = turn.query(Q)
+                Q = rotations.query(Q)
                 if number == first and prune and self.config.blocks > 1:
                     assert top_k is not None
-                    K, V, present = turn.context(KV, None)
+                    K, V, present = rotations.context(KV, None)
                     looked, received = attend_and_sum(Q, K, V, present, at.present, self.scale)
                     if torch.is_grad_enabled():
                         weight = straight_through(received, present, top_k)
                     else:
                         kept = most_attended(received.masked_fill(~present, -1.0), top_k)
                 elif weight is not None:
-                    K, V, _ = turn.context(KV, None)
+                    K, V, _ = rotations.context(KV, None)
                     looked = attend_weighted(Q, K, V, weight.to(Q.dtype), self.scale)
                 else:
-                    K, V, present = turn.context(KV, kept)
+                    K, V, present = rotations.context(KV, kept)
                     looked = attend(Q, K, V, present, self.scale)
-                tokens = tokens + rearrange(turn.back(looked), "b h n c -> b n (h c)")
+                tokens = tokens + rearrange(rotations.back(looked), "b h n c -> b n (h c)")
                 tokens = tokens + block.ffn(block.norm_ffn(tokens))
         return tokens
 
 
-class _Turns:
+class _Rotations:
     """The rotations of one forward pass, which all blocks share."""
 
     def __init__(self, transformer: Transformer, at: TokenPositions, context_at: TokenPositions) -> None:
@@ -154,23 +154,23 @@ class _Turns:
             self.value = (_cos_sin(-at_query), _cos_sin(at_key))
 
     def query(self, Q: Tensor) -> Tensor:
-        return Q if self.score is None else rope.turn(Q, self.score[0])
+        return Q if self.score is None else rope.rotate(Q, self.score[0])
 
     def back(self, looked: Tensor) -> Tensor:
-        return looked if self.value is None else rope.turn(looked, self.value[0])
+        return looked if self.value is None else rope.rotate(looked, self.value[0])
 
     def context(self, KV: Tensor, kept: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         """Rotated K and V of the kept keys and which of these count."""
-        present, turns = self.present, [None if t is None else t[1] for t in (self.score, self.value)]
+        present, rotations = self.present, [None if r is None else r[1] for r in (self.score, self.value)]
         if kept is not None:
             present = present.gather(1, kept)
             index = kept[:, None, :, None]
             KV = KV.gather(3, index.expand(2, -1, KV.shape[2], -1, KV.shape[4]))
-            turns = [None if t is None else t.gather(3, index.expand(2, -1, -1, -1, t.shape[4])) for t in turns]
-        K, V = (x if t is None else rope.turn(x, t) for x, t in zip(KV, turns, strict=True))
+            rotations = [None if r is None else r.gather(3, index.expand(2, -1, -1, -1, r.shape[4])) for r in rotations]
+        K, V = (x if r is None else rope.rotate(x, r) for x, r in zip(KV, rotations, strict=True))
         return K, V, present
 
 
 def _cos_sin(angle: Float[Tensor, "sample token pair"]) -> Float[Tensor, "2 sample 1 token pair"]:
-    """What turns every head and block by the same angles."""
-    return torch.stack([angle.cos(), angle.sin()])[:, :, None]
+    """Every head and block is rotated by the same angles."""
+    return rope.cos_sin(angle)[:, :, None]
