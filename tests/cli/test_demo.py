@@ -6,8 +6,8 @@ import cv2
 import torch
 
 from viewmend.cli import main
-from viewmend.cli.mending import Mender
 from viewmend.contact_sheet import GAP_PX, LABEL_PX
+from viewmend.evaluation.mending import Mender
 
 SMALL = ["--frames", "3", "--size", "72", "--cameras", "4", "--model", "telea", "--seed", "10001"]
 

@@ -1,6 +1,10 @@
-"""What several commands check of their options before they begin."""
+"""What several commands make of their options before they begin."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from viewmend.inpainting.protocol import ViewInpainter
 
 
 def check_device(name: str) -> None:
@@ -18,3 +22,18 @@ def check_people(performers: Path | None, motions: Path | None) -> None:
     for folder in (performers, motions):
         if folder is not None and not folder.exists():
             raise ValueError(f"{folder}: expected people or motions, found nothing; check --performers and --motions")
+
+
+def load_named(name: str | None, device: str) -> "ViewInpainter":
+    """The method of this name (`methods.make_method`); without a name the model that is shipped, else Telea.
+
+    Raises:
+        ValueError: there is none, it is damaged, or the device is not there.
+    """
+    from viewmend.cli.console import say
+    from viewmend.methods import default_method, make_method
+
+    check_device(device)
+    if name is None and (name := default_method()) == "telea":
+        say("no model is shipped with this version: the holes are filled by OpenCV's Telea")
+    return make_method(name, device)

@@ -83,3 +83,8 @@ def _without_nan(value: object) -> object:
     if isinstance(value, list | tuple):
         return [_without_nan(item) for item in value]
     return value
+
+
+def in_db(value: float | None) -> str:
+    """A figure of a table, five characters wide."""
+    return "    -" if value is None else f"{value:5.2f}"

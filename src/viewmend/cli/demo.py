@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from viewmend.cli.mend_summary import Fill, MendSummary, Metric
-    from viewmend.cli.mending import MendStep
+    from viewmend.evaluation.mending import Fill, MendStep, MendSummary, Metric
     from viewmend.geometry.cameras import Cameras
 
 
@@ -47,10 +46,10 @@ def run(options: Options) -> int:
     if wrong:
         raise ValueError(f"expected a positive --{wrong[0]}, got {getattr(options, wrong[0])}; see --help")
     from viewmend.capture.prefetch import prefetch
+    from viewmend.cli.checks import load_named
     from viewmend.cli.console import print_json, say, track
     from viewmend.cli.demo_output import write_demo
-    from viewmend.cli.mend_summary import MendSummary
-    from viewmend.cli.mending import Mender, load_named
+    from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.studio.stage import Studio, StudioConfig
 
     inpainter = load_named(options.model, "cpu")
@@ -93,7 +92,7 @@ def _report(summary: "MendSummary") -> dict[str, object]:
 
 
 def _table(summary: "MendSummary", steps: "list[MendStep]") -> list[str]:
-    from viewmend.cli.mend_summary import in_db
+    from viewmend.cli.console import in_db
 
     holes = sum(int((s.completed.view.error > 0).sum()) for s in steps)
     lines = [f"{len(steps)} frames, {holes} missing pixels; PSNR in dB against the truth:"]

@@ -11,8 +11,8 @@ from viewmend.capture.images import write_image
 from viewmend.capture.video_writer import write_mp4
 from viewmend.cli.console import say
 from viewmend.cli.mend_output import SHEET_ROWS, holes_marked, sheet_row
-from viewmend.cli.mending import MendStep
 from viewmend.contact_sheet import Tile, contact_sheet, picture
+from viewmend.evaluation.mending import MendStep
 
 APART = 4
 """Frames of the sheet are at least so many apart."""

@@ -9,6 +9,7 @@ import tyro
 
 if TYPE_CHECKING:
     from viewmend.capture.source import CaptureSource
+    from viewmend.evaluation.mending import MendSummary, Metric
     from viewmend.geometry.cameras import Cameras
     from viewmend.views import MultiViewFrame
 
@@ -69,10 +70,10 @@ def run(options: Options) -> int:
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     from viewmend.capture.prepare import prepare
     from viewmend.cli.alignment import say_alignment
+    from viewmend.cli.checks import load_named
     from viewmend.cli.console import print_json, say, track
     from viewmend.cli.mend_output import MendOutput
-    from viewmend.cli.mend_summary import MendSummary
-    from viewmend.cli.mending import Mender, load_named
+    from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.inpainting.protocol import RenderQuality
 
     held = () if options.leave_out is None else (options.leave_out,)
@@ -97,8 +98,28 @@ def run(options: Options) -> int:
     if options.json:
         print_json(summary.as_json())
     else:
-        print("\n".join(summary.in_words()))
+        print("\n".join(_in_words(summary)))
     return 0
+
+
+def _in_words(summary: "MendSummary") -> list[str]:
+    from viewmend.cli.console import in_db
+
+    iou = [value for values in summary.hull_iou.values() for value in values]
+    lines = [
+        f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
+        f"of the hull's pixels; hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}",
+        "a frame takes " + ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items()),
+    ]
+    if summary.mean("ours", "psnr_whole") is None:
+        return lines
+    lines += ["PSNR, dB", f"  whole image           {in_db(summary.mean('ours', 'psnr_whole'))}"]
+    lines.append(f"  rendered pixels       {in_db(summary.mean('ours', 'psnr_valid'))}")
+    holes: dict[str, Metric] = {"holes": "psnr_holes", "holes on the subject": "psnr_holes_fg"}
+    for kind, metric in holes.items():
+        ours, telea = summary.mean("ours", metric), summary.mean("telea", metric)
+        lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
+    return lines
 
 
 def _open(options: Options, held: tuple[str, ...]) -> "CaptureSource":

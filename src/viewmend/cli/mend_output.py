@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.capture.images import read_rgb, write_image
-from viewmend.cli.mending import MendStep
 from viewmend.contact_sheet import Tile, contact_sheet, picture
+from viewmend.evaluation.mending import MendStep
 from viewmend.views import IncompleteView
 
 SHEET_ROWS = 4

@@ -70,8 +70,8 @@ def run(options: Options) -> int:
     # Before torch is loaded. Its threads would spin between two pieces of work, on cores that a browser may need.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
+    from viewmend.cli.checks import load_named
     from viewmend.cli.console import say
-    from viewmend.cli.mending import load_named
     from viewmend.live.guard import token_query
     from viewmend.live.listener import Server
     from viewmend.live.memory import set_up

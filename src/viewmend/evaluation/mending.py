@@ -1,22 +1,28 @@
-"""One stream of mended views, with what a command shows and scores of it."""
+"""One stream of mended views, judged where the truth is known, and the scores of a whole run."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from statistics import mean, median
+from typing import Literal
 
 from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.baselines.classical import Telea
+from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
-from viewmend.metrics.image_quality import mask_iou
-from viewmend.metrics.view_scores import ViewScores, score_view
+from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
 from viewmend.observation import Observation
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.timing import StageTimes
 from viewmend.views import CompletedView, MultiViewFrame
+
+Fill = Literal["unfilled", "telea", "ours"]
+Metric = Literal["psnr_whole", "psnr_valid", "psnr_holes", "psnr_holes_fg"]
 
 
 @dataclass(frozen=True)
@@ -102,22 +108,60 @@ def _judge(completed: CompletedView, truth: MultiViewFrame) -> tuple[Float[Tenso
 def _hull_iou(observation: Observation) -> dict[str, float]:
     frame = observation.frame
     assert frame.mask is not None, "frames without masks are refused"
-    depth = observation.depth(frame.cameras.names)
-    scores = [mask_iou(depth[view] > 0, frame.mask[view] > 127) for view in range(len(frame.cameras))]
-    return {name: score for name, score in zip(frame.cameras.names, scores, strict=True) if score is not None}
+    iou = silhouette_iou(observation.depth(frame.cameras.names) > 0, frame.mask).tolist()
+    return {name: score for name, score in zip(frame.cameras.names, iou, strict=True) if not math.isnan(score)}
 
 
-def load_named(name: str | None, device: str) -> ViewInpainter:
-    """The method of this name (`methods.make_method`); without a name the model that is shipped, else Telea.
+class MendSummary:
+    """Gathers the steps of a run, without their images."""
 
-    Raises:
-        ValueError: there is none, it is damaged, or the device is not there.
-    """
-    from viewmend.cli.checks import check_device
-    from viewmend.cli.console import say
-    from viewmend.methods import default_method, make_method
+    def __init__(self) -> None:
+        self.frames = 0
+        self.hull_iou: dict[str, list[float]] = {}
+        """Of each camera, frame by frame."""
+        self._hull_px = self._holes_px = 0
+        self._scores: list[Scores] = []
+        self._times: list[StageTimes] = []
 
-    check_device(device)
-    if name is None and (name := default_method()) == "telea":
-        say("no model is shipped with this version: the holes are filled by OpenCV's Telea")
-    return make_method(name, device)
+    def add(self, step: MendStep) -> None:
+        """Count one more view."""
+        view = step.completed.view
+        self.frames += 1
+        self._hull_px += int((view.mask > 0.5).sum())
+        self._holes_px += int((view.error > 0).sum())
+        if step.scores is not None:
+            self._scores.append(step.scores)
+        for name, iou in step.hull_iou.items():
+            self.hull_iou.setdefault(name, []).append(iou)
+        self._times.append(step.times)
+
+    @property
+    def hole_fraction(self) -> float | None:
+        """The holes' share of the hull's pixels; None without a hull."""
+        return self._holes_px / self._hull_px if self._hull_px else None
+
+    def as_json(self) -> dict[str, object]:
+        """The scores; null where there are no such pixels, or no truth. Times are medians, milliseconds."""
+        return {
+            "frames": self.frames,
+            "hole_fraction": self.hole_fraction,
+            "psnr_whole": self.mean("ours", "psnr_whole"),
+            "psnr_valid": self.mean("ours", "psnr_valid"),
+            "psnr_holes": self.mean("ours", "psnr_holes"),
+            "psnr_holes_telea": self.mean("telea", "psnr_holes"),
+            "psnr_holes_fg": self.mean("ours", "psnr_holes_fg"),
+            "psnr_holes_fg_telea": self.mean("telea", "psnr_holes_fg"),
+            "hull_iou": {name: mean(values) for name, values in self.hull_iou.items()},
+            "stage_ms": self.stage_ms(),
+        }
+
+    def mean(self, fill: Fill, metric: Metric) -> float | None:
+        """Mean over frames of one metric of one way to fill the holes; None where there are no such pixels."""
+        scores: list[ViewScores] = [getattr(s, fill) for s in self._scores]
+        pixels = {"psnr_holes": [s.holes_px for s in scores], "psnr_holes_fg": [s.holes_fg_px for s in scores]}
+        return mean_over_frames([getattr(s, metric) for s in scores], pixels.get(metric))
+
+    def stage_ms(self) -> dict[str, float]:
+        """Median milliseconds of each stage."""
+        times = [asdict(stages) for stages in self._times]
+        return {stage: median(t[stage] for t in times) for stage in times[0]} if times else {}
