@@ -68,7 +68,7 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
 
     Raises:
         MethodMissing: its weights are not here.
-        ValueError: there is none, or it cannot be loaded (`CheckpointError`); no such precision.
+        ValueError: there is none, or it cannot be loaded (`WeightsError`); no such precision.
     """
     if name in METHODS:
         module, _, made = METHODS[name].partition(":")

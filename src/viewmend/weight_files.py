@@ -1,6 +1,6 @@
 """Weights of networks, read from files strictly: nothing in a file is run, and every name and shape must be right."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -29,7 +29,11 @@ class MismatchedWeightsError(WeightsError):
 
 
 def load_weights(
-    network: Network, path: str | Path, device: torch.device | str = "cpu", spare: Sequence[str] = ()
+    network: Network,
+    path: str | Path,
+    device: torch.device | str = "cpu",
+    spare: Sequence[str] = (),
+    rename: Callable[[str], str] | None = None,
 ) -> Network:
     """The network with the weights of this file, on `device` and ready to infer.
 
@@ -38,12 +42,15 @@ def load_weights(
         path: a .safetensors file, or torch's own format, which is read with `weights_only=True`.
         device: where the network computes.
         spare: beginnings of names that the file may have besides the network's own.
+        rename: from a name in the file to the network's, for files of an older format.
 
     Raises:
         DamagedWeightsError: the file is missing, unreadable or cut short.
         MismatchedWeightsError: a tensor is missing, unknown or of another shape.
     """
     path, weights, own = Path(path), read_weights(path), network.state_dict()
+    if rename is not None:
+        weights = {rename(key): value for key, value in weights.items()}
     weights = {key: value for key, value in weights.items() if key in own or not key.startswith(tuple(spare))}
     reshaped = [
         f"{key} {tuple(value.shape)} for {tuple(own[key].shape)}"

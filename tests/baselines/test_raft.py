@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from viewmend.baselines.raft import CELL_PX, LEVELS, RADIUS, Raft, correlations, load_raft, ray_batch, upsampled
+from viewmend.baselines.raft import CELL_PX, LEVELS, RADIUS, Raft, correlations, index_pyramid, load_raft, upsampled
 from viewmend.metrics.weights import MissingWeightsError
 
 
@@ -35,7 +35,7 @@ def test_correlations_are_looked_up_around_the_place(rng):
     first, second = torch.randn(2, 1, 6, 16, 24, generator=rng)
     pyramid = correlations(first, second)
     at = torch.rand(1, 2, 16, 24, generator=rng) * 8 + 6
-    found = ray_batch(pyramid, at.round())
+    found = index_pyramid(pyramid, at.round() + 0.5)
     assert len(pyramid) == LEVELS and found.shape == (1, LEVELS * (2 * RADIUS + 1) ** 2, 16, 24)
     for row, column in ((0, 0), (5, 7), (15, 23)):
         x, y = at.round()[0, :, row, column].int().tolist()

@@ -14,8 +14,6 @@ from viewmend import atomic_writes
 from viewmend.inpainting import checkpoint
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.checkpoint import (
-    DamagedCheckpointError,
-    MismatchedCheckpointError,
     MissingCheckpointError,
     load_inpainter,
     load_network,
@@ -23,6 +21,7 @@ from viewmend.inpainting.checkpoint import (
 )
 from viewmend.inpainting.config import InpainterConfig, paper, small
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
+from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError
 
 
 @pytest.fixture
@@ -68,13 +67,13 @@ def test_missing(saved, tmp_path):
 def test_weights_cut_short(saved, length):
     path = saved / "model.safetensors"
     path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(DamagedCheckpointError, match=r"model\.safetensors.*whole"):
+    with pytest.raises(DamagedWeightsError, match=r"model\.safetensors.*whole"):
         load_inpainter(saved)
 
 
 def test_a_config_that_is_no_json(saved):
     (saved / "config.json").write_text('{"dim": 12')
-    with pytest.raises(DamagedCheckpointError, match=r"config\.json"):
+    with pytest.raises(DamagedWeightsError, match=r"config\.json"):
         load_inpainter(saved)
 
 
@@ -82,7 +81,7 @@ def test_a_config_that_is_no_json(saved):
 def test_weights_of_another_config(saved, changes):
     values = json.loads((saved / "config.json").read_text()) | changes
     (saved / "config.json").write_text(json.dumps(values))
-    with pytest.raises(MismatchedCheckpointError, match=str(saved)):
+    with pytest.raises(MismatchedWeightsError, match=str(saved)):
         load_inpainter(saved)
 
 
@@ -90,7 +89,7 @@ def test_a_config_of_another_version(saved):
     values = json.loads((saved / "config.json").read_text())
     for changed in (values | {"viewmend_format": 99}, values | {"novelty": 1}, {"viewmend_format": 1}, []):
         (saved / "config.json").write_text(json.dumps(changed))
-        with pytest.raises(MismatchedCheckpointError):
+        with pytest.raises(MismatchedWeightsError):
             load_inpainter(saved)
 
 
@@ -126,7 +125,7 @@ def test_a_model_of_format_1_loads_as_it_was(saved):
     assert all(torch.equal(a, b) for a, b in zip(after.inner.parameters(), before.parameters(), strict=True))
     for gone in ({"grid": "absolute"}, {"attention_scale": "head"}):
         (saved / "config.json").write_text(json.dumps(values | gone))
-        with pytest.raises(MismatchedCheckpointError, match=f"expected {next(iter(gone))}"):
+        with pytest.raises(MismatchedWeightsError, match=f"expected {next(iter(gone))}"):
             load_inpainter(saved)
 
 

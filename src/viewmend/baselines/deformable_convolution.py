@@ -4,9 +4,9 @@ import torch
 from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F
 
-from viewmend.baselines.spynet import to_grid
+from viewmend.geometry.cameras import pixel_centers
+from viewmend.geometry.sampling import sample_bilinear
 
 
 def deform_conv2d(
@@ -34,15 +34,11 @@ def deform_conv2d(
     with torch.autocast(x.device.type, enabled=False):
         shift = rearrange(offsets.float(), "b (g k yx) h w -> yx (b g) k h w", k=points, yx=2)
         place = torch.arange(kernel, device=x.device) - kernel // 2
-        y = torch.arange(height, device=x.device)[:, None] + place.repeat_interleave(kernel).view(-1, 1, 1) + shift[0]
-        x_at = torch.arange(width, device=x.device) + place.repeat(kernel).view(-1, 1, 1) + shift[1]
-        grid = torch.stack([to_grid(x_at, width), to_grid(y, height)], -1)
-        read = F.grid_sample(
-            rearrange(x.float(), "b (g c) h w -> (b g) c h w", g=groups),
-            rearrange(grid, "n k h w xy -> n (k h) w xy"),
-            align_corners=False,
-        )
-        read = rearrange(read, "(b g) c (k h) w -> b g c k (h w)", g=groups, k=points)
+        kernel_points = torch.stack([place.repeat(kernel), place.repeat_interleave(kernel)], -1)[:, None, None]
+        at = pixel_centers(width, height, x.device) + kernel_points + shift.flip(0).movedim(0, -1)
+        images = rearrange(x.float(), "b (g c) h w -> (b g) c h w", g=groups)
+        read = sample_bilinear(images, rearrange(at, "n k h w xy -> n (k h w) xy"))
+        read = rearrange(read, "(b g) (k n) c -> b g c k n", g=groups, k=points)
         read = read * rearrange(masks.float(), "b (g k) h w -> b g 1 k (h w)", k=points)
     # Back to what the layers around it compute in, then the convolution is one product of matrices.
     out = weight.flatten(1) @ rearrange(read, "b g c k n -> b (g c k) n").to(weight.dtype)

@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.baselines.rgvi_flow import FlowMap, Image
+from viewmend.geometry.cameras import pixel_centers
+from viewmend.geometry.sampling import sample_bilinear
 from viewmend.metrics.weights import checked_weights, known_weights
 from viewmend.weight_files import load_weights
 
@@ -53,13 +55,10 @@ class Raft(nn.Module):
         hidden, context = self.context_encoder(pair[:1]).split(HIDDEN, 1)
         hidden, context = hidden.tanh(), context.relu()
         rows, columns = first.shape[2:]
-        y, x = torch.meshgrid(
-            torch.arange(rows, device=pair.device), torch.arange(columns, device=pair.device), indexing="ij"
-        )
-        start = torch.stack([x, y])[None].to(pair)
+        start = pixel_centers(columns, rows, pair.device).movedim(-1, 0)[None].to(pair)
         flow = torch.zeros_like(start)
         for _ in range(UPDATES):
-            hidden, step = self.update_block(hidden, context, ray_batch(pyramid, start + flow), flow)
+            hidden, step = self.update_block(hidden, context, index_pyramid(pyramid, start + flow), flow)
             flow = flow + step
         predictor = self.mask_predictor
         assert isinstance(predictor.convrelu, nn.Module) and isinstance(predictor.conv, nn.Module)
@@ -88,19 +87,18 @@ def correlations(
     return levels
 
 
-def ray_batch(
+def index_pyramid(
     pyramid: Sequence[Float[Tensor, "place 1 _rows _cols"]], at: Float[Tensor, "1 2 rows cols"]
 ) -> Float[Tensor, "1 channel rows cols"]:
-    """Correlations around the place `at` (x, y) of each place: level by level, columns of the square first."""
+    """Correlations around the position `at` (x, y) of each place: level by level, columns of the square first."""
     offset = torch.arange(-RADIUS, RADIUS + 1, device=at.device, dtype=at.dtype)
     square = torch.stack(torch.meshgrid(offset, offset, indexing="ij"), -1)  # the first index moves x
     center = at[0].flatten(1).T[:, None, None]
     found = []
     for level, volume in enumerate(pyramid):
-        rows, columns = volume.shape[2:]
-        places = center / 2**level + square
-        unit = 2 * places / (places.new_tensor([columns, rows]) - 1) - 1
-        found.append(F.grid_sample(volume, unit, align_corners=True).flatten(1))
+        # The network counts places from the middle of the first pixel, at each level anew.
+        places = (center - 0.5) / 2**level + 0.5 + square
+        found.append(sample_bilinear(volume, places.flatten(1, 2))[..., 0])
     return torch.cat(found, 1).T.reshape(1, -1, *at.shape[2:])
 
 

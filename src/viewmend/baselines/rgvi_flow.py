@@ -4,7 +4,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import grid_sample
+
+from viewmend.geometry.cameras import pixel_centers
+from viewmend.geometry.sampling import sample_bilinear
 
 Image = Float[Tensor, "3 height width"]
 FlowMap = Float[Tensor, "2 height width"]
@@ -32,14 +34,9 @@ def pull(
 ) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
     """The other image seen through the flow, bilinearly, and where all that was sampled lies in it."""
     height, width = flow.shape[1:]
-    y, x = torch.meshgrid(
-        torch.arange(height, device=flow.device), torch.arange(width, device=flow.device), indexing="ij"
-    )
-    at = torch.stack([x, y], -1) + flow.movedim(0, -1)
-    last = flow.new_tensor([width - 1, height - 1])
-    inside = ((at >= 0) & (at <= last)).all(-1)
-    unit = 2 * at / last.clamp_min(1) - 1
-    return grid_sample(image[None], unit[None], padding_mode="border", align_corners=True)[0], inside
+    at = pixel_centers(width, height, flow.device) + flow.movedim(0, -1)
+    inside = ((at >= 0.5) & (at <= at.new_tensor([width, height]) - 0.5)).all(-1)
+    return sample_bilinear(image[None], at.flatten(0, 1)[None], "border")[0].T.unflatten(1, (height, width)), inside
 
 
 def disagreeing(flow: FlowMap, back: FlowMap) -> Bool[Tensor, "height width"]:

@@ -1,11 +1,15 @@
 """Optical flow by a pyramid of small networks (SPyNet), and the warp that its flows are made for."""
 
 from itertools import pairwise
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from viewmend.geometry.cameras import pixel_centers
+from viewmend.geometry.sampling import sample_bilinear
 
 LEVELS = 6
 CHANNELS = (8, 32, 64, 32, 16, 2)
@@ -19,7 +23,7 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 def warp(
     image: Float[Tensor, "sample channel height width"],
     flow: Float[Tensor, "sample 2 height width"],
-    padding: str = "zeros",
+    padding: Literal["zeros", "border"] = "zeros",
 ) -> Float[Tensor, "sample channel height width"]:
     """What `image` shows at x + flow(x): bilinear, flow in pixels as (right, down).
 
@@ -28,16 +32,9 @@ def warp(
     height, width = image.shape[-2:]
     # Positions of a hundred pixels need more digits than half precision has.
     with torch.autocast(image.device.type, enabled=False):
-        flow = flow.float()
-        x = torch.arange(width, device=flow.device) + flow[:, 0]
-        y = torch.arange(height, device=flow.device)[:, None] + flow[:, 1]
-        grid = torch.stack([to_grid(x, width), to_grid(y, height)], -1)
-        return F.grid_sample(image.float(), grid, padding_mode=padding, align_corners=False).to(image.dtype)
-
-
-def to_grid(index: Float[Tensor, "*any"], size: int) -> Float[Tensor, "*any"]:
-    """Pixel indices (0 is the first pixel's centre) as `grid_sample` counts them with align_corners=False."""
-    return (2 * index + 1) / size - 1
+        at = pixel_centers(width, height, flow.device) + flow.float().movedim(1, -1)
+        read = sample_bilinear(image.float(), at.flatten(1, 2), padding)
+    return read.movedim(-1, 1).unflatten(2, (height, width)).to(image.dtype)
 
 
 class SPyNet(nn.Module):

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 
 from viewmend.atomic_writes import write_atomically, write_tensors
 from viewmend.inpainting.chain import Chain, build
@@ -12,6 +11,7 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
+from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError, load_weights
 
 FORMAT = 2
 """Grows when an older program could no longer read what is written. Format 1, of one network with switches, is read."""
@@ -20,20 +20,8 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 
 
-class CheckpointError(ValueError):
-    """An inpainter that cannot be loaded: which file, what was expected, what came, the next step."""
-
-
-class MissingCheckpointError(CheckpointError):
+class MissingCheckpointError(WeightsError):
     """No such model."""
-
-
-class DamagedCheckpointError(CheckpointError):
-    """A file that cannot be read, or is cut short."""
-
-
-class MismatchedCheckpointError(CheckpointError):
-    """Weights that belong to another config, or a config of another version."""
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -53,8 +41,8 @@ def load_inpainter(
 
     Raises:
         MissingCheckpointError: there is no such folder or name, or a file of it is missing.
-        DamagedCheckpointError: a file is unreadable or cut short.
-        MismatchedCheckpointError: weights and config do not belong together.
+        DamagedWeightsError: a file is unreadable or cut short.
+        MismatchedWeightsError: weights and config do not belong together.
         ValueError: no such precision.
     """
     if precision not in PRECISIONS:
@@ -70,23 +58,8 @@ def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -
     folder = _folder(name_or_path)
     version, config = _read_config(folder / CONFIG)
     network = build(config)
-    weights = _read_weights(folder / WEIGHTS, str(device))
-    if version == 1 and isinstance(network, Chain):
-        weights = {_renamed(key): weight for key, weight in weights.items()}
-    expected = network.state_dict()
-    missing, unknown = sorted(expected.keys() - weights.keys()), sorted(weights.keys() - expected.keys())
-    reshaped = [
-        f"{key} {tuple(weights[key].shape)} for {tuple(expected[key].shape)}"
-        for key in sorted(expected.keys() & weights.keys())
-        if weights[key].shape != expected[key].shape
-    ]
-    if missing or unknown or reshaped:
-        raise MismatchedCheckpointError(
-            f"{folder / WEIGHTS}: expected the weights of {CONFIG} beside it, got missing {missing[:3]}, "
-            f"unknown {unknown[:3]}, of another shape {reshaped[:3]}; use the {CONFIG} that was saved with them"
-        )
-    network.load_state_dict(weights)
-    return network.to(device).eval()
+    rename = _renamed if version == 1 and isinstance(network, Chain) else None
+    return load_weights(network, folder / WEIGHTS, device, rename=rename)
 
 
 def save_inpainter(network: Chain | PatchTransformer, folder: str | Path, card: str) -> None:
@@ -128,24 +101,13 @@ def _read_config(path: Path) -> tuple[int, InpainterConfig]:
     try:
         values = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise DamagedCheckpointError(f"{path}: expected JSON, got {error}; copy the file again") from error
+        raise DamagedWeightsError(f"{path}: expected JSON, got {error}; copy the file again") from error
     version = values.pop("viewmend_format", None) if isinstance(values, dict) else None
     if version not in (1, FORMAT):
-        raise MismatchedCheckpointError(
+        raise MismatchedWeightsError(
             f"{path}: expected viewmend_format 1 or {FORMAT}, got {version}; use the version of viewmend that wrote it"
         )
     try:
         return version, InpainterConfig.from_dict(values)
     except (TypeError, ValueError) as error:
-        raise MismatchedCheckpointError(f"{path}: {error}") from error
-
-
-def _read_weights(path: Path, device: str) -> dict[str, torch.Tensor]:
-    try:
-        with safe_open(path, framework="pt", device=device) as file:
-            return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise DamagedCheckpointError(
-            f"{path}: expected a whole safetensors file, got {path.stat().st_size} bytes that do not read ({error}); "
-            "copy or download it again"
-        ) from error
+        raise MismatchedWeightsError(f"{path}: {error}") from error

@@ -22,7 +22,7 @@ def describe_model(name_or_path: str) -> ModelDescription:
     """Load a model, so that a damaged one shows, and describe it.
 
     Raises:
-        CheckpointError: there is no such model, or it cannot be loaded.
+        WeightsError: there is no such model, or it cannot be loaded.
     """
     network = load_network(name_or_path)
     folder = Path(name_or_path) if Path(name_or_path).is_dir() else SHIPPED / name_or_path

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project, unproject
+from viewmend.geometry.sampling import in_view, sample_bilinear
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, crop_margin_px
 from viewmend.views import CompletedView, IncompleteView
 
@@ -92,14 +92,14 @@ def accumulate(completed: CompletedView, last: LastView | None, weight: float) -
     pixels = torch.nonzero((view.error > 0) & (view.depth > 0))
     index = tuple(pixels.unbind(1))
     points = unproject((pixels.flip(1) + 0.5).to(view.depth)[None], view.depth[index][None], view.camera)[0]
-    at, z = (x[0] for x in project(points, last.camera))
-    height, width = last.depth.shape
-    at = (at * at.new_tensor([2 / width, 2 / height]) - 1)[None, None]
-    there = F.grid_sample(last.depth[None, None], at, "nearest", align_corners=False)[0, 0, 0]
-    before = F.grid_sample(last.rgb[None], at, padding_mode="border", align_corners=False)[0, :, 0].T
+    at, z = project(points, last.camera)
+    inside = in_view(at, z, last.camera)[0]
+    before = sample_bilinear(last.rgb[None], at, "border")[0]
+    column, row = torch.where(inside[:, None], at[0], 0.0).long().unbind(-1)
+    there, z = last.depth[row, column], z[0]
     now = completed.rgb.movedim(0, -1)[index]
     agree = (-(((before - now) / SAME_COLOUR) ** 2).mean(1)).exp()
-    same = (z > 0) & (there > 0) & ((there - z).abs() < SAME_PLACE * z)
+    same = inside & (there > 0) & ((there - z).abs() < SAME_PLACE * z)
     carried = (weight * agree * same * view.error[index])[:, None]
     rgb = completed.rgb.movedim(0, -1).index_put(index, torch.lerp(now, before, carried)).movedim(-1, 0)
     return CompletedView(view, rgb)
