@@ -1,9 +1,12 @@
 """Milliseconds of the stages that a view goes through."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
+
+Times = TypeVar("Times", bound="StageTimes")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,9 +22,14 @@ class StageTimes:
     inpainting: float = 0.0
     """Incomplete to completed view, without `context`."""
 
-    def __add__(self, other: "StageTimes") -> "StageTimes":
+    def __add__(self: Times, other: "StageTimes") -> Times:
         """The stages of both views."""
-        return StageTimes(**{name: ms + getattr(other, name) for name, ms in vars(self).items()})
+        return replace(self, **{name: ms + getattr(other, name, 0.0) for name, ms in vars(self).items()})
+
+    @property
+    def total(self) -> float:
+        """All stages."""
+        return sum(vars(self).values())
 
 
 def now_s(device: torch.device) -> float:

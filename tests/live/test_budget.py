@@ -5,7 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from viewmend.live.budget import FULL, LADDER, Budget, FrameMs, Level
+from viewmend.live.budget import FULL, LADDER, Budget, QualityLevel
+from viewmend.live.protocol import FrameTimes
 
 
 class Device:
@@ -15,14 +16,15 @@ class Device:
         self.shared, self.pixels, self.relative_cost, self.context_share = shared, pixels, filling, context_share
         self.noise, self.chance = noise, random.Random(seed)
 
-    def frame(self, level: Level) -> FrameMs:
+    def frame(self, level: QualityLevel) -> FrameTimes:
         """Filling has a part that no picture size shrinks below a third; without context it is the first fill's."""
         size = 0.3 + 0.7 * level.scale**2
         context = 1 - self.context_share * (1 - level.context_times / 7) if level.context_times else 0.25
         by = 1 + self.noise * self.chance.uniform(-1, 1)
-        encoding = 0.2 * self.relative_cost * by if level.context_times else None
+        encoding = 0.2 * self.relative_cost * by if level.context_times else 0.0
         filling = 0.8 * self.relative_cost * size * context * by
-        return FrameMs(self.shared * by, self.pixels * level.scale**2 * by, filling, encoding)
+        rendering = self.pixels * level.scale**2 * by
+        return FrameTimes(geometry=self.shared * by, context=encoding, rendering=rendering, inpainting=filling)
 
 
 def run(budget: Budget, device: Device, frames: int) -> tuple[list[int], list[float]]:
@@ -79,7 +81,7 @@ def test_a_device_that_slows_down_is_followed_at_once_and_recovery_is_found():
 def test_one_slow_frame_changes_nothing():
     budget, device = Budget(100.0), Device(filling=50)
     run(budget, device, 200)
-    budget.record(budget.level, FrameMs(900.0, 30.0, 50.0))
+    budget.record(budget.level, FrameTimes(geometry=900.0, rendering=30.0, inpainting=50.0))
     assert budget.level == FULL
     run(budget, device, 50)
     assert budget.level == FULL
@@ -87,7 +89,7 @@ def test_one_slow_frame_changes_nothing():
 
 def test_the_ladder_grows_in_work_and_its_top_is_all():
     work = [level.relative_cost for level in LADDER]
-    assert work == sorted(work) and LADDER[-1] == Level(1.0, 7, None)
+    assert work == sorted(work) and LADDER[-1] == QualityLevel(1.0, 7, None)
     assert Budget(100.0).predicted_ms(FULL) == 0
 
 

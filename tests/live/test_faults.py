@@ -149,7 +149,7 @@ def test_disconnects_in_the_middle_of_a_frame():
             viewer._socket.socket.close()
         wait_until(lambda: not server.live.registry.sessions, 20)
         assert still_serves(server)
-        wait_until(lambda: not server.service._seats)
+        wait_until(lambda: not server.service._sessions)
 
 
 def test_requests_that_never_end_are_cut_off(monkeypatch):

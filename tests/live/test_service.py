@@ -10,7 +10,7 @@ from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live.clock import Span
 from viewmend.live.frames import FrameSupply, Rig, SourceStatus
 from viewmend.live.poses import rig_frame, view_camera
-from viewmend.live.protocol import Camera
+from viewmend.live.protocol import Camera, FrameTimes
 from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
 from viewmend.timing import StageTimes
@@ -39,10 +39,10 @@ class Drawing(Renderer):
     def is_of(self, rig):
         return True
 
-    def render(self, ask, viewer):
-        if ask.quality.top_k == 13:
+    def render(self, request, viewer):
+        if request.quality.top_k == 13:
             raise RuntimeError("bad luck")
-        return RenderResult(ask.time, (), State(), StageTimes())
+        return RenderResult(request.time, (), State(), StageTimes(geometry=3.0, rendering=4.0))
 
 
 class Eager:
@@ -54,13 +54,14 @@ class Eager:
         self.name, self.log, self.top_k, self.bad = name, log, top_k, bad
         self.failures = []
 
-    def due(self, now, scene):
+    def next_request(self, now, playback):
         if self.bad:
             raise KeyError("mine")
         return RenderRequest(0, (CAMERA,), RenderQuality(top_k=self.top_k))
 
-    def show(self, ask, rendered):
+    def show(self, request, rendered):
         self.log.append(self.name)
+        return FrameTimes(**vars(rendered.times), encode=2.0)
 
     def fail(self, message):
         self.failures.append(message)
@@ -78,25 +79,26 @@ def test_all_take_turns(service):
     for turn in range(9):
         if turn == 4:
             service.join(Eager("d", log))
-        assert service._turn()
+        assert service._serve_next()
     assert max(Counter(log).values()) - min(Counter(log[4:]).values()) <= 2 and log[:3] == ["a", "b", "c"]
 
 
 def test_who_fails_is_told_and_stops_nobody(service):
     log = []
     unlucky, odd = Eager("unlucky", log, top_k=13), Eager("odd", log, bad=True)
-    for seat in (odd, unlucky, Eager("a", log)):
-        service.join(seat)
+    for session in (odd, unlucky, Eager("a", log)):
+        service.join(session)
     for _ in range(6):
-        service._turn()
+        service._serve_next()
     assert log == ["a"] * 3 and unlucky.failures == ["RuntimeError: bad luck"] * 3 and len(odd.failures) >= 3
-    assert service.counts["errors"] == 3 and service.counts["frames"] == 3
+    assert service.counts == {"errors": 3, "frames": 3, "shared": 0}
+    assert (service.times.encode, service.times.rendering, service.times.total) == (6.0, 12.0, 27.0)
 
 
 def test_who_left_is_served_no_more(service):
     log = []
-    seat = Eager("a", log)
-    service.join(seat)
-    service.leave(seat)
-    service.leave(seat)
-    assert not service._turn() and log == []
+    session = Eager("a", log)
+    service.join(session)
+    service.leave(session)
+    service.leave(session)
+    assert not service._serve_next() and log == []

@@ -10,7 +10,7 @@ from viewmend.live.clock import Span
 from viewmend.live.poses import rig_frame
 from viewmend.live.protocol import ClockChange, Look, unpack
 from viewmend.live.renderer import RenderResult
-from viewmend.live.sessions import MOVING, REFINEMENTS, Scene, ViewerSession
+from viewmend.live.sessions import MOVING, REFINEMENTS, Playback, ViewerSession
 from viewmend.timing import StageTimes
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
@@ -18,28 +18,28 @@ SPAN = Span(0, 20, 20, 10.0)
 
 
 class Desk:
-    """A seat, and a hand that turns its clock and acknowledges."""
+    """A session, and a hand that turns its clock and acknowledges."""
 
     def __init__(self, budget_ms=None, present=lambda time: True):
         self.sent, self.errors, self.now = [], [], 1000.0
-        self.seat = ViewerSession(self.sent.append, self.errors.append, budget_ms)
-        self.seat._last = self.now
-        self.present, self.edge, self.crowd = present, 0.0, 1
+        self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms)
+        self.session._last = self.now
+        self.present, self.edge, self.active_viewers = present, 0.0, 1
 
     def look(self, **values):
-        self.seat.look(Look(**values))
-        self.seat._look_at = self.now
+        self.session.look(Look(**values))
+        self.session._look_at = self.now
 
     def due(self, after=0.01, edge=None):
         self.now += after
         self.edge = self.edge if edge is None else edge
-        return self.seat.due(self.now, Scene(SPAN, self.edge, FRAME, self.present, self.crowd))
+        return self.session.next_request(self.now, Playback(SPAN, self.edge, FRAME, self.present, self.active_viewers))
 
-    def size(self, ask):
-        return tuple(ask.cameras[0].size_px[0].tolist())
+    def size(self, request):
+        return tuple(request.cameras[0].size_px[0].tolist())
 
     def pause(self):
-        self.seat.change(ClockChange(playing=False), SPAN)
+        self.session.change(ClockChange(playing=False), SPAN)
 
 
 def test_nobody_is_served_who_does_not_look():
@@ -50,8 +50,8 @@ def test_the_newest_look_wins():
     desk = Desk()
     for azimuth in range(5):
         desk.look(id=azimuth)
-    assert desk.due() is not None and desk.seat._shown[0].id == 4
-    assert desk.seat.dropped == 4
+    assert desk.due() is not None and desk.session._shown[0].id == 4
+    assert desk.session.dropped == 4
 
 
 def test_the_same_look_again_is_answered_again():
@@ -66,12 +66,12 @@ def test_one_frame_is_in_flight_until_it_is_acknowledged():
     desk = Desk()
     desk.look(id=1)
     assert desk.due() is not None
-    desk.seat.in_flight = 7
+    desk.session.in_flight = 7
     desk.look(id=2)
     assert desk.due(edge=3.0) is None
-    desk.seat.ack(6)
+    desk.session.ack(6)
     assert desk.due() is None
-    desk.seat.ack(7)
+    desk.session.ack(7)
     assert desk.due().time == 3
 
 
@@ -79,19 +79,19 @@ def test_time_goes_on_and_what_was_skipped_is_counted():
     desk = Desk()
     desk.look(id=1)
     times = [desk.due(edge=edge).time for edge in (0.0, 1.2, 5.9)]
-    assert times == [0, 1, 5] and desk.due() is None and desk.seat.dropped == 3
+    assert times == [0, 1, 5] and desk.due() is None and desk.session.dropped == 3
 
 
 def test_a_moving_view_is_small_and_a_still_one_full():
     desk = Desk()
     desk.pause()
     desk.look(id=1, moving=True, width=200, height=100)
-    ask = desk.due()
-    assert desk.size(ask) == (100, 50) and ask.quality.context_times == MOVING.context_times
+    request = desk.due()
+    assert desk.size(request) == (100, 50) and request.quality.context_times == MOVING.context_times
     assert desk.due(1.0) is None, "a moving view is not refined"
     desk.look(id=2, width=200, height=100)
-    ask = desk.due()
-    assert desk.size(ask) == (200, 100) and ask.quality.context_times == 7
+    request = desk.due()
+    assert desk.size(request) == (200, 100) and request.quality.context_times == 7
     assert desk.due(1.0) is None, "nothing better follows"
     desk.look(id=3, moving=True, adaptive=False, width=200, height=100)
     assert desk.size(desk.due()) == (200, 100)
@@ -107,34 +107,34 @@ def test_a_still_view_is_refined_in_two_steps():
     assert desk.due(soon / 2) is None
     better = desk.due(soon)
     assert desk.size(better) == (160, 160) and better.quality.context_times == sharp.context_times == 0
-    assert not desk.seat._full and desk.due(0.1) is None
+    assert not desk.session._full and desk.due(0.1) is None
     best = desk.due(later)
-    assert best.quality.context_times == FULL.context_times and desk.seat._full
+    assert best.quality.context_times == FULL.context_times and desk.session._full
     assert best.quality.top_k == 100 and desk.due(1.0) is None
 
 
 def test_budgets_are_shared_among_a_crowd():
     desk = Desk(budget_ms=80.0)
-    desk.crowd = 4
+    desk.active_viewers = 4
     desk.look(id=1)
     desk.due()
-    assert desk.seat.budget.target_ms == 20
+    assert desk.session.budget.target_ms == 20
 
 
 def test_a_frame_that_is_not_there_is_waited_for():
     there = set()
     desk = Desk(present=lambda time: time in there)
     desk.look(id=1)
-    assert desk.due() is None and desk.seat.buffering
+    assert desk.due() is None and desk.session.buffering
     there.add(0)
-    assert desk.due().time == 0 and not desk.seat.buffering
+    assert desk.due().time == 0 and not desk.session.buffering
 
 
 def test_what_failed_is_said_and_not_tried_again_before_something_changes():
     desk = Desk()
     desk.look(id=1)
     desk.due()
-    desk.seat.fail("no")
+    desk.session.fail("no")
     assert desk.errors == ["no"] and desk.due(1.0) is None
     assert desk.due(edge=1.0) is not None
 
@@ -151,9 +151,9 @@ def test_rendering_without_mending_costs_no_filling():
 def test_frames_say_what_they_are(ball_view, mode):
     desk = Desk()
     desk.look(id=5, sent_ms=12.5, modes=(mode,), depth=True)
-    ask = desk.due()
-    desk.seat.show(
-        ask,
+    request = desk.due()
+    desk.session.show(
+        request,
         RenderResult(0, (ball_view,), State(), StageTimes(geometry=3.0, context=2.0, rendering=4.0, inpainting=5.0)),
     )
     header, parts = unpack(desk.sent[0])
@@ -161,4 +161,4 @@ def test_frames_say_what_they_are(ball_view, mode):
     assert [part["kind"] for part in header["parts"]] == ["image", "depth"] and parts[0][:2] == b"\xff\xd8"
     assert header["stage_ms"]["geometry"] == 3 and 0 < header["holes"] < 1
     assert header["colours"][0] == [230, 120, 60] and len(header["cameras"][0]["K"]) == 9
-    assert desk.seat.in_flight == 0 and desk.seat.stats_json(1)["viewers"] == 1
+    assert desk.session.in_flight == 0 and desk.session.stats_json(1)["viewers"] == 1

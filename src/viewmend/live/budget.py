@@ -1,17 +1,18 @@
-"""Holding a frame time: how much work the next view may cost, from what the last ones took.
+"""Holding a frame time: the quality of the next view is chosen by what the last views took.
 
 The control law, docs/live.md in code:
 
-* Levels are a ladder of efforts, from all that the model can do down to a small picture with little context. What is
-  given up first: older context, then context tokens, then resolution.
-* What a level will take is predicted from the medians of the last `MEMORY` frames' stage times, each brought to that
-  level: geometry stays, rendering and encoding go with the pixels, filling with pixels, tokens and times, and the
-  cameras' images are encoded at levels with context only.
-* Down, at once: when the prediction for the present level is above the target, to the highest level predicted to take
-  at most `AIM` of it. A single slow frame moves no median, three of five do.
-* Up, one level, when the level above is predicted to take at most `AIM` of the target for `patience` frames in a row.
-* A step up that has to be taken back within `PROBATION` frames doubles `patience`, up to `MOST_PATIENCE`: so where the
-  prediction is wrong, the controller settles below instead of swinging. A step that lasts resets it.
+* The ladder has quality levels from a small picture without context up to all that the model can do. Going down,
+  older context is given up first, then context tokens, then all context, then resolution.
+* The time that a level will take is predicted from the medians of the last `MEMORY_FRAMES` frames. Each stage is scaled
+  to the level: geometry stays, rendering and encoding grow with the pixels, inpainting grows with pixels, tokens and
+  times. The context stage counts at levels with context only.
+* The level goes down at once when its own prediction is above the target. It goes to the highest level that is
+  predicted to take at most `HEADROOM` of the target. One slow frame moves no median; three of five do.
+* The level goes up by one when the next level is predicted to take at most `HEADROOM` of the target for several frames
+  in a row: `UP_AFTER_FRAMES`, to begin with.
+* A step up that is taken back within `PROBATION_FRAMES` doubles this number, up to `MAX_UP_AFTER_FRAMES`. A step that
+  lasts resets it. Where a prediction is wrong, the level settles below and does not swing.
 """
 
 from collections import deque
@@ -19,17 +20,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-MEMORY = 5
-AIM = 0.85
-PATIENCE = 4
-MOST_PATIENCE = 256
-FIRST_FILL = 0.15
-"""Work of a fill without the transformer, relative to all."""
-PROBATION = 12
+from viewmend.live.protocol import FrameTimes
+
+MEMORY_FRAMES = 5
+HEADROOM = 0.85
+UP_AFTER_FRAMES = 4
+MAX_UP_AFTER_FRAMES = 256
+PROBATION_FRAMES = 12
+COARSE_FILL_COST = 0.15
+"""Cost of a fill without the transformer, relative to the full level's."""
 
 
 @dataclass(frozen=True)
-class Level:
+class QualityLevel:
     """What one view is made with."""
 
     scale: float
@@ -41,46 +44,28 @@ class Level:
 
     @property
     def relative_cost(self) -> float:
-        """Work of filling, relative to the full level's."""
+        """Cost of inpainting, relative to the full level's."""
         tokens = min(self.top_k or 2048, 2048) / 2048
         if self.context_times == 0:
-            return self.scale**2 * FIRST_FILL
+            return self.scale**2 * COARSE_FILL_COST
         return self.scale**2 * (0.4 + 0.4 * self.context_times / 7 + 0.2 * tokens)
 
 
 LADDER = (
-    *(Level(scale, 0, 256) for scale in (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)),
-    Level(1.0, 1, 256),
-    Level(1.0, 2, 512),
-    Level(1.0, 4, 1024),
-    Level(1.0, 7, None),
+    *(QualityLevel(scale, 0, 256) for scale in (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)),
+    QualityLevel(1.0, 1, 256),
+    QualityLevel(1.0, 2, 512),
+    QualityLevel(1.0, 4, 1024),
+    QualityLevel(1.0, 7, None),
 )
 """From the cheapest level to all."""
 FULL = LADDER[-1]
 
 
-@dataclass(frozen=True)
-class FrameMs:
-    """Milliseconds of a frame's stages."""
-
-    geometry: float
-    pixels: float
-    """Rendering, and encoding the picture."""
-    filling: float | None
-    """None where nothing was to be filled."""
-    context: float | None = None
-    """Encoding the cameras' images; None at a level without."""
-
-    @property
-    def total(self) -> float:
-        """All of it."""
-        return self.geometry + self.pixels + (self.filling or 0.0) + (self.context or 0.0)
-
-
 class Budget:
-    """Chooses one viewer's level, frame by frame."""
+    """Chooses one viewer's quality level, frame by frame."""
 
-    def __init__(self, target_ms: float, levels: Sequence[Level] = LADDER) -> None:
+    def __init__(self, target_ms: float, levels: Sequence[QualityLevel] = LADDER) -> None:
         """Begin in the middle of the ladder.
 
         Raises:
@@ -92,46 +77,62 @@ class Budget:
         self.levels = tuple(levels)
         self.index = len(levels) // 2
         self.measured_ms = 0.0
-        # Each brought to the full level, as far as it depends on the level.
-        self._geometry, self._pixels, self._filling, self._context = (deque[float](maxlen=MEMORY) for _ in range(4))
-        self._patience, self._calm, self._since_up = PATIENCE, 0, PROBATION
+        # Each is scaled to the full level, as far as it depends on the level.
+        self._geometry, self._pixels, self._inpainting, self._context = (
+            deque[float](maxlen=MEMORY_FRAMES) for _ in range(4)
+        )
+        self._up_after, self._frames_with_room, self._frames_since_up = UP_AFTER_FRAMES, 0, PROBATION_FRAMES
 
     @property
-    def level(self) -> Level:
+    def level(self) -> QualityLevel:
         """What the next view is made with."""
         return self.levels[self.index]
 
-    def predicted_ms(self, level: Level) -> float:
+    def predicted_ms(self, level: QualityLevel) -> float:
         """What a view of this level would take; 0 before the first frame."""
-        filling = level.relative_cost + (_median(self._context) if level.context_times else 0.0)
-        return _median(self._geometry) + _median(self._pixels) * level.scale**2 + _median(self._filling) * filling
+        inpainting = level.relative_cost + (_median(self._context) if level.context_times else 0.0)
+        return _median(self._geometry) + _median(self._pixels) * level.scale**2 + _median(self._inpainting) * inpainting
 
-    def record(self, level: Level, ms: FrameMs) -> None:
+    def record(self, level: QualityLevel, times: FrameTimes) -> None:
         """Learn from a frame, and choose the next one's level."""
-        self.measured_ms = ms.total
-        self._geometry.append(ms.geometry)
-        self._pixels.append(ms.pixels / level.scale**2)
-        if ms.filling is not None:
-            self._filling.append(ms.filling / level.relative_cost)
-        if ms.context is not None and ms.filling:
-            # As a share of filling, which is measured at all levels: so it is known how a level without has changed.
-            self._context.append(ms.context / (ms.filling / level.relative_cost))
-        self._since_up += 1
-        if self._since_up == PROBATION:
-            self._patience = PATIENCE
+        self.measured_ms = times.total - times.wait
+        self._geometry.append(times.geometry)
+        self._pixels.append((times.rendering + times.encode) / level.scale**2)
+        if times.inpainting > 0:  # else nothing was to be filled
+            inpainting = times.inpainting / level.relative_cost
+            self._inpainting.append(inpainting)
+            if level.context_times:
+                # Relative to inpainting, which all levels measure: so a level without context learns of a slow device.
+                self._context.append(times.context / inpainting)
+        self._frames_since_up += 1
+        if self._frames_since_up == PROBATION_FRAMES:
+            self._up_after = UP_AFTER_FRAMES
         if self.predicted_ms(self.level) > self.target_ms and self.index > 0:
             self._down()
         elif self.index + 1 < len(self.levels):
-            fits = self.predicted_ms(self.levels[self.index + 1]) <= AIM * self.target_ms
-            self._calm = self._calm + 1 if fits else 0
-            if self._calm >= self._patience:
-                self.index, self._calm, self._since_up = self.index + 1, 0, 0
+            fits = self.predicted_ms(self.levels[self.index + 1]) <= HEADROOM * self.target_ms
+            self._frames_with_room = self._frames_with_room + 1 if fits else 0
+            if self._frames_with_room >= self._up_after:
+                self.index, self._frames_with_room, self._frames_since_up = self.index + 1, 0, 0
+
+    def as_json(self) -> dict[str, float | int | None]:
+        """The part `budget` of the message `stats`."""
+        return {
+            "target_ms": round(self.target_ms, 1),
+            "predicted_ms": round(self.predicted_ms(self.level), 1),
+            "measured_ms": round(self.measured_ms, 1),
+            "scale": self.level.scale,
+            "top_k": self.level.top_k,
+            "context_times": self.level.context_times,
+            "level": self.index,
+            "levels": len(self.levels),
+        }
 
     def _down(self) -> None:
-        if self._since_up < PROBATION:
-            self._patience = min(MOST_PATIENCE, 2 * self._patience)
-        good = [n for n in range(self.index) if self.predicted_ms(self.levels[n]) <= AIM * self.target_ms]
-        self.index, self._calm, self._since_up = max(good, default=0), 0, PROBATION
+        if self._frames_since_up < PROBATION_FRAMES:
+            self._up_after = min(MAX_UP_AFTER_FRAMES, 2 * self._up_after)
+        good = [n for n in range(self.index) if self.predicted_ms(self.levels[n]) <= HEADROOM * self.target_ms]
+        self.index, self._frames_with_room, self._frames_since_up = max(good, default=0), 0, PROBATION_FRAMES
 
 
 def _median(values: Sequence[float]) -> float:

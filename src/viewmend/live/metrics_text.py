@@ -2,7 +2,6 @@
 
 from viewmend.live.connection import SessionRegistry
 from viewmend.live.memory import resident_bytes
-from viewmend.live.service import STAGES
 
 
 def metrics_text(registry: SessionRegistry) -> str:
@@ -23,7 +22,7 @@ def metrics_text(registry: SessionRegistry) -> str:
             "viewmend_stage_seconds_total",
             "counter",
             "Seconds spent in each stage.",
-            {f'{{stage="{stage}"}}': counts[f"{stage}_us"] / 1e6 for stage in STAGES},
+            {f'{{stage="{stage}"}}': ms / 1000 for stage, ms in vars(service.times).items() if stage != "wait"},
         ),
     ]
     resident = resident_bytes()

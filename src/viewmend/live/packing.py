@@ -1,12 +1,12 @@
-"""RenderResult views as the binary messages that are sent."""
+"""Rendered views as the binary messages that are sent."""
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from viewmend.live.pictures import COLOURS, Picture, depth_stride, pack_depth, picture, to_jpeg
 from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import Look, pack
+from viewmend.live.protocol import FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
 from viewmend.views import CompletedView
@@ -43,12 +43,12 @@ class Encoders:
 
 
 def frame_message(
-    look: Look, ask: RenderRequest, rendered: RenderResult, info: FrameInfo, encoders: Encoders
-) -> tuple[bytes, dict[str, float]]:
+    look: Look, request: RenderRequest, result: RenderResult, info: FrameInfo, encoders: Encoders
+) -> tuple[bytes, FrameTimes]:
     """The message, and the milliseconds of every stage."""
     start = time.perf_counter()
     parts, data = [], []
-    for eye, completed in enumerate(rendered.completed):
+    for eye, completed in enumerate(result.completed):
         for mode in look.modes:
             part, encoded = encoders.encode(picture(completed, mode), eye, mode, look, info.key)
             parts.append(part)
@@ -57,29 +57,29 @@ def frame_message(
             part, packed = _depth_part(eye, completed)
             parts.append(part)
             data.append(packed)
-    stage_ms = asdict(rendered.times) | {"encode": 1000 * (time.perf_counter() - start)}
-    stage_ms |= {"wait": info.wait_ms, "total": info.wait_ms + sum(stage_ms.values())}
-    first = rendered.completed[0].view
+    encode_ms = 1000 * (time.perf_counter() - start)
+    times = FrameTimes(**vars(result.times), encode=encode_ms, wait=info.wait_ms)
+    first = result.completed[0].view
     keys = ("K", "R", "T")
     header: dict[str, Any] = {
         "frame": info.frame,
         "look": look.id,
         "sent_ms": look.sent_ms,
-        "time": rendered.time,
+        "time": result.time,
         "width": first.mask.shape[1],
         "height": first.mask.shape[0],
         "full": info.full,
-        "cameras": [{k: c[k] for k in keys} for v in rendered.completed for c in cameras_json(v.view.camera)],
+        "cameras": [{k: c[k] for k in keys} for v in result.completed for c in cameras_json(v.view.camera)],
         "chosen": list(first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
-        "holes": round(hole_fraction(rendered.completed[0]), 5),
-        "top_k": ask.quality.top_k,
-        "context_times": ask.quality.context_times,
-        "stage_ms": {stage: round(ms, 2) for stage, ms in stage_ms.items()},
+        "holes": round(hole_fraction(result.completed[0]), 5),
+        "top_k": request.quality.top_k,
+        "context_times": request.quality.context_times,
+        "stage_ms": times.as_json(),
         "dropped": info.dropped,
         "parts": parts,
     }
-    return pack(header, data), stage_ms
+    return pack(header, data), times
 
 
 def hole_fraction(completed: CompletedView) -> float:

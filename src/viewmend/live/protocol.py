@@ -12,6 +12,7 @@ from msgspec.structs import force_setattr
 
 from viewmend.geometry.rigid import is_rotation
 from viewmend.json_input import LARGEST_INTEGER, one_of, read_json, typed
+from viewmend.timing import StageTimes
 
 VERSION = 1
 MODES = ("rendered", "holes", "mended", "depth", "coverage")
@@ -175,6 +176,20 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
         return typed(value, kind, "see docs/live-protocol.md", strict)
     except ValueError as error:
         raise ProtocolError(str(error)[:300]) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameTimes(StageTimes):
+    """Milliseconds of a frame that is sent: the stages of its views, and what the server adds."""
+
+    encode: float = 0.0
+    """Views to JPEG or video."""
+    wait: float = 0.0
+    """From the look to the start of its first frame."""
+
+    def as_json(self, frames: int = 1) -> dict[str, float]:
+        """The wire's `stage_ms`, means where this is the sum of several frames."""
+        return {name: round(ms / frames, 2) for name, ms in (vars(self) | {"total": self.total}).items()}
 
 
 def error_json(code: int | str, message: str, fatal: bool) -> dict[str, Any]:

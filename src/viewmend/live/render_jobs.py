@@ -1,5 +1,7 @@
 """Views that are asked for over plain HTTP: single pictures, and camera paths as videos."""
 
+import time
+from abc import ABC, abstractmethod
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from io import BytesIO
@@ -12,9 +14,9 @@ from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live import protocol
 from viewmend.live.pictures import picture, to_jpeg
 from viewmend.live.poses import view_camera
-from viewmend.live.protocol import Camera, Limits, ProtocolError, read_message
+from viewmend.live.protocol import Camera, FrameTimes, Limits, ProtocolError, read_message
 from viewmend.live.renderer import RenderRequest, RenderResult
-from viewmend.live.sessions import Scene
+from viewmend.live.sessions import Playback
 
 MAX_POSES = 900
 Result = TypeVar("Result")
@@ -80,12 +82,22 @@ def parse_path(body: bytes, limits: Limits) -> PathBody:
     return asked
 
 
-class RenderJob(Generic[Result]):
+class RenderJob(ABC, Generic[Result]):
     """A session that ends when `done` has its result."""
 
     def __init__(self) -> None:
         self.viewer: State | None = None
         self.done: Future[Result] = Future()
+
+    @abstractmethod
+    def encode(self, result: RenderResult) -> None:
+        """Take in one view, and `finish` after the last."""
+
+    def show(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
+        """Encode the view; what all of it took."""
+        start = time.perf_counter()
+        self.encode(result)
+        return FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
 
     def finish(self, result: Result) -> None:
         """Set the result, unless nobody waits any more."""
@@ -105,15 +117,15 @@ class PictureJob(RenderJob[tuple[bytes, RenderResult]]):
         super().__init__()
         self._asked = asked
 
-    def due(self, now: float, scene: Scene) -> RenderRequest | None:
+    def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The picture, once its frame has been read."""
-        time = scene.edge if self._asked.time == "live" else self._asked.time
-        return None if self.done.done() else _request(self._asked, self._asked.camera, time, scene)
+        at = playback.edge if self._asked.time == "live" else self._asked.time
+        return None if self.done.done() else _request(self._asked, self._asked.camera, at, playback)
 
-    def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
+    def encode(self, result: RenderResult) -> None:
         """Encode the picture."""
-        image = picture(rendered.completed[0], self._asked.mode)
-        self.finish((to_jpeg(image, self._asked.quality), rendered))
+        image = picture(result.completed[0], self._asked.mode)
+        self.finish((to_jpeg(image, self._asked.quality), result))
 
 
 class PathJob(RenderJob[bytes]):
@@ -126,28 +138,28 @@ class PathJob(RenderJob[bytes]):
         self._mp4 = BytesIO()
         self._video = VideoWriter(self._mp4, path.fps)
 
-    def due(self, now: float, scene: Scene) -> RenderRequest | None:
+    def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The next pose, once its frame has been read."""
-        if self.done.done() or scene.span.end <= scene.span.first:
+        if self.done.done() or playback.span.end <= playback.span.first:
             return None
         if self._times is None:  # the edge as it is now
-            self._times = (int(scene.span.clamp(scene.edge)),) * len(self._path.poses)
-        return _request(self._path, self._path.poses[self._count], self._times[self._count], scene)
+            self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
+        return _request(self._path, self._path.poses[self._count], self._times[self._count], playback)
 
-    def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
+    def encode(self, result: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
-        self.viewer: State | None = rendered.viewer
-        self._video.add(picture(rendered.completed[0], self._path.mode))
+        self.viewer: State | None = result.viewer
+        self._video.add(picture(result.completed[0], self._path.mode))
         self._count += 1
         if self._count == len(self._path.poses):
             self._video.close()
             self.finish(self._mp4.getvalue())
 
 
-def _request(asked: ViewOptions, pose: Camera, time: float | int, scene: Scene) -> RenderRequest | None:
+def _request(asked: ViewOptions, pose: Camera, at: float | int, playback: Playback) -> RenderRequest | None:
     """The view at the nearest time that there is; None while its frame is on its way."""
-    at = int(scene.span.clamp(time))
-    if scene.span.end <= scene.span.first or not scene.present(at):
+    time = int(playback.span.clamp(at))
+    if playback.span.end <= playback.span.first or not playback.has_frame(time):
         return None
-    camera = view_camera(pose, scene.frame, (asked.width, asked.height))
-    return RenderRequest(at, (camera,), RenderQuality(mend=asked.mode == "mended", top_k=asked.top_k))
+    camera = view_camera(pose, playback.rig_frame, (asked.width, asked.height))
+    return RenderRequest(time, (camera,), RenderQuality(mend=asked.mode == "mended", top_k=asked.top_k))

@@ -1,4 +1,4 @@
-"""From asks to views: the stream, its rig, and what went wrong, without threads and sockets."""
+"""From requests to views: the stream, its rig, and what went wrong, without threads and sockets."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,7 +13,7 @@ from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.timing import StageTimes
 from viewmend.views import CompletedView, MultiViewFrame
 
-WARM_PX = 64
+WARM_UP_PX = 64
 
 
 @dataclass(frozen=True)
@@ -27,22 +27,22 @@ class RenderRequest:
 
 @dataclass(frozen=True)
 class RenderResult:
-    """What came of it."""
+    """The views of one request."""
 
     time: int
     completed: tuple[CompletedView, ...]
     viewer: State
-    """To ask for the next views with."""
+    """To request for the next views with."""
     times: StageTimes
     """Of all eyes; geometry and context are 0 where another viewer has paid for them."""
 
 
-class NotThereError(Exception):
+class FrameNotReadyError(Exception):
     """The frame is on its way."""
 
 
 class Renderer:
-    """Renders asks one after the other. One thread only."""
+    """Renders requests one after the other. One thread only."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class Renderer:
         False where nothing was to be done.
 
         Raises:
-            NotThereError: the frame is on its way.
+            FrameNotReadyError: the frame is on its way.
             ValueError: no geometry can be made of it.
         """
         rig = self._supply.rig
@@ -88,32 +88,34 @@ class Renderer:
         center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
         cameras = observation.frame.cameras
         frame = rig_frame(cameras, center, rig.up)
-        warm = view_camera(Camera(azimuth=frame.azimuth), frame, (WARM_PX, WARM_PX)).to(self._device)
+        warm = view_camera(Camera(azimuth=frame.azimuth), frame, (WARM_UP_PX, WARM_UP_PX)).to(self._device)
         self._view(stream, warm, stream.viewer(), time, RenderQuality())
         rig_json = {"name": rig.name, "cameras": cameras_json(cameras), "bounds": bounds_json(bounds or proxy.bounds)}
         self.rig_json = rig_json | frame.as_json() | {"fps": self._supply.span.fps or None}
         self._rig, self._stream, self.frame = rig, stream, frame
         return True
 
-    def render(self, ask: RenderRequest, viewer: State | None) -> RenderResult:
+    def render(self, request: RenderRequest, viewer: State | None) -> RenderResult:
         """The views of all eyes, from one state.
 
         Raises:
-            NotThereError: the frame is on its way.
+            FrameNotReadyError: the frame is on its way.
             ValueError: no geometry can be made of the frame.
         """
         if self._stream is None:
-            raise NotThereError
-        self._stream.push(self._read(ask.time))
+            raise FrameNotReadyError
+        self._stream.push(self._read(request.time))
         before = viewer or self._stream.viewer()
-        views = [self._view(self._stream, c.to(self._device), before, ask.time, ask.quality) for c in ask.cameras]
+        views = [
+            self._view(self._stream, c.to(self._device), before, request.time, request.quality) for c in request.cameras
+        ]
         completed = tuple(view.completed for view in views)
-        return RenderResult(ask.time, completed, views[0].viewer, sum((v.times for v in views), StageTimes()))
+        return RenderResult(request.time, completed, views[0].viewer, sum((v.times for v in views), StageTimes()))
 
     def _read(self, at: int) -> MultiViewFrame:
         frame = self._supply.read(at)
         if frame is None:
-            raise NotThereError
+            raise FrameNotReadyError
         return frame.to(self._device)
 
     def _view(self, stream: Stream, camera: Cameras, viewer: State, at: int, quality: RenderQuality) -> StreamView:

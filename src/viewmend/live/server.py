@@ -151,21 +151,20 @@ class LiveServer:
         job = PictureJob(asked)
         self._pictures += 1
         try:
-            image, rendered = await self._wait(request, job, job.done, PICTURE_S)
+            image, result = await self._wait(request, job, job.done, PICTURE_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the frame did not come in time; see /health")
         finally:
             self._pictures -= 1
-        stages = ("geometry", "context", "rendering", "inpainting")
-        timing = ", ".join(f"{stage};dur={getattr(rendered.times, stage):.1f}" for stage in stages)
-        headers = {"Server-Timing": timing, "X-Viewmend-Time": str(rendered.time), "Cache-Control": "no-store"}
+        timing = ", ".join(f"{stage};dur={ms:.1f}" for stage, ms in vars(result.times).items())
+        headers = {"Server-Timing": timing, "X-Viewmend-Time": str(result.time), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
 
     async def _export(self, request: Request) -> Response:
         if not can_write_mp4():
             return _refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
         if self._exporting:
-            return _refusal(409, "another path is being rendered; ask again")
+            return _refusal(409, "another path is being result; ask again")
         self._exporting = True
         try:
             body = await _body(request)

@@ -1,4 +1,4 @@
-"""Who is waiting for views: what each wants next, and where it goes."""
+"""Viewers' sessions: what each wants to be rendered next, and where the result goes."""
 
 import time
 from collections import deque
@@ -8,108 +8,107 @@ from itertools import count
 from typing import Any, Protocol, runtime_checkable
 
 from viewmend.inpainting.protocol import RenderQuality, State
-from viewmend.live.budget import FULL, Budget, FrameMs, Level
+from viewmend.live.budget import FULL, Budget, QualityLevel
 from viewmend.live.clock import Clock, Span
 from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
-from viewmend.live.protocol import ClockChange, Look
+from viewmend.live.protocol import ClockChange, FrameTimes, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
 
-REFINEMENTS = ((0.25, Level(1.0, 0, None)), (0.8, FULL))
-"""What a view is rendered with once it has been still for so many seconds: sharp first, since whoever moves on waits
-for it; then with all that the model can do."""
-MOVING = Level(0.5, 0, 256)
-"""What a moving view is made with where no budget says."""
+REFINEMENTS = ((0.25, QualityLevel(1.0, 0, None)), (0.8, FULL))
+"""Seconds that a view has been still, and the level that it is rendered with again. The sharp picture comes first,
+since whoever moves on waits for it; then all that the model can do."""
+MOVING = QualityLevel(0.5, 0, 256)
+"""What a moving view is made with where there is no budget."""
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What there is to look at now."""
+class Playback:
+    """What sessions choose their next view from."""
 
     span: Span
     edge: float
-    """Where those are who follow the edge."""
-    frame: RigFrame
-    present: Callable[[int], bool]
-    """Whether a time's frame is at hand; asking makes it come."""
-    crowd: int
-    """Viewers that were served in the last second, this one included."""
+    """The position of the viewers who follow the edge."""
+    rig_frame: RigFrame
+    has_frame: Callable[[int], bool]
+    """Whether a time's frame is at hand. If it is not, asking begins to read it."""
+    active_viewers: int
+    """Viewers that a frame was sent to within the last second, this one included."""
 
 
 @runtime_checkable
 class Session(Protocol):
-    """Somebody who wants views; all calls come from the render thread, under the service's lock but for `show`."""
+    """Asks for views. All calls come from the render thread; those but `show` come under the service's lock."""
 
     viewer: State | None
 
-    def due(self, now: float, scene: Scene) -> RenderRequest | None:
+    def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The view that is wanted now."""
         ...
 
-    def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
-        """It is there."""
+    def show(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
+        """Encode the view and pass it on; what all of it took."""
         ...
 
     def fail(self, message: str) -> None:
-        """It could not be rendered."""
+        """The view could not be rendered."""
         ...
 
 
 @dataclass(frozen=True)
-class Shown:
+class SentFrame:
     """One frame that was sent, for statistics."""
 
     at: float
-    stage_ms: dict[str, float]
-    size: int
-    shared: bool
-    """Another viewer had paid for its geometry."""
+    times: FrameTimes
+    size_bytes: int
 
 
 class ViewerSession:
-    """One viewer of the page: newest look wins, one frame in flight."""
+    """One viewer of the page: the newest look wins, one frame is in flight."""
 
     def __init__(
         self,
         deliver: Callable[[bytes], None],
-        complain: Callable[[str], None],
+        report_error: Callable[[str], None],
         budget_ms: float | None,
     ) -> None:
-        """Take a seat.
+        """Begin a session.
 
         Args:
             deliver: called with each frame's message, on the render thread.
-            complain: called with what went wrong, likewise.
+            report_error: called with what went wrong, on the render thread.
             budget_ms: milliseconds that a view may take when alone; None without a limit.
         """
         self.viewer: State | None = None
         self.clock = Clock()
         self.buffering = False
         self.dropped = 0
-        self.recent: deque[Shown] = deque(maxlen=120)
+        self.recent: deque[SentFrame] = deque(maxlen=120)
         self.in_flight: int | None = None
         self.in_flight_since = 0.0
         self.budget = None if budget_ms is None else Budget(budget_ms)
         self._budget_ms = budget_ms
-        self._deliver, self._complain = deliver, complain
-        self._numbers = count()
+        self._deliver, self._report_error = deliver, report_error
+        self._frame_numbers = count()
         self._look: Look | None = None
         self._look_at = 0.0
         self._last = time.monotonic()
         self._shown: tuple[Look | None, int] = (None, -1)
+        """Look and time of the last request."""
         self._full = False
         self._level, self._wait_ms = FULL, 0.0
-        self._encoders, self._wants_key = Encoders(), False
+        self._encoders, self._wants_key_frame = Encoders(), False
 
     def look(self, look: Look) -> None:
-        """What to show from now on; one that was not shown yet is dropped."""
+        """Set what to show from now on; a look that was not shown yet is dropped."""
         if self._look is not self._shown[0]:
             self.dropped += 1
         self._look, self._look_at = look, time.monotonic()
-        self._wants_key = self._wants_key or look.key
+        self._wants_key_frame = self._wants_key_frame or look.key
 
     def change(self, change: ClockChange, span: Span) -> None:
-        """Play, pause, seek, speed, edge."""
+        """Play, pause, seek, change speed, or follow the edge."""
         self.clock.change(change, span)
 
     def ack(self, frame: int) -> None:
@@ -117,120 +116,104 @@ class ViewerSession:
         if frame == self.in_flight:
             self.in_flight = None
 
-    def due(self, now: float, scene: Scene) -> RenderRequest | None:
-        """The view that is wanted now: the newest look at the clock's time, or the same again, better."""
+    def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
+        """The newest look at the clock's time, or the same view again at a better level."""
         seconds, self._last = now - self._last, now
-        self.clock.advance(seconds, scene.span, scene.edge)
-        look, at = self._look, self.clock.time(scene.span)
+        self.clock.advance(seconds, playback.span, playback.edge)
+        look, at = self._look, self.clock.time(playback.span)
         self.buffering = False
         if look is None or at < 0 or self.in_flight is not None:
             return None
-        fresh = look is not self._shown[0] or at != self._shown[1]  # asked again in the same words is asked again
-        rests = not look.moving and not (self.clock.playing and scene.span.fps > 0)
-        level = self._choose(look, scene.crowd) if fresh else self._better(now - self._look_at) if rests else None
+        is_new_look = look is not self._shown[0]  # by identity: the same look sent again is answered again
+        is_new = is_new_look or at != self._shown[1]
+        at_rest = not look.moving and not (self.clock.playing and playback.span.fps > 0)
+        if is_new:
+            level = self._level_for(look, playback.active_viewers)
+        else:
+            level = self._refinement(now - self._look_at) if at_rest else None
         if level is None:
             return None
-        if not scene.present(at):
+        if not playback.has_frame(at):
             self.buffering = True
             return None
-        if fresh and look is self._shown[0]:
-            self.dropped += max(0, at - self._shown[1] - 1) if self.clock.playing else 0
+        if is_new and not is_new_look and self.clock.playing:
+            self.dropped += max(0, at - self._shown[1] - 1)
         self._level, self._full = level, level == FULL
-        self._wait_ms = 1000 * (now - self._look_at) if look is not self._shown[0] else 0.0
+        self._wait_ms = max(0.0, 1000 * (now - self._look_at)) if is_new_look else 0.0
         self._shown = (look, at)
-        return self._ask(look, at, scene.frame)
+        return self._request(look, at, playback.rig_frame)
 
-    def _better(self, still_s: float) -> Level | None:
-        """What to render a view again with that has been still for so long; None for what it was rendered with."""
+    def _refinement(self, still_s: float) -> QualityLevel | None:
+        """The level for a view that has been still so long; None where it was rendered as well already."""
         if self._full:
             return None
-        due = [
-            level
-            for after_s, level in REFINEMENTS
-            if still_s >= after_s and level.relative_cost > self._level.relative_cost
-        ]
-        return due[-1] if due else None
+        cost = self._level.relative_cost
+        better = [level for after_s, level in REFINEMENTS if still_s >= after_s and level.relative_cost > cost]
+        return better[-1] if better else None
 
-    def _choose(self, look: Look, crowd: int) -> Level:
+    def _level_for(self, look: Look, active_viewers: int) -> QualityLevel:
         if self.budget is not None and self._budget_ms is not None:
-            self.budget.target_ms = self._budget_ms / max(1, crowd)
+            self.budget.target_ms = self._budget_ms / max(1, active_viewers)
             level = self.budget.level
         else:
             level = MOVING if look.moving else FULL
         return level if look.adaptive else replace(level, scale=1.0)
 
-    def _ask(self, look: Look, at: int, frame: RigFrame) -> RenderRequest:
+    def _request(self, look: Look, at: int, rig_frame: RigFrame) -> RenderRequest:
         level = self._level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
         quality = RenderQuality(mend="mended" in look.modes, top_k=top_k, context_times=level.context_times)
         scale = look.scale * level.scale
-        cameras = tuple(view_camera(eye, frame, (look.width, look.height), scale) for eye in look.cameras)
+        cameras = tuple(view_camera(eye, rig_frame, (look.width, look.height), scale) for eye in look.cameras)
         return RenderRequest(at, cameras, quality)
 
-    def show(self, ask: RenderRequest, rendered: RenderResult) -> None:
+    def show(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Encode and send a frame, and learn from what it took."""
         look = self._shown[0]
         assert look is not None, "views are rendered for those who look"
-        self.viewer = rendered.viewer
-        # Once for each look that asks; a look that is dropped leaves its wish to the next.
-        key, self._wants_key = self._wants_key, False
-        info = FrameInfo(next(self._numbers), self._full, max(0.0, self._wait_ms), self.dropped, key)
-        message, stage_ms = frame_message(look, ask, rendered, info, self._encoders)
+        self.viewer = result.viewer
+        # Reset by the frame that has it: a look that is dropped leaves its wish to the next.
+        key_frame, self._wants_key_frame = self._wants_key_frame, False
+        info = FrameInfo(next(self._frame_numbers), self._full, self._wait_ms, self.dropped, key_frame)
+        message, times = frame_message(look, request, result, info, self._encoders)
         now = time.monotonic()
-        self.recent.append(Shown(now, stage_ms, len(message), rendered.times.geometry == 0))
+        self.recent.append(SentFrame(now, times, len(message)))
         if self.budget is not None:
-            pixels = stage_ms["rendering"] + stage_ms["encode"]
-            filling = stage_ms["inpainting"] if ask.quality.mend else None
-            context = stage_ms["context"] if filling is not None and self._level.context_times else None
-            self.budget.record(self._level, FrameMs(stage_ms["geometry"], pixels, filling, context))
+            self.budget.record(self._level, times)
         self.in_flight, self.in_flight_since = info.frame, now
         self._deliver(message)
+        return times
 
     def fail(self, message: str) -> None:
-        """Say so once; the same view is not tried again, the next one is."""
+        """Report it once; the same view is not tried again, the next one is."""
         self._full = True
-        self._complain(message)
+        self._report_error(message)
 
     def state_json(self, span: Span, edge: float) -> dict[str, Any]:
         """This viewer's part of the message `state`."""
         clock = self.clock
         now = clock.time(span)
-        behind = max(0, int(edge) - now) if span.live or not span.whole else 0
         return {
             "time": now,
             "playing": clock.playing,
             "speed": clock.speed,
             "live": clock.live,
-            "behind": behind,
+            "behind": max(0, int(edge) - now) if span.live or not span.whole else 0,
             "buffering": self.buffering,
         }
 
     def stats_json(self, viewers: int) -> dict[str, Any]:
         """The message `stats`: of the last second."""
         now = time.monotonic()
-        recent = [shown for shown in list(self.recent) if shown.at > now - 1]
-        stages = recent[0].stage_ms if recent else {}
-        budget = None
-        if self.budget is not None:
-            level = self.budget.level
-            budget = {
-                "target_ms": round(self.budget.target_ms, 1),
-                "predicted_ms": round(self.budget.predicted_ms(level), 1),
-                "measured_ms": round(self.budget.measured_ms, 1),
-                "scale": level.scale,
-                "top_k": level.top_k,
-                "context_times": level.context_times,
-                "level": self.budget.index,
-                "levels": len(self.budget.levels),
-            }
-        count_of = max(1, len(recent))
+        recent = [sent for sent in list(self.recent) if sent.at > now - 1]
+        frames = max(1, len(recent))
         return {
             "type": "stats",
             "fps": len(recent),
-            "stage_ms": {s: round(sum(shown.stage_ms[s] for shown in recent) / count_of, 2) for s in stages},
-            "kb_per_frame": round(sum(shown.size for shown in recent) / 1000 / count_of, 2),
+            "stage_ms": sum((sent.times for sent in recent), FrameTimes()).as_json(frames) if recent else {},
+            "kb_per_frame": round(sum(sent.size_bytes for sent in recent) / 1000 / frames, 2),
             "dropped": self.dropped,
             "viewers": viewers,
-            "shared": round(sum(shown.shared for shown in recent) / count_of, 3),
-            "budget": budget,
+            "shared": round(sum(sent.times.geometry == 0 for sent in recent) / frames, 3),
+            "budget": None if self.budget is None else self.budget.as_json(),
         }
