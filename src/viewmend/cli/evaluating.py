@@ -36,9 +36,9 @@ class RunOptions:
     frames: int | None = None
     """Of each scene, from the first. 10 for P and Q by default, all of a capture."""
     every: int = 1
-    """Only every so many-th scene of each set, for a quick look at all its kinds;"""
+    """Only every n-th scene of each set is taken: a quick look at all kinds of scenes."""
     scenes: int | None = None
-    """and of these only the first so many."""
+    """At most so many scenes of each set are taken, after `every`."""
     size: int = 512
     """Width and height of the views of P and Q."""
     background: Literal["black", "stage"] = "black"

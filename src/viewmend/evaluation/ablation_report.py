@@ -27,15 +27,15 @@ class Line:
 
     name: str
     holes: tuple[float | None, ...]
-    """PSNR in the holes, dB, of each seed: mean over scenes;"""
+    """PSNR in the holes, dB, of each seed: mean over scenes."""
     whole: tuple[float | None, ...]
-    """over whole images;"""
+    """PSNR over whole images, likewise."""
     ms: float | None
-    """the median step of all seeds;"""
+    """The median step of all seeds."""
     loss: tuple[float | None, ...]
-    """and what each seed loses in the holes against the full model of this seed, mean over the scenes of both;"""
+    """What each seed loses in the holes against the full model of this seed, dB: mean over the scenes of both."""
     loss_by_style: dict[str, float | None]
-    """the same by how fast the scenes are, mean over seeds."""
+    """The loss by how fast the scenes are: mean over seeds."""
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ class MeanScores(Scores):
     """Means of frames' scores; None where there is nothing to average."""
 
     holes_of_hull: float | None
-    """Pixels of E as a share of those that the proxy covers;"""
+    """Pixels of E as a share of those that the proxy covers."""
     holes_of_image: float | None
-    """and of all."""
+    """Pixels of E as a share of all."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,11 @@ class Table:
     title: str
     rows: tuple[Row, ...]
     frames: int
-    """Of all scenes together, as far as any method has them;"""
+    """Frames of all scenes together that any method has."""
     thin_frames: int
-    """left out of the scores in the holes;"""
+    """Frames left out of the scores in the holes: they miss too little."""
     empty_frames: int
-    """without any hole (they are among the former)."""
+    """Those of the thin frames that have no hole at all."""
     sizes_px: tuple[tuple[int, int], ...]
     """Widths and heights of their views."""
 

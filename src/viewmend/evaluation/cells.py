@@ -62,9 +62,9 @@ class Cell:
     error: str | None
     provenance: Provenance
     features: Features | None = field(default=None, repr=False, compare=False)
-    """Of the method's videos;"""
+    """Features of the method's videos, in a file of their own."""
     true_features: Features | None = field(default=None, repr=False, compare=False)
-    """and of the truth's. In files of their own."""
+    """Features of the true videos, in a file of their own."""
 
 
 REMEMBERED = tuple(f.name for f in fields(Cell) if f.compare)

@@ -45,7 +45,7 @@ OURS = "ours"
 
 
 def _rows(network: str, method: str, text: str) -> tuple[PaperRow, ...]:
-    """def, win and mul, one line of eight figures each."""
+    """Rows of def, win and mul, one line of eight figures each."""
     lines = [PaperFigures(*map(float, line.split())) for line in text.strip().splitlines()]
     return tuple(
         PaperRow(f"{network}, {framing}", method.replace("*", framing), figures)

@@ -36,9 +36,9 @@ class Alignment:
     offset_px: tuple[float, float]
     """To add to (cx, cy) of every camera; zeros where no shift is worth it."""
     iou_before: float
-    """Mean IoU of the hull's silhouettes and the masks, as calibrated;"""
+    """Mean IoU of the hull's silhouettes and the masks, as calibrated."""
     iou_after: float
-    """and after the move."""
+    """The same IoU after the move."""
 
 
 def shared_offset(

@@ -21,10 +21,10 @@ from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface, occupied_box
 
 WORTH_RECARVING = 0.85
-"""A subject smaller than this share of the carved box is carved again in its own box,"""
+"""A subject smaller than this fraction of the carved box is carved again in its own box."""
 
 RECARVINGS = 3
-"""so often at most."""
+"""A subject is carved again so often at most."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""uvicorn as the live server uses it: its port is taken before anything is said, silent connections are closed."""
+"""The server uvicorn as `live` uses it: its port is taken before anything is said, silent connections are closed."""
 
 import contextlib
 import socket
@@ -16,7 +16,7 @@ SILENT_S = 10.0
 
 
 class Server(uvicorn.Server):
-    """uvicorn, which also closes connections that ask for nothing."""
+    """A uvicorn that also closes connections that ask for nothing."""
 
     def __init__(self, server: LiveServer, config: ServerConfig, pushes: bool) -> None:
         """Set up; `pushes` allows messages as large as a rig's frames."""

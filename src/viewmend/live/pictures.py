@@ -16,9 +16,9 @@ HOLE = (1.0, 0.15, 0.55)
 COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
 """Of the first, second, ... chosen camera in `coverage`."""
 DEPTH_STRIDES = ((160, 1), (400, 2))
-"""Image pixels a depth pixel, both ways, for pictures whose longer side is at most so long;"""
+"""Pairs (longest side, stride): image pixels a depth pixel, both ways, for pictures at most so long."""
 COARSEST_STRIDE = 4
-"""and for all others."""
+"""Image pixels a depth pixel in longer pictures."""
 
 
 def picture(completed: CompletedView, mode: str) -> Picture:

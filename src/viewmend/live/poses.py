@@ -23,9 +23,9 @@ class RigFrame:
     """The subject's, metres."""
     up: Float[Tensor, "3"]
     front: Float[Tensor, "3"]
-    """Horizontal: where azimuth 0 is;"""
+    """Horizontal unit vector to azimuth 0."""
     side: Float[Tensor, "3"]
-    """and azimuth 90."""
+    """Horizontal unit vector to azimuth 90 degrees."""
     azimuth: float
     """Of the first view, degrees; so is the elevation."""
     elevation: float

@@ -35,10 +35,9 @@ TRUNK, LEGS, FEET, HANDS, HEAD = (NAMES.index(name) for name in ("trunk", "left 
 SHOULDER_M = 0.75
 """Where sleeves begin on the chart of a cloth: what is across the chest is not on them."""
 SKIN_RAD = (0.42, 0.25)
-"""Texels whose hue (the direction of a, b in CIELAB) is between that of hands and face, or at most this much redder or
-yellower, are skin,"""
+"""Skin has a hue (direction of a, b in CIELAB) of hands or face, at most this much redder or yellower."""
 SKIN_CHROMA = (0.5, 1.7)
-"""if they are also within these multiples of their chroma: bare legs are darker, greyer and redder than hands."""
+"""Skin also has a chroma within these multiples of theirs: bare legs are darker, greyer and redder than hands."""
 LIGHTNESS = 0.5
 """Weight of lightness beside the two hues where garments are told apart: cloth has folds."""
 MOST_GARMENTS = 4

@@ -25,9 +25,9 @@ class DataPlan:
     clip: int = 1
     """Consecutive times in a sample, for the terms of the loss that look at time; `times` must have that many."""
     context_cameras: tuple[int, ...] = (2, 3, 4, 5)
-    """How many cameras colour a view and are its context,"""
+    """How many cameras colour a view and are its context: each view takes one of these numbers."""
     context_weights: tuple[int, ...] = (2, 8, 2, 1)
-    """and how often each."""
+    """How often each of `context_cameras` is taken, relative to the others."""
     past: tuple[int, ...] = (0, 0, 0, 1, 99)
     """How many of the earlier times are context; each target takes one of these."""
     context: bool = True

@@ -34,9 +34,9 @@ class RayBatch:
     """`RayInputs.features`, half precision."""
     occupancy: Float[Tensor, "pixel point 4"]
     around: UInt8[Tensor, "pixel 8 11 11"]
-    """The view about each pixel, in 255ths,"""
+    """The view about each pixel, in 255ths."""
     far: UInt8[Tensor, "place 12 11 11"]
-    """and what is farther around at each place that differs."""
+    """What is farther around each distinct place, in 255ths."""
     place: Int[Tensor, "pixel"]
     """At which of these each pixel is."""
     truth: UInt8[Tensor, "pixel 3"]

@@ -27,9 +27,9 @@ class ValidationScores:
 
     step: int
     holes: float
-    """PSNR in the holes;"""
+    """PSNR in the holes."""
     telea: float
-    """what Telea scores there."""
+    """What Telea scores there."""
     first_fill: float
     """What the first fill scores, before any patch."""
 
@@ -38,7 +38,7 @@ class Validation:
     """Fixed views of a recipe's kind of data, made when they are first asked for."""
 
     def __init__(self, recipe: Recipe, folder: Path) -> None:
-        """folder: for a picture after each judgement, validation-000500.png."""
+        """Pictures go to `folder`, one after each validation: validation-000500.png."""
         self.recipe = recipe
         self.folder = folder
         self._samples: list[Sample] = []
