@@ -14,7 +14,7 @@ from viewmend.contact_sheet import Tile, contact_sheet, in_rows, picture
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import project
-from viewmend.geometry.hull import bounds_from_cameras
+from viewmend.geometry.hull import FOREGROUND, bounds_from_cameras
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.views import MultiViewFrame
 
@@ -78,7 +78,7 @@ def _draw(check: CalibrationCheck, view: int, up: Float[Tensor, "3"] | None) -> 
     image = picture(check.frame.rgb[view, :, :height, :width])
     if check.frame.mask is not None and check.silhouettes is not None:
         hull = check.silhouettes[view, :height, :width].cpu().numpy() > 0
-        mask = check.frame.mask[view, :height, :width].cpu().numpy() > 127
+        mask = check.frame.mask[view, :height, :width].cpu().numpy() > FOREGROUND
         image[~mask] //= 2  # the mask must be seen, upright and over the subject
         image[mask & ~hull] = MASK_ONLY
         image[hull & ~mask] = HULL_ONLY

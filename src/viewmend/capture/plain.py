@@ -16,11 +16,9 @@ from viewmend.capture.folder_listing import FolderListing
 from viewmend.capture.plain_format import CALIBRATION, PlainCamera, read_calibration, stays_inside
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.rigid import rigid
 from viewmend.views import MultiViewFrame
-
-FOREGROUND = 127
-"""A mask above this is foreground where a yes or no is wanted."""
 
 
 def open_capture(path: Path | str, cameras: Sequence[str] | None = None) -> "PlainCapture":

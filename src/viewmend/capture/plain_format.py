@@ -190,17 +190,11 @@ def _camera(entry: CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float
     K[:2, 2] += shift_px
     u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations carry few digits
     return PlainCamera(
-        name=entry.name,
-        width=entry.width,
-        height=entry.height,
+        **{key: getattr(entry, key) for key in ("name", "width", "height", *STREAMS)},
         K=K,
         R=u @ vt,
         t_m=np.array(entry.t) * scale,
         dist=np.array(entry.dist),
-        image=entry.image,
-        video=entry.video,
-        mask=entry.mask,
-        depth=entry.depth,
     )
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from viewmend.capture.images import read_rgb, write_image
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.evaluation.mending import MendStep
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.views import IncompleteView
 
 SHEET_ROWS = 4
@@ -108,7 +109,7 @@ def sheet_row(step: MendStep) -> list[Tile]:
     for name in view.source_views:
         own = step.frame.select([name])
         assert own.mask is not None, "frames without masks are refused"
-        tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > 127)]))
+        tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > FOREGROUND)]))
     tiles += [
         Tile(f"rendered, frame {view.time}", picture(view.rgb)[box]),
         Tile("holes", picture(holes_marked(view))[box]),

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from viewmend.evaluation.scorers import SSIM_ONLY, ScoreMap, Scorers
 from viewmend.evaluation.temporal import change, warp_error
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, psnr, ssim_map
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 from viewmend.views import CompletedView, MultiViewFrame
-
-FOREGROUND = 128
-"""A true mask from here on (of 255) is subject."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +98,7 @@ def true_view(frame: MultiViewFrame, backward_flow_px: Float[Tensor, "height wid
     """The truth of a frame of one view with a mask."""
     assert frame.mask is not None, "a held camera comes with its mask"
     mask = frame.mask[0]
-    return TrueView(frame.rgb[0].float() / 255 * (mask.float() / 255), mask >= FOREGROUND, backward_flow_px)
+    return TrueView(frame.rgb[0].float() / 255 * (mask.float() / 255), mask > FOREGROUND, backward_flow_px)
 
 
 def score_frame(

@@ -13,6 +13,7 @@ from viewmend.baselines.classical import Telea
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
 from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
 from viewmend.observation import Observation
@@ -101,7 +102,9 @@ def _judge(completed: CompletedView, truth: MultiViewFrame) -> tuple[Float[Tenso
     image = truth.rgb[0, :, :height, :width] / 255 * (mask / 255)
     baseline = Telea()
     filled, _ = baseline.step(view, ContextProvider(lambda *_: None), baseline.initial_state())
-    unfilled, telea, ours = (score_view(view, rgb, image, mask > 127) for rgb in (view.rgb, filled.rgb, completed.rgb))
+    unfilled, telea, ours = (
+        score_view(view, rgb, image, mask > FOREGROUND) for rgb in (view.rgb, filled.rgb, completed.rgb)
+    )
     return image, Scores(unfilled, telea, ours)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
 
 STEP_PX = 1.0
@@ -79,7 +79,7 @@ def silhouette_iou(
 
     Masks may be padded further right and below.
     """
-    inside = mask[:, : silhouettes.shape[1], : silhouettes.shape[2]] > 127
+    inside = mask[:, : silhouettes.shape[1], : silhouettes.shape[2]] > FOREGROUND
     return (silhouettes & inside).sum((1, 2)) / (silhouettes | inside).sum((1, 2))
 
 

@@ -13,6 +13,9 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.threads import parallel_for
 
+FOREGROUND = 127
+"""A mask above this is foreground where a yes or no is wanted."""
+
 TILES = 32
 """Tiles across a mask's shorter side, by which the search for the subject's box judges blocks of space."""
 
