@@ -11,8 +11,7 @@ from reference.blend_twin import blend_twin
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering._blend_numba import blend_numba
 from viewmend.rendering._blend_torch import blend_torch
-from viewmend.rendering.blend_rule import BlendConfig
-from viewmend.rendering.blending import blend
+from viewmend.rendering.blending import BlendConfig, blend
 from viewmend.views import ContextViews, MultiViewFrame
 
 BIAS_M = 0.01

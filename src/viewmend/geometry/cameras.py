@@ -29,20 +29,12 @@ class Cameras:
 
     def __getitem__(self, views: int | slice | Sequence[int]) -> "Cameras":
         """The cameras at these positions; an int gives a `Cameras` of one view."""
-        order = list(range(len(self)))
-        if isinstance(views, int):
-            chosen = [order[views]]
-        elif isinstance(views, slice):
-            chosen = order[views]
-        else:
-            chosen = [int(v) for v in views]
-        index = torch.tensor(chosen, dtype=torch.long, device=self.K.device)
-        return Cameras(
-            tuple(self.names[v] for v in chosen),
-            self.K[index],
-            self.camera_from_world[index],
-            self.size_px[index],
+        index = (
+            range(len(self))[views] if isinstance(views, slice) else [views] if isinstance(views, int) else list(views)
         )
+        names = tuple(self.names[view] for view in index)
+        at = torch.tensor(list(index), dtype=torch.long, device=self.K.device)
+        return Cameras(names, self.K[at], self.camera_from_world[at], self.size_px[at])
 
     def select(self, names: Sequence[str]) -> "Cameras":
         """The cameras of these names, in this order.

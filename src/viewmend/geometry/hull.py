@@ -117,13 +117,11 @@ def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
 
 
 def _kernels(mask: Tensor) -> ModuleType | None:
-    """The fast path for CPU tensors, where numba is installed."""
+    """The fast path for CPU tensors."""
     if mask.device.type != "cpu":
         return None
-    try:
-        from viewmend.geometry import _hull_numba
-    except ImportError:
-        return None
+    from viewmend.geometry import _hull_numba
+
     return _hull_numba
 
 

@@ -22,14 +22,11 @@ class Mesh:
 def vertex_normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:
     """Unit normals at the vertices, outward: the area-weighted mean of the faces around each (zero where none)."""
     if mesh.vertices.device.type == "cpu" and not mesh.vertices.requires_grad:
-        try:
-            from viewmend.geometry._surface_numba import sum_face_normals
-        except ImportError:
-            pass
-        else:
-            sums = torch.zeros_like(mesh.vertices)
-            sum_face_normals(mesh.vertices.numpy(), mesh.faces.numpy(), sums.numpy())
-            return sums
+        from viewmend.geometry._surface_numba import sum_face_normals
+
+        sums = torch.zeros_like(mesh.vertices)
+        sum_face_normals(mesh.vertices.numpy(), mesh.faces.numpy(), sums.numpy())
+        return sums
     a, b, c = mesh.vertices[mesh.faces.long()].unbind(1)
     face_normals = torch.linalg.cross(b - a, c - a)
     normals = torch.zeros_like(mesh.vertices)

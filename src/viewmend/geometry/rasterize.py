@@ -1,6 +1,5 @@
 """Drawing a triangle mesh into cameras: depth, triangle ids, and interpolated attributes."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,18 +36,13 @@ def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front
     equally near ones the lower index. What is behind a camera draws nothing. Depth is perspective-correct.
 
     Args:
-        mesh: triangles in the world; on the CPU numba draws them where it is installed, else torch does.
+        mesh: triangles in the world; numba draws them on the CPU, torch elsewhere.
         cameras: on the mesh's device.
         cull: "back" leaves out the faces whose corners run clockwise in the image, "front" the others.
     """
     side = {"none": 0, "back": 1, "front": -1}[cull]
     if mesh.vertices.device.type == "cpu":
-        try:
-            from viewmend.geometry import _rasterize_numba as kernels
-        except ImportError:
-            pass
-        else:
-            return _rasterize_cpu(kernels, mesh, cameras, side)
+        return _rasterize_cpu(mesh, cameras, side)
     return Raster(*rasterize_torch(mesh, cameras, NEAR_M, side))
 
 
@@ -66,18 +60,15 @@ def interpolate(
     """Vertex attributes at every pixel of `raster`, perspective-correct; zeros where there is no surface."""
     image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
     if attributes.device.type == "cpu" and not (attributes.requires_grad or mesh.vertices.requires_grad):
-        try:
-            from viewmend.geometry._interpolate_numba import interpolate_band
-        except ImportError:
-            pass
-        else:
-            return _interpolate_cpu(interpolate_band, attributes, mesh, cameras, raster, image)
+        return _interpolate_cpu(attributes, mesh, cameras, raster, image)
     where, corners, weights = _visible_corners(mesh, cameras, raster)
     image[where] = (attributes[corners] * weights[..., None].to(attributes)).sum(1)
     return image
 
 
-def _interpolate_cpu(band: Callable[..., None], attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
+def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
+    from viewmend.geometry._interpolate_numba import interpolate_band
+
     P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
     given = attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy()
     triangles, images, rows = raster.triangle.numpy(), image.numpy(), image.shape[1]
@@ -85,7 +76,7 @@ def _interpolate_cpu(band: Callable[..., None], attributes, mesh: Mesh, cameras:
     def work(item: int) -> None:
         view, part = divmod(item, BANDS)
         first, end = rows * part // BANDS, rows * (part + 1) // BANDS
-        band(*given, P[view], triangles[view], first, end, images[view])
+        interpolate_band(*given, P[view], triangles[view], first, end, images[view])
 
     parallel_for(work, len(cameras) * BANDS)
     return image
@@ -103,7 +94,9 @@ def _visible_corners(
     return where, corners, (values / values.sum(-1, keepdim=True)).to(mesh.vertices)
 
 
-def _rasterize_cpu(kernels, mesh: Mesh, cameras: Cameras, side: int) -> Raster:
+def _rasterize_cpu(mesh: Mesh, cameras: Cameras, side: int) -> Raster:
+    from viewmend.geometry import _rasterize_numba as kernels
+
     width, height = cameras.max_size_px
     views, vertices, faces = len(cameras), mesh.vertices.detach().numpy(), mesh.faces.numpy()
     P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).detach().numpy()

@@ -24,29 +24,29 @@ def extract_surface(grid: OccupancyGrid) -> Mesh:
         return Mesh(empty, torch.zeros(0, 3, dtype=torch.int32, device=device))
     values = torch.nn.functional.pad(grid.values[box], (1, 1, 1, 1, 1, 1))
     first = torch.tensor([side.start for side in box], device=device)
-    vertices, faces = _march(values)
+    vertices, faces = (march_numba if values.device.type == "cpu" else march_torch)(values)
     # Padding moved the origin by one voxel, values sit in the middle of theirs.
     return Mesh((vertices + first - 0.5) * grid.voxel_m + grid.low, faces)
 
 
-def _march(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Vertices, in voxels, and triangles; by numba on the CPU where it is installed."""
-    if values.device.type == "cpu":
-        try:
-            from viewmend.geometry import _surface_numba as kernels
-        except ImportError:
-            pass
-        else:
-            grid = values.contiguous().numpy()
-            vertices = torch.empty(kernels.count_crossings(grid, ISO), 3)
-            vertex_of_edge = torch.empty(3, *values.shape, dtype=torch.int32).numpy()
-            kernels.place_crossings(grid, ISO, vertices.numpy(), vertex_of_edge)
-            # A vertex is in one loop of each of its edge's four cells, and n vertices of a loop make n - 2 triangles.
-            faces = torch.empty(4 * len(vertices), 3, dtype=torch.int32)
-            starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
-            table = triangle_table().numpy()
-            count = kernels.connect(grid, ISO, table, starts.numpy(), vertex_of_edge, faces.numpy())
-            return vertices, faces[:count].clone()  # half of it: the rest would stay as long as the mesh
+def march_numba(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Vertices, in voxels, and triangles, on the CPU."""
+    from viewmend.geometry import _surface_numba as kernels
+
+    grid = values.contiguous().numpy()
+    vertices = torch.empty(kernels.count_crossings(grid, ISO), 3)
+    vertex_of_edge = torch.empty(3, *values.shape, dtype=torch.int32).numpy()
+    kernels.place_crossings(grid, ISO, vertices.numpy(), vertex_of_edge)
+    # A vertex is in one loop of each of its edge's four cells, and n vertices of a loop make n - 2 triangles.
+    faces = torch.empty(4 * len(vertices), 3, dtype=torch.int32)
+    starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
+    table = triangle_table().numpy()
+    count = kernels.connect(grid, ISO, table, starts.numpy(), vertex_of_edge, faces.numpy())
+    return vertices, faces[:count].clone()  # half of it: the rest would stay as long as the mesh
+
+
+def march_torch(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """The same on any device."""
     vertices, vertex_of_edge = _crossings(values)
     return vertices, _triangles(values > ISO, vertex_of_edge)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.threads import parallel_for
-from viewmend.rendering.blend_rule import GRAZING, Blend, BlendConfig
+from viewmend.rendering.blending import GRAZING, Blend, BlendConfig
 from viewmend.views import ContextViews
 
 ROWS = 16

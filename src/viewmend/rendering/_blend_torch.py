@@ -7,7 +7,7 @@ from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import Cameras, project, unproject
 from viewmend.geometry.sampling import bilinear_taps, in_view
-from viewmend.rendering.blend_rule import GRAZING, Blend, BlendConfig
+from viewmend.rendering.blending import GRAZING, Blend, BlendConfig
 from viewmend.views import ContextViews
 
 

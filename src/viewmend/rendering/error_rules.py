@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.rendering.blend_rule import Blend
+from viewmend.rendering.blending import Blend
 
 MIN_WEIGHT = 1e-5
 """Sum of raw weights below which a pixel has no colour (RIFTCast)."""

@@ -1,7 +1,5 @@
 """Which cameras colour a novel view: those closest in angle (the paper, section 2)."""
 
-from collections.abc import Sequence
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -23,14 +21,12 @@ def select_closest(
     cameras: Cameras,
     subject_center: Float[Tensor, "3"],
     k: int = 3,
-    exclude: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
 
     Close means a small angle at the subject's centre between the two viewing rays (the paper does not define it); it
     is what decides how similar the two images are, while the distance to the subject only changes the scale. Fewer
-    than k names come back when there are fewer cameras; none of `exclude` ever does.
+    than k names come back when there are fewer cameras.
     """
     angle = angles_to(target, cameras, subject_center).tolist()
-    allowed = [v for v, name in enumerate(cameras.names) if name not in exclude]
-    return tuple(cameras.names[v] for v in sorted(allowed, key=lambda v: angle[v])[:k])
+    return tuple(cameras.names[view] for view in sorted(range(len(cameras)), key=lambda view: angle[view])[:k])

@@ -10,8 +10,7 @@ from torch import Tensor
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
-from viewmend.rendering.blend_rule import BlendConfig
-from viewmend.rendering.blending import blend
+from viewmend.rendering.blending import BlendConfig, blend
 from viewmend.rendering.error_rules import Evidence, error_rule
 from viewmend.rendering.selection import select_closest
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
