@@ -69,6 +69,11 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
     Raises:
         MethodMissing: its weights are not here.
         ValueError: there is none, or it cannot be loaded (`WeightsError`); no such precision.
+
+    Examples:
+        >>> from viewmend import make_method
+        >>> type(make_method("telea")).__name__
+        'Telea'
     """
     if name in METHODS:
         module, _, made = METHODS[name].partition(":")

@@ -21,7 +21,18 @@ from viewmend.views import ContextViews, MultiViewFrame
 
 @runtime_checkable
 class DepthProvider(Protocol):
-    """All that an inpainter asks of G[t]; `GeometryProxy` is one, a renderer's own geometry may be another."""
+    """All that an inpainter asks of G[t]; `GeometryProxy` is one, a renderer's own geometry may be another.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import DepthProvider
+        >>> class Wall:
+        ...     def depth(self, cameras):
+        ...         width, height = cameras.max_size_px
+        ...         return torch.full((len(cameras), height, width), 3.0)
+        >>> isinstance(Wall(), DepthProvider)
+        True
+    """
 
     def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
         """z-depth of the surface in each camera, metres; 0 where there is none."""
@@ -30,7 +41,15 @@ class DepthProvider(Protocol):
 
 @dataclass
 class Observation:
-    """What the cameras saw at one time, and what was computed of it; all viewers of that time share it."""
+    """What the cameras saw at one time, and what was computed of it; all viewers of that time share it.
+
+    Examples:
+        >>> from viewmend import Stream, make_method
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> Stream(make_method("telea")).push(frame).depth(frame.cameras.names[:1]).shape
+        torch.Size([1, 64, 64])
+    """
 
     frame: MultiViewFrame
     proxy: GeometryProxy | DepthProvider

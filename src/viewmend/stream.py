@@ -34,7 +34,13 @@ WINDOW = 33
 
 @dataclass(frozen=True, kw_only=True)
 class StreamConfig:
-    """The system without its inpainter."""
+    """The system without its inpainter.
+
+    Examples:
+        >>> from viewmend import Stream, StreamConfig, make_method
+        >>> Stream(make_method("telea"), StreamConfig(memory_mb=200.0)).times
+        ()
+    """
 
     hull: HullConfig = field(default_factory=HullConfig)
     """How the geometry proxy is carved."""
@@ -46,7 +52,21 @@ class StreamConfig:
 
 @dataclass(frozen=True)
 class StreamView:
-    """What one viewer gets."""
+    """What one viewer gets.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Stream, look_at, make_method, pinhole
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> up, subject = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.95, 0.0])
+        >>> target = pinhole(0.8, 64, 64, look_at(torch.tensor([0.5, 1.0, 3.0]), subject, up))
+        >>> stream = Stream(make_method("telea"))
+        >>> first = stream.view(target, time=stream.push(frame).frame.time)
+        >>> again = stream.view(target, first.viewer)
+        >>> first.times.geometry > 0, again.times.geometry
+        (True, 0.0)
+    """
 
     completed: CompletedView
     viewer: State
@@ -55,7 +75,21 @@ class StreamView:
 
 
 class Stream:
-    """Frames in, mended views out, for any number of viewers. Call it from one thread at a time."""
+    """Frames in, mended views out, for any number of viewers. Call it from one thread at a time.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Stream, look_at, make_method, pinhole
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> up, subject = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.95, 0.0])
+        >>> target = pinhole(0.8, 64, 64, look_at(torch.tensor([0.5, 1.0, 3.0]), subject, up))
+        >>> stream = Stream(make_method("telea"))
+        >>> observation = stream.push(frame)
+        >>> seen = stream.view(target)
+        >>> seen.completed.rgb.shape, stream.times
+        (torch.Size([3, 64, 64]), (0,))
+    """
 
     def __init__(
         self, inpainter: ViewInpainter, config: StreamConfig | None = None, bounds: Bounds | None = None
@@ -185,7 +219,18 @@ class Stream:
         quality: RenderQuality | None = None,
         exclude: Sequence[str] = (),
     ) -> StreamView:
-        """`render` one novel view, and `mend` it; with their arguments and errors."""
+        """`render` one novel view, and `mend` it.
+
+        Args:
+            target: the novel view's camera (one view), on the frames' device.
+            viewer: what the last view gave; None for a first look.
+            time: which of `times`; the latest by default.
+            quality: what it may cost.
+            exclude: names of cameras whose images must not be used.
+
+        Raises:
+            ValueError: as `render`'s.
+        """
         start = now_s(target.K.device)
         view = self.render(target, time, exclude)
         rendering_ms = ms_since(start, target.K.device)

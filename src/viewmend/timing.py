@@ -11,7 +11,13 @@ Times = TypeVar("Times", bound="StageTimes")
 
 @dataclass(frozen=True, kw_only=True)
 class StageTimes:
-    """Milliseconds of each stage of one view, the device's work included."""
+    """Milliseconds of each stage of one view, the device's work included.
+
+    Examples:
+        >>> from viewmend import StageTimes
+        >>> StageTimes(geometry=30.0) + StageTimes(rendering=20.0)
+        StageTimes(geometry=30.0, context=0.0, rendering=20.0, inpainting=0.0)
+    """
 
     geometry: float = 0.0
     """Masks to geometry proxy. The first view of a time pays for it, the others have 0."""

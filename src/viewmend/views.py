@@ -16,6 +16,14 @@ class MultiViewFrame:
 
     Images are 8 bit, as cameras deliver them, undistorted, and padded with zeros right and below to the largest;
     `cameras.size_px` says what is image. A camera without a frame at this time is absent.
+
+    Examples:
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> frame.rgb.shape, frame.time
+        (torch.Size([4, 3, 64, 64]), 0)
+        >>> len(frame.without(frame.cameras.names[:1]).cameras)
+        3
     """
 
     cameras: Cameras
@@ -58,7 +66,16 @@ class MultiViewFrame:
 
 @dataclass(frozen=True)
 class ContextViews:
-    """Camera images of one time with the geometry proxy's depth in them: all that an inpainter sees of a rig."""
+    """Camera images of one time with the geometry proxy's depth in them: all that an inpainter sees of a rig.
+
+    Examples:
+        >>> from viewmend import Stream, make_method
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> seen = Stream(make_method("telea")).push(frame).context(frame.cameras.names[:2])
+        >>> seen.depth.shape
+        torch.Size([2, 64, 64])
+    """
 
     frame: MultiViewFrame
     depth: Float[Tensor, "view height width"]
@@ -78,7 +95,15 @@ class ContextViews:
 
 @dataclass(frozen=True)
 class Silhouettes:
-    """The masks of a rig at one time, without its images."""
+    """The masks of a rig at one time, without its images.
+
+    Examples:
+        >>> from viewmend import Silhouettes
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> Silhouettes(frame.mask, frame.cameras).mask.dtype
+        torch.uint8
+    """
 
     mask: UInt8[Tensor, "view height width"]
     """Foreground, 0 to 255."""
@@ -91,7 +116,17 @@ class Silhouettes:
 
 @dataclass(frozen=True)
 class IncompleteView:
-    """A rendered novel view and what is missing in it: F[t], M[t], E[t] of section 1."""
+    """A rendered novel view and what is missing in it: F[t], M[t], E[t] of section 1.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import IncompleteView, pinhole
+        >>> camera = pinhole(0.8, 64, 48, torch.eye(4))
+        >>> rgb, ones, weights = torch.zeros(3, 48, 64), torch.ones(48, 64), torch.zeros(1, 48, 64)
+        >>> view = IncompleteView(camera, rgb, ones, ones, 2 * ones, source_views=("left",), weights=weights, time=0)
+        >>> int((view.error > 0).sum())
+        3072
+    """
 
     camera: Cameras
     """The novel view's camera (one view)."""
@@ -121,7 +156,21 @@ class IncompleteView:
 
 @dataclass(frozen=True)
 class CompletedView:
-    """A novel view without holes: Fhat = E * Ftilde + (1 - E) * F (section 1)."""
+    """A novel view without holes: Fhat = E * Ftilde + (1 - E) * F (section 1).
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Stream, look_at, make_method, pinhole
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> up, subject = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.95, 0.0])
+        >>> target = pinhole(0.8, 64, 64, look_at(torch.tensor([0.5, 1.0, 3.0]), subject, up))
+        >>> stream = Stream(make_method("telea"))
+        >>> completed = stream.view(target, time=stream.push(frame).frame.time).completed
+        >>> right = completed.view.error == 0
+        >>> torch.equal(completed.rgb[:, right], completed.view.rgb[:, right])
+        True
+    """
 
     view: IncompleteView
     rgb: Float[Tensor, "3 height width"]

@@ -26,6 +26,20 @@ def open_capture(path: Path | str, cameras: Sequence[str] | None = None) -> "Pla
 
     Raises:
         CaptureError: the calibration is wrong, files are missing, or a name is unknown (see `PlainCapture`).
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from viewmend import open_capture
+        >>> from viewmend.capture.plain_writer import write_capture
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> folder = Path(tempfile.mkdtemp()) / "take"
+        >>> write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), folder)
+        >>> capture = open_capture(folder)
+        >>> len(capture.cameras), len(capture.frame_ids), capture.has_masks
+        (4, 1, True)
+        >>> capture.read(0).rgb.shape
+        torch.Size([4, 3, 64, 64])
     """
     path = Path(path)
     return PlainCapture(path.parent if path.name == CALIBRATION and path.is_file() else path, cameras)

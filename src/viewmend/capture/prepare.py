@@ -91,6 +91,13 @@ def prepare(
     Raises:
         CaptureError: a frame cannot be read.
         ValueError: the masks agree on no subject.
+
+    Examples:
+        >>> from viewmend import prepare
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> capture = prepare(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), longest_px=32, align=False)
+        >>> capture.read(0).rgb.shape
+        torch.Size([4, 3, 32, 32])
     """
     return PreparedCapture(source, _alignment(source, inputs, first) if align else None, longest_px)
 

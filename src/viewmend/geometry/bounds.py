@@ -9,7 +9,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Bounds:
-    """The box between two corners, world coordinates, metres; `low` < `high` on every axis."""
+    """The box between two corners, world coordinates, metres; `low` < `high` on every axis.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Bounds
+        >>> Bounds(torch.zeros(3), torch.tensor([2.0, 4.0, 2.0])).center
+        tensor([1., 2., 1.])
+    """
 
     low: Float[Tensor, "3"]
     high: Float[Tensor, "3"]

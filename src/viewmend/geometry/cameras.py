@@ -16,6 +16,14 @@ class Cameras:
 
     Axes are OpenCV's: x right, y down, z forward. K is in pixels of an image whose top-left pixel has its centre
     at (0.5, 0.5). Lengths are metres. One camera is a `Cameras` of one view.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Cameras
+        >>> K = torch.tensor([[[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]])
+        >>> front = Cameras(("front",), K, camera_from_world=torch.eye(4)[None], size_px=torch.tensor([[640, 480]]))
+        >>> front.resized(320, 240).K[0, 0]
+        tensor([250.,   0., 160.])
     """
 
     names: tuple[str, ...]
@@ -87,7 +95,14 @@ class Cameras:
         return replace(self, K=K)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Cameras":
-        """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image."""
+        """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image.
+
+        Args:
+            left: the window's first column in the image; below 0 it begins outside.
+            top: its first row.
+            width: its width.
+            height: its height.
+        """
         K = self.K.clone()
         K[:, 0, 2] -= left
         K[:, 1, 2] -= top
@@ -145,7 +160,23 @@ def pixel_centers(width: int, height: int, device: torch.device | str = "cpu") -
 def pinhole(
     fov_y_rad: float, width: int, height: int, camera_from_world: Float[Tensor, "4 4"], name: str = "view"
 ) -> Cameras:
-    """One camera with square pixels, its principal point in the middle, and this vertical field of view."""
+    """One camera with square pixels, its principal point in the middle, and this vertical field of view.
+
+    Args:
+        fov_y_rad: angle between the image's top and bottom, radians.
+        width: of the image, pixels.
+        height: of the image, pixels.
+        camera_from_world: the pose (OpenCV axes), metres; `look_at` makes one.
+        name: what the camera is called.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import pinhole
+        >>> pinhole(1.5708, 640, 480, torch.eye(4)).K[0].round()
+        tensor([[240.,   0., 320.],
+                [  0., 240., 240.],
+                [  0.,   0.,   1.]])
+    """
     f = 0.5 * height / float(torch.tan(torch.tensor(fov_y_rad / 2)))
     K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
     size = torch.tensor([[width, height]])

@@ -25,7 +25,13 @@ BLOCK = 4
 
 @dataclass(frozen=True, kw_only=True)
 class HullConfig:
-    """How the visual hull is carved."""
+    """How the visual hull is carved.
+
+    Examples:
+        >>> from viewmend import HullConfig, StreamConfig
+        >>> StreamConfig(hull=HullConfig(resolution=192)).hull.resolution
+        192
+    """
 
     resolution: int = 128
     """Voxels along the longest side of the box that is carved."""

@@ -37,6 +37,13 @@ def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tenso
 
     Raises:
         ValueError: eye equals target, or up is parallel to the viewing direction.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import look_at
+        >>> pose = look_at(torch.tensor([0.0, 1.0, 3.0]), torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+        >>> float((pose @ torch.tensor([0.0, 1.0, 0.0, 1.0]))[2])
+        3.0
     """
     forward = target - eye
     right = torch.linalg.cross(forward, up)

@@ -44,6 +44,11 @@ def load_inpainter(
         DamagedWeightsError: a file is unreadable or cut short.
         MismatchedWeightsError: weights and config do not belong together.
         ValueError: no such precision.
+
+    Examples:
+        >>> from viewmend import ViewInpainter, load_inpainter
+        >>> isinstance(load_inpainter("small"), ViewInpainter)
+        True
     """
     if precision not in PRECISIONS:
         raise ValueError(f"expected --precision float32 or bfloat16, got '{precision}'")

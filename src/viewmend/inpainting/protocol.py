@@ -19,7 +19,12 @@ REMEMBERED_TIMES = 34
 
 @dataclass(frozen=True, kw_only=True)
 class RenderQuality:
-    """How much work one view may cost; the default is all that the model was trained with."""
+    """How much work one view may cost; the default is all that the model was trained with.
+
+    Examples:
+        >>> from viewmend import RenderQuality
+        >>> cheapest = RenderQuality(context_times=0)
+    """
 
     mend: bool = True
     """False leaves the holes as they are rendered."""
@@ -35,6 +40,17 @@ class ContextProvider:
 
     `provider(time, names)` gives these cameras at that time, or None. Whoever runs one stream by `step` alone makes one
     provider for all of its views; `viewmend.Stream` makes one for each view, upon a memory that all viewers share.
+
+    Examples:
+        >>> from viewmend import ContextProvider, Stream, make_method
+        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> now = Stream(make_method("telea")).push(frame)
+        >>> context = ContextProvider(lambda time, names: now.context(names) if time == 0 else None)
+        >>> context(0, frame.cameras.names[:2]).frame.rgb.shape
+        torch.Size([2, 3, 64, 64])
+        >>> context(-1, frame.cameras.names) is None
+        True
     """
 
     def __init__(
@@ -97,12 +113,29 @@ class ContextProvider:
 
 @dataclass(frozen=True)
 class State:
-    """What an inpainter carries from one view of a stream to the next: of its own kind, never changed in place."""
+    """What an inpainter carries from one view of a stream to the next: of its own kind, never changed in place.
+
+    Examples:
+        >>> from viewmend import State, make_method
+        >>> isinstance(make_method("telea").initial_state(), State)
+        True
+    """
 
 
 @runtime_checkable
 class ViewInpainter(Protocol):
-    """Completes one view after another."""
+    """Completes one view after another.
+
+    Examples:
+        >>> from viewmend import CompletedView, State, ViewInpainter
+        >>> class Grey:
+        ...     def initial_state(self):
+        ...         return State()
+        ...     def step(self, view, context, state):
+        ...         return CompletedView(view, view.error * 0.5 + (1 - view.error) * view.rgb), state
+        >>> isinstance(Grey(), ViewInpainter)
+        True
+    """
 
     def initial_state(self) -> State:
         """The state before the first view of a stream."""

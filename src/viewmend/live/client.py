@@ -29,7 +29,13 @@ class Frame:
 
 @dataclass
 class Client:
-    """A viewer's connection; a context manager. ConnectionError says why a server refuses, or ends it."""
+    """A viewer's connection; a context manager. ConnectionError says why a server refuses, or ends it.
+
+    Examples:
+        >>> from viewmend import Client
+        >>> with Client("ws://127.0.0.1:8008") as viewer:  # doctest: +SKIP
+        ...     print(viewer.messages["welcome"])
+    """
 
     url: str = "ws://127.0.0.1:8008"
     token: str | None = None

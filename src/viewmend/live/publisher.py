@@ -23,6 +23,11 @@ class Publisher:
 
     Raises:
         ConnectionError: the server refuses; says why.
+
+    Examples:
+        >>> from viewmend import Publisher
+        >>> with Publisher(frame.cameras, "ws://127.0.0.1:8008", fps=15.0) as rig:  # doctest: +SKIP
+        ...     rig.push(frame)
     """
 
     def __init__(
@@ -35,6 +40,17 @@ class Publisher:
         up: Tensor | None = None,
         bounds: Bounds | None = None,
     ) -> None:
+        """Connect.
+
+        Args:
+            cameras: the rig, calibrated in metres.
+            url: of the server, without a path.
+            token: what `viewmend serve` was given, or said.
+            fps: frames that will come a second.
+            name: what the page calls the rig.
+            up: the world's up, shape (3,); None to find it from the cameras.
+            bounds: the volume that may hold the subject; None to find it from the masks.
+        """
         self._open = contextlib.ExitStack()
         self._socket = self._open.enter_context(
             connect(f"{url}/push{token_query(token)}", max_size=None, compression=None)

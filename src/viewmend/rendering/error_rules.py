@@ -14,7 +14,16 @@ MIN_WEIGHT = 1e-5
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that a rule may look at."""
+    """All that a rule may look at.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Evidence, error_rule
+        >>> from viewmend.rendering.error_rules import Blend
+        >>> blend = Blend(torch.zeros(3, 1, 2), torch.tensor([[[0.0, 0.7]]]), torch.zeros(1, 2))
+        >>> error_rule("unseen")(Evidence(mask=torch.ones(1, 2), depth=torch.ones(1, 2), blend=blend))
+        tensor([[1., 0.]])
+    """
 
     mask: Float[Tensor, "height width"]
     """M: 1 where the geometry proxy covers the pixel."""
@@ -37,6 +46,11 @@ def error_rule(name: str) -> ErrorRule:
 
     Raises:
         ValueError: there is none.
+
+    Examples:
+        >>> from viewmend import error_rule
+        >>> error_rule("unseen").__name__
+        'unseen'
     """
     rules: dict[str, ErrorRule] = {"unseen": unseen}
     if name not in rules:

@@ -21,7 +21,13 @@ SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """How a novel view is rendered from the cameras' images."""
+    """How a novel view is rendered from the cameras' images.
+
+    Examples:
+        >>> from viewmend import RenderConfig, StreamConfig
+        >>> StreamConfig(render=RenderConfig(cameras=4)).render.cameras
+        4
+    """
 
     cameras: int = 3
     """How many cameras colour a view: those closest to it in angle (the paper: 3)."""
