@@ -10,6 +10,7 @@ import torch
 
 from viewmend.capture.prepare import prepare, reduced
 from viewmend.geometry.hull import HullConfig
+from viewmend.leave_one_out.scenes import LeaveOneOutFrames
 from viewmend.leave_one_out.studio_scenes import P_SEEDS, Q_SEEDS
 from viewmend.rendering.view import RenderConfig
 from viewmend.studio.stage import Studio, StudioConfig
@@ -45,8 +46,8 @@ def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
     vandalised.mask[2] = 255
     truth = studio.truth(studio.true_cameras.select([held]), 1)
     samples = [
-        LeaveOneOut({1: f}, held, None, HullConfig(resolution=48)).sample(1, (1,), truth, RenderConfig(), 0)
-        for f in (frame, vandalised)
+        LeaveOneOut(rig.inputs(held, {}), None, HullConfig(resolution=48)).sample(1, (1,), truth, RenderConfig(), 0)
+        for rig in (LeaveOneOutFrames({1: f}, None, lambda held: studio.cameras) for f in (frame, vandalised))
     ]
     first, second = samples
     assert first is not None and second is not None

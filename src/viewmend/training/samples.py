@@ -53,12 +53,10 @@ class Sample:
 
 
 class LeaveOneOut:
-    """The frames of one rig without one of its cameras, image and mask; proxies are computed once a time."""
+    """What a rig without one of its cameras saw (`LeaveOneOutFrames.inputs`); proxies are computed once a time."""
 
-    def __init__(self, frames: Mapping[int, MultiViewFrame], held: str, bounds: Bounds | None, hull: HullConfig):
-        # Nobody may look at the true depth, and samples that wait in memory need not carry it.
-        self.frames = {time: replace(frame.without([held]), depth=None) for time, frame in frames.items()}
-        self.held = held
+    def __init__(self, inputs: Mapping[int, MultiViewFrame], bounds: Bounds | None, hull: HullConfig):
+        self.frames = inputs
         self.bounds = bounds
         self.hull = hull
         self._proxies: dict[int, GeometryProxy] = {}

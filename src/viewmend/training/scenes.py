@@ -130,7 +130,7 @@ def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[
     samples = []
     for held in random.sample(names, min(plan.held_cameras, len(names))):
         hull = HullConfig(resolution=plan.hull_resolution)
-        others = LeaveOneOut(rig.inputs(held, dropped), held, rig.bounds, hull)
+        others = LeaveOneOut(rig.inputs(held, dropped), rig.bounds, hull)
         for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
             reach = random.choice(plan.past)
             render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
