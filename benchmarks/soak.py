@@ -65,7 +65,7 @@ class Soak:
                     number += 1
                     self.counts["pushed"] += 1
                     time.sleep(1 / 10)
-                rig._socket.socket.close()
+                rig._socket._socket.socket.close()
                 self.counts["rigs"] += 1
             time.sleep(chance.uniform(0.5, 3))
 
@@ -79,7 +79,7 @@ class Soak:
                 while time.monotonic() < until and not self.over:
                     self._look(viewer, seat, chance)
                 if chance.random() < 0.5:
-                    viewer._socket.socket.close()
+                    viewer._socket._socket.socket.close()
                 else:
                     viewer.__exit__()
                 self.counts["visits"] += 1

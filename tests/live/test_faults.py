@@ -146,7 +146,7 @@ def test_disconnects_in_the_middle_of_a_frame():
             viewer = Client(server.ws).__enter__()
             viewer.look(width=64, height=64, camera={"azimuth": float(number)})
             time.sleep(0.003 * number)
-            viewer._socket.socket.close()
+            viewer._socket._socket.socket.close()
         wait_until(lambda: not server.live.registry.sessions, 20)
         assert still_serves(server)
         wait_until(lambda: not server.service._sessions)
@@ -226,8 +226,8 @@ def test_stopping_frees_the_port_while_viewers_watch():
     again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     again.bind(("127.0.0.1", port))
     again.close()
-    assert closing(viewer._socket) in (1012, None)
-    viewer._open.close()
+    assert closing(viewer._socket._socket) in (1012, None)
+    viewer._socket.close()
     assert set(threading.enumerate()) <= before
 
 

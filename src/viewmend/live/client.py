@@ -16,6 +16,42 @@ from viewmend.live.pictures import PackedDepth, from_jpeg, unpack_depth
 from viewmend.live.protocol import VERSION, unpack
 
 
+class ServerSocket:
+    """A connection to the server's path `ws` or `push`."""
+
+    def __init__(self, url: str, token: str | None) -> None:
+        self._open = contextlib.ExitStack()
+        address = f"{url}{token_query(token)}"
+        self._socket = self._open.enter_context(connect(address, max_size=None, compression=None))
+
+    def send(self, message: str | bytes) -> None:
+        """Send a message. If the connection is closed already, `receive` says why."""
+        with contextlib.suppress(ConnectionClosed):
+            self._socket.send(message)
+
+    def receive(self, timeout_s: float) -> dict[str, Any] | bytes:
+        """The next message: JSON, or a binary one.
+
+        Raises:
+            ConnectionError: the server refuses, or the connection is closed; says why.
+            TimeoutError: none came in time.
+        """
+        try:
+            message = self._socket.recv(timeout=max(0.0, timeout_s))
+        except ConnectionClosed as closed:
+            raise ConnectionError(f"the server has closed the connection: {closed}") from None
+        if isinstance(message, bytes):
+            return message
+        content = json.loads(message)
+        if content["type"] == "error" and content["fatal"]:
+            raise ConnectionError(content["message"])
+        return content
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._open.close()
+
+
 @dataclass(frozen=True)
 class Frame:
     """One frame: its header (docs/live-protocol.md), RGB by eye and mode, depth in metres by eye, latency, bytes."""
@@ -44,24 +80,21 @@ class Client:
     """The last message of each type."""
 
     def __enter__(self) -> "Client":
-        url = f"{self.url}/ws{token_query(self.token)}"
-        self._open = contextlib.ExitStack()
-        self._socket = self._open.enter_context(connect(url, max_size=None, compression=None))
+        self._socket = ServerSocket(f"{self.url}/ws", self.token)
         self._looks = 0
         self.send("hello", version=VERSION, codecs=["jpeg"])
         self.wait_for("welcome")
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._open.close()
+        self._socket.close()
 
     def send(self, kind: str, **values: object) -> None:
         """Send a message of the protocol."""
-        with contextlib.suppress(ConnectionClosed):  # the reason is waiting to be read
-            self._socket.send(json.dumps({"type": kind, **values}))
+        self._socket.send(json.dumps({"type": kind, **values}))
 
     def look(self, **values: object) -> int:
-        """RenderRequest for views from now on, e.g. camera={"azimuth": 30}, width=320, height=320; the look's id."""
+        """Ask for views from now on, e.g. camera={"azimuth": 30}, width=320, height=320; the look's id."""
         self._looks += 1
         self.send("look", id=self._looks, sent_ms=1000 * time.perf_counter(), **values)
         return self._looks
@@ -83,15 +116,9 @@ class Client:
                 return frame
 
     def _receive(self, end: float) -> Frame | None:
-        try:
-            message = self._socket.recv(timeout=max(0.0, end - time.monotonic()))
-        except ConnectionClosed as closed:
-            raise ConnectionError(f"the server has closed the connection: {closed}") from None
-        if isinstance(message, str):
-            note = json.loads(message)
-            self.messages[note["type"]] = note
-            if note["type"] == "error" and note["fatal"]:
-                raise ConnectionError(note["message"])
+        message = self._socket.receive(end - time.monotonic())
+        if isinstance(message, dict):
+            self.messages[message["type"]] = message
             return None
         header, parts = unpack(message)
         self.send("ack", frame=header["frame"])
@@ -100,6 +127,6 @@ class Client:
             if part["kind"] == "image":
                 frame.images[part["eye"], part["mode"]] = from_jpeg(data)
             else:
-                sizes = (part[key] for key in ("width", "height", "near_m", "far_m"))
+                sizes = (part[key] for key in ("width", "height", "stride", "near_m", "far_m"))
                 frame.depth[part["eye"]] = unpack_depth(PackedDepth(data, *sizes))
         return frame

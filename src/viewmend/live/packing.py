@@ -1,7 +1,7 @@
 """Rendered views as the binary messages that are sent."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from viewmend.live.pictures import COLOURS, Picture, depth_stride, pack_depth, picture, to_jpeg
@@ -72,7 +72,7 @@ def frame_message(
         "cameras": [{k: c[k] for k in keys} for v in result.completed for c in cameras_json(v.view.camera)],
         "chosen": list(first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
-        "holes": round(hole_fraction(result.completed[0]), 5),
+        "holes": round(_hole_fraction(result.completed[0]), 5),
         "top_k": request.quality.top_k,
         "context_times": request.quality.context_times,
         "stage_ms": times.as_json(),
@@ -82,23 +82,12 @@ def frame_message(
     return pack(header, data), times
 
 
-def hole_fraction(completed: CompletedView) -> float:
+def _hole_fraction(completed: CompletedView) -> float:
     """Pixels of E as a share of the subject's."""
     return float((completed.view.error > 0).sum()) / max(1.0, float((completed.view.mask > 0).sum()))
 
 
 def _depth_part(eye: int, completed: CompletedView) -> tuple[dict[str, Any], bytes]:
-    stride = depth_stride(*completed.view.depth.shape)
-    packed = pack_depth(completed.view.depth, stride)
-    part = {
-        "kind": "depth",
-        "eye": eye,
-        "bytes": len(packed.data),
-        "encoding": "u16-delta-zlib",
-        "width": packed.width,
-        "height": packed.height,
-        "stride": stride,
-        "near_m": packed.near_m,
-        "far_m": packed.far_m,
-    }
-    return part, packed.data
+    packed = asdict(pack_depth(completed.view.depth, depth_stride(*completed.view.depth.shape)))
+    data = packed.pop("data")
+    return {"kind": "depth", "eye": eye, "bytes": len(data), "encoding": "u16-delta-zlib", **packed}, data

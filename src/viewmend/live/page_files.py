@@ -1,9 +1,7 @@
 """The page's files, read once: a request can name these and nothing else."""
 
-import mimetypes
 from dataclasses import dataclass
-from importlib.resources import files
-from importlib.resources.abc import Traversable
+from pathlib import Path
 
 POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
@@ -35,19 +33,10 @@ class PageFile:
 
 def page_files() -> dict[str, PageFile]:
     """All files of `viewmend/live/page`, by their path in it with slashes."""
-    root = files("viewmend.live") / "page"
-    return dict(_walk(root, "")) if root.is_dir() else {}
-
-
-def _walk(folder: Traversable, prefix: str) -> list[tuple[str, PageFile]]:
-    found: list[tuple[str, PageFile]] = []
-    for item in folder.iterdir():
-        if item.name.startswith((".", "_")):
-            continue
-        if item.is_dir():
-            found += _walk(item, f"{prefix}{item.name}/")
-        else:
-            suffix = "." + item.name.rsplit(".", 1)[-1]
-            guessed = TYPES.get(suffix) or mimetypes.guess_type(item.name)[0] or "application/octet-stream"
-            found.append((prefix + item.name, PageFile(item.read_bytes(), guessed)))
-    return found
+    root = Path(__file__).parent / "page"
+    paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file()]
+    return {
+        path.as_posix(): PageFile((root / path).read_bytes(), TYPES.get(path.suffix, "application/octet-stream"))
+        for path in paths
+        if not any(part.startswith((".", "_")) for part in path.parts)
+    }

@@ -14,7 +14,7 @@ Picture = UInt8[np.ndarray, "height width 3"]
 HOLE = (1.0, 0.15, 0.55)
 """What marks missing pixels: no cloth nor skin is of that pink."""
 COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
-"""Of the first, second, ... chosen camera in `coverage`."""
+"""Of the first, second, ... source view in `coverage`."""
 DEPTH_STRIDES = ((160, 1), (400, 2))
 """Pairs (longest side, stride): image pixels a depth pixel, both ways, for pictures at most so long."""
 COARSEST_STRIDE = 4
@@ -40,7 +40,7 @@ def picture(completed: CompletedView, mode: str) -> Picture:
 
 
 def _coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:
-    """The chosen cameras' colours, mixed as they colour each pixel, with the picture's own light and dark."""
+    """The colours of the source views, mixed by their blending weights, with the picture's own light and dark."""
     palette = (
         torch.tensor([COLOURS[n % len(COLOURS)] for n in range(len(view.source_views))], device=view.rgb.device) / 255
     )
@@ -86,6 +86,8 @@ class PackedDepth:
     data: bytes
     width: int
     height: int
+    stride: int
+    """Image pixels a depth pixel, both ways."""
     near_m: float
     far_m: float
 
@@ -96,7 +98,7 @@ def depth_stride(height: int, width: int) -> int:
 
 
 def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth:
-    """Every so manieth pixel: inverse depth in 16 bit, differences along rows, zlib."""
+    """Every `stride`-th pixel: inverse depth in 16 bit, differences along rows, zlib."""
     height, width = depth.shape
     rows = (torch.arange(-(-height // stride)) * stride + stride // 2).clamp(max=height - 1)
     columns = (torch.arange(-(-width // stride)) * stride + stride // 2).clamp(max=width - 1)
@@ -107,7 +109,7 @@ def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth
     inverse = 1 / np.where(surface, z, near)
     q = np.where(surface, 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far)), 0).astype(np.uint16)
     deltas = np.diff(q, axis=1, prepend=np.uint16(0))
-    return PackedDepth(zlib.compress(deltas.tobytes(), 1), len(columns), len(rows), near, far)
+    return PackedDepth(zlib.compress(deltas.tobytes(), 1), len(columns), len(rows), stride, near, far)
 
 
 def unpack_depth(packed: PackedDepth) -> Float[np.ndarray, "height width"]:

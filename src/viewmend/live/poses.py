@@ -1,4 +1,4 @@
-"""Where viewers stand: around the subject by angles, or anywhere by a matrix."""
+"""Viewers' cameras: around the subject by angles, or anywhere by a matrix."""
 
 import math
 from dataclasses import dataclass
@@ -20,21 +20,21 @@ class RigFrame:
     """The subject's place in the world, and the view to begin with."""
 
     center: Float[Tensor, "3"]
-    """The subject's, metres."""
+    """The middle of the subject, metres."""
     up: Float[Tensor, "3"]
     front: Float[Tensor, "3"]
     """Horizontal unit vector to azimuth 0."""
     side: Float[Tensor, "3"]
     """Horizontal unit vector to azimuth 90 degrees."""
     azimuth: float
-    """Of the first view, degrees; so is the elevation."""
+    """Azimuth and elevation are those of the first view, in degrees."""
     elevation: float
     distance_m: float
     fov_y: float
     """Vertical field of view, degrees, for square pictures and wide ones; the shorter side's in tall ones."""
 
     def as_json(self) -> dict[str, Any]:
-        """Of the message `rig`."""
+        """Its part of the message `rig`."""
         axes = {key: _list(getattr(self, key)) for key in ("center", "up", "front", "side")}
         names = {"azimuth": self.azimuth, "elevation": self.elevation, "distance": self.distance_m, "fov_y": self.fov_y}
         return axes | {"home": {name: round(value, 4) for name, value in names.items()}}

@@ -1,18 +1,15 @@
 """Pushing a rig's frames to `viewmend serve live` (needs `viewmend[live]`)."""
 
-import contextlib
 import json
 from typing import Any
 
 import cv2
 import numpy as np
 from torch import Tensor
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.live.guard import token_query
+from viewmend.live.client import ServerSocket
 from viewmend.live.poses import bounds_json, cameras_json
 from viewmend.live.protocol import VERSION, pack
 from viewmend.views import MultiViewFrame
@@ -51,10 +48,7 @@ class Publisher:
             up: the world's up, shape (3,); None to find it from the cameras.
             bounds: the volume that may hold the subject; None to find it from the masks.
         """
-        self._open = contextlib.ExitStack()
-        self._socket = self._open.enter_context(
-            connect(f"{url}/push{token_query(token)}", max_size=None, compression=None)
-        )
+        self._socket = ServerSocket(f"{url}/push", token)
         rig = {
             "type": "rig",
             "version": VERSION,
@@ -73,8 +67,8 @@ class Publisher:
         self.close()
 
     def close(self) -> None:
-        """Say goodbye."""
-        self._open.close()
+        """Close the connection."""
+        self._socket.close()
 
     def push(self, frame: MultiViewFrame, quality: int = 92) -> int:
         """Send what the cameras see now; the number that it gets. Waits until the server has it.
@@ -97,14 +91,9 @@ class Publisher:
         return self._ask(pack({"images": images}, parts))["frame"]
 
     def _ask(self, message: str | bytes) -> dict[str, Any]:
-        try:
-            with contextlib.suppress(ConnectionClosed):  # closed already: the reason is waiting to be read
-                self._socket.send(message)
-            answer = json.loads(self._socket.recv(timeout=30))
-        except ConnectionClosed as error:
-            raise ConnectionError(f"the server has closed the connection: {error}") from None
-        if answer["type"] == "error":
-            raise ConnectionError(answer["message"])
+        self._socket.send(message)
+        answer = self._socket.receive(timeout_s=30.0)
+        assert isinstance(answer, dict), "rigs are answered in JSON"
         return answer
 
 

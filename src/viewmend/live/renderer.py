@@ -32,7 +32,7 @@ class RenderResult:
     time: int
     completed: tuple[CompletedView, ...]
     viewer: State
-    """To request for the next views with."""
+    """To ask for the next views with."""
     times: StageTimes
     """Of all eyes; geometry and context are 0 where another viewer has paid for them."""
 

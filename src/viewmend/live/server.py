@@ -164,7 +164,7 @@ class LiveServer:
         if not can_write_mp4():
             return _refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
         if self._exporting:
-            return _refusal(409, "another path is being result; ask again")
+            return _refusal(409, "another path is being rendered; ask again")
         self._exporting = True
         try:
             body = await _body(request)
