@@ -51,14 +51,13 @@ def test_ssim_is_scikit_images(pair):
     assert ssim(*pair) == pytest.approx(float(expected), abs=1e-9)
 
 
-@pytest.mark.parametrize("size", [7, 65])
-def test_uniform_windows_are_scikit_images(rng, size):
+def test_uniform_windows_are_scikit_images(rng):
     truth, noise = torch.rand(2, 3, 70, 80, generator=rng)
     image = (truth + 0.2 * noise).clamp(0, 1)
     expected = structural_similarity(
-        image.double().numpy(), truth.double().numpy(), channel_axis=0, data_range=1, win_size=size
+        image.double().numpy(), truth.double().numpy(), channel_axis=0, data_range=1, win_size=7
     )
-    assert ssim(image, truth, window=f"uniform{size}") == pytest.approx(float(expected), abs=1e-9)
+    assert ssim(image, truth, window="uniform7") == pytest.approx(float(expected), abs=1e-9)
     assert ssim(image, truth) != pytest.approx(float(expected), abs=1e-4)
 
 

@@ -43,8 +43,8 @@ class RunOptions:
     """Width and height of the views of P and Q."""
     background: Literal["black", "stage"] = "black"
     """What stands behind the people of P: a stage for models that are not given masks."""
-    ssim: Literal["gaussian", "uniform7", "uniform65"] = "gaussian"
-    """Windows of SSIM: Gaussian of 11 x 11 pixels, or uniform ones of 7 x 7 or 65 x 65, as others use."""
+    ssim: Literal["gaussian", "uniform7"] = "gaussian"
+    """Windows of SSIM: Gaussian of 11 x 11 pixels, or uniform of 7 x 7."""
     jobs: int = 1
     """Processes that share the work. Milliseconds are only comparable within a run."""
     ray: str | None = None

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-SsimWindow = Literal["gaussian", "uniform7", "uniform65"]
-"""Wang et al.'s Gaussian (11 x 11, sigma 1.5), or the means over 7 x 7 or 65 x 65 pixels that others report."""
-SSIM_SIZE_PX: dict[str, int] = {"gaussian": 11, "uniform7": 7, "uniform65": 65}
+SsimWindow = Literal["gaussian", "uniform7"]
+"""Wang et al.'s Gaussian (11 x 11, sigma 1.5), or means over 7 x 7 pixels (scikit-image's default)."""
+SSIM_SIZE_PX: dict[str, int] = {"gaussian": 11, "uniform7": 7}
 SSIM_SIGMA_PX = 1.5
 MAX_PSNR_DB = 100.0
 """What equal pixels score, so that means stay finite."""
@@ -43,8 +43,8 @@ def ssim_map(
 ) -> Float[Tensor, "inner_height inner_width"] | None:
     """The similarity of each window that lies in the image, mean of the channels; None where the image is smaller.
 
-    The first is centred half a window (5, 3 or 32 pixels) from the top and from the left. As published, the Gaussian
-    window takes the variances of the population, the uniform ones (scikit-image's) those of a sample.
+    The first is centred half a window (5 or 3 pixels) from the top and from the left. As published, the Gaussian
+    window takes the variances of the population, the uniform one (scikit-image's) those of a sample.
     """
     size = SSIM_SIZE_PX[window]
     if min(image.shape[1:]) < size:
