@@ -40,7 +40,7 @@ def optimiser(recipe: Recipe, steps: int, device: str) -> dict[str, float]:
             samples += source.scene(100 + len(samples))
         list(write_shards(samples[: recipe.batch], shards))
         data = replace(recipe.data, shards=shards)
-        used = replace(recipe, data=data, steps=steps + 2, minutes=None, fresh=1, buffer=recipe.batch)
+        used = replace(recipe, data=data, steps=steps + 2, minutes=None, new_per_batch=1, replay_size=recipe.batch)
         used = replace(used, workers=0, validate_every=0, checkpoint_every=10**6)
         taken = []
         run = Run(used, Path(folder) / "run", None, Processes(0, 1, torch.device(device)))
@@ -65,7 +65,7 @@ def main() -> None:
     options = parser.parse_args()
     figures = {}
     for name in options.recipes:
-        recipe = RECIPES[name](DataPlan(device=options.device, sizes_px=(320,)))
+        recipe = RECIPES[name](DataPlan(data_device=options.device, sizes_px=(320,)))
         made, used = generator(recipe, options.scenes), optimiser(recipe, options.steps, options.device)
         figures[name] = {"generator": made, "optimiser": used}
     print(json.dumps(figures, indent=2))

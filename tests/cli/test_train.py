@@ -34,7 +34,7 @@ def model(tmp_path_factory):
 
 def test_fine_tuning_on_a_capture_of_ones_own_goes_on_from_a_model(capture, model, tmp_path, capsys):
     out = tmp_path / "mine"
-    command = ["train", "finetune", "--capture", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
+    command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
     assert main(command) == 0
     assert load_inpainter(out).config == MODEL
     steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
@@ -45,14 +45,14 @@ def test_fine_tuning_on_a_capture_of_ones_own_goes_on_from_a_model(capture, mode
 
 def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
     shards = tmp_path / "shards"
-    command = ["samples", "--recipe", "finetune", "--capture", str(capture), "--out", str(shards)]
-    assert main([*command, "--clip", "2", "--count", "3", "--workers", "0"]) == 0
+    command = ["samples", "finetune", "--captures", str(capture), "--out", str(shards)]
+    assert main([*command, "--clip-length", "2", "--count", "3", "--workers", "0"]) == 0
     assert [path.name for path in shards.iterdir()] == ["shard-00000.tar"]
     assert [len(sample.clip) for sample in read_shard(shards / "shard-00000.tar")] == [2, 2, 2]
     assert main([*command, "--count", "1", "--workers", "0"]) == 2, "shards are never replaced"
     trained = ["train", "finetune", "--shards", str(shards), "--from", str(model), "--out", str(tmp_path / "out")]
-    assert main([*trained, "--temporal", "0.1", "--clip", "3", *BRIEF]) == 2, "clips are too short"
-    assert main([*trained, "--bfloat16", "False", *BRIEF]) == 0
+    assert main([*trained, "--clip-length", "3", *BRIEF]) == 2, "clips are too short"
+    assert main([*trained, "--no-bfloat16", *BRIEF]) == 0
     assert load_inpainter(tmp_path / "out").config == MODEL
 
 
@@ -60,9 +60,9 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
     ("arguments", "said"),
     [
         (["train", "smal"], "expected a recipe among"),
-        (["train", "finetune"], "expected --capture DIR"),
+        (["train", "finetune"], "expected --captures DIR"),
         (["train", "small", "--performers", "people"], "--performers and --motions together"),
-        (["train", "small", "--temporal", "0.1"], "give --clip 2"),
+        (["train", "small", "--adversarial", "1", "--discriminator", "clip"], "give --clip-length 2"),
         (["train", "small_rays", "--adversarial", "0.01"], "no adversarial loss for rays"),
         (["train", "small", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
         (["train", "small", "--from", "nothing"], "one of the shipped models"),
@@ -71,7 +71,7 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
         (["train", "small", "--checkpoint-every", "0"], "checkpoint_every of 0"),
         (["train", "small", "--minutes", "nan"], "minutes of nan"),
         (["train", "small", "--batch", "0"], "batch of 0"),
-        (["train", "small", "--clip", "-1"], "clip of -1"),
+        (["train", "small", "--clip-length", "-1"], "clip_length of -1"),
         (["train", "small", "--data-device", "abacus"], "expected a device that is there"),
         (["train", "small", "--performers", "nobody", "--motions", "nobody"], "nobody: expected people or motions"),
         (["samples", "--out", "x", "--count", "0"], "count of at least 1"),
@@ -89,7 +89,7 @@ def test_a_model_that_lies_there_is_not_overwritten(capture, model, tmp_path, ca
     out = tmp_path / "mine"
     shutil.copytree(model, out)
     before = (out / "model.safetensors").read_bytes()
-    command = ["train", "finetune", "--capture", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
+    command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
     assert main(command) == 2
     assert "config.json, README.md of something else" in capsys.readouterr().err
     assert (out / "model.safetensors").read_bytes() == before
@@ -100,7 +100,7 @@ def test_a_sample_that_cannot_be_made_in_a_worker_is_one_line(capture, tmp_path,
     shutil.copytree(capture, broken)
     for image in broken.glob("image/*/*1.*"):
         image.write_bytes(b"none")
-    command = ["samples", "--recipe", "finetune", "--capture", str(broken), "--out", str(tmp_path / "out")]
+    command = ["samples", "finetune", "--captures", str(broken), "--out", str(tmp_path / "out")]
     assert main([*command, "--count", "40", "--workers", "1"]) == 2
     said = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
     assert len(said) == 1 and "expected an image" in said[0] and "Traceback" not in said[0]

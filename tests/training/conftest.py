@@ -17,7 +17,7 @@ PLAN = DataPlan(
     held_cameras=2,
     targets_per_camera=1,
     min_hole_px=5,
-    rays=3,
+    ray_views=3,
     hull_resolution=48,
 )
 MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
@@ -32,7 +32,7 @@ def plan() -> DataPlan:
 def shards(tmp_path_factory) -> Path:
     """Clips of two frames, made once for all runs."""
     folder = tmp_path_factory.mktemp("shards")
-    scenes = StudioScenes(replace(PLAN, clip=2), "tests")
+    scenes = StudioScenes(replace(PLAN, clip_length=2), "tests")
     list(write_shards((sample for number in range(3) for sample in scenes.scene(number)), folder, per_shard=2))
     return folder
 
@@ -42,11 +42,11 @@ def tiny(shards) -> Recipe:
     return Recipe(
         name="tiny",
         model=MODEL,
-        data=replace(PLAN, shards=shards, clip=2),
+        data=replace(PLAN, shards=shards, clip_length=2),
         steps=4,
         batch=2,
-        fresh=1,
-        buffer=3,
+        new_per_batch=1,
+        replay_size=3,
         warmup=1,
         workers=0,
         ema=0.5,

@@ -13,7 +13,7 @@ from viewmend.training.adversarial import (
 )
 from viewmend.training.discriminator import DiscriminatorConfig, build_discriminator
 
-OBJECTIVES = ("gan", "nonsaturating", "hinge")
+OBJECTIVES = ("gan", "hinge")
 KINDS = ("image", "clip")
 SIZES = {"image": ((3, 12, 12), (3, 9, 20)), "clip": ((3, 2, 12, 12), (3, 3, 9, 20))}
 

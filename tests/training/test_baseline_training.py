@@ -75,8 +75,8 @@ def test_flows_are_compared_with_those_of_the_true_frames_and_only_after_a_check
     for begun in (start, None):
         objective = BaselineObjective(network, (60, 108), False, begun)
         outcome = objective([clip_of_two])
-        assert (float(outcome.temporal.detach()) > 0) == (begun is not None)
-        expected = outcome.image.inside + outcome.image.outside + outcome.temporal
+        assert (float(outcome.flow.detach()) > 0) == (begun is not None)
+        expected = outcome.image.inside + outcome.image.outside + outcome.flow
         assert torch.allclose(outcome.total, expected)
     teacher = BaselineObjective(network, (60, 108), False, start).teacher
     assert teacher is not None and not any(p.requires_grad for p in teacher.parameters())
@@ -101,14 +101,16 @@ def log_of(out):
 def recipe(tiny):
     made = baseline_recipe("dstt", tiny.data)
     return replace(
-        made, data=tiny.data, size_px=SIZE, steps=3, minutes=None, batch=1, buffer=1, workers=0, checkpoint_every=2
+        made, data=tiny.data, size_px=SIZE, steps=3, minutes=None, batch=1, replay_size=1, workers=0, checkpoint_every=2
     )
 
 
 def test_recipes_have_the_authors_parameters(plan):
     recipe = baseline_recipe("e2fgvi", plan)
     assert (recipe.learning_rate, recipe.discriminator_rate, recipe.loss.adversarial) == (1e-4, 1e-4, 0.01)
-    assert recipe.loss.adversarial_kind == "hinge" and recipe.loss.discriminator == "clip" and recipe.data.clip == 5
+    assert (
+        recipe.loss.adversarial_kind == "hinge" and recipe.loss.discriminator == "clip" and recipe.data.clip_length == 5
+    )
     assert recipe.size_px == (240, 432) and recipe.ema == 0 and recipe.weight_decay == 0
 
 
@@ -178,9 +180,9 @@ def test_the_command_begins_with_a_checkpoint(shards, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["dstt", "--from", "absent.pth"], "absent.pth: expected a checkpoint file, found none"),
+        (["dstt", "--from", "absent.pth"], "absent.pth: expected a file of weights, found none"),
         (["sttn"], "expected a recipe among small, .*dstt, fuseformer, e2fgvi, e2fgvi-hq, got 'sttn'"),
-        (["small", "--size-px", "60", "108"], "expected --size-px with dstt, .* alone, got it with small"),
+        (["small", "--size-px", "60", "108"], "Unrecognized options: --size-px"),
         (["fuseformer", "--size-px", "64", "108"], "frames of 432x240.*got 108x64"),
         (["e2fgvi", "--validate-every", "5", "--steps", "1"], "expected --validate-every 0"),
     ],

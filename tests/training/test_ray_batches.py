@@ -8,7 +8,7 @@ import torch
 from viewmend.inpainting.chain import build
 from viewmend.training.loop import train
 from viewmend.training.losses import image_loss
-from viewmend.training.ray_batches import RayBatch, RayBatchScenes, RaysObjective, varied
+from viewmend.training.ray_batches import RayBatch, RayBatchScenes, RaysObjective, augmented
 from viewmend.training.sample_files import ShardError, ShardScenes, sample_from_bytes, sample_to_bytes, write_shards
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import StudioScenes
@@ -61,7 +61,7 @@ def test_variations_are_what_other_cameras_in_another_light_might_have_seen(tiny
         truth, guess = lookups.truth.float(), lookups.around[:, 5:, 5, 5].float()
         for seed in range(8):
             torch.manual_seed(seed)
-            other = varied(lookups)
+            other = augmented(lookups)
             gain = float(other.truth.float().sum() / truth.sum())
             assert 0.59 < gain <= 1.01
             error = (other.around[:, 5:, 5, 5].float() - other.truth.float()).square().sum(1)
@@ -73,5 +73,5 @@ def test_variations_are_what_other_cameras_in_another_light_might_have_seen(tiny
             total, before = (f[..., [0, 1, 2]].float().sum() for f in (kept, lookups.features[..., left, :]))
             assert float(total / before.clamp_min(1)) == pytest.approx(gain, abs=0.03)
     torch.manual_seed(1)
-    again = [varied(lookups) for _ in range(2)]
+    again = [augmented(lookups) for _ in range(2)]
     assert sample_to_bytes(again[0]) != sample_to_bytes(again[1])

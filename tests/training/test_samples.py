@@ -67,13 +67,13 @@ def test_truth_is_black_where_the_mask_is_and_context_is_past(plan):
 
 
 def test_a_clip_is_one_camera_at_consecutive_times(plan):
-    samples = StudioScenes(replace(plan, clip=2), "0").scene(0)
+    samples = StudioScenes(replace(plan, clip_length=2), "0").scene(0)
     assert samples
     for sample in samples:
         before, now = sample.clip
         assert before.view.time == now.view.time - 1 and before.view.camera.names == now.view.camera.names
     with pytest.raises(ValueError, match="expected 3 consecutive times"):
-        StudioScenes(replace(plan, clip=3), "0").scene(0)
+        StudioScenes(replace(plan, clip_length=3), "0").scene(0)
 
 
 def test_no_stage_takes_a_seed_that_is_kept_for_validation_or_tests(plan):
@@ -110,8 +110,8 @@ def test_rough_stages_are_only_more_wrong_than_imperfect_ones(plan):
         random = Random(3)
         return [random_stage(replace(plan, **changes), random).imperfections for _ in range(100)]
 
-    assert {it.calibration_px for it in stages(imperfect_share=0.0, rough_share=1.0)} == {0.0}
-    usual, rough = stages(imperfect_share=1.0), stages(imperfect_share=1.0, rough_share=1.0)
+    assert {it.calibration_px for it in stages(imperfect_fraction=0.0, rough_fraction=1.0)} == {0.0}
+    usual, rough = stages(imperfect_fraction=1.0), stages(imperfect_fraction=1.0, rough_fraction=1.0)
     assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in rough) <= 2.5
     assert max(it.mask_edge_px for it in usual) <= 1 < max(it.mask_edge_px for it in rough) <= 2
 
@@ -123,10 +123,10 @@ def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
     for (scene, number, sample), (other_scene, other_number, other) in zip(first, helped, strict=False):
         assert (scene, number) == (other_scene, other_number) and same(sample, other)
     helped.close()
-    feed = SampleReplay(source, "7", fresh=1, buffer=3, workers=0)
+    feed = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0)
     batches = [feed.batch(step, 2) for step in range(3)]
     assert [len(batch) for batch in batches] == [1, 2, 2]
-    again = SampleReplay(source, "7", fresh=1, buffer=3, workers=0, start=feed.position)
+    again = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0, start=feed.position)
     for one, other in zip(feed.batch(3, 2), again.batch(3, 2), strict=True):
         assert same(one, other)
     assert feed.position == again.position
@@ -149,8 +149,8 @@ def test_widened_holes_reach_so_far_and_stay_on_the_subject(plan):
 
 
 def test_dropped_cameras_are_missing_from_what_a_sample_sees(plan):
-    plan = replace(plan, cameras=(8, 8), rays=8, targets_per_camera=2)
-    whole, dropped = (StudioScenes(replace(plan, dropped_share=share), "0").scene(0) for share in (0.0, 1.0))
+    plan = replace(plan, cameras=(8, 8), ray_views=8, targets_per_camera=2)
+    whole, dropped = (StudioScenes(replace(plan, dropped_fraction=share), "0").scene(0) for share in (0.0, 1.0))
     assert whole and dropped
     assert {len(s.view.silhouettes.cameras) for s in whole} == {7}
     assert {len(s.view.silhouettes.cameras) for s in dropped} <= {5, 6, 7}
@@ -168,7 +168,7 @@ def test_scenes_without_holes_are_an_error_not_a_wait():
 
 
 def test_samples_come_back_from_disk_bit_for_bit_and_damage_is_noticed(plan, tmp_path):
-    samples = StudioScenes(replace(plan, clip=2), "0").scene(0)
+    samples = StudioScenes(replace(plan, clip_length=2), "0").scene(0)
     assert all(same(sample_from_bytes(sample_to_bytes(s)), s) for s in samples)
     paths = list(write_shards(samples, tmp_path, per_shard=1))
     assert [path.name for path in paths] == [f"shard-{n:05d}.tar" for n in range(len(samples))]

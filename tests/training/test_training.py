@@ -57,7 +57,7 @@ def test_a_short_run_trains_its_part_and_writes_a_model_that_loads_and_a_log(par
     assert "tiny" in (tmp_path / "README.md").read_text()
 
 
-ADVERSARIAL = LossWeights(adversarial=0.01, adversarial_kind="hinge", discriminator="clip", temporal=0.1)
+ADVERSARIAL = LossWeights(adversarial=0.01, adversarial_kind="hinge", discriminator="clip")
 
 
 @pytest.mark.parametrize("loss", [LossWeights(), ADVERSARIAL], ids=["image", "adversarial"])
@@ -136,7 +136,7 @@ def test_validation_scores_the_averaged_weights_and_leaves_a_picture(tiny, tmp_p
     train(replace(tiny, validate_every=3), tmp_path)
     judged = [entry for entry in log_of(tmp_path) if "validation" in entry]
     assert [entry["step"] for entry in judged] == [3, 4]
-    assert all(5 < entry["validation"][n] < 60 for entry in judged for n in ("holes", "telea", "first_fill"))
+    assert all(5 < entry["validation"][n] < 60 for entry in judged for n in ("holes", "telea", "coarse_fill"))
     assert judged[0]["validation"]["telea"] == judged[1]["validation"]["telea"], "the views are fixed"
     assert sorted(p.name for p in tmp_path.glob("*.png")) == ["validation-000003.png", "validation-000004.png"]
 
@@ -151,9 +151,10 @@ from dataclasses import replace
 from viewmend.training.loop import train
 from viewmend.training.plan import Recipe
 
-plan = replace(PLAN, clip=2, shards=Path(sys.argv[5]))
-recipe = Recipe(name="tiny", model=MODEL, data=plan, steps=int(sys.argv[3]), batch=2, fresh=1, buffer=3, warmup=1,
-                workers=0, ema=0.5, bfloat16=False, checkpoint_every=1, validate_every=0, streams=int(sys.argv[4]))
+plan = replace(PLAN, clip_length=2, shards=Path(sys.argv[5]))
+recipe = Recipe(name="tiny", model=MODEL, data=plan, steps=int(sys.argv[3]), batch=2, new_per_batch=1, replay_size=3,
+                warmup=1, workers=0, ema=0.5, bfloat16=False, checkpoint_every=1, validate_every=0,
+                streams=int(sys.argv[4]))
 train(recipe, Path(sys.argv[2]))
 """
 
@@ -200,7 +201,7 @@ def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, 
 def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
     for name, make in RECIPES.items():
         recipe = make(plan)
-        assert recipe.name == name and recipe.data.rays == (
+        assert recipe.name == name and recipe.data.ray_views == (
             recipe.model.num_ray_views if recipe.model.coarse_fill == "rays" else 0
         )
     assert small(plan).part == "patches" and small_rays(plan).part == "rays"
@@ -212,9 +213,9 @@ def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"loss": LossWeights(temporal=1.0), "data": DataPlan()}, "expected clips of 2 or more"),
+        ({"loss": ADVERSARIAL, "data": DataPlan()}, "expected clips of 2 or more"),
         ({"loss": LossWeights(adversarial=0.01), "part": "rays"}, "expected no adversarial loss for rays alone"),
-        ({"fresh": 9}, "expected 1 to 2 fresh samples"),
+        ({"new_per_batch": 0}, "new_per_batch of 0"),
     ],
 )
 def test_a_recipe_that_cannot_be_is_refused(change, message, tiny):

@@ -2,8 +2,9 @@
 
 `cli/<command>.py` holds a frozen, keyword-only dataclass `Options`, whose field docstrings are the command line's
 help (tyro) and whose own docstring's is the command's, and a function `run(options: Options) -> int` that gives the
-exit code. At module top it imports nothing heavy (no torch, cv2, rich): help must be instant. Results go to standard
-output, everything else to standard error (`console.py`); with `--json`, standard output is one JSON value.
+exit code; where defaults follow from the first word, also `parse(arguments, prog) -> Options`. At module top it imports
+nothing heavy (no torch, cv2, rich): help must be instant. Results go to standard output, everything else to standard
+error (`console.py`); with `--json`, standard output is one JSON value.
 
 What a user can get wrong is a ValueError (`CaptureError` is one) or an OSError and ends here as one line on standard
 error with exit code 2; any other exception is our mistake and shows its traceback, exit code 1.
@@ -66,8 +67,11 @@ def _run(command: Command, arguments: list[str]) -> int:
         import tyro
 
         module = importlib.import_module(command.module)
-        flags = (tyro.conf.FlagCreatePairsOff,)
-        options = tyro.cli(module.Options, args=arguments, prog=f"viewmend {command.name}", config=flags)
+        prog, flags = f"viewmend {command.name}", (tyro.conf.FlagCreatePairsOff,)
+        if hasattr(module, "parse"):
+            options = module.parse(arguments, prog)
+        else:
+            options = tyro.cli(module.Options, args=arguments, prog=prog, config=flags)
         return int(module.run(options) or 0)
     except SystemExit as exit_request:  # tyro's: 0 after --help, 2 after a wrong option
         return exit_request.code if isinstance(exit_request.code, int) else 2

@@ -1,18 +1,20 @@
 """`viewmend train`: run a recipe, or go on with a run."""
 
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from viewmend.cli import recipe_options
+from viewmend.training.plan import FLAT, Recipe
 
 if TYPE_CHECKING:
     from torch import nn
 
     from viewmend.training.logs import Progress
     from viewmend.training.loop import Run
-    from viewmend.training.plan import Recipe
 
 LINE_EVERY = 20
 """Steps between lines where there is no terminal."""
@@ -20,65 +22,25 @@ LINE_EVERY = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Train a model; --out gets its averaged weights, a log, pictures, and what it takes to go on.
+    """Train a model: viewmend train RECIPE --out DIR [--from MODEL] [options].
 
-    The same command goes on with a run that was stopped, at any moment and in any way. Under torchrun the same
-    command uses many processes and machines.
+    RECIPE is small (the default), small_rays, base, paper or finetune; or a published network's, to fine-tune it: dstt,
+    fuseformer, e2fgvi, e2fgvi-hq. Every value of the recipe is an option; defaults are the recipe's. DIR gets the
+    averaged weights, a log, pictures, and what it takes to go on: the same command goes on with a run that was stopped,
+    at any moment and in any way. Under torchrun the same command uses many processes and machines.
     """
 
-    recipe: Annotated[str, tyro.conf.Positional] = "small"
-    """Name of the recipe: small, small_rays, base, paper, finetune; or a published network's, to fine-tune it: dstt,
-    fuseformer, e2fgvi, e2fgvi-hq."""
+    recipe: Annotated[Recipe, FLAT]
     out: Path = Path("out/train")
     """Folder for all that is written."""
     start: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Name or folder of a model to begin with (small and finetune: the shipped small by default). For a published
     network its checkpoint, a run's folder, or pretrained for the file among the known weights; else, random weights."""
-    performers: Path | None = None
-    """Folder of glTF characters for a share of the scenes; never one that is kept for tests."""
-    motions: Path | None = None
-    """Folder of BVH motions for them."""
-    capture: tuple[Path, ...] = ()
-    """Folders of captures of your own to learn from."""
-    cameras: tuple[int, int] | None = None
-    """Fewest and most cameras of the studio's rigs, for rigs like yours; 4 to 60."""
-    shards: Path | None = None
-    """Folder that `viewmend samples` wrote; samples come from there alone."""
-    data_device: str | None = None
-    """Where samples are made, e.g. cuda; goes with --workers 0 then."""
-    steps: int | None = None
-    """Instead of the recipe's; so are all below."""
-    minutes: float | None = None
-    batch: int | None = None
-    streams: int | None = None
-    workers: int | None = None
-    learning_rate: float | None = None
-    bfloat16: bool | None = None
-    """Mixed precision; the published networks' authors train in float32."""
-    size_px: tuple[int, int] | None = None
-    """Height and width that a published network sees in training: 240 432 by default, parts of that for short runs."""
-    checkpoint_every: int | None = None
-    validate_every: int | None = None
-    part: Literal["rays", "patches", "all"] | None = None
-    log_error: float | None = None
-    """Weight of the logarithm of the squared error in the holes."""
-    adversarial: float | None = None
-    """Weight of L_adv; the paper's is 0.01."""
-    adversarial_kind: Literal["gan", "hinge"] | None = None
-    discriminator: Literal["image", "clip"] | None = None
-    """What judges: single images, or clips (--clip)."""
-    clip: int | None = None
-    """Consecutive times in a sample."""
-    temporal: float | None = None
-    """Weight of the difference between consecutive outputs, warped."""
-    perceptual: float | None = None
-    """Weight of VGG16's features; needs --perceptual-weights."""
-    perceptual_weights: Path | None = None
-    """File of torchvision's vgg16."""
-    varied: bool | None = None
-    """Vary what small_rays looked up, anew each time it is seen: for few samples and many steps."""
-    seed: int = 0
-    """Of weights and scenes."""
+
+
+def parse(arguments: Sequence[str], prog: str) -> Options:
+    """The options of a command line that begins with a recipe."""
+    return recipe_options.parse(Options, arguments, prog)
 
 
 def run(options: Options) -> int:
@@ -91,14 +53,15 @@ def run(options: Options) -> int:
     from viewmend.inpainting.chain import build
     from viewmend.training.loop import NETWORKS, fitting_weights, train
 
+    recipe = options.recipe
     start, kind = _start(options)
-    recipe = chosen_recipe(options, start)
     if isinstance(start, NETWORKS):
         with torch.device("meta"):
             wanted = build(recipe.model)
         fitting, count = len(fitting_weights(wanted, start)), len(wanted.state_dict())
         if 0 < fitting < count:
-            say(f"{fitting} of {count} tensors begin as {options.start or 'small'} has them, the others at random")
+            begun = recipe_options.started_from(recipe, options.start)
+            say(f"{fitting} of {count} tensors begin as {begun} has them, the others at random")
     with _Reporter(recipe.steps) as reporter:
         try:
             train(recipe, options.out, start, reporter.report, kind)
@@ -116,62 +79,11 @@ def _start(options: Options) -> "tuple[nn.Module | None, type[Run]]":
     from viewmend.training.baseline_run import BaselineRun
     from viewmend.training.loop import Run
 
-    name = options.start or ("small" if options.recipe in ("small", "finetune") else None)
-    if options.recipe not in NETWORKS:
+    name = recipe_options.started_from(options.recipe, options.start)
+    if options.recipe.name not in NETWORKS:
         return load_network(name) if name is not None else None, Run
     weights = "" if name == "pretrained" else f"@{name}"
-    return load_baseline(options.recipe, weights) if name is not None else None, BaselineRun
-
-
-def chosen_recipe(options: Options, start: "nn.Module | None") -> "Recipe":
-    """The recipe with what the options change.
-
-    Raises:
-        ValueError: no such recipe, or options that do not go together.
-    """
-    from viewmend.baselines.published import NETWORKS
-    from viewmend.cli.checks import check_device, check_people
-    from viewmend.training.baseline_run import baseline_recipe
-    from viewmend.training.loop import NETWORKS as OURS
-    from viewmend.training.plan import DataPlan
-    from viewmend.training.recipes import RECIPES, for_model
-
-    networks = {name: partial(baseline_recipe, name, started=start is not None) for name in NETWORKS}
-    recipes = RECIPES | networks
-    if options.recipe not in recipes:
-        raise ValueError(f"expected a recipe among {', '.join(recipes)}, got '{options.recipe}'; see --help")
-    if options.recipe == "finetune" and not (options.capture or options.shards):
-        raise ValueError("expected --capture DIR for finetune, got none; name the folder of your capture")
-    if options.size_px and options.recipe not in NETWORKS:
-        raise ValueError(
-            f"expected --size-px with {', '.join(NETWORKS)} alone, got it with {options.recipe}; leave it out"
-        )
-    if options.cameras is not None and not 4 <= options.cameras[0] <= options.cameras[1] <= 60:
-        raise ValueError(f"expected --cameras of 4 to 60, the fewer first, got {options.cameras}; for example 6 8")
-    check_people(options.performers, options.motions)
-    check_device(options.data_device or "cpu")
-    data = DataPlan(
-        performers=options.performers,
-        motions=options.motions,
-        captures=options.capture,
-        shards=options.shards,
-        device=options.data_device or "cpu",
-        clip=1 if options.clip is None else options.clip,
-    )
-    recipe = recipes[options.recipe](data)
-    recipe = replace(recipe, data=replace(recipe.data, cameras=options.cameras or recipe.data.cameras))
-    if options.recipe == "finetune" and isinstance(start, OURS):
-        recipe = replace(recipe, model=start.config, data=for_model(start.config, recipe.data))
-    loss = {n: getattr(options, n) for n in recipe.loss.__dataclass_fields__ if n != "image"}
-    own = ("steps", "minutes", "batch", "streams", "workers", "learning_rate", "bfloat16", "part", "checkpoint_every")
-    values = {n: getattr(options, n) for n in (*own, "validate_every", "varied", "size_px")}
-    return replace(
-        recipe,
-        seed=options.seed,
-        fresh=recipe.fresh if options.batch is None else max(1, min(recipe.fresh, options.batch)),
-        loss=replace(recipe.loss, **{n: v for n, v in loss.items() if v is not None}),
-        **{n: v for n, v in values.items() if v is not None},
-    )
+    return load_baseline(options.recipe.name, weights) if name is not None else None, BaselineRun
 
 
 class _Reporter:

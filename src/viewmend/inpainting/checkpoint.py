@@ -67,6 +67,11 @@ def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -
     return load_weights(network, folder / WEIGHTS, device, rename=rename)
 
 
+def load_config(name_or_path: str | Path) -> InpainterConfig:
+    """The config of an inpainter, without its weights. Raises as `load_inpainter` does."""
+    return _read_config(_folder(name_or_path) / CONFIG)[1]
+
+
 def save_inpainter(network: Chain | PatchTransformer, folder: str | Path, card: str) -> None:
     """Writes the three files; each is whole or not there, also when the machine stops halfway.
 

@@ -39,7 +39,7 @@ def ablation(name: str, data: DataPlan) -> Recipe:
     """
     model = replace(small_model(), coarse_fill="none", n_c=1, n_w=1)
     few = replace(data, cameras=(5, 9), sizes_px=(192,), min_hole_px=250, context_cameras=(3,), context_weights=(1,))
-    few = replace(few, imperfect_share=0.0, staged=True)
+    few = replace(few, imperfect_fraction=0.0, staged=True)
     return Recipe(
         name=name,
         model=replace(model, **DIFFERENCES[name]),
@@ -47,8 +47,8 @@ def ablation(name: str, data: DataPlan) -> Recipe:
         loss=LossWeights(log_error=0.5),
         steps=300,
         batch=4,
-        fresh=4,
-        buffer=1,
+        new_per_batch=4,
+        replay_size=1,
         workers=0,
         validate_every=0,
     )

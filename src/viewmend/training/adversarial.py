@@ -16,9 +16,8 @@ from torch.nn.functional import softplus
 
 from viewmend.training.discriminator import Discriminator
 
-Objective = Literal["gan", "nonsaturating", "hinge"]
-"""The paper's; the same with -log D(Fhat) for the inpainter (Goodfellow et al. 2014), whose gradient does not fade
-where the discriminator is sure; the hinge (Miyato et al. 2018), with which the baselines were trained."""
+Objective = Literal["gan", "hinge"]
+"""The paper's, and the hinge (Miyato et al. 2018), with which the baselines were trained."""
 
 
 def discriminator_loss(
@@ -45,16 +44,14 @@ def generator_loss(
     objective: Objective = "gan",
     counted: Float[Tensor, "image"] | None = None,
 ) -> Float[Tensor, ""]:
-    """What the inpainter minimises: E log(1 - D(Fhat)), -E log D(Fhat), or the hinge's -E of the logits.
+    """What the inpainter minimises: E log(1 - D(Fhat)), or the hinge's -E of the logits.
 
     counted: a weight for each image; None counts each as 1.
     """
     if objective == "hinge":
         parts = [-f.float().mean() for f in fake_logits]
-    elif objective == "gan":
-        parts = [-softplus(f.float()).mean() for f in fake_logits]
     else:
-        parts = [softplus(-f.float()).mean() for f in fake_logits]
+        parts = [-softplus(f.float()).mean() for f in fake_logits]
     return _mean(parts, counted)
 
 

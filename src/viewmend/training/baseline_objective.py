@@ -18,8 +18,10 @@ from viewmend.training.samples import Sample
 
 @dataclass(frozen=True)
 class BaselineOutcome(StepOutput):
-    """`completed` is each clip's last view; `temporal` is the flow's term."""
+    """`completed` is each clip's last view."""
 
+    flow: Float[Tensor, ""]
+    """E2FGVI's term of completed flows; 0 of others."""
     clips: tuple[TrainingClip, ...]
     composed: tuple[Float[Tensor, "_time 3 _h _w"], ...]
     """Of each clip: what the network made of the holes, in the frames as they were rendered; in [-1, 1]."""
@@ -44,14 +46,13 @@ class BaselineObjective(nn.Module):
         made, flow_terms = zip(*(self._complete(clip) for clip in clips), strict=True)
         terms = [clip_terms(out, clip) for out, clip in zip(made, clips, strict=True)]
         inside, outside = (torch.stack(parts).mean() for parts in zip(*terms, strict=True))
-        flow, none = torch.stack(flow_terms).mean(), torch.zeros_like(inside)
+        flow = torch.stack(flow_terms).mean()
         composed = tuple(
             torch.where(clip.holes[:, None], out, clip.frames) for out, clip in zip(made, clips, strict=True)
         )
         return BaselineOutcome(
-            image=ImageLoss(inside, outside, none),
-            temporal=flow,
-            perceptual=none,
+            image=ImageLoss(inside, outside, torch.zeros_like(inside)),
+            flow=flow,
             total=inside + outside + flow,
             completed=tuple((images[-1] + 1) / 2 for images in composed),
             clips=tuple(clips),

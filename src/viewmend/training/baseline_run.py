@@ -18,7 +18,7 @@ from viewmend.training.model_card import model_card
 from viewmend.training.objective import StepOutput
 from viewmend.training.plan import DataPlan, LossWeights, Recipe
 
-CLIP = 5
+CLIP_LENGTH = 5
 """Consecutive views in the authors' training clips."""
 FULL_RATE = 0.8
 """Share of a run at the full learning rate; the rest is at a tenth."""
@@ -42,21 +42,21 @@ def baseline_recipe(network: str, data: DataPlan, started: bool = False) -> Base
     Theirs too: a tenth of the rate in the last fifth, neither warm-up nor clipping nor averaging. What the hardware
     sets is not: steps, and the batch (theirs is 8).
     """
-    clip = data.clip if data.clip > 1 else CLIP
+    clip_length = data.clip_length if data.clip_length > 1 else CLIP_LENGTH
     return BaselineRecipe(
         name=network,
-        data=replace(data, clip=clip, times=(0, *range(10, 10 + clip)), rays=0),
+        data=replace(data, clip_length=clip_length, times=(0, *range(10, 10 + clip_length)), ray_views=0),
         loss=LossWeights(adversarial=0.01, adversarial_kind="hinge", discriminator="clip"),
         steps=2000,
         minutes=40.0,
         batch=8,
-        fresh=1,
-        buffer=32,
+        new_per_batch=1,
+        replay_size=32,
         learning_rate=1e-4,
         discriminator_rate=1e-4,
         warmup=1,
         weight_decay=0.0,
-        clip=1e6,
+        max_grad_norm=1e6,
         ema=0.0,
         bfloat16=False,
         validate_every=0,

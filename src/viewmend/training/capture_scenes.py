@@ -31,13 +31,13 @@ class CaptureScenes:
         first = random.randint(0, max(0, last - max(self.plan.times)))
         size_px = random.choice(self.plan.sizes_px)
         times = sorted({min(first + offset, last) for offset in self.plan.times})
-        frames = {time: reduced(capture.read(time), size_px).to(self.plan.device) for time in times}
+        frames = {time: reduced(capture.read(time), size_px).to(self.plan.data_device) for time in times}
         # A camera that has no image at some of these times cannot be judged then.
         always = [n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())]
         frames = {time: frame.select(always) for time, frame in frames.items()}
 
         def cameras(held: str) -> Cameras:
-            return replace(self._without(which, held), longest_px=size_px).cameras.to(self.plan.device)
+            return replace(self._without(which, held), longest_px=size_px).cameras.to(self.plan.data_device)
 
         return rig_samples(LeaveOneOutFrames(frames, capture.bounds, cameras), self.plan, random)
 

@@ -19,8 +19,6 @@ class LossTerms:
     """L_out."""
     total: float
     """The weighted sum with every term that is switched on."""
-    temporal: float = 0.0
-    perceptual: float = 0.0
     adversarial: float = 0.0
     """L_adv, the inpainter's side."""
     discriminator: float = 0.0

@@ -186,7 +186,7 @@ class Run:
                 self._demand_finite(total.detach(), step, batch)
                 (total / len(batches)).backward()
             costs.append(_costs(outcome, total, adversarial, judged))
-        torch.nn.utils.clip_grad_norm_(self.learned, self.recipe.clip)
+        torch.nn.utils.clip_grad_norm_(self.learned, self.recipe.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
@@ -227,7 +227,7 @@ class Run:
             seed = f"{recipe.seed}/{number}"
             at: ReplayPosition | None = self.state.positions[number] if self.state.positions else None
             source = training_source(recipe, seed)
-            streams.append(SampleReplay(source, seed, recipe.fresh, recipe.buffer, recipe.workers, at))
+            streams.append(SampleReplay(source, seed, recipe.new_per_batch, recipe.replay_size, recipe.workers, at))
         return streams
 
     def _save(self, step: int, schedule: Schedule) -> None:
@@ -268,8 +268,6 @@ def _costs(outcome: StepOutput, total: torch.Tensor, adversarial: float, discrim
         inside=float(outcome.image.inside.detach()),
         outside=float(outcome.image.outside.detach()),
         total=float(total.detach()),
-        temporal=float(outcome.temporal.detach()),
-        perceptual=float(outcome.perceptual.detach()),
         adversarial=adversarial,
         discriminator=discriminator,
     )

@@ -14,10 +14,12 @@ def model_card(recipe: Recipe, state: RunState) -> str:
     else:
         source = "studio scenes made on the fly"
         if data.performers is not None:
-            source += f", {data.performers_share:.0%} of them with glTF performers"
+            source += f", {data.performers_fraction:.0%} of them with glTF performers"
         if data.captures:
-            source += f", and {data.captures_share:.0%} of all from {len(data.captures)} captures of the trainer's own"
-    terms = {name: getattr(recipe.loss, name) for name in ("log_error", "adversarial", "temporal", "perceptual")}
+            source += (
+                f", and {data.captures_fraction:.0%} of all from {len(data.captures)} captures of the trainer's own"
+            )
+    terms = {name: getattr(recipe.loss, name) for name in ("log_error", "adversarial")}
     extra = ", ".join(f"{weight:g} x {name.replace('_', ' ')}" for name, weight in terms.items() if weight)
     averaged = "; averaged weights" if recipe.ema else ""
     hardware = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{torch.get_num_threads()} CPU threads"

@@ -3,9 +3,14 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from viewmend.inpainting.config import InpainterConfig
+
+FLAT = tyro.conf.arg(name="")
+"""On the command line, the fields are options without a prefix."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,13 +22,13 @@ class DataPlan:
     cameras: tuple[int, int] = (5, 20)
     """Fewest and most cameras of a rig."""
     times: tuple[int, ...] = (0, 10, 11, 12, 13)
-    """Frames of a scene that are drawn; every one is a target whose past is the window's share of the earlier ones."""
+    """Frames of a scene that are drawn; every one is a target whose past is the window's part of the earlier ones."""
     held_cameras: int = 4
     """Cameras of a scene that are left out in turn."""
     targets_per_camera: int = 3
     """Times at which a camera that is left out gives a sample."""
-    clip: int = 1
-    """Consecutive times in a sample, for the terms of the loss that look at time; `times` must have that many."""
+    clip_length: int = 1
+    """Consecutive times in a sample, for a discriminator of clips; `times` must have that many."""
     context_cameras: tuple[int, ...] = (2, 3, 4, 5)
     """How many cameras colour a view and are its context: each view takes one of these numbers."""
     context_weights: tuple[int, ...] = (2, 8, 2, 1)
@@ -34,18 +39,18 @@ class DataPlan:
     """Whether samples have context; rays alone need none, and are smaller without."""
     least_context: int = 0
     """So many cameras are context at least, whatever number coloured the view: for models that look at so many."""
-    rays: int = 0
-    """How many cameras near a view an inpainter that reads rays is given."""
-    imperfect_share: float = 0.6
+    ray_views: int = 0
+    """How many cameras close to a view `RayBlendNet` is given."""
+    imperfect_fraction: float = 0.6
     """Share of the scenes whose cameras have noise, differ in colour, and have wrong masks and calibration."""
-    rough_share: float = 0.0
+    rough_fraction: float = 0.0
     """Share of the imperfect scenes whose calibration and outlines are worse still, as those of older stages are."""
     staged: bool = False
     """Whether a stage stands behind the people of every scene; else behind half of those that are imperfect, and black
     behind the others, which tells the background as well as a mask does."""
-    dropped_share: float = 0.0
+    dropped_fraction: float = 0.0
     """Share of the times at which one or two cameras have no frame."""
-    widened_share: float = 0.0
+    widened_fraction: float = 0.0
     """Share of the views in which more is missing than the cameras could not see: holes are a few pixels wider."""
     min_hole_px: int = 50
     """Views that miss less are passed over."""
@@ -55,17 +60,17 @@ class DataPlan:
     """Folder of glTF characters; without it all are procedural."""
     motions: Path | None = None
     """Folder of BVH motions for them."""
-    performers_share: float = 0.5
+    performers_fraction: float = 0.5
     """Share of the studio's scenes whose performers come from these folders, where they are given."""
     cloth_variety: tuple[float, float] = (0.0, 1.0)
     """Least and largest share of these performers' garments that are dyed or made of another cloth."""
     captures: tuple[Path, ...] = ()
     """Folders of real captures."""
-    captures_share: float = 0.75
+    captures_fraction: float = 0.75
     """Share of the scenes that come from them, where they are given."""
     shards: Path | None = None
     """Folder of tar files that `viewmend samples` wrote: samples come from there alone."""
-    device: str = "cpu"
+    data_device: str = "cpu"
     """Where the studio draws, hulls are carved and views rendered."""
 
 
@@ -82,31 +87,25 @@ class LossWeights:
     adversarial_kind: Literal["gan", "hinge"] = "gan"
     """The paper's objective, or the hinge."""
     discriminator: Literal["image", "clip"] = "image"
-    """Whether D judges single images or clips of `DataPlan.clip` of them."""
-    temporal: float = 0.0
-    """Of the difference of consecutive outputs, warped by the proxy. Ours; needs clips."""
-    perceptual: float = 0.0
-    """Of VGG16's features around the holes. Ours; needs `perceptual_weights`."""
-    perceptual_weights: Path | None = None
-    """File of torchvision's vgg16."""
+    """Whether D judges single images or clips of `DataPlan.clip_length` of them."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """A named training run."""
 
-    name: str
+    name: Annotated[str, tyro.conf.Suppress]
     model: InpainterConfig
-    data: DataPlan = field(default_factory=DataPlan)
-    loss: LossWeights = field(default_factory=LossWeights)
+    data: Annotated[DataPlan, FLAT] = field(default_factory=DataPlan)
+    loss: Annotated[LossWeights, FLAT] = field(default_factory=LossWeights)
     steps: int
     minutes: float | None = None
     """Ends the run by then, whatever its steps: the learning rate follows whichever is further along."""
     batch: int = 8
     """Samples a step and stream."""
-    fresh: int = 3
-    """New samples among them; the others come again from the buffer."""
-    buffer: int = 600
+    new_per_batch: int = 3
+    """New samples among them, at most all; the others are replayed."""
+    replay_size: int = 600
     """How many of a stream's last samples are seen again."""
     streams: int = 1
     """Batches whose gradients are averaged in a step. As many processes share them as torchrun starts, and there is
@@ -116,18 +115,17 @@ class Recipe:
     """Learning rate of D's own optimiser."""
     warmup: int = 60
     weight_decay: float = 0.01
-    clip: float = 1.0
-    """Largest norm of the gradient."""
+    max_grad_norm: float = 1.0
     ema: float = 0.995
     """Decay of the averaged weights, which are what is shipped."""
     workers: int = 1
     """Processes that make samples, for each that trains."""
     part: Literal["rays", "patches", "all"] = "all"
-    """What is trained: the ray reader alone, on the fill that it makes, all but it, or both."""
-    pixels: int = 300
+    """What is trained: `RayBlendNet` alone, on the fill that it makes; all but it; or both."""
+    pixels_per_view: int = 300
     """For the rays alone: missing pixels that are read of each view, at most."""
-    varied: bool = False
-    """For the rays alone: what is looked up is varied anew each time it is seen, so that few samples last longer."""
+    augment: bool = False
+    """For the rays alone: what was looked up is augmented each time it is seen, so that few samples last longer."""
     bfloat16: bool = True
     """Run the networks under autocast."""
     checkpoint_every: int = 100
@@ -140,17 +138,16 @@ class Recipe:
 
     def __post_init__(self) -> None:
         least = {"steps": 1, "batch": 1, "streams": 1, "checkpoint_every": 1, "workers": 0, "validate_every": 0}
+        least |= {"new_per_batch": 1}
         wrong = [f"{name} of {getattr(self, name)}" for name, low in least.items() if getattr(self, name) < low]
         wrong += [f"minutes of {self.minutes}"] if self.minutes is not None and not self.minutes > 0 else []
         wrong += [] if 0 < self.learning_rate < math.inf else [f"learning_rate of {self.learning_rate}"]
-        wrong += [] if self.data.clip > 0 else [f"clip of {self.data.clip}"]
+        wrong += [] if self.data.clip_length > 0 else [f"clip_length of {self.data.clip_length}"]
         if wrong:
             raise ValueError(f"expected positive numbers (workers and validate_every may be 0), got {', '.join(wrong)}")
-        over_time = self.loss.temporal or (self.loss.adversarial and self.loss.discriminator == "clip")
-        if over_time and self.data.clip < 2:
-            raise ValueError(f"expected clips of 2 or more for a loss over time, got {self.data.clip}; give --clip 2")
-        beyond = [n for n in ("adversarial", "temporal", "perceptual") if getattr(self.loss, n)]
-        if self.part == "rays" and beyond:
-            raise ValueError(f"expected no {' or '.join(beyond)} loss for rays alone, whose pixels are no image")
-        if not 0 < self.fresh <= self.batch:
-            raise ValueError(f"expected 1 to {self.batch} fresh samples in a batch of {self.batch}, got {self.fresh}")
+        if self.loss.adversarial and self.loss.discriminator == "clip" and self.data.clip_length < 2:
+            raise ValueError(
+                f"expected clips of 2 or more to judge, got {self.data.clip_length}; give --clip-length 2 or more"
+            )
+        if self.part == "rays" and self.loss.adversarial:
+            raise ValueError("expected no adversarial loss for rays alone, whose pixels are no image")

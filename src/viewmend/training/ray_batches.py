@@ -82,7 +82,7 @@ def ray_batch(sample: Sample, most_px: int, random: Random) -> RayBatch:
     )
 
 
-def varied(lookups: RayBatch) -> RayBatch:
+def augmented(lookups: RayBatch) -> RayBatch:
     """The same pixels as they might have been, by torch's random numbers: other colours, turned, with fewer cameras.
 
     Channels change places and everything gets darker, for cameras, surroundings and truth alike; the surroundings are
@@ -117,9 +117,9 @@ class RaysObjective(nn.Module):
 
     def forward(self, batch: Sequence[RayBatch]) -> StepOutput:
         """Both terms, the means over the samples."""
-        loss = rays_loss(self.model, [varied(b) for b in batch] if self.recipe.varied else batch)
-        weights, zero = self.recipe.loss, torch.zeros_like(loss.inside)
-        return StepOutput(loss, zero, zero, weights.image * loss.inside + weights.log_error * loss.log_error, ())
+        loss = rays_loss(self.model, [augmented(b) for b in batch] if self.recipe.augment else batch)
+        weights = self.recipe.loss
+        return StepOutput(loss, weights.image * loss.inside + weights.log_error * loss.log_error, ())
 
 
 def rays_loss(model: Chain, batch: Sequence[RayBatch]) -> ImageLoss:

@@ -28,8 +28,8 @@ def small_rays(data: DataPlan) -> Recipe:
 
     A moment of each scene: many scenes teach more than many views of few.
     """
-    dense = replace(data, context=False, cameras=(6, 20), min_hole_px=15, imperfect_share=0.8)
-    dense = replace(dense, rough_share=0.5, dropped_share=0.1, widened_share=0.15)
+    dense = replace(data, context=False, cameras=(6, 20), min_hole_px=15, imperfect_fraction=0.8)
+    dense = replace(dense, rough_fraction=0.5, dropped_fraction=0.1, widened_fraction=0.15)
     dense = replace(dense, times=(0,), held_cameras=5, targets_per_camera=1)
     return replace(
         small(data),
@@ -40,9 +40,9 @@ def small_rays(data: DataPlan) -> Recipe:
         steps=10_000,
         minutes=60.0,
         batch=16,
-        fresh=4,
-        buffer=600,
-        pixels=64,
+        new_per_batch=4,
+        replay_size=600,
+        pixels_per_view=64,
         learning_rate=1e-3,
         ema=0.998,
     )
@@ -57,7 +57,7 @@ def paper(data: DataPlan) -> Recipe:
         loss=LossWeights(adversarial=0.01),
         steps=200_000,
         batch=8,
-        fresh=4,
+        new_per_batch=4,
         learning_rate=1e-4,
         warmup=1000,
         ema=0.999,
@@ -75,8 +75,8 @@ def base(data: DataPlan) -> Recipe:
         loss=LossWeights(log_error=0.5),
         steps=20_000,
         batch=16,
-        fresh=6,
-        buffer=4000,
+        new_per_batch=6,
+        replay_size=4000,
         learning_rate=4e-4,
     )
 
@@ -90,7 +90,7 @@ def finetune(data: DataPlan) -> Recipe:
         steps=400,
         minutes=20.0,
         learning_rate=1e-4,
-        buffer=200,
+        replay_size=200,
         checkpoint_every=50,
         validate_every=100,
     )
@@ -99,7 +99,7 @@ def finetune(data: DataPlan) -> Recipe:
 def for_model(model: InpainterConfig, data: DataPlan, sizes_px: tuple[int, ...] | None = None) -> DataPlan:
     """The data that this model can use."""
     return replace(
-        data, rays=model.num_ray_views if model.coarse_fill == "rays" else 0, sizes_px=sizes_px or data.sizes_px
+        data, ray_views=model.num_ray_views if model.coarse_fill == "rays" else 0, sizes_px=sizes_px or data.sizes_px
     )
 
 

@@ -41,27 +41,28 @@ class SampleReplay(Generic[Item]):
         self,
         scenes: SceneSource[Item],
         seed: str,
-        fresh: int,
-        buffer: int,
+        new_per_batch: int,
+        replay_size: int,
         workers: int,
         start: ReplayPosition | None = None,
     ) -> None:
-        """`start` takes up a stream: the samples of its buffer are made again."""
+        """`start` takes up a stream: the samples that it replays are made again."""
         start = start or ReplayPosition(0, 0, 0)
         self.seed = seed
-        self.fresh = fresh
+        self.new_per_batch = new_per_batch
         self._new = samples_in_order(scenes, start.scene, workers)
         for _ in range(start.sample):
             next(self._new)
-        self._buffer: deque[tuple[int, int, Item]] = deque(maxlen=max(1, buffer))
+        self._buffer: deque[tuple[int, int, Item]] = deque(maxlen=max(1, replay_size))
         for _ in range(start.buffered):
             self._buffer.append(next(self._new))
 
     def batch(self, step: int, size: int) -> list[Item]:
         """The batch of `step`; steps follow one another. Smaller than `size` until the buffer holds enough."""
-        again = min(size - self.fresh, len(self._buffer))
+        count = min(self.new_per_batch, size)
+        again = min(size - count, len(self._buffer))
         seen = Random(f"{self.seed}/{step}").sample([sample for _, _, sample in self._buffer], again)
-        new = [next(self._new) for _ in range(self.fresh)]
+        new = [next(self._new) for _ in range(count)]
         self._buffer.extend(new)
         return [sample for _, _, sample in new] + seen
 

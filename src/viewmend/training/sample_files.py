@@ -125,7 +125,7 @@ class ShardScenes(Generic[Kind]):
         if shortest < self.clip:
             raise ShardError(
                 f"{order[position]}: expected clips of {self.clip} times, got {shortest}; make samples for this recipe "
-                f"(viewmend samples --recipe, or --clip {self.clip})"
+                f"(viewmend samples RECIPE, or --clip-length {self.clip})"
             )
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
 

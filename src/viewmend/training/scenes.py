@@ -64,7 +64,7 @@ class StudioScenes:
 
 def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> StudioConfig:
     """A stage as real ones differ: who performs, how many cameras in which rig, and what is wrong with them."""
-    flawed = random.random() < plan.imperfect_share
+    flawed = random.random() < plan.imperfect_fraction
     strength = random.random() if flawed else 0.0
     config = StudioConfig(
         seed=random.choice(PROCEDURAL_SEEDS[split]),
@@ -87,13 +87,13 @@ def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> S
             calibration_m=0.003 * strength * random.random(),
             jpeg_quality=random.randint(70, 95) if flawed and random.random() < 0.5 else None,
         ),
-        device=plan.device,
+        device=plan.data_device,
     )
-    if plan.rough_share and random.random() < plan.rough_share:
+    if plan.rough_fraction and random.random() < plan.rough_fraction:
         config = replace(config, imperfections=_rougher(config.imperfections, random))
     if plan.staged:
         config = replace(config, background="stage")
-    if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_share:
+    if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_fraction:
         variety = random.uniform(*plan.cloth_variety)
         config = replace(config, performers=plan.performers, motions=plan.motions, cloth_variety=variety)
     return config
@@ -118,13 +118,13 @@ def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[
         plan: how many cameras and times, and how views are rendered.
         random: which.
     """
-    dropped = _dropouts(rig.frames, plan.dropped_share, random)
+    dropped = _dropouts(rig.frames, plan.dropped_fraction, random)
     times = sorted(rig.frames)
-    ends = [t for t in times if all(t - back in rig.frames for back in range(plan.clip))]
+    ends = [t for t in times if all(t - back in rig.frames for back in range(plan.clip_length))]
     if not ends:
         raise ValueError(
-            f"expected {plan.clip} consecutive times for clips, got {times}; leave --clip away, or use captures of "
-            f"{max(plan.times) + 1} frames or more"
+            f"expected {plan.clip_length} consecutive times for clips, got {times}; leave --clip-length away, or use "
+            f"captures of {max(plan.times) + 1} frames or more"
         )
     names = [n for n in rig.frames[times[-1]].cameras.names if n not in dropped.get(times[-1], ())]
     samples = []
@@ -134,9 +134,9 @@ def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[
         for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
             reach = random.choice(plan.past)
             render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
-            sample, cameras = None, (plan.least_context, plan.rays)
-            wider_px = random.randint(1, WIDEST_PX) if random.random() < plan.widened_share else 0
-            for time in range(end - plan.clip + 1, end + 1):
+            sample, cameras = None, (plan.least_context, plan.ray_views)
+            wider_px = random.randint(1, WIDEST_PX) if random.random() < plan.widened_fraction else 0
+            for time in range(end - plan.clip_length + 1, end + 1):
                 past = [t for t in reversed(times) if t < time][:reach]
                 context = (time, *past) if plan.context else ()
                 least_px = plan.min_hole_px if time == end else 0

@@ -20,7 +20,7 @@ def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayBatch]
         return scene_source(recipe.data, seed)
     shards = recipe.data.shards
     scenes = scene_source(recipe.data, seed) if shards is None else ShardScenes(shards, seed, (Sample, RayBatch))
-    return RayBatchScenes(scenes, seed, recipe.pixels)
+    return RayBatchScenes(scenes, seed, recipe.pixels_per_view)
 
 
 def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneSource[Sample]:
@@ -33,9 +33,9 @@ def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneS
         ValueError: the plan names what is kept for tests.
     """
     if plan.shards is not None and split == "training":
-        return ShardScenes(plan.shards, seed, (Sample,), plan.clip)
+        return ShardScenes(plan.shards, seed, (Sample,), plan.clip_length)
     studio = StudioScenes(plan, seed, split)
     if not plan.captures:
         return studio
     captures = [open_masked(folder, held=1) for folder in recordings(split, plan.captures)]
-    return MixedScenes(CaptureScenes(captures, plan, seed), studio, plan.captures_share, seed)
+    return MixedScenes(CaptureScenes(captures, plan, seed), studio, plan.captures_fraction, seed)

@@ -30,8 +30,8 @@ class ValidationScores:
     """PSNR in the holes."""
     telea: float
     """What Telea scores there."""
-    first_fill: float
-    """What the first fill scores, before any patch."""
+    coarse_fill: float
+    """What the coarse fill scores, before any patch."""
 
 
 class Validation:
@@ -67,7 +67,7 @@ class Validation:
 
     def _views(self) -> list[Sample]:
         # One view a scene and no clips: more scenes say more.
-        plan = replace(self.recipe.data, held_cameras=1, targets_per_camera=1, clip=1, device="cpu")
+        plan = replace(self.recipe.data, held_cameras=1, targets_per_camera=1, clip_length=1, data_device="cpu")
         scenes = scene_source(plan, "validation", "validation")
         samples = (sample for number in count() for sample in scenes.scene(number))
         return list(islice(samples, self.recipe.validation_views))
