@@ -10,6 +10,9 @@ from torch import Tensor
 from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.views import CompletedView, IncompleteView
 
+RADIUS_PX = 3.0
+"""How far from a hole OpenCV's fills look."""
+
 
 class ViewFill(Protocol):
     """A `ViewInpainter` that looks at the view alone; `context` is never asked, nothing is remembered."""
@@ -33,27 +36,24 @@ class ViewFill(Protocol):
 class Telea(ViewFill):
     """OpenCV's fast-marching fill of E (Telea 2004), in 8 bits."""
 
-    def __init__(self, radius_px: float = 3.0) -> None:
-        self.radius_px = radius_px
+    method = 1
+    """`cv2.INPAINT_TELEA`."""
 
     def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
         """By `cv2.inpaint`."""
         import cv2
 
-        return _opencv(view, self.radius_px, cv2.INPAINT_TELEA)
+        holes = (view.error > 0).cpu().numpy().astype(np.uint8)
+        image = (view.rgb.detach().clamp(0, 1) * 255).round().byte().cpu().movedim(0, -1).contiguous().numpy()
+        filled = torch.from_numpy(cv2.inpaint(image, holes, RADIUS_PX, self.method))
+        return filled.movedim(-1, 0).to(view.rgb) / 255
 
 
-class NavierStokes(ViewFill):
+class NavierStokes(Telea):
     """OpenCV's fill of E along lines of equal brightness (Bertalmio et al. 2001), in 8 bits."""
 
-    def __init__(self, radius_px: float = 3.0) -> None:
-        self.radius_px = radius_px
-
-    def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
-        """By `cv2.inpaint`."""
-        import cv2
-
-        return _opencv(view, self.radius_px, cv2.INPAINT_NS)
+    method = 0
+    """`cv2.INPAINT_NS`."""
 
 
 class Unfilled(ViewFill):
@@ -81,12 +81,3 @@ class NearestColour(ViewFill):
         places[np.asarray(labels)[right].astype(np.int64)] = np.flatnonzero(right)
         nearest = torch.from_numpy(places[np.asarray(labels).astype(np.int64)]).to(view.rgb.device)
         return view.rgb.flatten(1)[:, nearest]
-
-
-def _opencv(view: IncompleteView, radius_px: float, method: int) -> Float[Tensor, "3 height width"]:
-    import cv2
-
-    holes = (view.error > 0).cpu().numpy().astype(np.uint8)
-    image = (view.rgb.detach().clamp(0, 1) * 255).round().byte().cpu().movedim(0, -1).contiguous().numpy()
-    filled = torch.from_numpy(cv2.inpaint(image, holes, radius_px, method))
-    return filled.movedim(-1, 0).to(view.rgb) / 255

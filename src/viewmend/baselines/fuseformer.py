@@ -92,10 +92,6 @@ class FuseFormer(TokenTransformer):
                 f"{width}x{height}; resize them or run windows of that size"
             )
 
-    def encode(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
-        """Features at a quarter of the size."""
-        return self.encoder(frames)
-
     def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
         """Tokens of overlapping patches that know their place."""
         return self.add_pos_emb(self.ss(features))

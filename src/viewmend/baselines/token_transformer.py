@@ -64,6 +64,7 @@ class TokenBlock(nn.Module, ABC):
 class TokenTransformer(nn.Module, ABC):
     """Frames with holes in, whole frames out; subclasses name the parts as the official checkpoints do."""
 
+    encoder: nn.Module
     transformer: nn.ModuleList
     name: str
     """As messages say it."""
@@ -72,9 +73,9 @@ class TokenTransformer(nn.Module, ABC):
     def check_size(self, height: int, width: int) -> None:
         """ValueError for frames of a size that this network cannot take."""
 
-    @abstractmethod
     def encode(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
         """Features at a quarter of the size."""
+        return self.encoder(frames)
 
     @abstractmethod
     def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
@@ -104,24 +105,22 @@ class TokenTransformer(nn.Module, ABC):
             tokens, _ = block(tokens)
         return self.decode(features, tokens.flatten(0, 1)).unflatten(0, clips.shape[:2])
 
-    def forward_remembering(
-        self, frames: Float[Tensor, "frame 3 height width"], memory: Sequence[MemorySlot], decoded: int = 1
-    ) -> tuple[Float[Tensor, "decoded 3 height width"], MemorySlot]:
-        """The frames of one time alone go through the network; earlier ones are remembered (Thiry et al., OM).
+    def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
+        """See `OnlineNetwork`."""
+        return self(torch.cat([clip.now, *clip.neighbours, *clip.references])[None])[0, 0]
 
-        Args:
-            frames: of one time, in [-1, 1], 0 in the holes.
-            memory: the slots of earlier times, at will; their order does not matter.
-            decoded: how many of `frames` to complete, the first ones.
+    def complete_remembering(
+        self, now: Frames, memory: Sequence[MemorySlot]
+    ) -> tuple[Float[Tensor, "3 height width"], MemorySlot]:
+        """See `OnlineNetwork`: the frames of one time alone go through the network (Thiry et al., OM).
 
-        Returns:
-            Those frames, filled, in [-1, 1]; and the slot of this time.
+        The order of `memory` does not matter.
 
         Raises:
             ValueError: a size that the network cannot take, or slots of another size.
         """
-        self.check_size(*frames.shape[-2:])
-        features = self.encode(frames)
+        self.check_size(*now.shape[-2:])
+        features = self.encode(now)
         tokens = self.split(features)[None]
         if any(slot.shape[2:] != tokens.shape[2:] for slot in memory):
             raise ValueError(
@@ -133,18 +132,7 @@ class TokenTransformer(nn.Module, ABC):
             past = torch.cat([slot[number] for slot in memory])[None] if memory else None
             tokens, own = block(tokens, past)
             remembered.append(own[0])
-        return self.decode(features[:decoded], tokens[0, :decoded]), torch.stack(remembered)
-
-    def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
-        """See `OnlineNetwork`."""
-        return self(torch.cat([clip.now, *clip.neighbours, *clip.references])[None])[0, 0]
-
-    def complete_remembering(
-        self, now: Frames, memory: tuple[MemorySlot, ...]
-    ) -> tuple[Float[Tensor, "3 height width"], MemorySlot]:
-        """See `OnlineNetwork`."""
-        completed, slot = self.forward_remembering(now, memory)
-        return completed[0], slot
+        return self.decode(features[:1], tokens[0, :1])[0], torch.stack(remembered)
 
 
 def initialise(network: nn.Module) -> None:
