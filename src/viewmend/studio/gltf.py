@@ -12,7 +12,6 @@ from torch import Tensor
 
 from viewmend.capture.errors import CaptureError
 from viewmend.studio.gltf_document import Document, read_document
-from viewmend.studio.quaternions import rotation_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -101,9 +100,20 @@ def _node(entry: Mapping[str, Any], index: int, parent: int, path: Path) -> Node
         if not bool((scale > 0).all()):
             raise CaptureError(f"{path}: node {name} has a singular matrix; apply transforms and export again")
         return Node(name, parent, matrix[:3, 3].clone(), matrix[:3, :3] / scale, scale)
-    rotation = rotation_from_quaternion(torch.tensor(entry.get("rotation", [0, 0, 0, 1]), dtype=torch.float32))
+    rotation = _rotation_from_quaternion(torch.tensor(entry.get("rotation", [0, 0, 0, 1]), dtype=torch.float32))
     translation = torch.tensor(entry.get("translation", [0, 0, 0]), dtype=torch.float32)
     return Node(name, parent, translation, rotation, torch.tensor(entry.get("scale", [1, 1, 1]), dtype=torch.float32))
+
+
+def _rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation of a quaternion (x, y, z, w) of any length but zero."""
+    x, y, z, w = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 class _Parts:

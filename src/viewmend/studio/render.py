@@ -10,14 +10,10 @@ from torch import Tensor
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.rasterize import Raster, barycentric, rasterize
 from viewmend.geometry.threads import parallel_for
+from viewmend.studio import _shade_numba as kernels
 from viewmend.studio.performer import TexturedMesh
 from viewmend.studio.shading import GLOSS_DOUBLINGS, Lights, irradiance
-from viewmend.studio.textures import (
-    TexturePyramid,
-    face_levels,
-    sample_texture,
-    srgb_from_linear,
-)
+from viewmend.studio.textures import TexturePyramid, face_levels, sample_texture, srgb_from_linear
 
 BANDS = 4
 
@@ -64,7 +60,7 @@ def render(
     """Draw a lit scene into every camera.
 
     Each pixel is shaded at samples_per_side x samples_per_side points, which gives its colour and coverage; the depth
-    is that of its centre. On the CPU numba shades where it is installed, else torch does.
+    is that of its centre. On the CPU numba shades, elsewhere torch does.
 
     Args:
         surface: what `light` made.
@@ -85,12 +81,7 @@ def render(
     if background is None:
         background = torch.zeros(len(cameras), 3, *depth.shape[1:], device=depth.device)
     if depth.device.type == "cpu":
-        try:
-            from viewmend.studio import _shade_numba as kernels
-        except ImportError:
-            pass
-        else:
-            return Rendering(*_shade_cpu(kernels, surface, fine, triangle, background), depth)
+        return Rendering(*_shade_cpu(surface, fine, triangle, background), depth)
     return Rendering(*shade_torch(surface, fine, triangle, background), depth)
 
 
@@ -115,9 +106,7 @@ def shade_torch(
 
 
 def _sample_colors(
-    surface: Surface,
-    camera: Cameras,
-    triangle: Int[Tensor, "1 fine_height fine_width"],
+    surface: Surface, camera: Cameras, triangle: Int[Tensor, "1 fine_height fine_width"]
 ) -> Float[Tensor, "sample 3"]:
     """Linear light of the covered samples of one view."""
     scene, lights = surface.scene, surface.lights
@@ -151,7 +140,6 @@ def _highlight(
 
 
 def _shade_cpu(
-    kernels,
     surface: Surface,
     fine: Cameras,
     triangle: Int[Tensor, "view fine_height fine_width"],
@@ -165,7 +153,7 @@ def _shade_cpu(
     vertex = torch.cat([scene.mesh.vertices, scene.uv, scene.normals, surface.irradiance], 1).float()
     parts = (vertex, scene.mesh.faces, scene.texture_of_face, pyramid.texels, pyramid.first, pyramid.size)
     arrays = [t.contiguous().numpy() for t in (*parts, lights.lamps, lights.gloss)]
-    shared = kernels.Scene(*arrays, GLOSS_DOUBLINGS, *kernels.encoding())
+    shared = kernels.Scene._make((*arrays, GLOSS_DOUBLINGS, *kernels.encoding()))
     seen = [t.contiguous().numpy() for t in (triangle, projected, fine.centers, background)]
     rgb = torch.zeros(views, 3, height, width, dtype=torch.uint8)
     mask = torch.zeros(views, height, width, dtype=torch.uint8)

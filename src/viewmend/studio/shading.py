@@ -1,4 +1,4 @@
-"""Light on the stage: a soft surrounding and a few lamps, with the shadows that the performer casts on itself."""
+"""The stage: a wall and a floor, and a soft surrounding and a few lamps with the shadows that they cast."""
 
 import math
 from dataclasses import dataclass
@@ -7,12 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, project
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.rigid import look_at
 from viewmend.geometry.threads import parallel_for
+from viewmend.studio import _shade_numba as kernels
 
+_WALLS = ((0.05, 0.35, 0.08), (0.22, 0.22, 0.23), (0.04, 0.04, 0.05), (0.6, 0.6, 0.58), (0.06, 0.12, 0.4))
+"""Linear light: green screen, grey, dark, white, blue screen."""
 SHADOW_PX = 128
 SHADOW_DISTANCE_M = 12.0
 """Lights are this far away: near enough to be a pinhole camera, far enough to look parallel."""
@@ -88,18 +91,13 @@ def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
     pixels, z = project(mesh.vertices + SHADOW_BIAS_M * normals, cameras)
     if z.device.type == "cpu":
-        try:
-            from viewmend.studio import _shade_numba as kernels
-        except ImportError:
-            pass
-        else:
-            seen = torch.empty_like(z)
+        seen = torch.empty_like(z)
 
-            def look(n: int) -> None:
-                kernels.unshadowed(pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
+        def look(n: int) -> None:
+            kernels.unshadowed(pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
 
-            parallel_for(look, len(cameras))
-            return seen.T
+        parallel_for(look, len(cameras))
+        return seen.T
     return unshadowed_torch(pixels, z, depth).T
 
 
@@ -135,3 +133,22 @@ def _light_cameras(mesh: Mesh, lights: Lights) -> Cameras:
         pose = look_at(middle + toward * distance, middle, turn)
         cameras.append(pinhole(2 * math.asin(radius / distance), SHADOW_PX, SHADOW_PX, pose))
     return concatenate_cameras(cameras)
+
+
+def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height width"]:
+    """Linear light behind the subject in each camera's image: a wall that darkens downwards into a floor.
+
+    The colours are seeded. Rays are looked at by their elevation alone, so that all cameras agree on a far backdrop.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    wall = torch.tensor(_WALLS[int(torch.randint(len(_WALLS), (), generator=generator))])
+    floor = wall * (0.5 + 0.6 * float(torch.rand((), generator=generator)))
+    width, height = cameras.max_size_px
+    pixels = pixel_centers(width, height, cameras.K.device).flatten(0, 1)
+    pixels = torch.cat([pixels, torch.ones_like(pixels[:, :1])], -1)
+    up_from_pixel = cameras.camera_from_world[:, :3, 1:2].mT @ torch.linalg.inv(cameras.K)
+    rays = torch.linalg.inv(cameras.K) @ pixels.T
+    upward = (up_from_pixel @ pixels.T)[:, 0] / rays.norm(dim=1)
+    share = torch.sigmoid((upward + 0.15) * 12)[:, None]
+    wall, floor = (c.to(pixels)[None, :, None] for c in (wall, floor))
+    return ((floor + (wall - floor) * share) * (0.9 + 0.2 * upward[:, None])).unflatten(-1, (height, width))

@@ -8,10 +8,7 @@ TRUNK = ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head")
 PARTS = (*TRUNK, *(side + part for side in ("Left", "Right") for part in SIDED))
 """Parts of a body, parents before children: named as in HumanIK and Mixamo; Spine2 carries the collars."""
 
-REQUIRED = (
-    "Hips",
-    *(side + part for side in ("Left", "Right") for part in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")),
-)
+REQUIRED = ("Hips", *(side + part for side in ("Left", "Right") for part in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")))
 
 _LEFT = {
     # Trunk and left side in the order of PARTS; the right side follows by the family's rule.

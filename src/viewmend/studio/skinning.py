@@ -6,9 +6,7 @@ from torch import Tensor
 
 
 def blend_transforms(
-    joints: Int[Tensor, "vertex 4"],
-    weights: Float[Tensor, "vertex 4"],
-    world_from_bind: Float[Tensor, "joint 4 4"],
+    joints: Int[Tensor, "vertex 4"], weights: Float[Tensor, "vertex 4"], world_from_bind: Float[Tensor, "joint 4 4"]
 ) -> Float[Tensor, "vertex 3 4"]:
     """Average each vertex' four joint transforms by weight: affine maps, given as their top three rows.
 

@@ -13,12 +13,11 @@ from viewmend.capture.errors import CaptureError
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import Mesh
-from viewmend.studio.backdrop import stage_backdrop
 from viewmend.studio.imperfections import Imperfections, imperfect_cameras, imperfect_frame
 from viewmend.studio.performer import Performer, TexturedMesh
 from viewmend.studio.render import Surface, light, render
 from viewmend.studio.rigs import dome_rig, ring_rig
-from viewmend.studio.shading import stage_lights
+from viewmend.studio.shading import stage_backdrop, stage_lights
 from viewmend.studio.textures import TexturePyramid, texture_pyramid
 from viewmend.views import MultiViewFrame
 

@@ -98,10 +98,7 @@ def sample_texture(
 
 
 def _bilinear(
-    pyramid: TexturePyramid,
-    texture: Int[Tensor, "sample"],
-    uv: Float[Tensor, "sample 2"],
-    level: Int[Tensor, "sample"],
+    pyramid: TexturePyramid, texture: Int[Tensor, "sample"], uv: Float[Tensor, "sample 2"], level: Int[Tensor, "sample"]
 ) -> Float[Tensor, "sample 3"]:
     size, first = pyramid.size[texture, level], pyramid.first[texture, level]
     place = (uv * size - 0.5).clamp(min=0).minimum(size - 1)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.studio.procedural.physique import Physique, leg_stretch
-from viewmend.studio.procedural.skeleton import SIDES, Skeleton, unit
+from viewmend.studio.procedural.skeleton import SIDES, Points, Rotation, Skeleton, Values, Vector, unit
 
 # Height, half width (masculine, feminine), front depth (masculine, feminine), back depth, z of the centre line.
 TORSO = np.array(
@@ -101,7 +101,7 @@ class Torso:
         steps = np.hypot(np.diff(self.y), np.diff(self.width))
         return np.concatenate([[0.0], np.cumsum(steps)])
 
-    def radius(self, azimuth: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    def radius(self, azimuth: Values, y: Values) -> Values:
         """Distance of the surface from the axis; azimuth 0 is the front, a quarter turn the left."""
         a, f, b = (np.interp(y, self.y, table) for table in (self.width, self.front, self.back))
         sine, cosine = np.abs(np.sin(azimuth)), np.cos(azimuth)
@@ -113,12 +113,12 @@ class Torso:
             r = r + swell * np.exp(-((turn / spread) ** 2) - ((y - height) / drop) ** 2)
         return r
 
-    def point(self, azimuth: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    def point(self, azimuth: Values, y: Values) -> Points:
         """The surface at this azimuth and height."""
         r = self.radius(azimuth, y)
         return np.stack([r * np.sin(azimuth), y, r * np.cos(azimuth) + np.interp(y, self.y, self.z)], -1)
 
-    def field(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    def field(self, points: Points) -> Values:
         """Distance to the surface to first order, negative inside."""
         x, y = points[..., 0], points[..., 1]
         z = points[..., 2] - np.interp(y, self.y, self.z)
@@ -150,9 +150,9 @@ class Torso:
 class Limb:
     """An arm or a leg: a round profile about the line from its first joint to its last. Metres."""
 
-    start: Float[np.ndarray, "3"]
-    end: Float[np.ndarray, "3"]
-    forward: Float[np.ndarray, "3"]
+    start: Vector
+    end: Vector
+    forward: Vector
     t: Float[np.ndarray, "sample"]
     r: Float[np.ndarray, "sample"]
     shift: Float[np.ndarray, "sample"]
@@ -164,27 +164,27 @@ class Limb:
         return float(np.linalg.norm(self.end - self.start))
 
     @property
-    def frame(self) -> Float[np.ndarray, "3 3"]:
+    def frame(self) -> Rotation:
         """Rows: sideways, up the limb, and forward."""
         up = unit(self.start - self.end)
         side = unit(np.cross(up, self.forward))
         return np.stack([side, up, np.cross(side, up)])
 
-    def center(self, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    def center(self, t: Values) -> Points:
         """The centre line at `t`."""
         axis = self.start + t[..., None] * (self.end - self.start)
         return axis - np.interp(t, self.t, self.shift)[..., None] * self.frame[2]
 
-    def point(self, azimuth: Float[np.ndarray, "*n"], t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    def point(self, azimuth: Values, t: Values) -> Points:
         """The surface at this azimuth (0 is forward) and place along the limb."""
         around = np.sin(azimuth)[..., None] * self.frame[0] + np.cos(azimuth)[..., None] * self.frame[2]
         return self.center(t) + np.interp(t, self.t, self.r)[..., None] * around
 
-    def along(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    def along(self, points: Points) -> Values:
         """Place along the limb of the nearest point of its axis, not clamped."""
         return (self.start - points) @ self.frame[1] / self.length
 
-    def field(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    def field(self, points: Points) -> Values:
         """Distance to the surface to first order, negative inside."""
         t = np.clip(self.along(points), self.t[0], self.t[-1])
         return np.linalg.norm(points - self.center(t), axis=-1) - np.interp(t, self.t, self.r)
@@ -221,13 +221,11 @@ class Body:
         """Torso, arms, legs."""
         return (self.torso, *self.limbs)
 
-    def fields(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "part *n"]:
+    def fields(self, points: Points) -> Float[np.ndarray, "part *n"]:
         """The field of each part."""
         return np.stack([part.field(points) for part in self.parts])
 
-    def settle(
-        self, points: Float[np.ndarray, "*n 3"], outward: Float[np.ndarray, "*n 3"], part: int, seam_m: float = 0.002
-    ) -> Float[np.ndarray, "*n 3"]:
+    def settle(self, points: Points, outward: Points, part: int, seam_m: float = 0.002) -> Points:
         """Move a part's surface outward onto the smooth union of all parts.
 
         The other parts count as `seam_m` thinner: this part's sheet dives under theirs exactly where their fields
@@ -281,7 +279,7 @@ def _limb(
     profile: Float[np.ndarray, "knot 3"],
     girth_m: float,
     height_m: float,
-    forward: Float[np.ndarray, "3"],
+    forward: Vector,
 ) -> Limb:
     t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth_m, height_m]))
     return Limb(skeleton.at(first), skeleton.at(last), forward, t, table[:, 0], table[:, 1])

@@ -5,24 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from viewmend.studio.procedural.body import Body, Limb, Torso
-from viewmend.studio.procedural.fabric import (
-    Canvas,
-    Image,
-    blend,
-    edge,
-    write,
-)
+from viewmend.studio.procedural.fabric import Canvas, Image, blend, edge, write
 from viewmend.studio.procedural.outfit import Cut, Outfit
 from viewmend.studio.procedural.patches import Patch
-from viewmend.studio.procedural.sheets import (
-    Azimuths,
-    Folds,
-    Wearer,
-    azimuths,
-    limb_sheet,
-    skirt_sheets,
-    torso_sheet,
-)
+from viewmend.studio.procedural.sheets import Azimuths, Folds, Wearer, azimuths, limb_sheet, skirt_sheets, torso_sheet
 
 
 def neckline(around: Azimuths, height_m: float, depth: float, vee: bool = False, wide: float = 0.0) -> Azimuths:

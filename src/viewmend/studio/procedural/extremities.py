@@ -6,7 +6,7 @@ from jaxtyping import Float
 from viewmend.studio.procedural.body import Body
 from viewmend.studio.procedural.fabric import Image
 from viewmend.studio.procedural.patches import Patch
-from viewmend.studio.procedural.skeleton import SIGN, Skeleton, unit
+from viewmend.studio.procedural.skeleton import SIGN, Skeleton, Vector, unit
 from viewmend.studio.procedural.weights import mix, one_joint, smoothstep
 
 
@@ -71,13 +71,7 @@ def hand_patches(body: Body, skeleton: Skeleton, height_m: float, side: str, ski
 
 
 def _finger(
-    root: Float[np.ndarray, "3"],
-    along: Float[np.ndarray, "3"],
-    palm: Float[np.ndarray, "3"],
-    length_m: float,
-    radius_m: float,
-    joint: str,
-    skin: Image,
+    root: Vector, along: Vector, palm: Vector, length_m: float, radius_m: float, joint: str, skin: Image
 ) -> Patch:
     s = np.linspace(1, 0, 9)
     curl = 0.28 * s**2
@@ -110,9 +104,7 @@ SHOE = np.array(
 )
 
 
-def shoe_patch(
-    skeleton: Skeleton, height_m: float, side: str, upper_rgb: Float[np.ndarray, "3"], sole_rgb: Float[np.ndarray, "3"]
-) -> Patch:
+def shoe_patch(skeleton: Skeleton, height_m: float, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Patch:
     """One shoe, its sole on the floor y = 0 in the bind pose. The chart's u runs around, v from heel to tip."""
     H = height_m
     ankle = skeleton.at(f"{side}_foot")

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from viewmend.studio.procedural.skeleton import Vector
+
 PX_PER_M = 520.0
 WORDS = ("VIEW", "MEND", "STUDIO", "NORTH", "RIVER", "SUN", "TEAM 7", "HELLO", "WAVE", "1984", "JAZZ", "ATLAS", "GO!")
 KINDS = (
@@ -67,7 +69,7 @@ class Canvas:
         return cv2.resize(values, (columns, rows), interpolation=cv2.INTER_CUBIC)
 
 
-def hsv(h: float, s: float, v: float) -> Float[np.ndarray, "3"]:
+def hsv(h: float, s: float, v: float) -> Vector:
     """SRGB of a hue, saturation and value, each in [0, 1]."""
     return np.array(colorsys.hsv_to_rgb(h % 1.0, min(max(s, 0), 1), min(max(v, 0), 1)))
 
@@ -108,7 +110,7 @@ def sample_fabric(rng: np.random.Generator, kinds: tuple[str, ...] = KINDS) -> F
     return Fabric(kind, np.stack([main, second, accent]), period, int(rng.integers(2**31)))
 
 
-def blend(base: Image, color: Float[np.ndarray, "3"] | Image, alpha: Plane) -> Image:
+def blend(base: Image, color: Vector | Image, alpha: Plane) -> Image:
     """`color` over `base` with coverage `alpha`."""
     return base + np.clip(alpha, 0, 1)[..., None] * (color - base)
 
@@ -233,12 +235,7 @@ def _letters(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
 
 
 def write(
-    image: Image,
-    canvas: Canvas,
-    word: str,
-    color: Float[np.ndarray, "3"],
-    center_m: tuple[float, float],
-    width_m: float,
+    image: Image, canvas: Canvas, word: str, color: Vector, center_m: tuple[float, float], width_m: float
 ) -> Image:
     """A word of this width, at most 9 cm tall, centred at this place of the canvas."""
     font, thick = cv2.FONT_HERSHEY_DUPLEX, max(2, round(0.05 * width_m * canvas.px_per_m))

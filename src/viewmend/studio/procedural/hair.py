@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from viewmend.studio.procedural.body import Torso
 from viewmend.studio.procedural.fabric import Canvas, Image, hsv
 from viewmend.studio.procedural.head import Head, face_grid
 from viewmend.studio.procedural.patches import Patch
+from viewmend.studio.procedural.skeleton import Values, Vector
 from viewmend.studio.procedural.weights import mix, one_joint, smoothstep
 
 STYLES = ("bald", "cropped", "short", "parted", "afro", "bob", "long", "ponytail", "bun", "cap")
@@ -19,7 +19,7 @@ class Hair:
     """A hairstyle and its colour."""
 
     style: str
-    color: Float[np.ndarray, "3"]
+    color: Vector
     volume: float
     """0 to 1."""
     seed: int
@@ -45,7 +45,7 @@ def sample_hair(rng: np.random.Generator, femininity: float, dark_skin: bool) ->
     return Hair(style, color, float(rng.random()), int(rng.integers(2**31)))
 
 
-def hairline(azimuth: Float[np.ndarray, "*n"], recede: float) -> Float[np.ndarray, "*n"]:
+def hairline(azimuth: Values, recede: float) -> Values:
     """Height of the hairline on the head (0 chin, 1 crown) at an azimuth."""
     turn = np.abs(np.angle(np.exp(1j * azimuth)))
     line = np.interp(
@@ -66,7 +66,7 @@ def strands(hair: Hair, canvas: Canvas) -> Image:
     return np.clip(hair.color * (1 + 0.20 * streaks[..., None]) + 0.012 * streaks[..., None], 0, 1)
 
 
-def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Float[np.ndarray, "3"]) -> list[Patch]:
+def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Vector) -> list[Patch]:
     """All sheets of this hairstyle."""
     if hair.style == "bald" and hair.volume < 0.5:
         return []

@@ -9,7 +9,7 @@ from viewmend.studio.procedural.body import smooth_table
 from viewmend.studio.procedural.fabric import Canvas, Image, blend, hsv
 from viewmend.studio.procedural.patches import Patch
 from viewmend.studio.procedural.physique import Physique
-from viewmend.studio.procedural.skeleton import Skeleton
+from viewmend.studio.procedural.skeleton import Points, Skeleton, Values, Vector
 from viewmend.studio.procedural.weights import one_joint, smoothstep
 
 # Height above the chin, half width, front depth, back depth: shares of the head's height.
@@ -42,13 +42,13 @@ class Head:
     """A person's head: the surface at an azimuth (0 is the nose) and height (0 chin, 1 crown)."""
 
     person: Physique
-    origin: Float[np.ndarray, "3"]
+    origin: Vector
     """Below the ears at chin height, world metres."""
     size_m: float
     thickness: float = 0.0
     """Layer on top (hair), a share of the head's height."""
 
-    def radius(self, azimuth: Float[np.ndarray, "*n"], y: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    def radius(self, azimuth: Values, y: Values) -> Values:
         """Horizontal distance from the axis in head heights, with the face's features."""
         f, face = self.person.femininity, self.person.face
         heights, rings = smooth_table(RINGS[:, 0], RINGS[:, 1:])
@@ -61,7 +61,7 @@ class Head:
         r = ((sine / np.maximum(a, 1e-3)) ** 2.25 + (np.abs(cosine) / depth) ** 2.25) ** (-1 / 2.25)
         turn = np.abs(np.angle(np.exp(1j * azimuth)))
 
-        def bump(at: float, height: float, wide: float, tall: float) -> Float[np.ndarray, "*n"]:
+        def bump(at: float, height: float, wide: float, tall: float) -> Values:
             return np.exp(-(((turn - at) / wide) ** 2) - ((y - height) / tall) ** 2)
 
         ridge = np.interp(y, [0.315, 0.345, 0.37, 0.45, 0.53, 0.57], [0, 0.085, 0.112, 0.068, 0.028, 0.0])
@@ -81,12 +81,7 @@ class Head:
         )
         return r + features * (np.cos(azimuth) > -0.2)
 
-    def point(
-        self,
-        azimuth: Float[np.ndarray, "*n"],
-        y: Float[np.ndarray, "*n"],
-        thickness: Float[np.ndarray, "*n"] | float = 0.0,
-    ) -> Float[np.ndarray, "*n 3"]:
+    def point(self, azimuth: Values, y: Values, thickness: Values | float = 0.0) -> Points:
         """World position on the head, or `thickness` head heights above it."""
         r = self.radius(azimuth, y)
         # Rings nearly flat at the crown must rise, not only widen, to grow thicker.
@@ -118,9 +113,7 @@ def chart_coordinates(canvas: Canvas) -> tuple[Float[np.ndarray, "height width"]
     return canvas.x / canvas.width_m * 2 * np.pi, canvas.y / canvas.height_m
 
 
-def head_patches(
-    person: Physique, head: Head, rng: np.random.Generator, hair_rgb: Float[np.ndarray, "3"]
-) -> list[Patch]:
+def head_patches(person: Physique, head: Head, rng: np.random.Generator, hair_rgb: Vector) -> list[Patch]:
     """The head with its painted face, and two ears."""
     azimuth, y = face_grid(68, 73)
     points = head.point(azimuth, y)
@@ -144,7 +137,7 @@ def head_patches(
     return patches
 
 
-def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_rgb: Float[np.ndarray, "3"]) -> Image:
+def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_rgb: Vector) -> Image:
     """Skin with eyes, brows, mouth, cheeks, nostrils, and stubble on some."""
     theta, y = chart_coordinates(canvas)
     turn = np.abs(theta)

@@ -124,13 +124,6 @@ def sample_motion(
     if chosen == "sidestep":
         path = float(rng.uniform(0.12, 0.3))
     score = Score(
-        chosen,
-        tempo,
-        beat,
-        skeleton,
-        person.height_m,
-        float(rng.uniform(-np.pi, np.pi)),
-        path,
-        rng.uniform(0, 1, 8),
+        chosen, tempo, beat, skeleton, person.height_m, float(rng.uniform(-np.pi, np.pi)), path, rng.uniform(0, 1, 8)
     )
     return Motion(score, (gestures[0], gestures[1]), float(rng.uniform(2.5, 5.0)), center)

@@ -63,7 +63,7 @@ def assemble(patches: list[Patch]) -> BoundMesh:
         faces.append(triangles + first)
         first += rows * columns
     vertices = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
-    dense = np.concatenate([patch.weights.reshape(first_dim(patch), -1) for patch in patches])
+    dense = np.concatenate([patch.weights.reshape(-1, patch.weights.shape[-1]) for patch in patches])
     joints = np.argsort(-dense, axis=1, kind="stable")[:, :4]
     weights = np.take_along_axis(dense, joints, axis=1)
     weights /= weights.sum(1, keepdims=True)
@@ -77,11 +77,6 @@ def assemble(patches: list[Patch]) -> BoundMesh:
         weights=_float(weights[face_table]),
         atlas=_float(atlas).permute(2, 0, 1).contiguous(),
     )
-
-
-def first_dim(patch: Patch) -> int:
-    """Number of the patch' points."""
-    return patch.points.shape[0] * patch.points.shape[1]
 
 
 def _float(array: np.ndarray) -> Tensor:

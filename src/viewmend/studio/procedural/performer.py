@@ -1,19 +1,38 @@
 """Performers and scenes drawn from a seed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
+from viewmend.geometry.mesh import Mesh
+from viewmend.studio.performer import TexturedMesh
 from viewmend.studio.procedural.grounds import Tempo, seat_height
 from viewmend.studio.procedural.motion import MOTIONS
-from viewmend.studio.procedural.patches import Patch, assemble
+from viewmend.studio.procedural.patches import BoundMesh, Patch, assemble
 from viewmend.studio.procedural.person import ProceduralPerson, draw_person
 from viewmend.studio.procedural.props import STANDING, standing_prop, stool
-from viewmend.studio.procedural.scene import ProceduralPerformer, still
 
 TEMPOS: tuple[Tempo, ...] = ("calm", "dance", "fast")
 ROAMING = ("walk", "run", "sidestep")
 """Motions that need the floor for themselves."""
+
+
+@dataclass(frozen=True)
+class ProceduralPerformer:
+    """One or two people and what stands around them. `pose` keeps nothing between calls."""
+
+    people: tuple[ProceduralPerson, ...]
+    things: TexturedMesh | None
+    description: str
+
+    def pose(self, time_s: float) -> TexturedMesh:
+        """All of them at this time, in seconds."""
+        parts = [person.pose(time_s) for person in self.people]
+        if self.things is not None:
+            parts.append(self.things)
+        return parts[0] if len(parts) == 1 else merge(parts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,3 +129,26 @@ def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], lis
         patches += standing_prop(kind, rng, at, float(rng.uniform(0, 6.3)))
         names.append(f"a {kind}")
     return patches, names
+
+
+def merge(parts: Sequence[TexturedMesh]) -> TexturedMesh:
+    """All parts in one mesh; their textures stay separate."""
+    vertices, faces, textures, first, layer = [], [], [], 0, 0
+    for part in parts:
+        vertices.append(part.mesh.vertices)
+        faces.append(part.mesh.faces + first)
+        textures.append(part.texture_of_face + layer)
+        first, layer = first + len(part.mesh.vertices), layer + len(part.textures)
+    return TexturedMesh(
+        Mesh(torch.cat(vertices), torch.cat(faces)),
+        torch.cat([part.normals for part in parts]),
+        torch.cat([part.uv for part in parts]),
+        torch.cat(textures),
+        tuple(texture for part in parts for texture in part.textures),
+    )
+
+
+def still(bound: BoundMesh) -> TexturedMesh:
+    """A mesh that stays in its bind pose: what stands on the floor."""
+    texture = torch.zeros(len(bound.mesh.faces), dtype=torch.int64)
+    return TexturedMesh(bound.mesh, bound.normals, bound.uv, texture, (bound.atlas,))

@@ -3,17 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
-from viewmend.studio.procedural.skeleton import (
-    ARM,
-    ARM_ANGLE_RAD,
-    JOINTS,
-    SIDES,
-    SIGN,
-    SKIRT_COLUMNS,
-    Skeleton,
-)
+from viewmend.studio.procedural.skeleton import ARM, ARM_ANGLE_RAD, JOINTS, SIDES, SIGN, SKIRT_COLUMNS, Skeleton, Values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +95,6 @@ def build_skeleton(person: Physique) -> Skeleton:
     return Skeleton(positions * person.height_m)
 
 
-def leg_stretch(y: Float[np.ndarray, "*n"], share: float) -> Float[np.ndarray, "*n"]:
+def leg_stretch(y: Values, share: float) -> Values:
     """Heights (fractions) after the legs take `share` of their length; ankles, shoulders and head stay."""
     return np.interp(y, [0.0, 0.043, 0.522, 0.797, 1.0], [0.0, 0.043, 0.522 * share, 0.797, 1.0])

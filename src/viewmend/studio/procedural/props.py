@@ -9,7 +9,7 @@ from viewmend.studio.procedural.body import Body
 from viewmend.studio.procedural.extremities import unit_grid
 from viewmend.studio.procedural.fabric import Canvas, Fabric, Image, blend, edge, hsv, sample_fabric, wave
 from viewmend.studio.procedural.patches import Patch
-from viewmend.studio.procedural.skeleton import SIGN, Skeleton, rotation
+from viewmend.studio.procedural.skeleton import SIGN, Rotation, Skeleton, Vector, rotation
 from viewmend.studio.procedural.weights import one_joint
 
 HELD = ("ball", "cup", "book", "bag", "staff", "bottle", "tablet")
@@ -20,8 +20,8 @@ STANDING = ("crate", "plant", "lamp", "ball", "suitcase", "table", "stool")
 class Frame:
     """Where a thing is in the bind pose or the world, and the joint it follows."""
 
-    origin: Float[np.ndarray, "3"]
-    axes: Float[np.ndarray, "3 3"]
+    origin: Vector
+    axes: Rotation
     """Columns: the thing's x, y (up) and z."""
     joint: str = "pelvis"
 
@@ -64,7 +64,7 @@ def box(frame: Frame, size: tuple[float, float, float], chart: Image) -> list[Pa
     return [frame.patch(side, chart, closed=False) for side in sides]
 
 
-def plain_chart(color: Float[np.ndarray, "3"], size: int = 8) -> Image:
+def plain_chart(color: Vector, size: int = 8) -> Image:
     """One colour."""
     return np.broadcast_to(color, (size, size, 3)).astype(np.float64)
 
@@ -84,7 +84,7 @@ def _print(rng: np.random.Generator, width: float, height: float) -> Image:
     return blend(image, 0.5 * image, edge(0.006 - rim, canvas))
 
 
-def stool(rng: np.random.Generator, origin: Float[np.ndarray, "3"], yaw: float, height_m: float) -> list[Patch]:
+def stool(rng: np.random.Generator, origin: Vector, yaw: float, height_m: float) -> list[Patch]:
     """A seat of this height: round on four legs, or a block."""
     frame = Frame(origin, rotation(1, yaw))
     if rng.random() < 0.4:
@@ -102,7 +102,7 @@ def stool(rng: np.random.Generator, origin: Float[np.ndarray, "3"], yaw: float, 
     return patches
 
 
-def standing_prop(kind: str, rng: np.random.Generator, origin: Float[np.ndarray, "3"], yaw: float) -> list[Patch]:
+def standing_prop(kind: str, rng: np.random.Generator, origin: Vector, yaw: float) -> list[Patch]:
     """One of `STANDING` on the floor at `origin`."""
     frame = Frame(origin, rotation(1, yaw))
     if kind == "stool":

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from viewmend.studio.procedural.body import Body
 from viewmend.studio.procedural.fabric import PX_PER_M, Canvas, Image
 from viewmend.studio.procedural.patches import Patch
-from viewmend.studio.procedural.skeleton import INDEX, SKIRT_COLUMNS, Skeleton
+from viewmend.studio.procedural.skeleton import INDEX, SKIRT_COLUMNS, Points, Skeleton, Values, Weights
 from viewmend.studio.procedural.weights import body_weights, mix, one_joint, smoothstep
 
 Painter = Callable[[Canvas], Image]
@@ -25,7 +25,7 @@ class Wearer:
     skeleton: Skeleton
     height_m: float
 
-    def weights(self, points: Float[np.ndarray, "*n 3"], part: int = 0) -> Float[np.ndarray, "*n joint"]:
+    def weights(self, points: Points, part: int = 0) -> Weights:
         """Skinning weights at these points of a part's sheet."""
         return body_weights(self.body, self.skeleton, self.height_m, points, part)
 
@@ -159,9 +159,7 @@ def limb_sheet(
     return Patch(points, _with_lips(uv, uv[0], None), wearer.weights(points, part), _paint(canvas, painter, folds))
 
 
-def skirt_weights(
-    wearer: Wearer, points: Float[np.ndarray, "*n 3"], around: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n joint"]:
+def skirt_weights(wearer: Wearer, points: Points, around: Values) -> Weights:
     """Weights of a skirt's points: the waist, then its hanging columns, high and low, each between two neighbours."""
     shape = points.shape[:-1]
     column = (around / (2 * np.pi) * SKIRT_COLUMNS) % SKIRT_COLUMNS

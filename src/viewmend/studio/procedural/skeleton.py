@@ -8,6 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+Vector = Float[np.ndarray, "3"]
+Rotation = Float[np.ndarray, "3 3"]
+Transforms = Float[np.ndarray, "joint 4 4"]
+"""The world_from_bind of every joint."""
+Values = Float[np.ndarray, "*n"]
+Points = Float[np.ndarray, "*n 3"]
+Weights = Float[np.ndarray, "*n joint"]
+"""Skinning weights, dense over the joints."""
+
 ARM_ANGLE_RAD = np.radians(48.0)
 SKIRT_COLUMNS = 8
 
@@ -45,7 +54,7 @@ SIGN = {"left": 1.0, "right": -1.0}
 """Of x on this side of the body."""
 
 
-def rotation(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
+def rotation(axis: int, angle_rad: float) -> Rotation:
     """Rotation about coordinate axis 0, 1 or 2."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     R = np.eye(3)
@@ -54,12 +63,12 @@ def rotation(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
     return R
 
 
-def unit(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def unit(v: Points) -> Points:
     """`v` at length one."""
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
 
 
-def hinge_frame(along: Float[np.ndarray, "3"], hinge: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def hinge_frame(along: Vector, hinge: Vector) -> Rotation:
     """Rotation whose -y axis is `along` (a bone) and whose x axis is as near `hinge` as that allows."""
     y = -unit(along)
     z = unit(np.cross(hinge, y))
@@ -67,11 +76,8 @@ def hinge_frame(along: Float[np.ndarray, "3"], hinge: Float[np.ndarray, "3"]) ->
 
 
 def two_bone(
-    start: Float[np.ndarray, "3"],
-    target: Float[np.ndarray, "3"],
-    lengths: tuple[float, float],
-    pole: Float[np.ndarray, "3"],
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    start: Vector, target: Vector, lengths: tuple[float, float], pole: Vector
+) -> tuple[Vector, Vector, Vector]:
     """Directions of a limb's two bones from `start` to `target`, its middle joint bent towards `pole`, and the hinge.
 
     A target out of reach is replaced by the nearest point the limb does reach.
@@ -92,7 +98,7 @@ class Skeleton:
 
     positions: Float[np.ndarray, "joint 3"]
 
-    def at(self, name: str) -> Float[np.ndarray, "3"]:
+    def at(self, name: str) -> Vector:
         """Bind position of this joint."""
         return self.positions[INDEX[name]]
 
@@ -100,7 +106,7 @@ class Skeleton:
         """Distance between two joints in the bind pose, metres."""
         return float(np.linalg.norm(self.at(second) - self.at(first)))
 
-    def place(self, joint: int, R: Float[np.ndarray, "3 3"], world_from_bind: Float[np.ndarray, "joint 4 4"]) -> None:
+    def place(self, joint: int, R: Rotation, world_from_bind: Transforms) -> None:
         """Set `joint` to the world rotation R at the place its parent carries it to."""
         parent = world_from_bind[PARENTS[joint]]
         origin = parent[:3, :3] @ self.positions[joint] + parent[:3, 3]
@@ -108,9 +114,7 @@ class Skeleton:
         world_from_bind[joint, :3, 3] = origin - R @ self.positions[joint]
 
 
-def joint_origin(
-    skeleton: Skeleton, name: str, world_from_bind: Float[np.ndarray, "joint 4 4"]
-) -> Float[np.ndarray, "3"]:
+def joint_origin(skeleton: Skeleton, name: str, world_from_bind: Transforms) -> Vector:
     """World position of a joint that is already placed."""
     motion = world_from_bind[INDEX[name]]
     return motion[:3, :3] @ skeleton.at(name) + motion[:3, 3]

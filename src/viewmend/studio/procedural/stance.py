@@ -12,7 +12,10 @@ from viewmend.studio.procedural.skeleton import (
     SIDES,
     SIGN,
     SKIRT_COLUMNS,
+    Rotation,
     Skeleton,
+    Transforms,
+    Vector,
     hinge_frame,
     joint_origin,
     rotation,
@@ -34,7 +37,7 @@ class ArmPose:
     elbow: float = 0.25
     curl: float = 0.3
     """Of the fingers."""
-    target: Float[np.ndarray, "3"] | None = None
+    target: Vector | None = None
     """World place of the wrist, metres; the angles above then do not count."""
 
 
@@ -42,7 +45,7 @@ class ArmPose:
 class FootPose:
     """A foot: where the point below the ankle would be on a flat sole (world metres), where it points, its pitch."""
 
-    place: Float[np.ndarray, "3"]
+    place: Vector
     yaw: float
     pitch: float = 0.0
     """Positive: the tip is up and the heel down; negative: the heel is up. The lower end keeps its place."""
@@ -52,7 +55,7 @@ class FootPose:
 class Stance:
     """A whole body at one moment. Angles in radians; lean and bend are forward, side and roll to the left."""
 
-    pelvis: Float[np.ndarray, "3"]
+    pelvis: Vector
     yaw: float
     feet: tuple[FootPose, FootPose]
     arms: tuple[ArmPose, ArmPose]
@@ -69,7 +72,7 @@ class Stance:
     knees_out: float = 0.1
 
 
-def solve(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float) -> Float[np.ndarray, "joint 4 4"]:
+def solve(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float) -> Transforms:
     """world_from_bind of every joint; `before` is the stance `elapsed_s` earlier, for what swings behind."""
     world = np.tile(np.eye(4), (len(INDEX), 1, 1))
     heading = rotation(1, stance.yaw)
@@ -91,7 +94,7 @@ def solve(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float) 
     return world
 
 
-def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Vector, Rotation]:
     """World place of the ankle and rotation of the foot, which turns about its ball or its heel."""
     ankle, toe = skeleton.at(f"{side}_foot"), skeleton.at(f"{side}_toe")
     reach = float(toe[2] - ankle[2]) if foot.pitch < 0 else -0.45 * float(toe[2] - ankle[2])
@@ -101,7 +104,7 @@ def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Float[np.ndar
     return foot.place + np.array([0, ankle[1], 0]) + turn @ pivot - R @ pivot, R
 
 
-def _reachable(skeleton: Skeleton, stance: Stance, R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+def _reachable(skeleton: Skeleton, stance: Stance, R: Rotation) -> Vector:
     """The pelvis, lowered where a leg would be too short for its foot."""
     pelvis = stance.pelvis.copy()
     for i, side in enumerate(SIDES):
@@ -116,9 +119,7 @@ def _reachable(skeleton: Skeleton, stance: Stance, R: Float[np.ndarray, "3 3"]) 
     return pelvis
 
 
-def _place_leg(
-    skeleton: Skeleton, side: str, foot: FootPose, stance: Stance, world: Float[np.ndarray, "joint 4 4"]
-) -> None:
+def _place_leg(skeleton: Skeleton, side: str, foot: FootPose, stance: Stance, world: Transforms) -> None:
     hip_parent = world[INDEX["pelvis"]]
     hip = hip_parent[:3, :3] @ skeleton.at(f"{side}_thigh") + hip_parent[:3, 3]
     ankle, foot_R = _ankle(skeleton, side, foot)
@@ -136,7 +137,7 @@ def _place_leg(
     skeleton.place(INDEX[names[3]], flat, world)
 
 
-def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Float[np.ndarray, "joint 4 4"]) -> None:
+def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -> None:
     s = SIGN[side]
     names = [f"{side}_{part}" for part in ("clavicle", "upperarm", "forearm", "hand", "fingers")]
     chest = world[INDEX["upper"], :3, :3]
@@ -161,13 +162,7 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Float[np.ndar
     skeleton.place(INDEX[names[4]], fore @ curl, world)
 
 
-def _hang(
-    skeleton: Skeleton,
-    stance: Stance,
-    before: Stance,
-    elapsed_s: float,
-    world: Float[np.ndarray, "joint 4 4"],
-) -> None:
+def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, world: Transforms) -> None:
     """Place the columns of a skirt, held off by the legs and pulled down by weight, and the tail of the hair."""
     pelvis = world[0, :3, :3]
     speed = pelvis.T @ (stance.pelvis - before.pelvis) / elapsed_s

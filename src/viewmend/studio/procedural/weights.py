@@ -1,35 +1,30 @@
 """Skinning weights of points near the body, dense over the joints."""
 
 import numpy as np
-from jaxtyping import Float
 
 from viewmend.studio.procedural.body import Body, Limb, opposite
-from viewmend.studio.procedural.skeleton import INDEX, JOINTS, SIDES, SPINE, Skeleton
+from viewmend.studio.procedural.skeleton import INDEX, JOINTS, SIDES, SPINE, Points, Skeleton, Values, Weights
 
 
-def smoothstep(x: Float[np.ndarray, "*n"], low: float, high: float) -> Float[np.ndarray, "*n"]:
+def smoothstep(x: Values, low: float, high: float) -> Values:
     """0 below `low`, 1 above `high` (low < high), smooth between."""
     s = np.clip((x - low) / (high - low), 0, 1)
     return s * s * (3 - 2 * s)
 
 
-def one_joint(shape: tuple[int, ...], name: str) -> Float[np.ndarray, "*n joint"]:
+def one_joint(shape: tuple[int, ...], name: str) -> Weights:
     """Weights of points that follow this joint alone."""
     weights = np.zeros((*shape, len(JOINTS)))
     weights[..., INDEX[name]] = 1
     return weights
 
 
-def mix(
-    first: Float[np.ndarray, "*n joint"], second: Float[np.ndarray, "*n joint"], share: Float[np.ndarray, "*n"]
-) -> Float[np.ndarray, "*n joint"]:
+def mix(first: Weights, second: Weights, share: Values) -> Weights:
     """`first` where `share` is 0, `second` where it is 1."""
     return first + share[..., None] * (second - first)
 
 
-def body_weights(
-    body: Body, skeleton: Skeleton, height_m: float, points: Float[np.ndarray, "*n 3"], part: int = 0
-) -> Float[np.ndarray, "*n joint"]:
+def body_weights(body: Body, skeleton: Skeleton, height_m: float, points: Points, part: int = 0) -> Weights:
     """Weights of points on or near the body: soft membership in a part, then soft steps along the part's chain.
 
     Points of a limb's sheet (`part`, as in `Body.parts`) never follow the limb of the other side.
@@ -50,9 +45,7 @@ def body_weights(
     return weights
 
 
-def limb_weights(
-    limb: Limb, points: Float[np.ndarray, "*n 3"], names: list[str], skeleton: Skeleton, width: float
-) -> Float[np.ndarray, "*n joint"]:
+def limb_weights(limb: Limb, points: Points, names: list[str], skeleton: Skeleton, width: float) -> Weights:
     """Weights along a limb's three joints; `width` is half the bend's extent as a share of the limb."""
     t = limb.along(points)
     middle = float(limb.along(skeleton.at(names[1])[None])[0])
@@ -61,7 +54,7 @@ def limb_weights(
     return mix(weights, one_joint(points.shape[:-1], names[2]), smoothstep(t, 0.94, 1.05))
 
 
-def _trunk(skeleton: Skeleton, height_m: float, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n joint"]:
+def _trunk(skeleton: Skeleton, height_m: float, points: Points) -> Weights:
     shape = points.shape[:-1]
     weights = one_joint(shape, "pelvis")
     for name, half in zip(SPINE[1:], (0.035, 0.04, 0.04, 0.018, 0.016), strict=True):
