@@ -40,7 +40,7 @@ def served(size: tuple[int, int], budget_ms: float | None, device: str):
     with server.bound() as url:
         thread = threading.Thread(target=server.run_bound)
         thread.start()
-        while not (service.ready and supply.span.whole):
+        while not (service.ready and supply.span.complete):
             time.sleep(0.1)
         yield url.replace("http", "ws"), service
         server.should_exit = True

@@ -23,7 +23,7 @@ def test_a_recording_begins_anew():
 def test_a_recording_that_is_being_made_waits_at_its_end():
     clock, growing = parted(seek=0), Span(0, 3, 30, 10.0)
     clock.advance(5.0, growing)
-    assert clock.time(growing) == 2 and not growing.whole
+    assert clock.time(growing) == 2 and not growing.complete
     clock.advance(0.1, Span(0, 10, 30, 10.0))
     assert clock.time(Span(0, 10, 30, 10.0)) == 3
 

@@ -63,9 +63,9 @@ def test_what_is_made_can_be_asked_for_as_far_as_it_is(reading):
     assert supply.span.end == 0 and supply.status.state == "loading"
     read(source, supply, 3)
     wait_until(lambda: supply.span.end == 3)
-    assert supply.span.total == 5 and supply.span.fps == 7 and not supply.span.whole
+    assert supply.span.total == 5 and supply.span.fps == 7 and not supply.span.complete
     read(source, supply, 2)
-    wait_until(lambda: supply.span.whole)
+    wait_until(lambda: supply.span.complete)
     assert source.order == [0, 1, 2, 3, 4] and supply.status.state == "ready"
 
 

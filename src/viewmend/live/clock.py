@@ -1,4 +1,4 @@
-"""Which time a viewer looks at: play, pause, seek, speed, and the edge that all share."""
+"""The playback clocks: play, pause, seek, speed, and the edge that viewers share."""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,9 @@ class Span:
     total: int | None = None
     """How many there will be; None for a live rig."""
     fps: float = 0.0
-    """Frames a second; 0 for a single one."""
+    """Frames a second; 0 where there is a single frame."""
     live: bool = False
-    """Frames arrive as they happen; else they are a recording, which begins anew after its end."""
+    """Frames arrive as they happen. Otherwise they are a recording, which is played in a loop."""
 
     @property
     def newest(self) -> int:
@@ -24,8 +24,8 @@ class Span:
         return self.end - 1
 
     @property
-    def whole(self) -> bool:
-        """A recording of which nothing more is to come."""
+    def complete(self) -> bool:
+        """Whether this is a recording with all of its frames."""
         return not self.live and self.end == self.total
 
     def clamp(self, position: float | int) -> float:
@@ -34,7 +34,7 @@ class Span:
 
 
 class Clock:
-    """A position in a span, in frames, moved on by seconds. The edge of a recording is one, too."""
+    """A position in a span, in frames. Each viewer has one, and the edge of a recording is one."""
 
     def __init__(self) -> None:
         self.position = 0.0
@@ -43,10 +43,9 @@ class Clock:
         self.live = True
 
     def advance(self, seconds: float, span: Span, edge: float | None = None) -> None:
-        """Move on; a clock that follows the edge is where the edge is.
+        """Move on by `seconds`, or to the `edge` where the clock follows it.
 
-        A recording begins anew after its end (a frame's duration after the last began); one that is still being made
-        waits at its end.
+        A recording begins anew one frame after its last. One that is still being generated waits at its end.
         """
         if self.live and edge is not None:
             self.position = edge
@@ -54,13 +53,13 @@ class Clock:
         if self.playing:
             self.position += seconds * span.fps * self.speed
         count = span.end - span.first
-        if span.whole and count > 0 and self.position >= span.end:
+        if span.complete and count > 0 and self.position >= span.end:
             self.position = span.first + (self.position - span.first) % count
         elif not span.first <= self.position < span.end:
             self.position = span.clamp(self.position)
 
     def change(self, change: ClockChange, span: Span) -> None:
-        """Do what a viewer asks."""
+        """Obey a viewer."""
         if change.seek is not None:
             self.position, self.live = span.clamp(float(change.seek)), False
         if change.speed is not None and not span.live:
@@ -78,5 +77,5 @@ class Clock:
 
 
 def edge_of(span: Span, recording: Clock) -> float:
-    """Where the edge is: a live rig's newest frame, or the position that all followers of a recording share."""
+    """The edge: the newest frame of a live rig, or the position that all who follow a recording share."""
     return float(span.newest) if span.live else recording.position

@@ -1,4 +1,4 @@
-"""Who may ask, and how often."""
+"""Who may connect, and how often they may send."""
 
 import hmac
 import time
@@ -10,7 +10,7 @@ from starlette.requests import HTTPConnection
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address is this machine's alone."""
+    """Whether only this machine can reach an address."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:  # a name, and who knows what 127.0.0.1.example resolves to
@@ -18,7 +18,7 @@ def is_loopback(host: str) -> bool:
 
 
 def token_query(token: str | None) -> str:
-    """What follows a path where the token is wanted; empty without one."""
+    """The query that carries the token; empty without one."""
     return f"?token={quote(token, safe='')}" if token else ""
 
 
@@ -40,10 +40,10 @@ class Guard:
         self.token = token
 
     def foreign_origin(self, connection: HTTPConnection) -> str | None:
-        """Why a request comes from a page that is not ours; None if it does not.
+        """Why a request is refused that comes from another site's page; None if it does not.
 
-        A page elsewhere has another `Origin`, or shows our pictures as its own; one that made its own name resolve to
-        this machine calls us by it. A link to us may be anywhere.
+        Such a page has another `Origin`, or embeds our pictures (`Sec-Fetch-Site`). A page whose own name resolves to
+        this machine has that name as `Host`. A plain link to us may be anywhere.
         """
         host = connection.headers.get("host", "")
         if self._local and not is_loopback(_name(host)):

@@ -12,7 +12,7 @@ from viewmend.live.server import LiveServer, ServerConfig
 
 PUSH_BYTES = 64_000_000
 SILENT_S = 10.0
-"""A connection that asks for nothing, or never to the end, is closed after so long."""
+"""Seconds after which a connection without a whole request is closed."""
 
 
 class Server(uvicorn.Server):
@@ -76,7 +76,7 @@ class Server(uvicorn.Server):
     def _close_silent(self) -> None:
         now = time.monotonic()
         for connection in list(self.server_state.connections):
-            # Of HTTP; sockets of viewers have other watchmen. A request that is half sent is none.
+            # HTTP connections only: viewers' sockets have time limits of their own. Half a request is no request.
             cycle = getattr(connection, "cycle", connection)
             if cycle is not None and not getattr(cycle, "response_complete", False):
                 self._since.pop(connection, None)

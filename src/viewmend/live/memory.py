@@ -1,7 +1,8 @@
-"""Giving memory back.
+"""Handing free memory back to the system.
 
-Stores are bounded, and have pages of their own (`own_pages.py`). But glibc keeps what lies free between small things
-that live long and buffers of views that are gone. Left alone that comes to more than the stores.
+The caches of frames and of the stream are bounded, and have memory pages of their own (`own_pages.py`). But glibc keeps
+the free memory between small objects that live long and buffers of views that are gone. Without this module it comes to
+more than the caches.
 """
 
 import ctypes
@@ -11,15 +12,15 @@ from functools import cache
 from pathlib import Path
 
 IDLE_S, BUSY_S = 5.0, 60.0
-"""So often at most it is given back while nobody waits for a view, and while somebody does."""
+"""Least seconds from one time to the next: while nobody waits for a view, and while somebody does."""
 SLACK_BYTES = 100e6
-"""What may lie free, for it is used again at once: giving 100 MB back takes 10 ms, and getting them again more."""
+"""Free memory that is kept, since it is used again at once. To hand 100 MB back takes 10 ms, to get them again more."""
 ARENAS = 1
-"""Of glibc's heaps. By default there are eight a core, each with holes of its own that no other fills; here one thread
+"""Heaps of glibc. By default there are eight a core, each with free memory that the others do not use; here one thread
 renders."""
 LARGE_BYTES = 8_000_000
-"""Larger buffers are mapped on their own, and unmapped after use: no view in motion needs such. glibc would raise the
-limit to 32 MB by itself."""
+"""Larger buffers are mapped on their own, and unmapped after use; no moving view needs one. By itself glibc would raise
+the limit to 32 MB."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 
 
@@ -36,14 +37,14 @@ def _glibc() -> ctypes.CDLL | None:
 
 
 def set_up() -> bool:
-    """Call it before threads are started; whether it could be done."""
+    """Set the allocator's options, before threads are started; whether it could be done."""
     library = _glibc()
     options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE_BYTES), (_M_TRIM_THRESHOLD, int(SLACK_BYTES / 2)))
     return library is not None and all(library.mallopt(*option) == 1 for option in options)
 
 
 def resident_bytes() -> int | None:
-    """What the process occupies of the machine's memory; None where /proc does not say it."""
+    """Physical memory of the process; None where /proc does not say it."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -57,10 +58,10 @@ class HeapTrimmer:
     def __init__(self) -> None:
         self._last = time.monotonic()
         self._least = 0
-        """What was resident when it was last given back: mostly what is in use."""
+        """Resident bytes after the last time: mostly what is in use."""
 
     def when_due(self, idle: bool) -> bool:
-        """Call it between views; whether something was handed back, which takes some hundredths of a second."""
+        """Hand memory back if it is time; whether it was. It takes some hundredths of a second: call it between views."""
         now = time.monotonic()
         if now - self._last < (IDLE_S if idle else BUSY_S):
             return False

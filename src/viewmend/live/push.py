@@ -20,14 +20,14 @@ from viewmend.live.pushed import PushedFrames
 from viewmend.views import MultiViewFrame
 
 MAX_CAMERAS = 128
-Side = Annotated[int, Meta(ge=8, le=16384)]
 MAX_PIXELS = 64_000_000
 """Of all cameras together."""
 SILENT_S = 30.0
+ImageSide = Annotated[int, Meta(ge=8, le=16384)]
 
 
 async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
-    """Take in a rig and its frames until it goes."""
+    """Receive a rig and its frames, until it disconnects."""
     cameras: Cameras | None = None
     while True:
         try:
@@ -43,7 +43,7 @@ async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
                 cameras = _begin(message.get("text") or "", supply)
                 await socket.send_text(json.dumps({"type": "taken", "frame": None}))
                 continue
-            # Decoding eight images takes milliseconds that other viewers' messages need not wait for.
+            # On a thread: other viewers' messages need not wait while images are decoded.
             frame = await asyncio.to_thread(_frame, message.get("bytes") or b"", cameras)
             number = supply.push(frame)
         except ValueError as error:
@@ -56,8 +56,8 @@ class CameraEntry(Struct, frozen=True, kw_only=True):
     """One camera of the message `rig`."""
 
     name: Annotated[str, Meta(max_length=200)]
-    width: Side
-    height: Side
+    width: ImageSide
+    height: ImageSide
     K: Annotated[tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...], Meta(min_length=9, max_length=9)]
     R: Rotation
     T: Point

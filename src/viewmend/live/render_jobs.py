@@ -90,6 +90,10 @@ class RenderJob(ABC, Generic[Result]):
         self.done: Future[Result] = Future()
 
     @abstractmethod
+    def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
+        """The next view, once its frame has been read."""
+
+    @abstractmethod
     def encode(self, result: RenderResult) -> None:
         """Take in one view, and `finish` after the last."""
 

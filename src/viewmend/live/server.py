@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from importlib.metadata import version
 
@@ -22,7 +21,7 @@ from viewmend.live.page_files import HEADERS, page_files
 from viewmend.live.protocol import Limits, ProtocolError
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import PushedFrames
-from viewmend.live.render_jobs import PathJob, PictureJob, parse_path, parse_query
+from viewmend.live.render_jobs import PathJob, PictureJob, RenderJob, Result, parse_path, parse_query
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 
@@ -68,9 +67,10 @@ class LiveServer:
 
     def app(self) -> Starlette:
         """The ASGI application; its lifespan starts and stops the service."""
+        page = self._guarded(self._page, needs_token=False)  # it holds no secret
         routes = [
-            Route("/", self._open(self._index)),
-            Route("/page/{name:path}", self._open(self._page)),
+            Route("/", page),
+            Route("/page/{name:path}", page),
             Route("/health", self._guarded(self._health)),
             Route("/metrics", self._guarded(self._metrics)),
             Route("/frame.jpg", self._guarded(self._picture)),
@@ -88,21 +88,14 @@ class LiveServer:
         finally:
             await asyncio.to_thread(self._service.stop)
 
-    def _open(self, answer: Callable[[Request], Response]) -> Callable[[Request], Awaitable[Response]]:
-        """A route for which no token is needed: the page holds no secret."""
-
-        async def checked(request: Request) -> Response:
-            foreign = self._guard.foreign_origin(request)
-            return _refusal(403, foreign) if foreign else answer(request)
-
-        return checked
-
-    def _guarded(self, answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    def _guarded(
+        self, answer: Callable[[Request], Awaitable[Response]], needs_token: bool = True
+    ) -> Callable[[Request], Awaitable[Response]]:
         async def checked(request: Request) -> Response:
             foreign = self._guard.foreign_origin(request)
             if foreign:
                 return _refusal(403, foreign)
-            if self._guard.lacks_token(request):
+            if needs_token and self._guard.lacks_token(request):
                 return _refusal(401, "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN")
             try:
                 return await answer(request)
@@ -111,14 +104,8 @@ class LiveServer:
 
         return checked
 
-    def _index(self, request: Request) -> Response:
-        return self._file("index.html")
-
-    def _page(self, request: Request) -> Response:
-        return self._file(request.path_params["name"])
-
-    def _file(self, name: str) -> Response:
-        file = self._files.get(name)
+    async def _page(self, request: Request) -> Response:
+        file = self._files.get(request.path_params.get("name", "index.html"))
         if file is None:
             return _refusal(404, "there is no such file of the page")
         return Response(file.content, media_type=file.media_type, headers=HEADERS)
@@ -151,7 +138,7 @@ class LiveServer:
         job = PictureJob(asked)
         self._pictures += 1
         try:
-            image, result = await self._wait(request, job, job.done, PICTURE_S)
+            image, result = await self._wait(request, job, PICTURE_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the frame did not come in time; see /health")
         finally:
@@ -171,17 +158,17 @@ class LiveServer:
             if body is None:
                 return _refusal(413, f"expected at most {BODY_BYTES} bytes")
             job = PathJob(parse_path(body, self._config.limits))
-            video = await self._wait(request, job, job.done, EXPORT_S)
+            video = await self._wait(request, job, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
         finally:
             self._exporting = False
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
-    async def _wait(self, request: Request, job: PictureJob | PathJob, done: Future, limit_s: float):
+    async def _wait(self, request: Request, job: RenderJob[Result], limit_s: float) -> Result:
         """The job's result. A job is given up when its client goes."""
         self._service.join(job)
-        end, waiting = time.monotonic() + limit_s, asyncio.wrap_future(done)
+        end, waiting = time.monotonic() + limit_s, asyncio.wrap_future(job.done)
         try:
             while not waiting.done():
                 await asyncio.wait([waiting], timeout=0.5)
@@ -190,7 +177,7 @@ class LiveServer:
             return waiting.result()
         finally:
             self._service.leave(job)
-            done.cancel()
+            job.done.cancel()
 
     async def _welcome(self, socket: WebSocket) -> bool:
         """Accept a socket. One of a foreign page is closed without a word, one without the token with an error."""

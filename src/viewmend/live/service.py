@@ -1,4 +1,4 @@
-"""One thread that renders for everybody, in turn."""
+"""One thread that renders for all sessions, in turn."""
 
 import logging
 import threading
@@ -14,7 +14,7 @@ from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
 from viewmend.live.sessions import Playback, Session, ViewerSession
 
 TICK_S = 0.004
-"""How often clocks are looked at while somebody is there."""
+"""Seconds between looks at the sessions' clocks."""
 IDLE_S = 0.05
 AFTER_ERROR_S = 0.5
 
@@ -63,25 +63,25 @@ class RenderService:
             self.lock.notify_all()
 
     def join(self, session: Session) -> None:
-        """Serve this one, too."""
+        """Begin to serve a session."""
         with self.lock:
             self._sessions.append(session)
             self.lock.notify_all()
 
     def leave(self, session: Session) -> None:
-        """Serve it no more."""
+        """End serving a session."""
         with self.lock:
             if session in self._sessions:
                 self._sessions.remove(session)
 
     @property
     def edge(self) -> float:
-        """Where those are who follow the edge."""
+        """The position of the viewers who follow the edge."""
         return edge_of(self.supply.span, self.recording)
 
     @property
     def ready(self) -> bool:
-        """Whether there is something to look at."""
+        """Whether views can be rendered."""
         return self.renderer.frame is not None and self.renderer.is_of(self.supply.rig)
 
     def _run(self) -> None:

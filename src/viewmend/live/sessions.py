@@ -198,7 +198,7 @@ class ViewerSession:
             "playing": clock.playing,
             "speed": clock.speed,
             "live": clock.live,
-            "behind": max(0, int(edge) - now) if span.live or not span.whole else 0,
+            "behind": max(0, int(edge) - now) if span.live or not span.complete else 0,
             "buffering": self.buffering,
         }
 
