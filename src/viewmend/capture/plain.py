@@ -1,7 +1,8 @@
 """Plain capture folders: `cameras.json` and the files that it names, as a source of frames."""
 
+import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from torch import Tensor
 
 from viewmend.capture.camera_reader import CameraImages, CameraReader
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.folder_listing import FolderListing
 from viewmend.capture.plain_format import CALIBRATION, PlainCamera, read_calibration, stays_inside
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -161,12 +161,21 @@ class PlainCapture:
         return not lacking
 
     def _find_files(self) -> Bool[np.ndarray, "view time"]:
-        listing = FolderListing(self.folder)
-        rows = [[_is_there(camera, frame, listing) for frame in self.frame_ids] for camera in self._plain]
-        present = np.array(rows, bool)
+        listing = functools.cache(lambda parent: _files(self.folder / parent))  # the disk is asked once a folder
+
+        def has(path: str) -> bool:
+            if not stays_inside(path):
+                raise CaptureError(f"{self.folder}: expected a file inside the folder, got {path}; rename the frame")
+            parent, name = os.path.split(path)
+            return name in listing(parent)
+
+        def has_all(camera: PlainCamera, frame: str) -> bool:
+            return all(has(camera.file(stream, frame)) for stream in camera.streams)
+
+        present = np.array([[has_all(camera, frame) for frame in self.frame_ids] for camera in self._plain], bool)
         for camera, row in zip(self._plain, present, strict=True):
             if not row.any():
-                raise CaptureError(_never(self.folder, camera, self.frame_ids, listing))
+                raise CaptureError(_never(self.folder, camera, self.frame_ids, has))
         for frame, column in zip(self.frame_ids, present.T, strict=True):
             if not column.any():
                 example = self.folder / self._plain[0].file(self._plain[0].streams[0], frame)
@@ -187,20 +196,19 @@ def _select(cameras: tuple[PlainCamera, ...], names: Sequence[str] | None, file:
     return tuple(by_name[name] for name in names)
 
 
-def _is_there(camera: PlainCamera, frame: str, listing: FolderListing) -> bool:
-    return all(listing.has(_safe(camera.file(stream, frame), listing)) for stream in camera.streams)
+def _files(folder: Path) -> frozenset[str]:
+    """Names of the files in a folder; none where there is no such folder."""
+    try:
+        with os.scandir(folder) as entries:
+            return frozenset(entry.name for entry in entries if entry.is_file())
+    except OSError:
+        return frozenset()
 
 
-def _safe(path: str, listing: FolderListing) -> str:
-    if not stays_inside(path):
-        raise CaptureError(f"{listing.folder}: expected a file inside the folder, got {path}; rename the frame")
-    return path
-
-
-def _never(folder: Path, camera: PlainCamera, frames: Sequence[str], listing: FolderListing) -> str:
+def _never(folder: Path, camera: PlainCamera, frames: Sequence[str], has: Callable[[str], bool]) -> str:
     """What to say of a camera that is at no time there."""
     for stream in camera.streams:
-        if not any(listing.has(camera.file(stream, frame)) for frame in frames):
+        if not any(has(camera.file(stream, frame)) for frame in frames):
             file, what = camera.file(stream, frames[0]), f"the camera's {stream} at one frame or more"
             break
     else:

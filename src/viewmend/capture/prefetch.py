@@ -8,33 +8,23 @@ from itertools import islice
 from viewmend.capture.source import CaptureSource
 from viewmend.views import MultiViewFrame
 
+AHEAD = 2
+"""So many frames are read while one is used."""
 
-def prefetch(
-    source: CaptureSource, times: Iterable[int] | None = None, ahead: int = 2, workers: int = 1
-) -> Iterator[MultiViewFrame]:
-    """The frames at `times` (default: all) in order, the next `ahead` of them being read while one is used.
 
-    `workers` frames are read at once. One is right for folders, which read their cameras in parallel, and for videos,
-    whose frames must be asked for in order; more help a source that uses one core. An error of reading a frame is
-    raised where that frame would have come. Closing the iterator, or leaving its loop, drops what was not begun.
+def prefetch(source: CaptureSource, times: Iterable[int] | None = None) -> Iterator[MultiViewFrame]:
+    """The frames at `times` (default: all) in order, the next ones being read while one is used.
 
-    Raises:
-        ValueError: `ahead` or `workers` is below one.
+    One frame is read at once: folders read its cameras in parallel, and videos must be asked for frames in order. An
+    error of reading a frame is raised where that frame would have come. Closing the iterator, or leaving its loop,
+    drops what was not begun.
     """
-    if ahead < 1 or workers < 1:
-        raise ValueError(
-            f"expected to read at least 1 frame ahead with 1 worker, got {ahead} and {workers}; raise them"
-        )
-    return _read_ahead(source, range(len(source.frame_ids)) if times is None else times, ahead, workers)
-
-
-def _read_ahead(source: CaptureSource, times: Iterable[int], ahead: int, workers: int) -> Iterator[MultiViewFrame]:
-    coming = iter(times)
+    coming = iter(range(len(source.frame_ids)) if times is None else times)
     reading: deque[Future[MultiViewFrame]] = deque()
-    pool = ThreadPoolExecutor(workers, thread_name_prefix="prefetch")
+    pool = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
     try:
         while True:
-            reading.extend(pool.submit(source.read, time) for time in islice(coming, ahead + 1 - len(reading)))
+            reading.extend(pool.submit(source.read, time) for time in islice(coming, AHEAD + 1 - len(reading)))
             if not reading:
                 return
             yield reading.popleft().result()

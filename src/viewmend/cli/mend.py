@@ -1,6 +1,5 @@
 """`viewmend mend`: novel views of a capture, rendered and mended, and scored against a camera that was left out."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,7 +10,6 @@ if TYPE_CHECKING:
     from viewmend.capture.source import CaptureSource
     from viewmend.evaluation.mending import MendSummary, Metric
     from viewmend.geometry.cameras import Cameras
-    from viewmend.views import MultiViewFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +66,7 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --context of at least 1 camera, got {options.context}; the paper uses 3")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+    from viewmend.capture.prefetch import prefetch
     from viewmend.capture.prepare import prepare
     from viewmend.cli.alignment import say_alignment
     from viewmend.cli.checks import load_named
@@ -87,11 +86,13 @@ def run(options: Options) -> int:
     say_alignment(capture.alignment)
     mender = Mender(inpainter, options.context, capture.bounds, held, RenderQuality(top_k=options.top_k))
     summary = MendSummary()
-    views = _views(options, capture, times)
+    plan, frames, frame = _plan(options, capture, times), prefetch(capture, times), None
     with MendOutput(options.out, fps=capture.fps or 15.0) as output:
-        for frame, target in track(views, "mending", _count(options, capture, times)):
+        for time, target in track(plan, "mending"):
+            if frame is None or frame.time != time:
+                frame = next(frames).to(options.device)
             truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
-            step = mender.mend(frame.without(held), target, truth)
+            step = mender.mend(frame.without(held), target.to(options.device), truth)
             summary.add(step)
             output.add(step)
     say(f"wrote {options.out}")
@@ -150,31 +151,18 @@ def _times(frames: str | None, count: int) -> range:
     return wanted
 
 
-def _count(options: Options, capture: "CaptureSource", times: range) -> int:
-    return STATIC_VIEWS if options.path == "orbit" and len(capture.frame_ids) == 1 else len(times)
-
-
-def _views(options: Options, capture: "CaptureSource", times: range) -> "Iterator[tuple[MultiViewFrame, Cameras]]":
-    """Each frame with the novel view's camera, in order of time."""
+def _plan(options: Options, capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
+    """Which time is looked at from where, in order of time."""
     from viewmend.capture.camera_path import paired, read_path
-    from viewmend.capture.prefetch import prefetch
 
     if options.leave_out is not None:
-        plan = [(time, capture.cameras.select([options.leave_out])) for time in times]
-    elif options.path == "orbit":
-        plan = _orbit(capture, times)
-    else:
-        plan = paired(read_path(Path(str(options.path)), capture.cameras), times)
-    frames = prefetch(capture, times)
-    frame = None
-    for time, target in plan:
-        if frame is None or frame.time != time:
-            frame = next(frames).to(options.device)
-        yield frame, target.to(options.device)
+        return [(time, capture.cameras.select([options.leave_out])) for time in times]
+    if options.path == "orbit":
+        return paired(_orbit(capture, times), times)
+    return paired(read_path(Path(str(options.path)), capture.cameras), times)
 
 
-def _orbit(capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
-    from viewmend.capture.camera_path import paired
+def _orbit(capture: "CaptureSource", times: range) -> "Cameras":
     from viewmend.geometry.orbit import orbit_around
     from viewmend.geometry.proxy import reconstruct
 
@@ -182,4 +170,4 @@ def _orbit(capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]
     assert first.mask is not None, "captures without masks are refused"
     center = reconstruct(first.mask, first.cameras, capture.bounds).mesh.vertices.mean(0)
     views, turn = (STATIC_VIEWS, STATIC_VIEWS) if len(times) == 1 else (len(times), FRAMES_PER_TURN)
-    return paired(orbit_around(center, capture.cameras, capture.up, views, turn), times)
+    return orbit_around(center, capture.cameras, capture.up, views, turn)

@@ -11,19 +11,14 @@ import torch
 from viewmend.capture.plain_format import read_calibration
 from viewmend.capture.prepare import open_masked, prepare
 from viewmend.geometry.cameras import Cameras
-from viewmend.leave_one_out.scenes import SceneFrame, without_held
+from viewmend.leave_one_out.scenes import LeaveOneOutScene, SceneFrame, without_held
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaptureScene:
+class CaptureScene(LeaveOneOutScene):
     """One camera of a capture, left out; a shift that all images share is undone first, as `viewmend mend` does."""
 
-    name: str
-    set: str
-    rig: str
-    style: str
     folder: Path
-    held: str
     inputs: tuple[str, ...]
     """Cameras that are looked at."""
     count: int

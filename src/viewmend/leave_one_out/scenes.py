@@ -1,8 +1,8 @@
 """A rig's frames without one of its cameras, and what that camera saw."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -26,38 +26,29 @@ class SceneFrame:
     """Where in the previous true image each pixel's surface point was (`backward_flow`); None where nobody knows."""
 
 
-@runtime_checkable
-class LeaveOneOutScene(Protocol):
+@dataclass(frozen=True, kw_only=True)
+class LeaveOneOutScene(ABC):
     """A stream with truth. Scenes can be pickled: they hold no frames, only how to get them."""
 
-    @property
-    def name(self) -> str:
-        """Unique among the scenes of an evaluation."""
-        ...
+    name: str
+    """Unique among the scenes of an evaluation."""
+    set: str
+    """The set it belongs to: scores are averaged over it."""
+    rig: str
+    """Which cameras look, for tables by kind."""
+    style: str
+    """What happens, for tables by kind."""
+    held: str
+    """The camera that is left out."""
 
     @property
-    def set(self) -> str:
-        """The set it belongs to: scores are averaged over it."""
-        ...
-
-    @property
-    def rig(self) -> str:
-        """Which cameras look, for tables by kind."""
-        ...
-
-    @property
-    def style(self) -> str:
-        """What happens, for tables by kind."""
-        ...
-
-    @property
+    @abstractmethod
     def definition(self) -> str:
         """All that its frames depend on, in words that are the same on every machine."""
-        ...
 
+    @abstractmethod
     def frames(self, device: str) -> Iterator[SceneFrame]:
         """Its frames in order of time, on a device."""
-        ...
 
 
 def without_held(

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
-from viewmend.leave_one_out.scenes import SceneFrame, without_held
+from viewmend.leave_one_out.scenes import LeaveOneOutScene, SceneFrame, without_held
 from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, TEST_FOLDER
 from viewmend.leave_one_out.true_motion import backward_flow
 from viewmend.studio.procedural import PerformerStyle, procedural_scene
@@ -30,16 +30,10 @@ Tempo = Literal["calm", "dance", "fast"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudioScene:
+class StudioScene(LeaveOneOutScene):
     """A scene of the studio, perfectly calibrated; the truth is exact."""
 
-    name: str
-    set: str
-    rig: str
-    style: str
     config: StudioConfig
-    held: str
-    """The camera that is left out."""
     tempo: Tempo | None = None
     """Of procedural people; None leaves it to the seed."""
     files_sha256: tuple[str, ...] = ()
