@@ -61,7 +61,7 @@ class HeapTrimmer:
         """Resident bytes after the last time: mostly what is in use."""
 
     def when_due(self, idle: bool) -> bool:
-        """Hand memory back if it is time; whether it was. It takes some hundredths of a second: call it between views."""
+        """Hand memory back if it is time; whether it was. Call it between views: it takes hundredths of a second."""
         now = time.monotonic()
         if now - self._last < (IDLE_S if idle else BUSY_S):
             return False
