@@ -43,7 +43,7 @@ BASELINES = tuple(
     for weights in ("", "-finetuned")
     for framing in ("def", "win", "mul")
 )
-"""Those of the paper's Table 1, in its order: pretrained, then fine-tuned. `baselines.published` knows more."""
+"""The baselines of the paper's Table 1 in its order: pretrained, then fine-tuned. `baselines.published` knows more."""
 
 
 def method_names(selection: str) -> tuple[str, ...]:

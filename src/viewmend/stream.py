@@ -70,7 +70,7 @@ class StreamView:
 
     completed: CompletedView
     viewer: State
-    """To ask for the next view with: a value, so that no viewer can disturb another."""
+    """What to ask for the next view with: a value, so that no viewer can disturb another."""
     times: StageTimes
 
 

@@ -40,7 +40,7 @@ class Telea(ViewFill):
     """`cv2.INPAINT_TELEA`."""
 
     def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
-        """By `cv2.inpaint`."""
+        """The view filled by `cv2.inpaint`."""
         import cv2
 
         holes = (view.error > 0).cpu().numpy().astype(np.uint8)
@@ -68,7 +68,7 @@ class NearestColour(ViewFill):
     """Each pixel of E takes the colour of the nearest pixel of the subject that is right."""
 
     def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
-        """Without a right pixel the view stays as it is."""
+        """Colours of the nearest right pixels; without any the view stays as it is."""
         import cv2
 
         right = ((view.error == 0) & (view.mask > 0.5)).cpu().numpy()

@@ -26,7 +26,7 @@ MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)
 Clips = Float[Tensor, "sample frame 3 height width"]
 """Frames in [-1, 1], 0 in the holes."""
 Features = Float[Tensor, "sample frame 128 rows cols"]
-"""At a quarter of the frames' size."""
+"""Features of clips, at a quarter of the frames' size."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class E2FGVIMemory:
     propagated: Propagated
     """The forward sweep's last results."""
     tokens: tuple[FocalTokens, ...]
-    """Of each block, of all frames of that time."""
+    """The tokens of all frames of that time, block by block."""
 
 
 class FocalBlock(nn.Module):

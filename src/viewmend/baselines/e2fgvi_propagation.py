@@ -14,7 +14,7 @@ from viewmend.baselines.spynet import warp
 GROUPS = 16
 """Groups of channels with offsets of their own."""
 POINTS = 9
-"""Of a 3 x 3 kernel."""
+"""Points of a 3 x 3 kernel."""
 REACH_PX = 10.0
 """How far a kernel point may move away from where the flow leads."""
 
@@ -27,9 +27,9 @@ class Propagated:
     """What one direction hands on from frame to frame: the last two results and the flows between them."""
 
     features: tuple[Feature, ...] = ()
-    """The latest last, at most two."""
+    """At most two results, the latest last."""
     flow: Flow | None = None
-    """From the latest frame to the one before it, once there are two."""
+    """The flow from the latest frame to the one before it, once there are two."""
 
 
 class AlignedConvolution(nn.Module):

@@ -86,7 +86,7 @@ def resized(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 newheight n
 
 
 def dilated(holes: Bool[Tensor, "height width"], by_px: int) -> Bool[Tensor, "height width"]:
-    """By a 3 x 3 cross, so many times."""
+    """Holes widened by a 3 x 3 cross, so many times."""
     grown = holes[None].float()
     for _ in range(by_px):
         up_down, left_right = max_pool2d(grown, (3, 1), 1, (1, 0)), max_pool2d(grown, (1, 3), 1, (0, 1))

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 SLOPE = 0.2
-"""Of every LeakyReLU in encoder and decoder."""
+"""Slope of every LeakyReLU in encoder and decoder."""
 STRIDE_PX = 4
 """Pixels per feature cell."""
 SHALLOW, FEATURES = 256, 128
@@ -40,7 +40,7 @@ class DeepLayers(nn.Module):
         self.layers = nn.Sequential(*_with_leaks(_convolution(i, o, 1, g) for i, o, g in deep))
 
     def forward(self, shallow: Float[Tensor, "frame 256 rows cols"]) -> Float[Tensor, "frame 128 rows cols"]:
-        """From the first four convolutions' output to features of the same size."""
+        """Features of the same size as `shallow`, the first four convolutions' output."""
         return with_skips(list(self.layers), shallow)
 
 

@@ -32,7 +32,7 @@ class OnlineConfig:
     dilation_px: int = 4
     """Holes are widened by so many steps of a 3 x 3 cross before the network sees the frame."""
     overlap_px: int = 48
-    """Of neighbouring windows, at least; they are blended across it."""
+    """Neighbouring windows overlap by at least so much, and are blended there."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ NETWORKS: dict[str, Callable[[], DSTT | FuseFormer | E2FGVI]] = {
     "e2fgvi": E2FGVI,
     "e2fgvi-hq": E2FGVIHQ,
 }
-"""As names of methods, of weights and of recipes say them."""
+"""The published networks by the names of methods, weights and recipes."""
 TRAINED = "model.safetensors"
 """The weights in the folder of a run."""
 _NAME = re.compile(

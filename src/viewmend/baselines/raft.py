@@ -78,7 +78,7 @@ def load_raft(device: torch.device | str = "cpu") -> Raft:
 def correlations(
     first: Float[Tensor, "1 channel rows cols"], second: Float[Tensor, "1 channel rows cols"]
 ) -> list[Float[Tensor, "place 1 _rows _cols"]]:
-    """Of each place of the first with all of the second, at full and halved resolutions."""
+    """Correlations of each place of the first with all of the second, at full and halved resolutions."""
     _, channels, rows, columns = first.shape
     volume = first[0].flatten(1).T @ second[0].flatten(1) / channels**0.5
     levels = [volume.view(-1, 1, rows, columns)]

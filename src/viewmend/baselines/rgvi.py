@@ -58,9 +58,9 @@ class RgviState(State):
     """The past that a stream was shown."""
 
     past: tuple[Image, ...] = ()
-    """Latest first."""
+    """The frames that it was shown, the latest first."""
     flows: tuple[FlowMap, ...] = ()
-    """From each of these to the next older one; there is one less of them."""
+    """The flow from each of these frames to the next older one."""
 
 
 @runtime_checkable

@@ -13,7 +13,7 @@ from viewmend.geometry.sampling import sample_bilinear
 
 LEVELS = 6
 CHANNELS = (8, 32, 64, 32, 16, 2)
-"""Of one level: both images and the flow so far go in, what the flow lacks comes out."""
+"""Channels of one level: both images and the flow so far go in, what the flow lacks comes out."""
 MULTIPLE = 2 ** (LEVELS - 1)
 """Sizes that halve at each level."""
 IMAGENET_MEAN = (0.485, 0.456, 0.406)

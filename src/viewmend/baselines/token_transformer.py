@@ -67,7 +67,7 @@ class TokenTransformer(nn.Module, ABC):
     encoder: nn.Module
     transformer: nn.ModuleList
     name: str
-    """As messages say it."""
+    """The network's name in messages."""
 
     @abstractmethod
     def check_size(self, height: int, width: int) -> None:

@@ -44,7 +44,7 @@ class CaptureDescription:
     """Camera and frame id of each."""
     checked_frame: str
     subject_extent_m: tuple[float, ...] | None
-    """Of the visual hull; None without masks or where the masks agree on nothing."""
+    """Edges of the visual hull's box; None without masks, or where the masks agree on nothing."""
     hull_iou_mean: float | None
     hull_iou_min: float | None
     cameras: tuple[CameraDescription, ...]

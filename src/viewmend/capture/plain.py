@@ -103,7 +103,7 @@ class PlainCapture:
 
     @property
     def metres_per_unit(self) -> float:
-        """Of the folder's own unit; everything that this class gives is metres."""
+        """Length of the folder's own unit; everything that this class gives is in metres."""
         return self._calibration.metres_per_unit
 
     @property

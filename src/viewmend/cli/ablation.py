@@ -31,11 +31,11 @@ class Options:
     samples: int = 480
     """How many samples are made."""
     steps: int | None = None
-    """Of each training, instead of the recipe's."""
+    """Steps of each training, instead of the recipe's."""
     scenes: int = 12
     """How many scenes of P are evaluated."""
     frames: int = 4
-    """Of each scene."""
+    """Frames of each scene."""
     size: int = 320
     """Width and height of their views."""
     performers: Path | None = None

@@ -48,7 +48,7 @@ def _bar():
 
 @contextlib.contextmanager
 def busy(description: str) -> Iterator[None]:
-    """For work that cannot be counted: says what is going on once two seconds went by, if there is a terminal."""
+    """Say what is going on once two seconds went by, if there is a terminal: for work that cannot be counted."""
     if not sys.stderr.isatty():
         yield
         return

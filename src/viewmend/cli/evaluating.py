@@ -34,11 +34,11 @@ class RunOptions:
     closest: int = 3
     """How many of these colour a view: the closest to it."""
     frames: int | None = None
-    """Of each scene, from the first. 10 for P and Q by default, all of a capture."""
+    """Frames of each scene, from the first. By default 10 of P and Q, all of a capture."""
     every: int = 1
     """Only every n-th scene of each set is taken: a quick look at all kinds of scenes."""
     scenes: int | None = None
-    """At most so many scenes of each set are taken, after `every`."""
+    """Only so many scenes of each set are taken, after `every`."""
     size: int = 512
     """Width and height of the views of P and Q."""
     background: Literal["black", "stage"] = "black"
@@ -52,7 +52,7 @@ class RunOptions:
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of our networks."""
+    """Numbers that our networks compute with."""
     shown: int = 12
     """How many scenes of each set the report's page shows in pictures; sheets/ has them all."""
     video: bool = True
@@ -172,7 +172,7 @@ def _check(options: RunOptions, sets: tuple[str, ...]) -> None:
 
 
 def _look_first_in(folder: Path) -> None:
-    """For weights, also in the processes that this one starts."""
+    """Look for weights in this folder first, also in the processes that this one starts."""
     import os
 
     from viewmend.metrics.weights import PLACES_VARIABLE

@@ -54,7 +54,7 @@ class Options:
 
 
 STATIC_VIEWS = 60
-"""Of an orbit around a capture of one frame."""
+"""Views of an orbit around a capture of one frame."""
 FRAMES_PER_TURN = 150
 
 

@@ -27,7 +27,7 @@ class Options(RunOptions):
     table: Annotated[Literal[1, 2, 3], tyro.conf.Positional]
     """Which."""
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[P|Q|CAPTURE...]")] = ()
-    """As for viewmend evaluate; by default P, and Q if there are --performers. Table 2 wants captures."""
+    """Sets as viewmend evaluate takes them; by default P, and Q if there are --performers. Table 2 wants captures."""
     ours: str = "small"
     """Our models, by name or folder, with commas; the first takes the row of the paper's own."""
     models: Path | None = None

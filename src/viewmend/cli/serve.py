@@ -52,11 +52,11 @@ class Options:
     size: int = 320
     """Width and height of the studio's images."""
     seed: int = PROCEDURAL_SEEDS["test"][1]
-    """Of the studio's scene."""
+    """Seed of the studio's scene."""
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
     memory_mb: float = 3000.0
-    """For frames at hand and what was computed of them."""
+    """Memory for frames at hand and what was computed of them."""
 
 
 def run(options: Options) -> int:

@@ -51,7 +51,7 @@ class Ablation:
 
     @classmethod
     def of(cls, trained: Sequence[Trained], cells: Sequence[Cell]) -> "Ablation":
-        """From the cells of all these models, whose methods are their folders, and of telea."""
+        """The ablation from the cells of all these models, whose methods are their folders, and of telea."""
         methods = ["telea", *(str(one.folder) for one in trained)]
         rows = {row.method: row for row in tables(cells, methods)[0].rows}
         whole = [one for one in trained if one.top_k is None]

@@ -1,4 +1,4 @@
-"""From frames to scenes to sets: how the figures of a report are averaged."""
+"""How the figures of a report are averaged, from frames to scenes to sets."""
 
 import statistics
 from collections.abc import Iterable, Sequence
@@ -33,9 +33,9 @@ class CellScores:
     scores: MeanScores
     frames: int
     thin_frames: int
-    """Of these, the frames left out of the scores in the holes: with fewer than `ENOUGH_HOLE_PX` pixels of E."""
+    """Frames left out of the scores in the holes: they have fewer than `ENOUGH_HOLE_PX` pixels of E."""
     empty_frames: int
-    """Of these, the frames with none."""
+    """Frames without any pixel of E: thin ones, too."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class Row:
     over_reference: float | None
     """`psnr_holes` over that of `REFERENCE`, mean over the scenes where both have it."""
     below_reference: int
-    """In how many of these scenes it is below."""
+    """Scenes where it is below the reference."""
     scenes: int
     scored_scenes: int
     """Scenes with a frame that has enough holes."""
     failed: int
     vfid: "Vfid"
     speed: "Speed | None"
-    """Of the inpainter's step, over all frames with holes; None without any."""
+    """Speed of the inpainter's step over all frames with holes; None without any."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Table:
     thin_frames: int
     """Frames left out of the scores in the holes: they miss too little."""
     empty_frames: int
-    """Those of the thin frames that have no hole at all."""
+    """Frames without any hole: thin ones, too."""
     sizes_px: tuple[tuple[int, int], ...]
     """Widths and heights of their views."""
 
@@ -122,7 +122,7 @@ def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
 
 
 def tables_by_kind(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
-    """For each set, one for each rig and each style that it has more than one of."""
+    """Tables of each set: one for each rig and each style that it has more than one of."""
     averaged = [average_cell(cell) for cell in cells]
     found = []
     for name in dict.fromkeys(cell.set for cell in cells):
@@ -206,7 +206,7 @@ def vfid(cells: Sequence[Cell]) -> Vfid:
 
 
 def speed(done: Sequence[CellScores]) -> Speed | None:
-    """Of the steps in frames that have a hole."""
+    """Speed of the steps in frames that have a hole."""
     taken = sorted(f.step_ms for a in done for f in a.cell.frames if f.hole_px)
     if not taken:
         return None

@@ -39,12 +39,12 @@ class CellKey:
 
     @property
     def stem(self) -> str:
-        """Of the cell's files."""
+        """How the names of the cell's files begin."""
         return f"{slug(self.scene)}--{slug(self.method)}--{self.digest}"
 
     @property
     def scene_stem(self) -> str:
-        """Of the files that all methods of the scene share."""
+        """How the names of the files begin that all methods of the scene share."""
         return f"{slug(self.scene)}--{self.scene_digest}"
 
 
@@ -57,7 +57,7 @@ class Cell:
     rig: str
     style: str
     identity: str
-    """Of the method, `methods.identity`."""
+    """What the method is, by `methods.identity`."""
     frames: tuple[FrameScores, ...]
     error: str | None
     provenance: Provenance
@@ -73,7 +73,7 @@ REMEMBERED = tuple(f.name for f in fields(Cell) if f.compare)
 
 @dataclass(frozen=True)
 class CellPictures:
-    """At the time of the largest hole."""
+    """Pictures of the time of the largest hole."""
 
     rendered: Picture
     error: Picture

@@ -47,14 +47,14 @@ class Scores:
     warp_error_truth: float | None
     """The truth's."""
     change: float | None
-    """From the frame before, in place, over the pixels of E now or then (`change`)."""
+    """The change from the frame before, in place, over the pixels of E now or then (`change`)."""
     change_truth: float | None
     """The truth's."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameScores(Scores):
-    """One frame's."""
+    """The scores of one frame."""
 
     time: int
     width_px: int
@@ -64,7 +64,7 @@ class FrameScores(Scores):
     hole_px: int
     """Pixels of E (E > 0)."""
     hole_fg_px: int
-    """Of these, inside the true mask."""
+    """Pixels of E inside the true mask."""
     step_ms: float
     """What the inpainter's step took."""
 
@@ -79,7 +79,7 @@ class TrueView:
     """What the completed view should look like."""
 
     rgb: Float[Tensor, "3 height width"]
-    """In [0, 1], black where there is no subject."""
+    """Colours in [0, 1], black where there is no subject."""
     mask: Bool[Tensor, "height width"]
     backward_flow_px: Float[Tensor, "height width 2"] | None
     """See `leave_one_out.true_motion.backward_flow`."""
@@ -202,6 +202,6 @@ def similarity(
 
 
 def _reach(at: Tensor, length: int, size: int) -> slice:
-    """From the first to the last of these places, with all windows that hold one of them."""
+    """All windows that hold one of these places, first to last."""
     start, stop = max(0, int(at.min()) - size + 1), min(length, int(at.max()) + size)
     return slice(min(start, length - size), max(stop, size))

@@ -121,7 +121,7 @@ class MendSummary:
     def __init__(self) -> None:
         self.frames = 0
         self.hull_iou: dict[str, list[float]] = {}
-        """Of each camera, frame by frame."""
+        """The IoU of each camera, frame by frame."""
         self._hull_px = self._holes_px = 0
         self._scores: list[Scores] = []
         self._times: list[StageTimes] = []

@@ -224,7 +224,7 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
 
 
 def _ours(rows: Sequence[Row]) -> list[float | None]:
-    """By `OUR_COLUMNS`, the mean of several."""
+    """Our figures in the order of `OUR_COLUMNS`: means over the rows."""
     scores = mean_scores([row.scores for row in rows])
     found: list[float | None] = []
     for _, field, _ in OUR_COLUMNS:

@@ -17,21 +17,21 @@ class Provenance:
 
     viewmend: str
     commit: str
-    """Of the code, "+" if files differed from it; "unknown" outside a checkout."""
+    """Commit of the code, with "+" if files differed from it; "unknown" outside a checkout."""
     python: str
     torch: str
     device: str
     """The processor's or the GPU's name."""
     threads: int
-    """Of torch, in each process."""
+    """Threads of torch in each process."""
     jobs: int
     """Processes at work at the same time, which slow each other down."""
     load: float
-    """Of the machine, a minute's average at the start: other work slows this one down, too."""
+    """Load of the machine, a minute's average at the start: other work slows this one down, too."""
 
 
 def provenance(device: str, threads: int, jobs: int) -> Provenance:
-    """Of figures that are computed now."""
+    """The provenance of figures that are computed now."""
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else _processor()
     load = round(os.getloadavg()[0], 1)
     return Provenance(__version__, _commit(), platform.python_version(), torch.__version__, name, threads, jobs, load)

@@ -18,9 +18,9 @@ COLUMNS = (
     ("warp", "warp_error", 255, 2),
     ("change", "change", 255, 2),
 )
-"""Of the main table: heading, field of `MeanScores`, factor, decimals."""
+"""Columns of the main table: heading, field of `MeanScores`, factor, decimals."""
 TRUTHS = ("warp_error", "change")
-"""Of these the truth has some, too."""
+"""Scores that the truth has, too."""
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
 """How each score is read, and the end of its field."""
 SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 5), ("LPIPS Alex", "lpips_alex", 4), ("LPIPS VGG", "lpips_vgg", 4))

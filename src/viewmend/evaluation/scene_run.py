@@ -32,13 +32,13 @@ class RunSettings:
 
     device: str = "cpu"
     precision: str = "float32"
-    """Of our networks: float32, or bfloat16 by autocast."""
+    """What our networks compute with: float32, or bfloat16 by autocast."""
     stream: StreamConfig = field(default_factory=lambda: StreamConfig(memory_mb=None))
     """Hull and renderer, the same for every method."""
     ssim: SsimWindow = "gaussian"
     """Over which windows SSIM is taken."""
     networks: tuple[str, ...] = ()
-    """Of `scorers.NETWORKS`, those to compare with."""
+    """The networks of `scorers.NETWORKS` to compare with."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class MethodRun:
     picture: Picture | None = None
     """The completed view at the time of the largest hole."""
     film: Picture | None = None
-    """Its first frames (`film.film`)."""
+    """The first frames (`film.film`)."""
     features: Features | None = None
-    """Of its videos, for VFID; None without I3D."""
+    """Features of the mended videos, for VFID; None without I3D."""
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,11 @@ class SceneRun:
     scene: str
     runs: tuple[MethodRun, ...]
     pictures: tuple[Picture, Picture, Picture] | None = None
-    """At the time of the largest hole: rendered view, E, truth. None if the scene could not be read or rendered."""
+    """Rendered view, E, truth at the time of the largest hole; None if the scene could not be read or rendered."""
     film: Picture | None = None
     """The first frames: as rendered, and beside them the truth."""
     features: Features | None = None
-    """Of the truth's videos."""
+    """Features of the true videos."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class _Shown:
             self._truth.append(picture(truth.rgb))
 
     def film(self) -> Picture | None:
-        """As rendered, and beside it the truth."""
+        """The film as rendered, and beside it the truth."""
         strips = [film(frames, self.box) for frames in (self._rendered, self._truth)]
         return None if strips[0] is None or strips[1] is None else np.concatenate([strips[0], strips[1]], 1)
 

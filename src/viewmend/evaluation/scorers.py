@@ -86,7 +86,7 @@ class VideoFeatures:
                 self._cut()
 
     def features(self) -> Features | None:
-        """Of all frames so far; None without the network, or without frames."""
+        """Features of all frames so far; None without the network, or without frames."""
         if self._frames:
             self._cut()
         if not self._found[KINDS[0]]:

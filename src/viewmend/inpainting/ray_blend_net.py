@@ -1,4 +1,4 @@
-"""A coarse fill of the holes that is read from the cameras, pixel by pixel. Ours.
+"""A first guess for the holes that is read from the cameras, pixel by pixel. Ours.
 
 Each missing pixel becomes a convex mix of what could be there: the colours that the cameras show along its ray, a
 smooth fill from around it, and background. The network only weighs them.
@@ -57,7 +57,7 @@ class RayInputs(NamedTuple):
     surroundings: Float[Tensor, "place 12 11 11"]
     """The `multi_scale_context` of each place that differs."""
     place: Int[Tensor, "pixel"]
-    """At which of these places each pixel is."""
+    """Index into `surroundings` of each pixel's place."""
 
     @staticmethod
     def cat(parts: Sequence["RayInputs"]) -> "RayInputs":
@@ -116,16 +116,16 @@ class RayBlendNet(CoarseFill):
         Args:
             views: of any sizes.
             ray_views: cameras at each view's own time; None where there are none, then the surroundings decide alone.
-            pixels: read these (row, column) alone, and keep the smooth fill elsewhere; None for all that are missing.
+            pixels: read these (row, column) alone, and keep the smooth guess elsewhere; None for all that are missing.
         """
-        coarse_fills = [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
+        guesses = [fill(view.rgb, view.error > 0, view.mask > 0) for view in views]
         if pixels is None:
             pixels = [torch.nonzero((view.error > 0) & (view.depth > 0).any()) for view in views]
-        seen = [look_around(*own) for own in zip(views, ray_views, pixels, coarse_fills, strict=True)]
+        seen = [look_around(*own) for own in zip(views, ray_views, pixels, guesses, strict=True)]
         read = self.mix(RayInputs.cat(seen)).split([len(p) for p in pixels])
         return [
-            coarse.movedim(0, -1).index_put(tuple(at.unbind(1)), rgb).movedim(-1, 0)
-            for coarse, at, rgb in zip(coarse_fills, pixels, read, strict=True)
+            guess.movedim(0, -1).index_put(tuple(at.unbind(1)), rgb).movedim(-1, 0)
+            for guess, at, rgb in zip(guesses, pixels, read, strict=True)
         ]
 
     def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
@@ -178,26 +178,26 @@ class RayBlendNet(CoarseFill):
 
 
 def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
-    """With zeros for pixels behind, up to a multiple of `PIXELS_STEP`."""
+    """The values, and zeros for more pixels behind, up to a multiple of `PIXELS_STEP`."""
     return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
 
 
 def look_around(
     view: IncompleteView,
-    ray_views: ContextViews | None,
+    nearby: ContextViews | None,
     pixels: Int[Tensor, "pixel 2"],
-    coarse: Float[Tensor, "3 height width"] | None = None,
+    guess: Float[Tensor, "3 height width"] | None = None,
 ) -> RayInputs:
     """All that the network is told of these pixels (row, column): along their rays, and around them in the view.
 
-    `coarse` is the view with its holes filled by `coarse_fill.fill`; it is made where it is not given.
+    `guess` is the view with its holes filled by `coarse_fill.fill`; it is made where it is not given.
     """
-    coarse = fill(view.rgb, view.error > 0, view.mask > 0) if coarse is None else coarse
-    shown = torch.cat([view.rgb, view.mask[None], view.error[None], coarse])
-    if ray_views is not None and len(pixels):
-        features, consistency = (values.stack() for values in sample_along_rays(view, pixels, ray_views))
+    guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
+    shown = torch.cat([view.rgb, view.mask[None], view.error[None], guess])
+    if nearby is not None and len(pixels):
+        features, consistency = (values.stack() for values in sample_along_rays(view, pixels, nearby))
     else:
         shape = (len(pixels), len(OFFSETS))
         features, consistency = view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 4)
     window = windows(shown, pixels, RADIUS_PX)
-    return RayInputs(features, consistency, window, *multi_scale_context(view, coarse, pixels))
+    return RayInputs(features, consistency, window, *multi_scale_context(view, guess, pixels))

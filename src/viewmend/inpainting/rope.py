@@ -54,7 +54,7 @@ def _frequencies(counts: tuple[int, ...], longest: float, shortest: float) -> Fl
 def angles(
     coordinates: Float[Tensor, "*batch 3"], frequencies: Float[Tensor, "3 pair"]
 ) -> Float[Tensor, "*batch pair"]:
-    """By how much each pair turns at these (u, v, s), radians."""
+    """Angles by which each pair is rotated at these (u, v, s), radians."""
     # A sum of products, not a matrix product: autocast would round the angles to bfloat16.
     return (coordinates[..., None] * frequencies).sum(-2)
 

@@ -22,7 +22,7 @@ COARSE = 0.9
 SAME_COLOUR = 0.07
 """Root mean square difference of colours, in [0, 1], at which a carried fill counts 1/e of what it could."""
 SAME_PLACE = 0.01
-"""Of its depth: a point so far from the last view's surface is not the same."""
+"""Fraction of its depth at which a point is not the last view's surface any more."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class LastView:
 
     @classmethod
     def of(cls, completed: CompletedView) -> "LastView":
-        """Of this view."""
+        """What the next view needs of this one."""
         view = completed.view
         return cls(view.camera, completed.rgb, view.depth, view.time)
 

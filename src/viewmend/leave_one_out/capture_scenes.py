@@ -24,7 +24,7 @@ class CaptureScene(LeaveOneOutScene):
     count: int
     """Frames from the first."""
     fingerprint: str
-    """Of the capture's files."""
+    """Hash of the capture's files."""
 
     @property
     def definition(self) -> str:
@@ -32,7 +32,7 @@ class CaptureScene(LeaveOneOutScene):
         return repr((self.fingerprint, self.held, self.inputs, self.count))
 
     def frames(self, device: str) -> Iterator[SceneFrame]:
-        """Those in which the camera that was left out, and at least two of the inputs, have images."""
+        """Frames in which the camera that was left out, and at least two of the inputs, have images."""
         capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1), self.inputs)
         bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):

@@ -22,7 +22,7 @@ RINGS = (12, 8)
 """Cameras of the two rigs, the left-out one among them: a usual ring, and a sparse one."""
 TEMPOS = ("calm", "dance", "fast")
 Q_SEEDS = PROCEDURAL_SEEDS["test"][10000:]
-"""Of lights, rig and the part of the motion that is shown."""
+"""Seeds of lights, rig and the part of the motion that is shown."""
 FRAMES, SIZE_PX = 10, 512
 
 Background = Literal["black", "stage"]
@@ -35,9 +35,9 @@ class StudioScene(LeaveOneOutScene):
 
     config: StudioConfig
     tempo: Tempo | None = None
-    """Of procedural people; None leaves it to the seed."""
+    """How fast procedural people move; None leaves it to the seed."""
     files_sha256: tuple[str, ...] = ()
-    """Of the character and the motion, for people who are no procedural ones."""
+    """Hashes of the character's and the motion's files; () for procedural people."""
 
     @property
     def definition(self) -> str:

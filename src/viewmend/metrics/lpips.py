@@ -15,7 +15,7 @@ from viewmend.weight_files import load_weights
 
 Backbone = Literal["alex", "vgg"]
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's, of RGB in [0, 1]; LPIPS' own shift and scale of images in [-1, 1] are the same."""
+"""ImageNet's mean and deviation of RGB in [0, 1]; LPIPS' own shift and scale of [-1, 1] are the same."""
 TAPS: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """The ReLUs whose features are compared."""
 CHANNELS: dict[Backbone, tuple[int, ...]] = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
@@ -54,7 +54,7 @@ class Heads(nn.Module):
             self.add_module(f"lin{number}", head)
 
     def weights(self) -> list[Float[Tensor, "1 _channel 1 1"]]:
-        """Of each layer's channels."""
+        """The weights of each layer's channels."""
         return list(self.state_dict().values())
 
 

@@ -29,9 +29,9 @@ class KnownWeights:
     """Where it is published, or the command that gets it."""
     licence: str
     sha256: str = ""
-    """Of the file, or the beginning of it; "" if nobody published one."""
+    """SHA-256 of the file, or the beginning of it; "" if nobody published one."""
     git_sha1: str = ""
-    """Its name in git; "" if it is in no repository."""
+    """The file's name in git; "" if it is in no repository."""
 
 
 KNOWN: tuple[KnownWeights, ...] = (

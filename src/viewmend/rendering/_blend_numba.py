@@ -120,7 +120,7 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, GRAZING)
     nearest = z - (tolerance[0] + tolerance[1] * per_pixel)
     left, top = floor(u - 0.5), floor(v - 0.5)
-    right, below = u - 0.5 - left, v - 0.5 - top
+    right_share, bottom_share = u - 0.5 - left, v - 0.5 - top
     usable, red, green, blue = 0.0, 0.0, 0.0, 0.0
     for tap in range(4):
         row = min(max(int(top) + tap // 2, 0), height - 1)
@@ -128,7 +128,7 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
         there = depths[view, row, column]
         if there > 0 and there < nearest:
             continue
-        part = (below if tap // 2 else 1 - below) * (right if tap % 2 else 1 - right)
+        part = (bottom_share if tap // 2 else 1 - bottom_share) * (right_share if tap % 2 else 1 - right_share)
         if masks.shape[0]:
             part *= masks[view, row, column] * (1 / 255)
         usable += part

@@ -18,8 +18,7 @@ class BlendConfig:
 
     weight = usable * (n . v)^normal_power * (cosine between camera and viewer)^view_power
 
-    where `usable` is the bilinear weight of those of the four pixels around the sample that are foreground and not
-    hidden.
+    where `usable` is the bilinear share of the four pixels around the sample that are foreground and not hidden.
     """
 
     normal_power: int = 2
@@ -27,7 +26,7 @@ class BlendConfig:
     view_power: int = 16
     """Exponent of the cosine between the directions to the camera and to the viewer."""
     depth_bias: float = 0.005
-    """A point is hidden if it lies this much behind the proxy's depth, in sizes of the subject."""
+    """A point is hidden if it lies this much behind the proxy's depth, as a share of the subject's size."""
     slope_px: float = 1.0
     """What oblique surface adds to the bias: its change of depth over this many of the camera's pixels."""
 
@@ -38,7 +37,7 @@ class Blend:
 
     rgb: Float[Tensor, "3 height width"]
     """The weighted mean of the samples, in [0, 1]; black where no camera has weight."""
-    weights: Float[Tensor, "source height width"]
+    weights: Float[Tensor, "chosen height width"]
     """Raw weights, not normalised."""
     disagreement: Float[Tensor, "height width"]
     """Weighted standard deviation of the samples about `rgb`, mean of the channels; 0 for a single camera."""

@@ -32,9 +32,9 @@ class RenderConfig:
     cameras: int = 3
     """How many cameras colour a view: those closest to it in angle (the paper: 3)."""
     blend: BlendConfig = field(default_factory=BlendConfig)
-    """How the source views' colours are weighted."""
+    """How the chosen cameras' colours are weighted."""
     error_rule: str = "unseen"
-    """What counts as missing: 'unseen' marks the pixels that no source view colours."""
+    """What counts as missing: 'unseen' marks the pixels that no chosen camera colours."""
 
 
 def render_view(

@@ -44,7 +44,7 @@ MOST_GARMENTS = 4
 APART_LAB = 18.0
 """Cloth of colours nearer than this is one garment."""
 LEAST_SHARE = 0.02
-"""Of the cloth: what is smaller is part of the garment next in colour."""
+"""Fraction of the cloth below which a garment is part of the one next in colour."""
 FACE_M = 0.06
 """The face is what is this far in front of the head's joint."""
 MARGIN_PX = 4

@@ -24,7 +24,7 @@ class Retarget:
 
     character: Character
     upright_from_file: Float[Tensor, "4 4"]
-    """Of the character."""
+    """The motion that brings the character upright."""
     driver: tuple[int, ...]
     """For each node of the character the position among `rotations`' joints that turns it, -1 where none does."""
     rotations: Float[Tensor, "frame driver 3 3"]

@@ -30,8 +30,8 @@ class StudioConfig:
     """One capture of the studio; everything random in it follows from `seed`."""
 
     seed: int = 0
-    """Of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds from 10000 on are kept
-    for tests and evaluation."""
+    """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds from 10000 on are
+    kept for tests and evaluation."""
     cameras: int | Cameras = 12
     """How many cameras the rig has, or the rig itself, in the stage's world."""
     rig: Literal["ring", "dome"] = "ring"

@@ -26,7 +26,7 @@ FAMILIES: dict[str, tuple[tuple[tuple[float, float], ...], float, float]] = {
     "laps": (((0.48, 0.06), (0.16, 0.03), (0.20, 0.08), (0.90, 0.12)), 0.5, 0.4),
 }
 FASTEST_RAD_S = 7.0
-"""Of an arm's joint; hands then stay below about ten metres a second."""
+"""Fastest turn of an arm's joint; hands then stay below about ten metres a second."""
 CURLS = {"box": 1.5, "drive": 1.0, "pump": 1.3, "clap": 0.05, "wave": 0.0, "jacks": 0.1, "hips": 0.6}
 
 

@@ -174,12 +174,12 @@ def _crouching(score: Score, time_s: float, beats: float) -> Stance:
 
 
 def seat_height(height_m: float) -> float:
-    """Of the stool that fits this person, metres."""
+    """Height of the stool that fits this person, metres."""
     return 0.262 * height_m
 
 
 def _sitting(score: Score, time_s: float, beats: float) -> Stance:
-    """On a stool at the centre; some get up and sit down again."""
+    """Sitting on a stool at the centre; some get up and sit down again."""
     H, a = score.height_m, score.amounts
     forward = rotation(1, score.heading) @ np.array([0, 0, 1.0])
     feet_at = 0.21 * H * forward

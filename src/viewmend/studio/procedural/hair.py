@@ -26,7 +26,7 @@ class Hair:
 
     @property
     def words(self) -> str:
-        """For a description."""
+        """The hair in words."""
         return {"bald": "bald", "cap": "in a cap"}.get(self.style, f"{self.style} hair")
 
 

@@ -22,7 +22,7 @@ class Outfit:
     bottom: str
     outer: str
     fabrics: tuple[Fabric, Fabric, Fabric]
-    """Of top, bottom and outer."""
+    """Fabrics of top, bottom and outer."""
     lettering: str
     """Across the chest; empty for none."""
     shoes: Float[np.ndarray, "2 3"]
@@ -31,7 +31,7 @@ class Outfit:
 
     @property
     def words(self) -> str:
-        """For a description."""
+        """The outfit in words."""
         lower = "" if self.bottom == "dress" else f" and {self.fabrics[1].kind} {self.bottom}"
         upper = "dress" if self.bottom == "dress" else self.top
         outer = "" if self.outer == "none" else f" under a {self.outer}"

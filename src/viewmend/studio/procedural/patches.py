@@ -18,7 +18,7 @@ class Patch:
 
     points: Float[np.ndarray, "row column 3"]
     uv: Float[np.ndarray, "row column 2"]
-    """In this patch' own chart: u to the right, v up, [0, 1]."""
+    """Texture coordinates in this patch's own chart: u to the right, v up, in [0, 1]."""
     weights: Float[np.ndarray, "row column joint"]
     chart: Float[np.ndarray, "height width 3"]
     """sRGB in [0, 1], top row first."""

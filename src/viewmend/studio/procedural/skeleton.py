@@ -51,7 +51,7 @@ def _parent(name: str) -> int:
 
 PARENTS: tuple[int, ...] = tuple(_parent(name) for name in JOINTS)
 SIGN = {"left": 1.0, "right": -1.0}
-"""Of x on this side of the body."""
+"""Sign of x on each side of the body."""
 
 
 def rotation(axis: int, angle_rad: float) -> Rotation:
