@@ -4,16 +4,19 @@ BIN := .venv/bin
 # Without a GPU: the version whose CPU build the package index is known to have.
 CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
 
-.PHONY: demo test test-all gate format clean
+.PHONY: demo test test-all gate format docs clean
 
 demo: .venv/installed ## environment, install, and the main job on a scene made on the spot
 	$(BIN)/viewmend demo --out out/demo
 
-test: gate ## environment, install, the gate, the tests
+test: gate docs ## environment, install, the gate, the documents, the tests
 	$(BIN)/pytest
 
 test-all: gate ## the tests that take longer, too
 	$(BIN)/pytest -m ""
+
+docs: .venv/installed ## the documentation site, in out/site; strict, and nothing is fetched
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 gate: .venv/installed ## what CI and you run alike
 	$(BIN)/ruff format --check .
@@ -27,7 +30,7 @@ format: .venv/installed
 
 .venv/installed: pyproject.toml constraints-cpu.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,docs,dev]'
 	touch $@
 
 clean:

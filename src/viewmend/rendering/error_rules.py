@@ -41,8 +41,12 @@ def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
     return (evidence.blend.weights.sum(0) < MIN_WEIGHT).to(evidence.mask) * evidence.mask
 
 
+ERROR_RULES: dict[str, ErrorRule] = {"unseen": unseen}
+"""By name. A new rule is a function, and a line here."""
+
+
 def error_rule(name: str) -> ErrorRule:
-    """The rule of this name; a new rule is a file with a function, and a line here.
+    """The rule of this name, of `ERROR_RULES`.
 
     Raises:
         ValueError: there is none.
@@ -52,7 +56,6 @@ def error_rule(name: str) -> ErrorRule:
         >>> error_rule("unseen").__name__
         'unseen'
     """
-    rules: dict[str, ErrorRule] = {"unseen": unseen}
-    if name not in rules:
-        raise ValueError(f"expected an error rule among {sorted(rules)}, got '{name}'; choose one of them")
-    return rules[name]
+    if name not in ERROR_RULES:
+        raise ValueError(f"expected an error rule among {sorted(ERROR_RULES)}, got '{name}'; choose one of them")
+    return ERROR_RULES[name]
