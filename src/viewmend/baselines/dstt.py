@@ -5,8 +5,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from viewmend.baselines.frame_decoder import FrameDecoder
-from viewmend.baselines.hierarchical_encoder import FEATURES, DeepLayers, shallow_layers
+from viewmend.baselines.frame_coder import FEATURES, DeepLayers, FrameDecoder, shallow_layers
 from viewmend.baselines.soft_split import DIM, MARGIN_CELLS, PATCH_CELLS, STEP_CELLS, STEP_PX, SoftComposition
 from viewmend.baselines.token_transformer import BLOCKS, TokenBlock, TokenClips, TokenTransformer, initialise
 

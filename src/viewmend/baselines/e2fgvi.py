@@ -12,8 +12,7 @@ from torch.nn import functional as F
 from viewmend.baselines.clips import Clip, Frames
 from viewmend.baselines.e2fgvi_propagation import AlignedConvolution, Propagated, Propagation
 from viewmend.baselines.focal_attention import WINDOW, FocalAttention, FocalTokens
-from viewmend.baselines.frame_decoder import FrameDecoder
-from viewmend.baselines.hierarchical_encoder import STRIDE_PX, HierarchicalEncoder
+from viewmend.baselines.frame_coder import STRIDE_PX, FrameDecoder, HierarchicalEncoder
 from viewmend.baselines.soft_split import DIM, STEP_PX, FusionFeedForward, SoftComposition, SoftSplit
 from viewmend.baselines.spynet import SPyNet
 from viewmend.baselines.token_transformer import BLOCKS, HEADS, NATIVE_PX, initialise

@@ -5,8 +5,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from viewmend.baselines.frame_decoder import FrameDecoder
-from viewmend.baselines.hierarchical_encoder import STRIDE_PX, HierarchicalEncoder
+from viewmend.baselines.frame_coder import STRIDE_PX, FrameDecoder, HierarchicalEncoder
 from viewmend.baselines.soft_split import (
     DIM,
     STEP_CELLS,

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import fold, unfold
 
-from viewmend.baselines.hierarchical_encoder import FEATURES, STRIDE_PX
+from viewmend.baselines.frame_coder import FEATURES, STRIDE_PX
 
 PATCH_CELLS, STEP_CELLS, MARGIN_CELLS = 7, 3, 3
 """Patches are 7 x 7 feature cells, one every 3, with 3 cells of zeros around the map."""

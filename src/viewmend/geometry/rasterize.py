@@ -67,7 +67,7 @@ def interpolate(
 
 
 def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
-    from viewmend.geometry._interpolate_numba import interpolate_band
+    from viewmend.geometry._rasterize_numba import interpolate_band
 
     P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
     given = attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy()

@@ -8,7 +8,7 @@ from torch import nn
 
 from viewmend.atomic_writes import write_tensors
 from viewmend.baselines.e2fgvi import E2FGVI
-from viewmend.baselines.hierarchical_encoder import SLOPE
+from viewmend.baselines.frame_coder import SLOPE
 from viewmend.baselines.published import NETWORKS, TRAINED
 from viewmend.baselines.token_transformer import NATIVE_PX, TokenTransformer
 from viewmend.training.adversary import BETAS, Adversary
