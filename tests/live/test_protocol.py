@@ -9,6 +9,7 @@ from viewmend.live.protocol import (
     Ack,
     Camera,
     ClockChange,
+    FrameTimes,
     Hello,
     Limits,
     Look,
@@ -156,6 +157,13 @@ def test_binary_garbage_is_refused(garbage, length):
     for message in (garbage, b"VMF1" + garbage, b"VMF1" + length.to_bytes(4, "little") + garbage):
         with pytest.raises(ProtocolError):
             unpack(message)
+
+
+def test_times_are_added_and_averaged():
+    times = FrameTimes(rendering=3.0, wait=1.0) + FrameTimes(rendering=5.0, encode=2.0)
+    assert times.as_json(2) == {
+        "geometry": 0, "context": 0, "rendering": 4, "inpainting": 0, "encode": 1, "wait": 0.5, "total": 5.5
+    }  # fmt: skip
 
 
 def test_a_null_is_absent():

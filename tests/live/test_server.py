@@ -49,7 +49,9 @@ def test_health_and_metrics(ball):
     assert status == 200 and headers["content-type"].startswith("text/plain")
     lines = [line for line in body.decode().splitlines() if not line.startswith("#")]
     values = {line.rsplit(" ", 1)[0]: float(line.rsplit(" ", 1)[1]) for line in lines}
-    assert values["viewmend_up"] == 1 and 'viewmend_stage_seconds_total{stage="rendering"}' in values
+    assert values["viewmend_up"] == 1
+    stages = [name.split('"')[1] for name in values if name.startswith("viewmend_stage_seconds_total")]
+    assert stages == ["geometry", "context", "rendering", "inpainting", "encode"]
     if Path("/proc/self/statm").exists():
         assert 50e6 < values["process_resident_memory_bytes"] < 100e9
 
@@ -60,6 +62,8 @@ def test_a_picture_shows_the_subject_from_where_it_was_asked(ball):
         status, headers, body = get(f"{ball.url}/frame.jpg?azimuth={azimuth}&time=0&width=64&height=48&mode=mended")
         image = decoded(body)
         assert status == 200 and image.shape == (48, 64, 3) and headers["x-viewmend-time"] == "0"
+        timing = dict(part.split(";dur=") for part in headers["server-timing"].split(", "))
+        assert list(timing) == ["geometry", "context", "rendering", "inpainting"] and float(timing["rendering"]) > 0
         right = truth(frame, (64, 48), azimuth=float(azimuth), elevation=0.0)
         assert np.abs(image.astype(float) - right).mean() < 14
     _, _, rendered = get(f"{ball.url}/frame.jpg?azimuth=200&time=0&width=64&height=48&mode=holes")

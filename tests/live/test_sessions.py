@@ -159,6 +159,10 @@ def test_frames_say_what_they_are(ball_view, mode):
     header, parts = unpack(desk.sent[0])
     assert (header["look"], header["sent_ms"], header["frame"], header["full"]) == (5, 12.5, 0, True)
     assert [part["kind"] for part in header["parts"]] == ["image", "depth"] and parts[0][:2] == b"\xff\xd8"
-    assert header["stage_ms"]["geometry"] == 3 and 0 < header["holes"] < 1
+    stages = header["stage_ms"]
+    assert list(stages) == ["geometry", "context", "rendering", "inpainting", "encode", "wait", "total"]
+    assert (stages["geometry"], stages["inpainting"]) == (3, 5) and stages["encode"] > 0 and 0 < header["holes"] < 1
+    assert stages["total"] == pytest.approx(14 + stages["encode"] + stages["wait"], abs=0.02)
+    assert desk.session.stats_json(1)["stage_ms"] == stages
     assert header["colours"][0] == [230, 120, 60] and len(header["cameras"][0]["K"]) == 9
     assert desk.session.in_flight == 0 and desk.session.stats_json(1)["viewers"] == 1
