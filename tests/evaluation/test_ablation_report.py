@@ -54,6 +54,7 @@ def test_it_is_written_in_three_ways(ablation):
     assert json.loads(to_json(ablation))["variants"][1]["name"] == "no-rope"
     picture = ElementTree.fromstring(plots(ablation))
     words = [element.text for element in picture.iter("{http://www.w3.org/2000/svg}text")]
-    dots = list(picture.iter("{http://www.w3.org/2000/svg}circle"))
-    assert "no-rope" in words and "64" in words
-    assert len(dots) == 2 + 2, "a dot for each seed that lost, and each top-k"
+    assert {"no-rope", "64", "all"} <= set(words)
+    groups = {group.get("id"): group for group in picture.iter("{http://www.w3.org/2000/svg}g")}
+    dots = [len(list(groups[name].iter("{http://www.w3.org/2000/svg}use"))) for name in ("variant0", "top-k")]
+    assert dots == [2, 2], "a dot for each seed that lost, and each top-k"

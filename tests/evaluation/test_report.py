@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from viewmend.evaluation.report import make_report
 from viewmend.evaluation.report_data import report_csv, report_json
 from viewmend.evaluation.report_markdown import markdown
 from viewmend.evaluation.report_page import page
-from viewmend.evaluation.report_plot import Point, trade_off
+from viewmend.evaluation.report_plot import Point, ablation_plot, trade_off
 from viewmend.evaluation.report_sheets import largest_hole, write_sheets
 from viewmend.evaluation.report_video import scene_video
 from viewmend.evaluation.runner import run_evaluation
@@ -61,7 +62,7 @@ def test_failures_and_gaps_are_shown_in_every_form(evaluated):
 def test_the_page_asks_nobody_for_anything_and_has_all_pictures(evaluated):
     report, cells, store = evaluated
     shown = page(report, cells, store)
-    sources = re.findall(r'(?:src|href|poster)="([^"]{0,30})', shown)
+    sources = re.findall(r'(?:src|href|poster)="([^"#][^"]{0,30})', shown)
     assert sources and all(re.match(r"data:(image/(png|jpeg)|video/mp4);base64,", source) for source in sources)
     assert not re.search(r"url\(|@import|<script|<link", shown)
     # Scene by scene: rendered, E, truth and each method that did not fail; E and the truth have no difference.
@@ -110,11 +111,22 @@ def test_the_largest_hole_is_in_the_close_up():
 def test_the_plot_has_every_method_and_no_label_on_another():
     points = [Point(f"method {n} & co", 10.0 ** (n % 3), 20 + 0.01 * n) for n in range(9)]
     svg = trade_off([*points, Point("free", 0.0, 21.0)], "dB", "title")
-    assert svg.count("<circle") == 10 and "method 3 &amp; co" in svg
-    labels = [(float(x), float(y)) for x, y in re.findall(r'<text x="([\d.]+)" y="([\d.-]+)" text-anchor="start"', svg)]
-    assert len(labels) == 10
+    assert svg == trade_off([*points, Point("free", 0.0, 21.0)], "dB", "title")
+    assert svg.count('class="dot"') == 10 and "<title>method 3 &amp; co: 20.03, 1.0 ms</title>" in svg
+    found = re.findall(r'<text [^>]*x="([\d.]+)" y="([\d.-]+)"[^>]*>(?:method|free)', svg)
+    labels = [(float(x), float(y)) for x, y in found]
+    assert len(labels) == 10 and all(0 < y < 400 for _, y in labels)
     close = [
         (a, b) for n, a in enumerate(labels) for b in labels[:n] if abs(a[0] - b[0]) < 60 and abs(a[1] - b[1]) < 11
     ]
     assert not close
-    assert trade_off([], "dB", "title") == "" and trade_off([Point("one", 5.0, 20.0)], "dB", "t").count("<circle") == 1
+    assert trade_off([], "dB", "title") == ""
+    assert trade_off([Point("one", 5.0, 20.0)], "dB", "t").count('class="dot"') == 1
+
+
+def test_without_matplotlib_the_page_says_what_is_missing(evaluated, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    shown = page(*evaluated, video=False)
+    assert "<svg" not in shown and shown.count("pip install &#x27;viewmend[plots]&#x27;") == 3
+    with pytest.raises(ValueError, match=r"pip install 'viewmend\[plots\]'"):
+        ablation_plot([], [], "losses")

@@ -50,7 +50,9 @@ def run(options: Options) -> int:
     """Run the command; 1 if an evaluation failed, else 0."""
     from viewmend.cli.console import say
     from viewmend.evaluation.ablation_report import Ablation, markdown, plots, to_json
+    from viewmend.evaluation.report_plot import require_matplotlib
 
+    require_matplotlib()  # now, and not after days of training
     recipes = _recipes(options)
     _make_samples(options, next(iter(recipes.values())))
     trained = _train(options, recipes)

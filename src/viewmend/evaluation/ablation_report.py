@@ -8,6 +8,7 @@ from pathlib import Path
 
 from viewmend.evaluation.averages import Row, average_cell, tables
 from viewmend.evaluation.cells import Cell
+from viewmend.evaluation.report_plot import ablation_plot
 
 
 @dataclass(frozen=True)
@@ -89,31 +90,15 @@ def to_json(ablation: Ablation) -> str:
 
 
 def plots(ablation: Ablation) -> str:
-    """An SVG: what each variant loses, a dot for each seed; and quality against milliseconds by top-k."""
-    others = ablation.variants[1:]
-    values = [v for line in others for v in line.loss if v is not None]
-    low, high = min([0.0, *values]), max([0.1, *values])
-    rows = 30 * len(others) + 70
+    """An SVG: what each variant loses, a dot for each seed; and quality against milliseconds by top-k.
 
-    def x(value: float) -> float:
-        return 220 + 300 * (value - low) / (high - low)
-
-    parts = [_text(220, 24, "loss in the holes against full, dB"), _path([(x(0.0), 36), (x(0.0), rows - 30)], "#888")]
-    for n, line in enumerate(others):
-        y = 50 + 30 * n
-        parts.append(_text(8, y + 5, line.name))
-        parts += [_dot(x(v), y, "#d33") for v in line.loss if v is not None]
-    parts += [_text(x(v), rows - 12, f"{v:.2f}") for v in (low, high)]
-    points = [(line.ms, _mean(line.holes), line.name) for line in ablation.top_k]
-    known = [(ms, db, name) for ms, db, name in points if ms is not None and db is not None]
-    if known:
-        parts += _curve(known, 600, 50, 300, rows - 110)
-    size = f'width="1100" height="{rows}" viewBox="0 0 1100 {rows}"'
-    body = "\n".join(parts)
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="14">\n'
-        f'<rect width="100%" height="100%" fill="white"/>\n{body}\n</svg>\n'
-    )
+    Raises:
+        MissingMatplotlibError: matplotlib is not installed.
+    """
+    losses = [(line.name, [v for v in line.loss if v is not None]) for line in ablation.variants[1:]]
+    points = [(line.name, line.ms, _mean(line.holes)) for line in ablation.top_k]
+    known = [(name, ms, db) for name, ms, db in points if ms is not None and db is not None]
+    return ablation_plot(losses, known, "loss in the holes against full, dB")
 
 
 def _line(
@@ -166,30 +151,3 @@ def _figure(value: float | None) -> str:
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known else None
-
-
-def _curve(points: Sequence[tuple[float, float, str]], left: int, top: int, width: int, height: int) -> list[str]:
-    """PSNR over milliseconds, a dot with its name for each top-k."""
-    ms, db = [p[0] for p in points], [p[1] for p in points]
-    wide, tall = max(ms) - min(ms) or 1, max(db) - min(db) or 1
-    at = [(left + width * (m - min(ms)) / wide, top + height * (max(db) - d) / tall) for m, d, _ in points]
-    parts = [
-        _text(left, 24, f"dB of full by top-k ({min(db):.2f} to {max(db):.2f}), ms ({min(ms):.0f} to {max(ms):.0f})")
-    ]
-    parts.append(_path(at, "#36c"))
-    for (x, y), (_, _, name) in zip(at, points, strict=True):
-        parts += [_dot(x, y, "#36c"), _text(x + 6, y - 6, name)]
-    return parts
-
-
-def _text(x: float | int, y: float | int, text: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}">{text}</text>'
-
-
-def _dot(x: float | int, y: float | int, colour: str) -> str:
-    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{colour}"/>'
-
-
-def _path(points: Sequence[tuple[float | int, float | int]], colour: str) -> str:
-    joined = " L".join(f"{x:.1f} {y:.1f}" for x, y in points)
-    return f'<path d="M{joined}" stroke="{colour}" fill="none"/>'

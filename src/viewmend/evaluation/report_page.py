@@ -19,7 +19,7 @@ from viewmend.evaluation.report_grids import (
     readings_grid,
     setting_lines,
 )
-from viewmend.evaluation.report_plot import Point, trade_off
+from viewmend.evaluation.report_plot import MissingMatplotlibError, Point, trade_off
 from viewmend.evaluation.report_sheets import columns, largest_hole
 from viewmend.evaluation.report_style import STYLE
 from viewmend.evaluation.report_video import scene_video
@@ -65,7 +65,10 @@ def _table(table: Table) -> str:
         for row in table.rows
         if row.speed is not None and row.scores.psnr_holes is not None
     ]
-    plot = trade_off(points, "PSNR in the holes, dB", f"{table.title}: quality against milliseconds")
+    try:
+        plot = trade_off(points, "PSNR in the holes, dB", f"{table.title}: quality against milliseconds")
+    except MissingMatplotlibError as error:
+        plot = f"<p>There is no plot here: {escape(str(error))}</p>"
     return (
         f"<h2>{escape(table.title)}</h2><p>{escape(holes_line(table))}</p>{_grid(main_grid(table))}"
         f'<div class="wide">{plot}</div>'

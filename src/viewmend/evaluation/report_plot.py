@@ -1,17 +1,42 @@
-"""The trade-off of a table as a picture: quality against milliseconds, as SVG that needs nothing else."""
+"""Plots of quality against milliseconds and of what an ablation's variants lose, as SVG, by matplotlib."""
 
+import io
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING, Any
 
-WIDTH, HEIGHT = 720.0, 400.0
-LEFT, RIGHT, TOP, BOTTOM = 62.0, 150.0, 18.0, 48.0
-"""Around the axes; labels of the points reach to the right."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NO_MATPLOTLIB = "plots need matplotlib: pip install 'viewmend[plots]'"
 LEAST_MS = 0.1
 """What is faster is drawn here: a logarithm has no 0."""
 LINE_PX = 13.0
 """Labels are at least so far apart."""
+LABEL_PX = 150.0
+"""Labels are at most about so wide."""
+INK = "#1a1a1a"
+"""The colour of axes and text."""
+STYLE: Any = {
+    "svg.hashsalt": "viewmend",
+    "svg.fonttype": "none",
+    "font.size": 12,
+    **dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK),
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+"""Settings with which the same figures give the same bytes, and text stays text."""
+
+
+class MissingMatplotlibError(ValueError):
+    """Plots were asked for where matplotlib is not installed."""
+
+    def __init__(self) -> None:
+        super().__init__(NO_MATPLOTLIB)
 
 
 @dataclass(frozen=True)
@@ -23,77 +48,101 @@ class Point:
     quality: float
 
 
-def trade_off(points: Sequence[Point], quality: str, title: str) -> str:
-    """Quality over the median milliseconds of a step (logarithmic), all methods; "" without any.
+def require_matplotlib() -> None:
+    """Do nothing where matplotlib is installed.
 
-    Colours are the page's (`currentColor`), so that it can be read on light and dark.
+    Raises:
+        MissingMatplotlibError: matplotlib is not installed.
+    """
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise MissingMatplotlibError from error
+
+
+def trade_off(points: Sequence[Point], quality: str, title: str) -> str:
+    """An `<svg>` of quality over the median milliseconds of a step (logarithmic), all methods; "" without any.
+
+    Text and axes take the page's colour (`currentColor`), so that they can be read on light and dark.
+
+    Raises:
+        MissingMatplotlibError: matplotlib is not installed.
     """
     if not points:
         return ""
-    low, high = _decades([max(p.ms, LEAST_MS) for p in points])
-    ticks = _ticks([p.quality for p in points])
-    x0, x1, y0, y1 = LEFT, WIDTH - RIGHT, HEIGHT - BOTTOM, TOP
+    require_matplotlib()
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    def x(ms: float) -> float:
-        return x0 + (x1 - x0) * (math.log10(max(ms, LEAST_MS)) - low) / (high - low)
-
-    def y(value: float) -> float:
-        return y0 + (y1 - y0) * (value - ticks[0]) / (ticks[-1] - ticks[0])
-
-    parts = [
-        f'<svg class="plot" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{escape(title)}" '
-        'font-family="inherit" font-size="12" fill="currentColor" xmlns="http://www.w3.org/2000/svg">',
-        f"<title>{escape(title)}</title>",
-    ]
-    for power in range(low, high + 1):
-        at = x(10.0**power)
-        parts.append(_line(at, y0, at, y1, 0.15) + _text(at, y0 + 18, f"{10.0**power:g}", "middle"))
-    parts += [_line(x0, y(tick), x1, y(tick), 0.15) + _text(x0 - 8, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    parts += [_line(x0, y0, x1, y0, 0.8), _line(x0, y0, x0, y1, 0.8)]
-    parts.append(_text((x0 + x1) / 2, HEIGHT - 8, "milliseconds of a step, median", "middle"))
-    parts.append(f'<g transform="rotate(-90 14 {(y0 + y1) / 2})">{_text(14.0, (y0 + y1) / 2, quality, "middle")}</g>')
-    labels = _apart([(x(p.ms), y(p.quality)) for p in points])
-    for point, label in zip(points, labels, strict=True):
-        px, py = x(point.ms), y(point.quality)
+    with rc_context(STYLE):
+        figure = Figure((10, 5.56), dpi=72)
+        axes = figure.add_axes((0.09, 0.12, 0.7, 0.83))
+        axes.set(xscale="log", xlabel="milliseconds of a step, median", ylabel=quality)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.grid(alpha=0.3, clip_on=False)
+        for n, point in enumerate(points):
+            axes.plot(max(point.ms, LEAST_MS), point.quality, "o", color="#0b62c4", clip_on=False, gid=f"dot{n}")
+        axes.margins(0.05, 0.1)
+        axes.autoscale_view()
+        _label(axes, points)
+        svg = _svg(figure).replace(INK, "currentColor")
+    for n, point in enumerate(points):
         said = f"{point.name}: {point.quality:.2f}, {point.ms:.1f} ms"
-        parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="4.5" class="dot"><title>{escape(said)}</title></circle>')
-        parts.append(_text(px + 8, label + 4, point.name, "start"))
-    return "".join([*parts, "</svg>"])
+        svg = svg.replace(f'<g id="dot{n}">', f'<g class="dot"><title>{escape(said)}</title>')
+    return svg.replace("<svg ", f'<svg class="plot" role="img" aria-label="{escape(title)}" ', 1)
 
 
-def _decades(values: Sequence[float]) -> tuple[int, int]:
-    low, high = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
-    return low, max(high, low + 1)
+def ablation_plot(
+    losses: Sequence[tuple[str, Sequence[float]]], top_k: Sequence[tuple[str, float, float]], title: str
+) -> str:
+    """An `<svg>` of two plots: the losses in dB of each variant's seeds, and quality over milliseconds by top-k.
+
+    Args:
+        losses: each variant's name, and what each seed loses.
+        top_k: the number of tokens as text, milliseconds and dB.
+        title: of the losses' plot.
+
+    Raises:
+        MissingMatplotlibError: matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure((12, 2 + 0.35 * len(losses)), dpi=72, layout="constrained")
+        left, right = figure.subplots(1, 2)
+        left.set(title=title, xlabel="dB", yticks=range(len(losses)), yticklabels=[name for name, _ in losses])
+        left.invert_yaxis()
+        left.axvline(0, color="#888888", linewidth=1)
+        for n, (_, values) in enumerate(losses):
+            left.plot(values, [n] * len(values), "o", color="#d33333", gid=f"variant{n}")
+        right.set(title="full by top-k", xlabel="milliseconds of a step, median", ylabel="PSNR in the holes, dB")
+        right.plot([ms for _, ms, _ in top_k], [db for _, _, db in top_k], "o-", color="#3366cc", gid="top-k")
+        for name, ms, db in top_k:
+            right.annotate(name, (ms, db), (6, 6), textcoords="offset points")
+        return _svg(figure)
 
 
-def _ticks(values: Sequence[float]) -> list[float]:
-    """Round numbers from below the least to above the largest."""
-    span = max(max(values) - min(values), 0.1)
-    size = 10.0 ** math.floor(math.log10(span / 4))
-    step = next(s * size for s in (1, 2, 5, 10) if span / (s * size) <= 6)
-    first, last = math.floor(min(values) / step), math.ceil(max(values) / step)
-    return [round(n * step, 9) for n in range(first, max(last, first + 1) + 1)]
+def _svg(figure: "Figure") -> str:
+    """The figure's `<svg>` alone, without date, metadata and prologue."""
+    file = io.StringIO()
+    figure.savefig(file, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    svg = file.getvalue()
+    return re.sub(r"font-family: [^;]*", "font-family: inherit", svg[svg.index("<svg ") :])
 
 
-def _apart(places: Sequence[tuple[float, float]]) -> list[float]:
-    """Heights of labels, moved towards the middle where one that is near would be written over."""
-    heights = [0.0] * len(places)
+def _label(axes: "Axes", points: Sequence[Point]) -> None:
+    """Names beside the points, moved towards the middle where one that is near would be written over."""
+    places = [tuple(axes.transData.transform((max(p.ms, LEAST_MS), p.quality))) for p in points]
+    middle = float(axes.transAxes.transform((0, 0.5))[1])
     written: list[tuple[float, float]] = []
-    middle = HEIGHT / 2
     for n in sorted(range(len(places)), key=lambda i: -abs(places[i][1] - middle)):
         across, at = places[n]
         away = math.copysign(LINE_PX, middle - at)
-        while any(abs(x - across) < RIGHT and abs(y - at) < LINE_PX for x, y in written):
+        while any(abs(x - across) < LABEL_PX and abs(y - at) < LINE_PX for x, y in written):
             at += away
         written.append((across, at))
-        heights[n] = at
-    return heights
-
-
-def _line(x0: float, y0: float, x1: float, y1: float, opacity: float) -> str:
-    at = f'x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"'
-    return f'<line {at} stroke="currentColor" stroke-opacity="{opacity}"/>'
-
-
-def _text(x: float, y: float, said: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(said)}</text>'
+        axes.annotate(
+            points[n].name, places[n], (across + 8, at - 4), xycoords="figure pixels", textcoords="figure pixels"
+        )

@@ -17,7 +17,7 @@ th:first-child, td:first-child { text-align: left; position: sticky; left: 0; ba
 thead th { background: var(--soft); } thead th:first-child { background: var(--soft); }
 tbody tr:hover td { background: var(--soft); }
 .plot { display: block; width: 100%; min-width: 560px; max-width: 900px; height: auto; margin: 1rem 0; }
-.dot { fill: var(--accent); }
+.dot use { fill: var(--accent) !important; stroke: none !important; }
 details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); padding: .3rem 0; }
 section { border-top: 1px solid var(--line); }
 .views { display: flex; gap: .5rem; align-items: flex-start; padding-bottom: .6rem; }
