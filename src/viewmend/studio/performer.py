@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -21,6 +22,11 @@ class TexturedMesh:
     texture_of_face: Int[Tensor, "face"]
     textures: tuple[Float[Tensor, "3 _ _"], ...]
     """sRGB colours in [0, 1]; the sizes may differ."""
+
+    def to(self, device: torch.device | str) -> "TexturedMesh":
+        """The same mesh on `device`; its textures stay where they are, since their pyramid moves."""
+        normals, uv, texture = (t.to(device) for t in (self.normals, self.uv, self.texture_of_face))
+        return TexturedMesh(self.mesh.to(device), normals, uv, texture, self.textures)
 
 
 @runtime_checkable

@@ -14,20 +14,9 @@ from viewmend.studio import _shade_numba as kernels
 from viewmend.studio.performer import TexturedMesh
 from viewmend.studio.shading import GLOSS_DOUBLINGS, Lights, irradiance
 from viewmend.studio.textures import TexturePyramid, face_levels, sample_texture, srgb_from_linear
+from viewmend.views import MultiViewFrame
 
 BANDS = 4
-
-
-@dataclass(frozen=True)
-class Rendering:
-    """Images of `cameras.max_size_px`; zeros beyond a view's own size."""
-
-    rgb: UInt8[Tensor, "view 3 height width"]
-    """sRGB over the background (black without one): pixels at the outline are mixed with it."""
-    mask: UInt8[Tensor, "view height width"]
-    """Share of the pixel that the subject covers, 0 to 255."""
-    depth: Float[Tensor, "view height width"]
-    """z-depth at the pixel's centre, metres; 0 where no surface is."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +45,8 @@ def render(
     cameras: Cameras,
     background: Float[Tensor, "view 3 height width"] | None = None,
     samples_per_side: int = 2,
-) -> Rendering:
-    """Draw a lit scene into every camera.
+) -> MultiViewFrame:
+    """Draw a lit scene into every camera, as the frame of time 0.
 
     Each pixel is shaded at samples_per_side x samples_per_side points, which gives its colour and coverage; the depth
     is that of its centre. On the CPU numba shades, elsewhere torch does.
@@ -81,8 +70,8 @@ def render(
     if background is None:
         background = torch.zeros(len(cameras), 3, *depth.shape[1:], device=depth.device)
     if depth.device.type == "cpu":
-        return Rendering(*_shade_cpu(surface, fine, triangle, background), depth)
-    return Rendering(*shade_torch(surface, fine, triangle, background), depth)
+        return MultiViewFrame(cameras, *_shade_cpu(surface, fine, triangle, background), 0, depth)
+    return MultiViewFrame(cameras, *shade_torch(surface, fine, triangle, background), 0, depth)
 
 
 def shade_torch(

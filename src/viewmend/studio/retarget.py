@@ -1,5 +1,6 @@
 """Puts a motion on a character: each limb turns as the actor's does, whatever the two rest poses are."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,10 @@ from viewmend.studio.skeletons import PARTS, find_parts
 
 _LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
 """Limbs whose rest directions are aligned, and the part that each points to."""
+
+
+Rest = Mapping[str, Float[Tensor, "3"]]
+"""Part -> position of its joint in a rest pose."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +70,19 @@ def retarget(character: Character, motion: Motion) -> Retarget:
     upright[:3, :3] *= 10.0 ** -round(float(torch.tensor(height / 0.8).log10()))
     rest = file_rest @ upright[:3, :3].T
     turn = _upright({p: motion.rest[j] for p, j in joint_of.items()})
-    source_rest = motion.rest @ turn.T
+    own = {p: rest[n] for p, n in node_of.items()}
+    actor = {p: (motion.rest @ turn.T)[j] for p, j in joint_of.items()}
     rotations = turn @ motion.rotations @ turn.T
 
     parts = [p for p in PARTS if p in node_of and p in joint_of]
-    alignment = {p: _alignment(p, rest, node_of, source_rest, joint_of) for p in parts}
+    alignment = {p: _alignment(p, own, actor) for p in parts}
     rest_turns = _rest_rotations(character, upright)
     driven = [rotations[:, joint_of[p]] @ alignment[p] @ rest_turns[node_of[p]] for p in parts]
     driver = [-1] * len(character.nodes)
     for place, part in enumerate(parts):
         driver[node_of[part]] = place
-    path = _hips_path(rest, node_of, source_rest, joint_of, rotations, _joint_path(motion, joint_of["Hips"]) @ turn.T)
+    hips = _joint_path(motion, joint_of["Hips"]) @ turn.T
+    path = _hips_path(own, actor, rotations[:, joint_of["Hips"]], hips)
     return Retarget(
         *(character, upright, tuple(driver), torch.stack(driven, 1), node_of["Hips"], path, motion.seconds_per_frame)
     )
@@ -122,7 +129,7 @@ def _rest_rotations(character: Character, upright: Float[Tensor, "4 4"]) -> list
     return turned
 
 
-def _upright(rest: dict[str, Tensor]) -> Float[Tensor, "3 3"]:
+def _upright(rest: Rest) -> Float[Tensor, "3 3"]:
     """The turn by right angles that brings a rest pose to y up and its left side to +x."""
     legs = (rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - (rest["LeftFoot"] + rest["RightFoot"]) / 2
     up = torch.zeros(3)
@@ -134,23 +141,15 @@ def _upright(rest: dict[str, Tensor]) -> Float[Tensor, "3 3"]:
     return torch.stack([side, up, torch.linalg.cross(side, up)])
 
 
-def _alignment(
-    part: str,
-    rest: Float[Tensor, "node 3"],
-    node_of: dict[str, int],
-    source_rest: Float[Tensor, "joint 3"],
-    joint_of: dict[str, int],
-) -> Float[Tensor, "3 3"]:
+def _alignment(part: str, own: Rest, actor: Rest) -> Float[Tensor, "3 3"]:
     """A_j: the smallest rotation from the character's bone direction at rest to the motion's."""
     side = "Left" if part.startswith("Left") else "Right"
     limb = part.removeprefix(side)
     limb = "ForeArm" if limb == "Hand" else limb
     start, end = side + limb, side + _LIMBS.get(limb, "")
-    if limb not in _LIMBS or not all(p in node_of and p in joint_of for p in (start, end)):
+    if limb not in _LIMBS or not all(p in own and p in actor for p in (start, end)):
         return torch.eye(3)
-    a = rest[node_of[end]] - rest[node_of[start]]
-    b = source_rest[joint_of[end]] - source_rest[joint_of[start]]
-    return smallest_rotation(a, b)
+    return smallest_rotation(own[end] - own[start], actor[end] - actor[start])
 
 
 def smallest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -168,22 +167,14 @@ def smallest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Ten
 
 
 def _hips_path(
-    rest: Float[Tensor, "node 3"],
-    node_of: dict[str, int],
-    source_rest: Float[Tensor, "joint 3"],
-    joint_of: dict[str, int],
-    rotations: Float[Tensor, "frame joint 3 3"],
-    hips: Float[Tensor, "frame 3"],
+    own: Rest, actor: Rest, turn: Float[Tensor, "frame 3 3"], hips: Float[Tensor, "frame 3"]
 ) -> Float[Tensor, "frame 3"]:
     """Where the hips are, s (p + G_root o_b) - G_root o_a: the middle of the hip joints moves as the actor's.
 
     Scaled by leg length, s.
     """
-    scale = _leg_length(rest, node_of) / _leg_length(source_rest, joint_of)
-    o_a = _hip_middle(rest, node_of)
-    o_b = _hip_middle(source_rest, joint_of)
-    turn = rotations[:, joint_of["Hips"]]
-    return scale * (hips + turn @ o_b) - turn @ o_a
+    scale = _leg_length(own) / _leg_length(actor)
+    return scale * (hips + turn @ _hip_middle(actor)) - turn @ _hip_middle(own)
 
 
 def _joint_path(motion: Motion, joint: int) -> Float[Tensor, "frame 3"]:
@@ -196,14 +187,14 @@ def _joint_path(motion: Motion, joint: int) -> Float[Tensor, "frame 3"]:
     return path
 
 
-def _hip_middle(rest: Float[Tensor, "joint 3"], at: dict[str, int]) -> Float[Tensor, "3"]:
-    return (rest[at["LeftUpLeg"]] + rest[at["RightUpLeg"]]) / 2 - rest[at["Hips"]]
+def _hip_middle(rest: Rest) -> Float[Tensor, "3"]:
+    return (rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - rest["Hips"]
 
 
-def _leg_length(rest: Float[Tensor, "joint 3"], at: dict[str, int]) -> float:
+def _leg_length(rest: Rest) -> float:
     total = 0.0
     for side in ("Left", "Right"):
-        hip, knee, foot = (rest[at[side + part]] for part in ("UpLeg", "Leg", "Foot"))
+        hip, knee, foot = (rest[side + part] for part in ("UpLeg", "Leg", "Foot"))
         total += float((knee - hip).norm() + (foot - knee).norm()) / 2
     return total
 

@@ -1,6 +1,6 @@
 """The studio: performers, lights and cameras as a capture with exact truth."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,6 @@ from torch import Tensor
 from viewmend.capture.errors import CaptureError
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.mesh import Mesh
 from viewmend.studio.imperfections import Imperfections, imperfect_cameras, imperfect_frame
 from viewmend.studio.performer import Performer, TexturedMesh
 from viewmend.studio.render import Surface, light, render
@@ -135,7 +134,7 @@ class Studio:
 
     def scene(self, time: int) -> TexturedMesh:
         """The performers' surface at index `time`, which may lie beyond the capture's frames."""
-        return _moved(self.performer.pose(time / self.config.fps), self.config.device)
+        return self.performer.pose(time / self.config.fps).to(self.config.device)
 
     def read(self, time: int) -> MultiViewFrame:
         """All cameras at index `time`: images and masks with the imperfections, and the true depth.
@@ -147,7 +146,7 @@ class Studio:
             raise IndexError(f"expected a time from 0 to {self.config.frames - 1}, got {time}")
         frame = self._draw(self.true_cameras, time, self._backdrop)
         frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, self._backdrop)
-        return MultiViewFrame(self._cameras, frame.rgb, frame.mask, time, frame.depth)
+        return replace(frame, cameras=self._cameras)
 
     def truth(self, cameras: Cameras, time: int) -> MultiViewFrame:
         """What perfect cameras anywhere would see at index `time`, before black, with exact mask and depth."""
@@ -156,8 +155,7 @@ class Studio:
     def _draw(
         self, cameras: Cameras, time: int, backdrop: Float[Tensor, "view 3 height width"] | None
     ) -> MultiViewFrame:
-        drawn = render(self._surface(time), cameras, backdrop, self.config.samples_per_side)
-        return MultiViewFrame(cameras, drawn.rgb, drawn.mask, time, drawn.depth)
+        return replace(render(self._surface(time), cameras, backdrop, self.config.samples_per_side), time=time)
 
     def _surface(self, time: int) -> Surface:
         last = self._last_surface
@@ -170,15 +168,11 @@ class Studio:
 
     def _pyramid(self, textures: tuple[Tensor, ...]) -> TexturePyramid:
         last = self._last_pyramid
-        if last is not None and len(last[0]) == len(textures) and all(map(_same, last[0], textures)):
+        if last is not None and [*map(id, last[0])] == [*map(id, textures)]:
             return last[1]
         pyramid = texture_pyramid(textures).to(self.config.device)
         self._last_pyramid = (textures, pyramid)
         return pyramid
-
-
-def _same(a: Tensor, b: Tensor) -> bool:
-    return a is b
 
 
 def _seeds(seed: int) -> tuple[int, ...]:
@@ -212,16 +206,3 @@ def _pick(place: Path, suffixes: tuple[str, ...], chance: np.random.Generator) -
         found = "no such files in it" if place.is_dir() else "no such folder or file"
         raise CaptureError(f"{place}: expected a {' or '.join(suffixes)} file or a folder of them, found {found}")
     return files[int(chance.integers(len(files)))]
-
-
-def _moved(scene: TexturedMesh, device: str) -> TexturedMesh:
-    """The scene on a device (its textures stay where they are: their pyramid moves)."""
-    if device == "cpu":
-        return scene
-    return TexturedMesh(
-        Mesh(scene.mesh.vertices.to(device), scene.mesh.faces.to(device)),
-        scene.normals.to(device),
-        scene.uv.to(device),
-        scene.texture_of_face.to(device),
-        scene.textures,
-    )

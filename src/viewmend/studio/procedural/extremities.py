@@ -7,6 +7,7 @@ from viewmend.studio.procedural.body import Body
 from viewmend.studio.procedural.fabric import Image
 from viewmend.studio.procedural.patches import Patch
 from viewmend.studio.procedural.skeleton import SIGN, Skeleton, Vector, unit
+from viewmend.studio.procedural.tables import TABLES
 from viewmend.studio.procedural.weights import mix, one_joint, smoothstep
 
 
@@ -85,23 +86,7 @@ def _finger(
     return Patch(grid, unit_grid(grid.shape), one_joint(grid.shape[:2], joint), skin)
 
 
-# Place from heel (0) to tip (1), half width, height of the upper: shares of the person's height.
-SHOE = np.array(
-    [
-        (0.00, 0.004, 0.022),
-        (0.02, 0.012, 0.034),
-        (0.08, 0.0190, 0.046),
-        (0.20, 0.0215, 0.052),
-        (0.36, 0.0215, 0.054),
-        (0.48, 0.0220, 0.046),
-        (0.62, 0.0255, 0.035),
-        (0.76, 0.0275, 0.027),
-        (0.88, 0.0245, 0.022),
-        (0.96, 0.0165, 0.018),
-        (0.99, 0.0090, 0.014),
-        (1.00, 0.0020, 0.010),
-    ]
-)
+SHOE = np.array(TABLES["shoe"])
 
 
 def shoe_patch(skeleton: Skeleton, height_m: float, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Patch:

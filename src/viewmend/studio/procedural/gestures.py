@@ -6,28 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.studio.procedural.stance import ArmPose
+from viewmend.studio.procedural.tables import TABLES
 
-# Per family: (base, amplitude) of flexion, abduction, twist, elbow; the harmonic of the beat; phase between the arms.
-FAMILIES: dict[str, tuple[tuple[tuple[float, float], ...], float, float]] = {
-    "hang": (((0.02, 0.05), (0.17, 0.03), (0.25, 0.05), (0.28, 0.06)), 0.5, 0.5),
-    "swing": (((0.0, 0.45), (0.16, 0.02), (0.30, 0.05), (0.50, 0.22)), 1.0, 0.5),
-    "drive": (((0.05, 0.75), (0.20, 0.04), (0.35, 0.10), (1.55, 0.20)), 1.0, 0.5),
-    "talk": (((0.42, 0.18), (0.22, 0.10), (0.20, 0.25), (1.35, 0.35)), 1.0, 0.35),
-    "sides": (((0.10, 0.15), (1.30, 0.30), (0.10, 0.40), (0.45, 0.35)), 1.0, 0.5),
-    "overhead": (((2.50, 0.25), (0.30, 0.15), (0.10, 0.30), (0.55, 0.35)), 1.0, 0.0),
-    "pump": (((0.75, 0.40), (0.32, 0.10), (0.15, 0.15), (1.65, 0.35)), 1.0, 0.5),
-    "disco": (((1.20, 1.10), (0.45, 0.25), (0.10, 0.20), (0.45, 0.30)), 0.5, 0.5),
-    "hips": (((-0.28, 0.05), (0.78, 0.06), (1.15, 0.05), (1.75, 0.05)), 0.5, 0.0),
-    "clap": (((1.05, 0.10), (0.12, 0.16), (0.40, 0.10), (0.95, 0.10)), 1.0, 0.0),
-    "wings": (((0.00, 0.20), (1.55, 1.20), (0.00, 0.20), (0.25, 0.15)), 0.5, 0.0),
-    "jacks": (((0.10, 0.05), (1.55, 1.25), (0.00, 0.05), (0.20, 0.05)), 1.0, 0.0),
-    "box": (((1.15, 0.30), (0.22, 0.05), (0.45, 0.10), (1.20, -1.00)), 1.0, 0.5),
-    "wave": (((0.10, 0.10), (1.25, 0.08), (-1.40, 0.10), (1.35, 0.40)), 2.0, 0.0),
-    "laps": (((0.48, 0.06), (0.16, 0.03), (0.20, 0.08), (0.90, 0.12)), 0.5, 0.4),
-}
+FAMILIES = TABLES["gestures"]
 FASTEST_RAD_S = 7.0
 """Fastest turn of an arm's joint; hands then stay below about ten metres a second."""
-CURLS = {"box": 1.5, "drive": 1.0, "pump": 1.3, "clap": 0.05, "wave": 0.0, "jacks": 0.1, "hips": 0.6}
 
 
 @dataclass(frozen=True)
@@ -63,7 +46,7 @@ def sample_gesture(
     own = rng.uniform(0, 1, 4)
     bases, amplitudes, phases, harmonics = [], [], [], []
     for i, name in enumerate(names):
-        angles, harmonic, apart = FAMILIES[name]
+        angles, harmonic, apart, curl = FAMILIES[name]
         table = np.array(angles)
         base = table[:, 0] + 0.08 * rng.standard_normal(4)
         base[1] = max(base[1], table[1, 0]) + bulk * np.clip(1.2 - base[1], 0, 1)
@@ -71,7 +54,7 @@ def sample_gesture(
         amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
         # The main angle beats with the music; the others follow it loosely.
         offsets = phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
-        bases.append([*base, CURLS.get(name, 0.3)])
+        bases.append([*base, curl])
         amplitudes.append([*amplitude, 0.05])
         phases.append([*offsets, phase])
         harmonics.append(harmonic)

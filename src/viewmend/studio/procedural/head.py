@@ -10,28 +10,10 @@ from viewmend.studio.procedural.fabric import Canvas, Image, blend, hsv
 from viewmend.studio.procedural.patches import Patch
 from viewmend.studio.procedural.physique import Physique
 from viewmend.studio.procedural.skeleton import Points, Skeleton, Values, Vector
+from viewmend.studio.procedural.tables import TABLES
 from viewmend.studio.procedural.weights import one_joint, smoothstep
 
-# Height above the chin, half width, front depth, back depth: shares of the head's height.
-RINGS = np.array(
-    [
-        (0.000, 0.020, 0.250, 0.240),
-        (0.012, 0.090, 0.355, 0.250),
-        (0.040, 0.150, 0.385, 0.262),
-        (0.100, 0.215, 0.400, 0.280),
-        (0.200, 0.262, 0.400, 0.315),
-        (0.330, 0.295, 0.400, 0.385),
-        (0.420, 0.312, 0.395, 0.430),
-        (0.500, 0.320, 0.390, 0.455),
-        (0.580, 0.325, 0.402, 0.470),
-        (0.680, 0.328, 0.402, 0.475),
-        (0.780, 0.312, 0.380, 0.455),
-        (0.870, 0.268, 0.325, 0.395),
-        (0.940, 0.195, 0.235, 0.290),
-        (0.985, 0.098, 0.118, 0.145),
-        (1.000, 0.003, 0.003, 0.003),
-    ]
-)
+RINGS = np.array(TABLES["head"])
 HEAD_SHARE = 0.132
 """The head's height as a share of the person's (7.6 heads)."""
 EYE_AZIMUTH, EYE_Y = 0.37, 0.495

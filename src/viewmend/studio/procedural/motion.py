@@ -9,29 +9,14 @@ from viewmend.studio.procedural.grounds import GROUNDS, Score, Tempo, ease
 from viewmend.studio.procedural.physique import Physique
 from viewmend.studio.procedural.skeleton import SIDES, Skeleton
 from viewmend.studio.procedural.stance import ArmPose, FootPose, Stance
+from viewmend.studio.procedural.tables import TABLES
 
 MOTIONS: dict[Tempo, tuple[str, ...]] = {
     "calm": ("walk", "talk", "turn", "reach", "sit", "crouch", "sway"),
     "dance": ("groove", "sidestep", "spin", "march", "lunge"),
     "fast": ("run", "jacks", "box", "groove", "spin"),
 }
-GESTURES: dict[str, tuple[str, ...]] = {
-    "walk": ("swing",),
-    "talk": ("talk", "wave", "hips", "hang"),
-    "turn": ("hang", "talk", "hips", "wave"),
-    "reach": ("hang",),
-    "sit": ("laps", "talk", "wave"),
-    "crouch": ("pump", "laps", "clap"),
-    "sway": ("hang", "hips", "sides", "wave"),
-    "groove": ("pump", "disco", "sides", "overhead", "wings", "clap", "hips"),
-    "sidestep": ("clap", "pump", "sides", "wings", "disco"),
-    "spin": ("sides", "overhead", "wings"),
-    "march": ("drive", "swing", "overhead"),
-    "lunge": ("sides", "overhead", "disco"),
-    "run": ("drive",),
-    "jacks": ("jacks",),
-    "box": ("box",),
-}
+GESTURES: dict[str, tuple[str, ...]] = {kind: tuple(names) for kind, names in TABLES["gestures_of_motion"].items()}
 BEAT_HZ: dict[Tempo, tuple[float, float]] = {"calm": (0.35, 0.6), "dance": (0.8, 1.15), "fast": (1.3, 1.8)}
 ENERGY: dict[Tempo, float] = {"calm": 0.8, "dance": 1.0, "fast": 1.1}
 

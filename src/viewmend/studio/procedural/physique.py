@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from viewmend.studio.procedural.skeleton import ARM, ARM_ANGLE_RAD, JOINTS, SIDES, SIGN, SKIRT_COLUMNS, Skeleton, Values
+from viewmend.studio.procedural.tables import TABLES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,19 +27,7 @@ class Physique:
     """Eight numbers in [-1, 1]: the features' individual sizes and places."""
 
 
-# Skin from light to dark, sRGB; a person is drawn between neighbours.
-SKIN_RGB = np.array(
-    [
-        (0.97, 0.84, 0.77),
-        (0.93, 0.76, 0.66),
-        (0.87, 0.68, 0.55),
-        (0.78, 0.57, 0.43),
-        (0.64, 0.44, 0.31),
-        (0.49, 0.32, 0.22),
-        (0.36, 0.23, 0.16),
-        (0.26, 0.16, 0.12),
-    ]
-)
+SKIN_RGB = np.array(TABLES["skin"])
 
 
 def sample_physique(rng: np.random.Generator) -> Physique:
