@@ -6,23 +6,23 @@ import pytest
 import torch
 
 from viewmend.studio.performer import Performer, TexturedMesh
-from viewmend.studio.procedural import PerformerStyle, procedural_performer, procedural_scene
+from viewmend.studio.procedural import PerformerStyle, procedural_scene
 from viewmend.studio.procedural.fabric import KINDS, Canvas, sample_fabric
-from viewmend.studio.procedural.gestures import FAMILIES
 from viewmend.studio.procedural.grounds import Tempo
 from viewmend.studio.procedural.hair import STYLES, sample_hair
 from viewmend.studio.procedural.head import build_head
-from viewmend.studio.procedural.motion import GESTURES, MOTIONS, sample_motion
+from viewmend.studio.procedural.motion import FAMILIES, GESTURES, MOTIONS, sample_motion
 from viewmend.studio.procedural.outfit import BOTTOMS, OUTERS, TOPS, sample_outfit
 from viewmend.studio.procedural.physique import sample_physique
 
 SEED = 10_000
+WALKER = PerformerStyle(tempo="calm", motion="walk", people=1, holding=False, furniture=False)
 KIND_OF_TEMPO = [(tempo, kind) for tempo, kinds in MOTIONS.items() for kind in kinds]
 
 
 @pytest.fixture(scope="module")
 def walker():
-    return procedural_performer(SEED, style=PerformerStyle(tempo="calm", motion="walk", holding=False))
+    return procedural_scene(SEED, style=WALKER)
 
 
 def tensors(scene: TexturedMesh):
@@ -30,7 +30,7 @@ def tensors(scene: TexturedMesh):
 
 
 def test_the_same_seed_is_the_same_bit_for_bit(walker):
-    again = procedural_performer(SEED, style=PerformerStyle(tempo="calm", motion="walk", holding=False))
+    again = procedural_scene(SEED, style=WALKER)
     assert again.description == walker.description
     for a, b in zip(tensors(again.pose(1.3)), tensors(walker.pose(1.3)), strict=True):
         assert torch.equal(a, b)
@@ -43,7 +43,7 @@ def test_pose_depends_on_time_alone(walker):
 
 
 def test_other_seeds_are_other_people(walker):
-    other = procedural_performer(SEED + 1, style=PerformerStyle(tempo="calm", motion="walk", holding=False))
+    other = procedural_scene(SEED + 1, style=WALKER)
     assert other.description != walker.description
     assert other.people[0].physique != walker.people[0].physique
 
@@ -146,7 +146,7 @@ def test_a_walker_stays_on_the_stage_and_plants_the_feet(walker):
 
 
 def test_a_sitter_rests_on_a_stool():
-    cast = procedural_performer(SEED, style=PerformerStyle(tempo="calm", motion="sit"))
+    cast = procedural_scene(SEED, style=PerformerStyle(tempo="calm", motion="sit", people=1, furniture=False))
     assert cast.things is not None
     seat = cast.things.mesh.vertices
     assert 0.35 < float(seat[:, 1].max()) < 0.55
@@ -197,7 +197,7 @@ def test_each_cloth_paints_colours_that_vary(kind):
 
 def test_unknown_styles_are_refused():
     with pytest.raises(ValueError, match="moonwalk"):
-        procedural_performer(SEED, style=PerformerStyle(motion="moonwalk"))
+        procedural_scene(SEED, style=PerformerStyle(motion="moonwalk"))
     with pytest.raises(ValueError, match="1 or 2 people"):
         procedural_scene(SEED, style=PerformerStyle(people=7))
     assert dataclasses.is_dataclass(PerformerStyle)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from viewmend.capture.errors import CaptureError
+from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.studio.gltf_document import Document, read_document
 
 
@@ -147,7 +148,8 @@ class _Parts:
                 f"of {len(faces)} up to {faces.max(initial=0)}; export the file again"
             )
         faces = faces.reshape(-1, 3)
-        normals = read(attributes["NORMAL"]) if "NORMAL" in attributes else _normals(vertices, faces)
+        shape = Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
+        normals = read(attributes["NORMAL"]) if "NORMAL" in attributes else vertex_normals(shape).numpy()
         uv = read(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((n, 2))
         joints, weights = self._binding(node, skin, attributes, n)
         # Tiled textures: whole turns are dropped once for the primitive, the rest is clamped by the sampler.
@@ -223,12 +225,3 @@ class _Parts:
             node_of_joint=torch.tensor(self.joint_nodes),
             joint_from_bind=floats(np.concatenate(self.inverse_binds)),
         )
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted vertex normals, for files without any."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, faces[:, k], np.cross(b - a, c - a))
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

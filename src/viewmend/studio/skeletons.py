@@ -10,28 +10,30 @@ PARTS = (*TRUNK, *(side + part for side in ("Left", "Right") for part in SIDED))
 
 REQUIRED = ("Hips", *(side + part for side in ("Left", "Right") for part in ("Arm", "ForeArm", "UpLeg", "Leg", "Foot")))
 
-_LEFT = {
-    # Trunk and left side in the order of PARTS; the right side follows by the family's rule.
-    "acclaim": "root lowerback upperback thorax lowerneck head "
-    "lclavicle lhumerus lradius lhand lfemur ltibia lfoot ltoes",
-    "cgspeed": "Hips lowerback Chest Chest2 Neck Head "
-    "LeftCollar LeftShoulder LeftElbow LeftWrist LeftHip LeftKnee LeftAnkle LeftToe",
-    "humanik": "Hips Spine Spine1 Spine3 Neck Head "
-    "LeftShoulder LeftArm LeftForeArm LeftHand LeftUpLeg LeftLeg LeftFoot LeftToeBase",
-    "mixamo": "Hips Spine Spine1 Spine2 Neck Head "
-    "LeftShoulder LeftArm LeftForeArm LeftHand LeftUpLeg LeftLeg LeftFoot LeftToeBase",
-    "rigify": "DEF-hips DEF-spine.001 DEF-spine.002 DEF-spine.003 DEF-neck DEF-head "
-    "DEF-shoulder.L DEF-upper_arm.L DEF-forearm.L DEF-hand.L DEF-thigh.L DEF-shin.L DEF-foot.L DEF-toe.L",
-    "mannequin": "pelvis spine_01 spine_02 spine_03 neck_01 head "
-    "clavicle_l upperarm_l lowerarm_l hand_l thigh_l calf_l foot_l ball_l",
-}
-_TO_RIGHT = {
-    "acclaim": (r"^l", "r"),
-    "cgspeed": (r"^Left", "Right"),
-    "humanik": (r"^Left", "Right"),
-    "mixamo": (r"^Left", "Right"),
-    "rigify": (r"\.L$", ".R"),
-    "mannequin": (r"_l$", "_r"),
+_LEFT = " ".join("Left" + part for part in SIDED)
+_FAMILIES = {
+    # Trunk and left side in the order of PARTS, and what in a name makes it the right side's.
+    "acclaim": (
+        "root lowerback upperback thorax lowerneck head lclavicle lhumerus lradius lhand lfemur ltibia lfoot ltoes",
+        *(r"^l", "r"),
+    ),
+    "cgspeed": (
+        "Hips lowerback Chest Chest2 Neck Head "
+        "LeftCollar LeftShoulder LeftElbow LeftWrist LeftHip LeftKnee LeftAnkle LeftToe",
+        *(r"^Left", "Right"),
+    ),
+    "humanik": (f"Hips Spine Spine1 Spine3 Neck Head {_LEFT}", r"^Left", "Right"),
+    "mixamo": (f"Hips Spine Spine1 Spine2 Neck Head {_LEFT}", r"^Left", "Right"),
+    "rigify": (
+        "DEF-hips DEF-spine.001 DEF-spine.002 DEF-spine.003 DEF-neck DEF-head "
+        "DEF-shoulder.L DEF-upper_arm.L DEF-forearm.L DEF-hand.L DEF-thigh.L DEF-shin.L DEF-foot.L DEF-toe.L",
+        *(r"\.L$", ".R"),
+    ),
+    "mannequin": (
+        "pelvis spine_01 spine_02 spine_03 neck_01 head "
+        "clavicle_l upperarm_l lowerarm_l hand_l thigh_l calf_l foot_l ball_l",
+        *(r"_l$", "_r"),
+    ),
 }
 
 _WORDS = (
@@ -51,9 +53,9 @@ _SKIP = ("twist", "roll", "end", "nub", "thumb", "index", "middle", "ring", "pin
 
 def family_table(family: str) -> dict[str, str]:
     """Part -> joint name of a known family: acclaim, cgspeed, humanik, mixamo, rigify or mannequin."""
-    left = _LEFT[family].split()
+    joined, pattern, replacement = _FAMILIES[family]
+    left = joined.split()
     trunk, sided = left[: len(TRUNK)], left[len(TRUNK) :]
-    pattern, replacement = _TO_RIGHT[family]
     right = [re.sub(pattern, replacement, name) for name in sided]
     return dict(zip(PARTS, [*trunk, *sided, *right], strict=True))
 
@@ -74,7 +76,7 @@ def find_parts(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
     best: dict[str, str] = {}
     for prefix in _prefixes(names):
         plain = {name[len(prefix) :].lower(): name for name in reversed(names) if name.startswith(prefix)}
-        for family in _LEFT:
+        for family in _FAMILIES:
             table = family_table(family)
             found = {part: plain[joint.lower()] for part, joint in table.items() if joint.lower() in plain}
             if all(part in found for part in REQUIRED) and len(found) > len(best):

@@ -114,15 +114,11 @@ class Tailor:
         image = self.outfit.fabrics[1].paint(canvas)
         top = canvas.height_m - canvas.y
         image = blend(image, 0.65 * image, edge(0.0015 - np.abs(top - 0.036), canvas))
-        belt = self.outfit.seed % 3 == 0
-        if belt:
+        if self.outfit.seed % 3 == 0:
             leather = 0.4 * self.outfit.shoes[0] + np.array([0.06, 0.04, 0.03])
             image = blend(image, leather, edge(0.034 - top, canvas))
-            image = blend(
-                image,
-                np.array([0.75, 0.7, 0.5]),
-                edge(0.018 - np.maximum(np.abs(canvas.x), np.abs(top - 0.018)), canvas),
-            )
+            buckle = np.maximum(np.abs(canvas.x), np.abs(top - 0.018))
+            image = blend(image, np.array([0.75, 0.7, 0.5]), edge(0.018 - buckle, canvas))
         pocket = np.abs(np.abs(canvas.x) - 0.10 - 0.35 * (top - 0.04))
         inside = edge(top - 0.036, canvas) * edge(0.15 - top, canvas)
         image = blend(image, 0.6 * image, inside * edge(0.0018 - pocket, canvas))

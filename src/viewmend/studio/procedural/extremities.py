@@ -57,18 +57,8 @@ def hand_patches(body: Body, skeleton: Skeleton, height_m: float, side: str, ski
         lean = along + 0.10 * (1.5 - k) * 0.5 * forward
         patches.append(_finger(root, unit(lean), palm, length, 0.0050 * H * girth, f"{side}_fingers", skin))
     root = wrist + (0.012 * along + 0.014 * forward) * H
-    patches.append(
-        _finger(
-            root,
-            unit(0.78 * along + 0.62 * forward + 0.15 * palm),
-            palm,
-            0.045 * H,
-            0.0062 * H * girth,
-            f"{side}_hand",
-            skin,
-        )
-    )
-    return patches
+    thumb = unit(0.78 * along + 0.62 * forward + 0.15 * palm)
+    return [*patches, _finger(root, thumb, palm, 0.045 * H, 0.0062 * H * girth, f"{side}_hand", skin)]
 
 
 def _finger(

@@ -7,7 +7,7 @@ import numpy as np
 from viewmend.studio.procedural.body import Torso
 from viewmend.studio.procedural.fabric import Canvas, Image, hsv
 from viewmend.studio.procedural.head import Head, face_grid
-from viewmend.studio.procedural.patches import Patch
+from viewmend.studio.procedural.patches import Patch, outward_of, two_sided
 from viewmend.studio.procedural.skeleton import Values, Vector
 from viewmend.studio.procedural.weights import mix, one_joint, smoothstep
 
@@ -114,19 +114,14 @@ def _curtain(head: Head, hair: Hair, torso: Torso, chart: Image, thick: float) -
     grow = thick * lock * (0.75 + 0.6 * smoothstep(-y, -0.80, 0.1))
     points = head.point(theta, held, grow)
     points[..., 1] -= (held - y) * head.size_m
-    outward = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], -1)
+    outward = outward_of(theta)
     for _ in range(5):
         gap = 0.022 - torso.field(points)
         points = points + np.clip(gap, 0, 0.03)[..., None] * np.array([0, 0, -1.0])
     turn = smoothstep(-y, 0.05, 0.45)
     weights = mix(one_joint(y.shape, "head"), one_joint(y.shape, "upper"), turn)
     uv = np.stack([(theta - opening) / (2 * np.pi - 2 * opening), (y - low) / (0.86 - low)], -1)
-    inside = points[:, ::-1] - 0.012 * outward[:, ::-1]
-    dark = np.broadcast_to(0.5 * chart.mean((0, 1)), (8, 8, 3))
-    return [
-        Patch(points, uv, weights, chart, closed=False),
-        Patch(inside, uv[:, ::-1], weights[:, ::-1], dark, closed=False),
-    ]
+    return two_sided(Patch(points, uv, weights, chart, closed=False), points - 0.012 * outward, 0.5)
 
 
 def _tied(head: Head, hair: Hair, chart: Image) -> Patch:

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
 
-from viewmend.studio.procedural.gestures import Gesture, arm_poses, sample_gesture
 from viewmend.studio.procedural.grounds import GROUNDS, Score, Tempo, ease
 from viewmend.studio.procedural.physique import Physique
 from viewmend.studio.procedural.skeleton import SIDES, Skeleton
-from viewmend.studio.procedural.stance import ArmPose, FootPose, Stance
+from viewmend.studio.procedural.stance import ArmPose, Stance
 from viewmend.studio.procedural.tables import TABLES
 
 MOTIONS: dict[Tempo, tuple[str, ...]] = {
@@ -18,7 +18,67 @@ MOTIONS: dict[Tempo, tuple[str, ...]] = {
 }
 GESTURES: dict[str, tuple[str, ...]] = {kind: tuple(names) for kind, names in TABLES["gestures_of_motion"].items()}
 BEAT_HZ: dict[Tempo, tuple[float, float]] = {"calm": (0.35, 0.6), "dance": (0.8, 1.15), "fast": (1.3, 1.8)}
+OWN_BEAT_HZ = {"walk": (0.75, 0.98), "jacks": (0.85, 1.15), "run": (1.25, 1.5)}
 ENERGY: dict[Tempo, float] = {"calm": 0.8, "dance": 1.0, "fast": 1.1}
+
+
+FAMILIES = TABLES["gestures"]
+FASTEST_RAD_S = 7.0
+"""Fastest turn of an arm's joint; hands then stay below about ten metres a second."""
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """A family with a person's own bases, amplitudes and phases, for left and right."""
+
+    families: tuple[str, str]
+    bases: Float[np.ndarray, "side angle"]
+    amplitudes: Float[np.ndarray, "side angle"]
+    phases: Float[np.ndarray, "side angle"]
+    harmonics: Float[np.ndarray, "side"]
+
+    def angles(self, beats: float) -> Float[np.ndarray, "side angle"]:
+        """Flexion, abduction, twist, elbow, curl of both arms at this point of the music."""
+        moving = self.bases + self.amplitudes * np.sin(2 * np.pi * (self.harmonics[:, None] * beats + self.phases))
+        moving[:, 1] = np.maximum(moving[:, 1], 0.02)
+        moving[:, 3] = np.maximum(moving[:, 3], 0.02)
+        return moving
+
+
+def sample_gesture(
+    rng: np.random.Generator, families: tuple[str, ...], bulk: float, energy: float, beat_hz: float
+) -> Gesture:
+    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes.
+
+    At `beat_hz` no joint turns faster than an arm can.
+    """
+    first = families[int(rng.integers(len(families)))]
+    names = (first, "hang" if first == "wave" else first)
+    if first == "wave" and rng.random() < 0.5:
+        names = (names[1], names[0])
+    phase = rng.random()
+    own = rng.uniform(0, 1, 4)
+    bases, amplitudes, phases, harmonics = [], [], [], []
+    for i, name in enumerate(names):
+        angles, harmonic, apart, curl = FAMILIES[name]
+        table = np.array(angles)
+        base = table[:, 0] + 0.08 * rng.standard_normal(4)
+        base[1] = max(base[1], table[1, 0]) + bulk * np.clip(1.2 - base[1], 0, 1)
+        most = FASTEST_RAD_S / (2 * np.pi * harmonic * beat_hz)
+        amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
+        # The main angle beats with the music; the others follow it loosely.
+        offsets = phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
+        bases.append([*base, curl])
+        amplitudes.append([*amplitude, 0.05])
+        phases.append([*offsets, phase])
+        harmonics.append(harmonic)
+    return Gesture(names, np.array(bases), np.array(amplitudes), np.array(phases), np.array(harmonics))
+
+
+def arm_poses(angles: Float[np.ndarray, "side angle"]) -> tuple[ArmPose, ArmPose]:
+    """Both arms at these angles."""
+    left, right = (ArmPose(flexion=a[0], abduction=a[1], twist=a[2], elbow=a[3], curl=a[4]) for a in angles.tolist())
+    return left, right
 
 
 @dataclass(frozen=True)
@@ -41,14 +101,17 @@ class Motion:
         nod = 0.10 * np.sin(0.7 * time_s + 6 * glance[2]) + (0.10 if self.score.tempo != "calm" else 0.03) * np.sin(
             2 * np.pi * beats
         )
+        offset = np.array([self.center[0], 0.0, self.center[1]])
+        left, right = (replace(foot, place=foot.place + offset) for foot in stance.feet)
+        left_arm, right_arm = (a if a.target is None else replace(a, target=a.target + offset) for a in stance.arms)
         return replace(
             stance,
             look=float(look) - 0.5 * stance.twist,
             nod=stance.nod + float(nod) - 0.45 * (stance.bend + stance.lean),
             tilt=0.10 * float(np.sin(np.pi * beats)),
-            pelvis=stance.pelvis + np.array([self.center[0], 0, self.center[1]]),
-            feet=_shifted(stance.feet, self.center),
-            arms=_shifted_arms(stance.arms, self.center),
+            pelvis=stance.pelvis + offset,
+            feet=(left, right),
+            arms=(left_arm, right_arm),
         )
 
     def gripping(self, side: str) -> "Motion":
@@ -71,18 +134,6 @@ class Motion:
         return replace(base, arms=arm_poses(first + share * (second - first)))
 
 
-def _shifted(feet: tuple[FootPose, FootPose], center: tuple[float, float]) -> tuple[FootPose, FootPose]:
-    offset = np.array([center[0], 0.0, center[1]])
-    left, right = (replace(foot, place=foot.place + offset) for foot in feet)
-    return left, right
-
-
-def _shifted_arms(arms: tuple[ArmPose, ArmPose], center: tuple[float, float]) -> tuple[ArmPose, ArmPose]:
-    offset = np.array([center[0], 0.0, center[1]])
-    left, right = (arm if arm.target is None else replace(arm, target=arm.target + offset) for arm in arms)
-    return left, right
-
-
 def sample_motion(
     rng: np.random.Generator,
     person: Physique,
@@ -96,12 +147,8 @@ def sample_motion(
     chosen = kind or MOTIONS[tempo][int(rng.integers(len(MOTIONS[tempo])))]
     low, high = BEAT_HZ[tempo]
     beat = float(rng.uniform(low, high))
-    if chosen == "walk":
-        beat = float(rng.uniform(0.75, 0.98))
-    if chosen == "jacks":
-        beat = float(rng.uniform(0.85, 1.15))
-    if chosen == "run":
-        beat = float(rng.uniform(1.25, 1.5))
+    if chosen in OWN_BEAT_HZ:
+        beat = float(rng.uniform(*OWN_BEAT_HZ[chosen]))
     gestures = [sample_gesture(rng, GESTURES[chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
     path = 0.0
     if chosen in ("walk", "run"):

@@ -40,6 +40,18 @@ class BoundMesh:
     atlas: Float[Tensor, "3 texture_height texture_width"]
 
 
+def outward_of(azimuth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+    """The horizontal unit vectors at these azimuths."""
+    return np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], -1)
+
+
+def two_sided(outside: Patch, inside: Float[np.ndarray, "row column 3"], shade: float) -> list[Patch]:
+    """An open sheet and its other side at the points `inside`: in one colour, `shade` times the chart's mean."""
+    dark = np.broadcast_to(shade * outside.chart.mean((0, 1)), (8, 8, 3))
+    back = Patch(inside[:, ::-1], outside.uv[:, ::-1], outside.weights[:, ::-1], dark, closed=outside.closed)
+    return [outside, back]
+
+
 def grid_faces(rows: int, columns: int) -> Int[np.ndarray, "face 3"]:
     """Two triangles for each cell of a grid, counter-clockwise from outside."""
     index = np.arange(rows * columns).reshape(rows, columns)

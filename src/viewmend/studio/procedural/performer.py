@@ -1,7 +1,7 @@
 """Performers and scenes drawn from a seed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -50,21 +50,14 @@ class PerformerStyle:
     """Whether things stand around, for scenes (who sits has a stool anyway)."""
 
 
-def procedural_performer(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
-    """A clothed person in motion around the stage's centre, the same for the same seed and style, bit for bit.
+def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
+    """One or two clothed people in motion around the stage's centre, perhaps with things in their hands and around.
+
+    The same seed and style give the same scene, bit for bit.
 
     Args:
         seed: any non-negative number; from 10000 on they are for tests, never for training.
         style: what to fix.
-
-    Raises:
-        ValueError: the style names a motion that does not exist.
-    """
-    return procedural_scene(seed, style=replace(style or PerformerStyle(), people=1, furniture=False))
-
-
-def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> ProceduralPerformer:
-    """One or two performers, perhaps with things in their hands and around them; deterministic as the above.
 
     Raises:
         ValueError: the style names a motion that does not exist, or another number of people than 1 or 2.

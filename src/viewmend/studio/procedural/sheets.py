@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from viewmend.studio.procedural.body import Body
 from viewmend.studio.procedural.fabric import PX_PER_M, Canvas, Image
-from viewmend.studio.procedural.patches import Patch
+from viewmend.studio.procedural.patches import Patch, outward_of, two_sided
 from viewmend.studio.procedural.skeleton import INDEX, SKIRT_COLUMNS, Points, Skeleton, Values, Weights
 from viewmend.studio.procedural.weights import body_weights, mix, one_joint, smoothstep
 
@@ -84,10 +84,8 @@ def _crease(canvas: Canvas, folds: Folds, uv: Float[np.ndarray, "row column 2"])
 
 
 def _with_lips(grid: np.ndarray, low: np.ndarray | None, high: np.ndarray | None) -> np.ndarray:
-    parts = (
-        [row[None] for row in (low,) if row is not None] + [grid] + [row[None] for row in (high,) if row is not None]
-    )
-    return np.concatenate(parts)
+    rows = (None if low is None else low[None], grid, None if high is None else high[None])
+    return np.concatenate([row for row in rows if row is not None])
 
 
 def torso_sheet(
@@ -113,7 +111,7 @@ def torso_sheet(
     girth = float(np.linalg.norm(np.diff(ring, axis=0), axis=1).sum())
     canvas = Canvas(girth, top - bottom, folds.px_per_m)
     uv = np.stack([np.broadcast_to(np.linspace(0, 1, len(around)), s.shape), (s - bottom) / (top - bottom)], -1)
-    outward = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], -1)
+    outward = outward_of(theta)
     points = shape.settle(torso.point(theta, y), outward, 0)
     points = points + _crease(canvas, folds, uv)[..., None] * outward
     lips = []
@@ -197,7 +195,7 @@ def skirt_sheets(
     held = np.maximum(y, hip_y)
     points = shape.torso.point(theta, held)
     fall = hip_y - np.minimum(y, hip_y)
-    outward = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], -1)
+    outward = outward_of(theta)
     wide = flare * fall + pleats[1] * (fall / max(hip_y - hem_y, 0.05)) * np.cos(pleats[0] * theta)
     points = points + wide[..., None] * outward
     points[..., 1] = y
@@ -209,10 +207,5 @@ def skirt_sheets(
     shade = 1 + 8 * pleats[1] * np.cos(pleats[0] * turn) * (1 - canvas.y / canvas.height_m)
     chart = np.clip(painter(canvas) * np.clip(shade, 0.65, 1.15)[..., None], 0, 1)
     weights = skirt_weights(wearer, points, theta)
-    inside = points[:, ::-1] - 0.005 * outward[:, ::-1]
     closed = bool(np.isclose(around[-1] - around[0], 2 * np.pi))
-    lining = np.broadcast_to(0.45 * chart.mean((0, 1)), (8, 8, 3))
-    return [
-        Patch(points, uv, weights, chart, closed=closed),
-        Patch(inside, uv[:, ::-1], weights[:, ::-1], lining, closed=closed),
-    ]
+    return two_sided(Patch(points, uv, weights, chart, closed=closed), points - 0.005 * outward, 0.45)
