@@ -31,7 +31,7 @@ def docstrings(tree: ast.AST) -> Iterator[tuple[int, str]]:
 def half_sentences(source: str) -> list[int]:
     """Lines of docstrings that go on in the next one, or go on with the one before."""
     goes_on = re.compile(r"[,;:]$")
-    continues = re.compile(r"[a-z]+(?![\w.(=\[/*-])")  # a plain word in lower case, no name and no z-depth
+    continues = re.compile(r"[a-z]+(?![\w.(=\[/*-])|(Of|And|By|Its|Their|Those)\b")  # a plain word, no name, no z-depth
     return [line for line, text in docstrings(ast.parse(source)) if goes_on.search(text) or continues.match(text)]
 
 
@@ -43,9 +43,9 @@ def test_no_docstring_goes_on_in_the_next():
 
 
 def test_half_sentences_are_seen():
-    fields = {"x": "How many,", "y": "and of what.", "z": "z-depth.", "w": "One; two."}
+    fields = {"x": "How many,", "y": "and of what.", "z": "z-depth.", "w": "One; two.", "v": "Of x."}
     source = "".join(f'{name} = 1\n"""{text}"""\n' for name, text in fields.items())
-    assert half_sentences(source) == [2, 4]
+    assert half_sentences(source) == [2, 4, 10]
 
 
 def parts(name: str, value: object) -> Iterator[tuple[str, FunctionType]]:

@@ -48,7 +48,7 @@ class LeaveOneOutScene(ABC):
 
     @abstractmethod
     def frames(self, device: str) -> Iterator[SceneFrame]:
-        """Its frames in order of time, on a device."""
+        """The scene's frames in order of time, on a device."""
 
 
 def without_held(

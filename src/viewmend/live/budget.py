@@ -36,9 +36,9 @@ class QualityLevel:
     """What one view is made with."""
 
     scale: float
-    """Of width and height."""
+    """Factor of width and height."""
     context_times: int
-    """Of the window's times, the latest first; 0: no camera image is encoded."""
+    """How many times of the window are context, the latest first; 0: no camera image is encoded."""
     top_k: int | None
     """Context tokens that survive pruning; None for all."""
 
@@ -58,7 +58,7 @@ LADDER = (
     QualityLevel(1.0, 4, 1024),
     QualityLevel(1.0, 7, None),
 )
-"""From the cheapest level to all."""
+"""All levels, the cheapest first."""
 FULL = LADDER[-1]
 
 

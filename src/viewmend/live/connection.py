@@ -40,7 +40,7 @@ class SessionRegistry:
     limits: Limits
     budget_ms: float | None
     about: dict[str, Any]
-    """Of the message `welcome`: model, codecs, export, token_needed, server."""
+    """Fields of the message `welcome`: model, codecs, export, token_needed, server."""
     sessions: list[ViewerSession] = field(default_factory=list)
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
 

@@ -41,7 +41,7 @@ class SourceStatus:
     state: str = "loading"
     """One of loading, ready and failing."""
     error: str | None = None
-    """For people."""
+    """What people are told of it."""
 
 
 class FrameSupply(ABC):

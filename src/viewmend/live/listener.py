@@ -39,7 +39,7 @@ class Server(uvicorn.Server):
             )
         )
         self._since: WeakKeyDictionary[object, tuple[int, float]] = WeakKeyDictionary()
-        """By its id, the last request that was answered, if any; and since when a connection asks for nothing more."""
+        """The id of the last request that was answered, if any, and since when the connection asks for nothing more."""
 
     @contextlib.contextmanager
     def bound(self) -> Iterator[str]:

@@ -14,7 +14,7 @@ Picture = UInt8[np.ndarray, "height width 3"]
 HOLE = (1.0, 0.15, 0.55)
 """What marks missing pixels: no cloth nor skin is of that pink."""
 COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
-"""Of the first, second, ... source view in `coverage`."""
+"""Colours of the first, second, ... source view in `coverage`."""
 DEPTH_STRIDES = ((160, 1), (400, 2))
 """Pairs (longest side, stride): image pixels a depth pixel, both ways, for pictures at most so long."""
 COARSEST_STRIDE = 4

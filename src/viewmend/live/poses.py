@@ -34,7 +34,7 @@ class RigFrame:
     """Vertical field of view, degrees, for square pictures and wide ones; the shorter side's in tall ones."""
 
     def as_json(self) -> dict[str, Any]:
-        """Its part of the message `rig`."""
+        """What the message `rig` says of it."""
         axes = {key: _list(getattr(self, key)) for key in ("center", "up", "front", "side")}
         names = {"azimuth": self.azimuth, "elevation": self.elevation, "distance": self.distance_m, "fov_y": self.fov_y}
         return axes | {"home": {name: round(value, 4) for name, value in names.items()}}

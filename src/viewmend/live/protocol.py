@@ -78,7 +78,7 @@ class Camera(Struct, frozen=True, kw_only=True):
     target: Point | None = None
     fov_y: FieldOfView | None = None
     fx: FocalLength | None = None
-    """In pixels of the size that was asked for, as fy, cx and cy are; by default fy is fx, and cx, cy the middle."""
+    """Pixels of the size that was asked for, as fy, cx and cy are; by default fy is fx, and cx, cy the middle."""
     fy: FocalLength | None = None
     cx: PrincipalPoint | None = None
     cy: PrincipalPoint | None = None
@@ -185,7 +185,7 @@ class FrameTimes(StageTimes):
     encode: float = 0.0
     """Views to JPEG or video."""
     wait: float = 0.0
-    """From the look to the start of its first frame."""
+    """Time from the look to the start of its first frame."""
 
     def as_json(self, frames: int = 1) -> dict[str, float]:
         """The wire's `stage_ms`, means where this is the sum of several frames."""

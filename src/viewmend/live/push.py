@@ -21,7 +21,7 @@ from viewmend.views import MultiViewFrame
 
 MAX_CAMERAS = 128
 MAX_PIXELS = 64_000_000
-"""Of all cameras together."""
+"""Pixels of all cameras together."""
 SILENT_S = 30.0
 ImageSide = Annotated[int, Meta(ge=8, le=16384)]
 

@@ -1,4 +1,4 @@
-"""From requests to views: the stream, its rig, and what went wrong, without threads and sockets."""
+"""Requests become views: the stream, its rig, and what went wrong, without threads and sockets."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,9 +32,9 @@ class RenderResult:
     time: int
     completed: tuple[CompletedView, ...]
     viewer: State
-    """To ask for the next views with."""
+    """What to ask for the next views with."""
     times: StageTimes
-    """Of all eyes; geometry and context are 0 where another viewer has paid for them."""
+    """Times of all eyes; geometry and context are 0 where another viewer has paid for them."""
 
 
 class FrameNotReadyError(Exception):

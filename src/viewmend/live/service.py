@@ -31,9 +31,9 @@ class RenderService:
         self.error: str | None = None
         """What went wrong with the last view, or with the rig's first frame."""
         self.counts = Counter(frames=0, shared=0, errors=0)
-        """For /metrics."""
+        """Counts for /metrics."""
         self.times = FrameTimes()
-        """Of all frames together, for /metrics."""
+        """Times of all frames together, for /metrics."""
         self.recording = Clock()
         """The edge of a recording."""
         self.recording.live = False

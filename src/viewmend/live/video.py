@@ -24,7 +24,7 @@ KEY_EVERY = 240
 
 @cache
 def video_codecs() -> tuple[str, ...]:
-    """Those that can be encoded here."""
+    """Codecs that can be encoded here."""
     try:
         import av
     except ImportError:

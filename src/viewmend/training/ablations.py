@@ -55,4 +55,4 @@ def ablation(name: str, data: DataPlan) -> Recipe:
 
 
 ABLATIONS: dict[str, Callable[[DataPlan], Recipe]] = {name: partial(ablation, name) for name in DIFFERENCES}
-"""By name."""
+"""The ablations by name."""

@@ -11,7 +11,7 @@ from viewmend.training.processes import Processes
 from viewmend.training.samples import Sample
 
 BETAS = (0.0, 0.99)
-"""Of Adam, as in the baselines' training."""
+"""Adam's betas, as in the baselines' training."""
 
 
 class Adversary:

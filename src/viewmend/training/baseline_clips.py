@@ -22,7 +22,7 @@ class TrainingClip:
     """Consecutive views of one camera, the oldest first, and what other cameras saw."""
 
     frames: Float[Tensor, "time 3 height width"]
-    """In [-1, 1], 0 in the holes."""
+    """Colours in [-1, 1], 0 in the holes."""
     holes: Bool[Tensor, "time height width"]
     """Where frames are 0: dilated, as the network sees them."""
     truth: Float[Tensor, "time 3 height width"]

@@ -24,7 +24,7 @@ class BaselineOutcome(StepOutput):
     """E2FGVI's term of completed flows; 0 of others."""
     clips: tuple[TrainingClip, ...]
     composed: tuple[Float[Tensor, "_time 3 _h _w"], ...]
-    """Of each clip: what the network made of the holes, in the frames as they were rendered; in [-1, 1]."""
+    """Frames of each clip, in [-1, 1]: as they were rendered, and in the holes what the network made."""
 
 
 class BaselineObjective(nn.Module):

@@ -15,7 +15,7 @@ from torch.nn.utils import parametrize
 from torch.nn.utils.parametrizations import spectral_norm
 
 SLOPE = 0.2
-"""Of the LeakyReLU between the convolutions."""
+"""Slope of the LeakyReLU between the convolutions."""
 SHORTEST_PX = 3
 """The first convolution of a clip is padded by 1 alone: nothing is left of fewer pixels."""
 
@@ -40,7 +40,7 @@ class DiscriminatorConfig:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Of the input and after each convolution."""
+        """Channels of the input and after each convolution."""
         return (3, *(self.width * 2 ** min(layer, 2) for layer in range(self.layers)))
 
 

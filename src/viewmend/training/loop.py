@@ -256,7 +256,7 @@ def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | Pa
 
 
 def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tensor]:
-    """Those weights of `start` whose name and shape `model` has, with or without a coarse fill before the patches."""
+    """The weights of `start` whose name and shape `model` has, with or without a coarse fill before the patches."""
     own, theirs = model.state_dict(), start.state_dict()
     inner = {name.removeprefix("patches."): weight for name, weight in theirs.items()}
     found = {f"patches.{name}": weight for name, weight in theirs.items()} | inner | theirs

@@ -81,7 +81,7 @@ class LossWeights:
     image: float = 1.0
     """lambda_img, of L_in + L_out."""
     log_error: float = 0.0
-    """Of log10 of the squared error in the holes, a tenth of -PSNR. Ours."""
+    """Weight of log10 of the squared error in the holes, a tenth of -PSNR. Ours."""
     adversarial: float = 0.0
     """lambda_adv, of L_adv; the paper's is 0.01."""
     adversarial_kind: Literal["gan", "hinge"] = "gan"

@@ -38,9 +38,9 @@ class RayBatch:
     far: UInt8[Tensor, "place 12 11 11"]
     """What is farther around each distinct place, in 255ths."""
     place: Int[Tensor, "pixel"]
-    """At which of these each pixel is."""
+    """Index into `far` of each pixel's place."""
     truth: UInt8[Tensor, "pixel 3"]
-    """F* there."""
+    """F* of each pixel, in 255ths."""
 
     def to(self, device: torch.device | str) -> "RayBatch":
         """The same on `device`."""
@@ -48,7 +48,7 @@ class RayBatch:
         return RayBatch(*(value.to(device) for value in values))
 
     def inputs(self) -> RayInputs:
-        """As the reader takes them."""
+        """The rays as `RayBlendNet` takes them."""
         around, far = self.around.float() / 255, self.far.float() / 255
         return RayInputs(self.features.float(), self.occupancy.float(), around, far, self.place)
 

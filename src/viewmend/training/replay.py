@@ -23,7 +23,7 @@ class ReplayPosition:
     scene: int
     """Scene of the oldest sample in the buffer."""
     sample: int
-    """Its number among that scene's."""
+    """Number of the oldest sample among that scene's."""
     buffered: int
     """Samples in the buffer."""
 

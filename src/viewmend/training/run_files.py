@@ -31,7 +31,7 @@ class RunState:
     """Steps that were made."""
     elapsed_s: float
     positions: tuple[ReplayPosition, ...]
-    """Of all streams, in their order."""
+    """Where all streams are, in their order."""
 
 
 def save_run(

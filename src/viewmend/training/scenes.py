@@ -18,7 +18,7 @@ from viewmend.views import MultiViewFrame
 ROUGHEST = 2.5
 """Calibration of a rough stage is so many times as wrong at most."""
 WIDEST_PX = 10
-"""By so much a hole is widened at most."""
+"""Holes are widened by at most so much."""
 FEWEST_CAMERAS = 5
 """A rig of so many never misses one."""
 

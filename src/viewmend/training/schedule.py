@@ -54,7 +54,7 @@ class Schedule:
         self._asked = time.monotonic()
 
     def got(self) -> None:
-        """And has them."""
+        """The step has its samples."""
         self._waited_s = time.monotonic() - self._asked
 
     def made(self, step: int, samples: int) -> Pace:

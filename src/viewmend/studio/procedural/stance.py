@@ -36,7 +36,7 @@ class ArmPose:
     """Inward about the upper arm."""
     elbow: float = 0.25
     curl: float = 0.3
-    """Of the fingers."""
+    """How far the fingers are curled."""
     target: Vector | None = None
     """World place of the wrist, metres; the angles above then do not count."""
 
