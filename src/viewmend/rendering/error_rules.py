@@ -42,7 +42,7 @@ def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
 
 
 ERROR_RULES: dict[str, ErrorRule] = {"unseen": unseen}
-"""By name. A new rule is a function, and a line here."""
+"""The rules by name. A new rule is a function, and a line here."""
 
 
 def error_rule(name: str) -> ErrorRule:
