@@ -8,22 +8,26 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs/options.md"
-CONFIG = re.compile(r"\w*(Config|Quality|Sampling)")
+CONFIG = re.compile(r"\w*(Config|Quality|Sampling|Plan)|LossWeights|Recipe")
 """How the classes are named whose fields change what the system computes; a server's settings are in docs/live.md."""
 NO_SWITCHES = {"ServerConfig", "StudioConfig"}
 COLUMNS = ["switch", "what it changes", "figure or reason", "page"]
 
 
 def switches_of(src: Path) -> dict[str, list[str]]:
-    """The fields of each config; one whose type is a config is no switch itself."""
+    """The fields of each config that have a default; one whose type is a config is no switch itself."""
     found = {}
     for path in sorted(src.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ClassDef) and CONFIG.fullmatch(node.name) and node.name not in NO_SWITCHES:
-                fields = [f for f in node.body if isinstance(f, ast.AnnAssign) and isinstance(f.target, ast.Name)]
-                names = [ast.unparse(f.target) for f in fields if not CONFIG.fullmatch(ast.unparse(f.annotation))]
-                found[node.name] = names
+                fields = [f for f in node.body if isinstance(f, ast.AnnAssign) and f.value is not None]
+                found[node.name] = [ast.unparse(f.target) for f in fields if not is_config(f.annotation)]
     return {name: fields for name, fields in found.items() if fields}
+
+
+def is_config(annotation: ast.expr) -> bool:
+    """Whether a field holds another config, annotated or not."""
+    return bool(CONFIG.fullmatch(ast.unparse(annotation).removeprefix("Annotated[").split(",")[0]))
 
 
 def rows_of(page: str) -> dict[str, dict[str, list[str]]]:
