@@ -85,7 +85,7 @@ def trade_off(points: Sequence[Point], quality: str, title: str) -> str:
         axes.margins(0.05, 0.1)
         axes.autoscale_view()
         _label(axes, points)
-        svg = _svg(figure).replace(INK, "currentColor")
+        svg = _svg(figure, transparent=True).replace(INK, "currentColor")
     for n, point in enumerate(points):
         said = f"{point.name}: {point.quality:.2f}, {point.ms:.1f} ms"
         svg = svg.replace(f'<g id="dot{n}">', f'<g class="dot"><title>{escape(said)}</title>')
@@ -124,10 +124,12 @@ def ablation_plot(
         return _svg(figure)
 
 
-def _svg(figure: "Figure") -> str:
+def _svg(figure: "Figure", transparent: bool = False) -> str:
     """The figure's `<svg>` alone, without date, metadata and prologue."""
     file = io.StringIO()
-    figure.savefig(file, format="svg", transparent=True, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    figure.savefig(
+        file, format="svg", transparent=transparent, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    )
     svg = file.getvalue()
     return re.sub(r"font-family: [^;]*", "font-family: inherit", svg[svg.index("<svg ") :])
 
