@@ -32,6 +32,12 @@ def test_type_checkers_see_the_names_where_they_are_defined():
         assert getattr(value, "__module__", module) == module, "import it from where it is defined"
 
 
+def test_the_reference_has_a_place_for_each():
+    page = (ROOT / "docs/api.md").read_text().split()
+    shown = {name: f"{getattr(viewmend, name).__module__}.{name}" for name in viewmend.__all__ if name != "__version__"}
+    assert [place for place in shown.values() if place not in page] == []
+
+
 def test_an_unknown_name_says_where_to_look():
     with pytest.raises(AttributeError, match="no attribute 'Steam'"):
         viewmend.Steam  # noqa: B018

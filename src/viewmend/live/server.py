@@ -5,7 +5,6 @@ import contextlib
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
-from importlib.metadata import version
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -13,6 +12,7 @@ from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from viewmend import __version__
 from viewmend.capture.video_writer import can_write_mp4
 from viewmend.live.connection import SessionRegistry, ViewerConnection, close_with_error
 from viewmend.live.guard import Guard
@@ -55,9 +55,8 @@ class LiveServer:
         self._pictures = 0
         self._exporting = False
         self._pushing = False
-        self._version = version("viewmend")
         about = {
-            "server": f"viewmend {self._version}",
+            "server": f"viewmend {__version__}",
             "model": config.model,
             "codecs": ["jpeg", *video_codecs()],
             "export": can_write_mp4(),
@@ -124,7 +123,7 @@ class LiveServer:
             "model": self._config.model,
             "error": error,
             "viewers": len(self.registry.sessions),
-            "version": self._version,
+            "version": __version__,
         }
         return JSONResponse(health, 503 if failing else 200)
 
