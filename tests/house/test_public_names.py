@@ -52,3 +52,11 @@ def test_an_installed_package_is_typed_and_says_its_version():
     assert "py.typed" in PROJECT["tool"]["setuptools"]["package-data"]["viewmend"]
     assert (ROOT / "src/viewmend/py.typed").is_file()
     assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "viewmend.__version__"}
+
+
+def test_all_names_are_there_without_the_extras():
+    """What an extra brings is imported where it is used; the reason is said there."""
+    missing = "for name in ('websockets', 'starlette', 'uvicorn', 'av', 'matplotlib'): sys.modules[name] = None"
+    code = chr(10).join(["import sys", missing, "from viewmend import *", "with Client(): pass"])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.strip().endswith("pip install 'viewmend[live]'"), done.stderr

@@ -74,10 +74,9 @@ def run(options: Options) -> int:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import say
-    from viewmend.live.guard import token_query
     from viewmend.live.listener import Server
     from viewmend.live.memory import set_up
-    from viewmend.live.protocol import Limits
+    from viewmend.live.protocol import Limits, token_query
     from viewmend.live.renderer import Renderer
     from viewmend.live.server import LiveServer, ServerConfig
     from viewmend.live.service import RenderService

@@ -8,25 +8,28 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
-from viewmend.live.guard import token_query
 from viewmend.live.pictures import PackedDepth, from_jpeg, unpack_depth
-from viewmend.live.protocol import VERSION, unpack
+from viewmend.live.protocol import VERSION, token_query, unpack
 
 
 class ServerSocket:
     """A connection to the server's path `ws` or `push`."""
 
     def __init__(self, url: str, token: str | None) -> None:
+        try:  # an extra: without it, the names of this module are there all the same
+            from websockets.exceptions import ConnectionClosed
+            from websockets.sync.client import connect
+        except ImportError:
+            raise ImportError("a connection needs websockets: pip install 'viewmend[live]'") from None
+        self._closed = ConnectionClosed
         self._open = contextlib.ExitStack()
         address = f"{url}{token_query(token)}"
         self._socket = self._open.enter_context(connect(address, max_size=None, compression=None))
 
     def send(self, message: str | bytes) -> None:
         """Send a message. If the connection is closed already, `receive` says why."""
-        with contextlib.suppress(ConnectionClosed):
+        with contextlib.suppress(self._closed):
             self._socket.send(message)
 
     def receive(self, timeout_s: float) -> dict[str, Any] | bytes:
@@ -38,7 +41,7 @@ class ServerSocket:
         """
         try:
             message = self._socket.recv(timeout=max(0.0, timeout_s))
-        except ConnectionClosed as closed:
+        except self._closed as closed:
             raise ConnectionError(f"the server has closed the connection: {closed}") from None
         if isinstance(message, bytes):
             return message

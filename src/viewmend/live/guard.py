@@ -4,7 +4,6 @@ import hmac
 import time
 from collections import deque
 from ipaddress import ip_address
-from urllib.parse import quote
 
 from starlette.requests import HTTPConnection
 
@@ -15,11 +14,6 @@ def is_loopback(host: str) -> bool:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:  # a name, and who knows what 127.0.0.1.example resolves to
         return False
-
-
-def token_query(token: str | None) -> str:
-    """The query that carries the token; empty without one."""
-    return f"?token={quote(token, safe='')}" if token else ""
 
 
 class Guard:

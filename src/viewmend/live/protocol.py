@@ -5,6 +5,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar
+from urllib.parse import quote
 
 import torch
 from msgspec import Meta, Struct
@@ -235,3 +236,8 @@ def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tupl
         raise ProtocolError(f"expected {start + sum(sizes)} bytes by the header, got {len(message)}")
     ends = [start + sum(sizes[: n + 1]) for n in range(len(sizes))]
     return header, [message[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+
+
+def token_query(token: str | None) -> str:
+    """The query that carries the token; empty without one."""
+    return f"?token={quote(token, safe='')}" if token else ""
