@@ -61,6 +61,7 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
     [
         (["train", "smal"], "expected a recipe among"),
         (["train", "finetune"], "expected --captures DIR"),
+        (["train", "finetune", "--captures", "here", "--from=nothing"], "one of the shipped models"),
         (["train", "small", "--performers", "people"], "--performers and --motions together"),
         (["train", "small", "--adversarial", "1", "--discriminator", "clip"], "give --clip-length 2"),
         (["train", "small_rays", "--adversarial", "0.01"], "no adversarial loss for rays"),

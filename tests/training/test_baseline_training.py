@@ -166,7 +166,7 @@ def test_the_command_begins_with_a_checkpoint(shards, tmp_path, capsys):
     torch.manual_seed(5)
     torch.save({"netG": DSTT().state_dict()}, tmp_path / "dstt.pth")
     arguments = ["train", "dstt", "--from", str(tmp_path / "dstt.pth"), "--shards", str(shards), "--batch", "1"]
-    arguments += ["--clip", "2"]
+    arguments += ["--clip-length", "2"]
     out = tmp_path / "out"
     assert cli.main([*arguments, "--steps", "1", "--workers", "0", "--out", str(out)]) == 0
     tuned, begun = load_file(out / "model.safetensors"), DSTT()

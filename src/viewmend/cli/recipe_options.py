@@ -32,7 +32,8 @@ def parse(options: Callable[..., Options], arguments: Sequence[str], prog: str) 
     """
     named = bool(arguments) and not arguments[0].startswith("-")
     name, rest = (arguments[0], arguments[1:]) if named else (DEFAULT, arguments)
-    start = next((after for word, after in pairwise(rest) if word == "--from"), None)
+    words = [part for word in rest for part in (word.split("=", 1) if word.startswith("--from=") else [word])]
+    start = next((after for word, after in pairwise(words) if word == "--from"), None)
     flags = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
     default = options(recipe=_named(name, start))
     found = tyro.cli(type(default), args=list(rest), default=default, prog=f"{prog} {name}", config=flags)

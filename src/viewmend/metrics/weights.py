@@ -46,7 +46,7 @@ KNOWN: tuple[KnownWeights, ...] = (
     KnownWeights(
         "vgg16",
         ("vgg16-397923af.pth",),
-        "VGG16, the layers under LPIPS (VGG), and the perceptual term of training",
+        "VGG16, the layers under LPIPS (VGG)",
         "torchvision.models.vgg16(weights='IMAGENET1K_V1')",
         "BSD 3-Clause",
         sha256="397923af",

@@ -82,7 +82,7 @@ def base(data: DataPlan) -> Recipe:
 
 
 def finetune(data: DataPlan) -> Recipe:
-    """All of the small model, slowly, on captures of one's own with studio scenes among them (--capture, --from)."""
+    """All of the small model, slowly, on captures of one's own with studio scenes among them (--captures, --from)."""
     return replace(
         small(data),
         name="finetune",
