@@ -47,7 +47,7 @@ def assemble(
     """Pads the targets' input tokens, and their context: the frames and then their own complete patches."""
     queries, asking, keys, context = [], [], [], []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
-        uvs = _own_uvs(target)
+        uvs = F.pad(centers_px(target.places) / target.view.camera.size_px, (0, 1))  # where they are, now
         queries.append(target.tokens[target.incomplete])
         asking.append((uvs[target.incomplete], torch.ones_like(uvs[target.incomplete, 0], dtype=torch.bool)))
         carried = [_carried(frame, frames, target.view, config) for frame in frames]
@@ -57,17 +57,10 @@ def assemble(
         keys.append([*(frame.keys_values.to(own) for frame in frames), own])
     # One key at least, though it does not count: kernels dislike empty tensors.
     most = max(1, *(sum(part.shape[2] for part in parts) for parts in keys))
-    return Batch(
-        torch.stack([_padded(q, max(len(q) for q in queries)) for q in queries]),
-        _placed(asking, targets, max(len(q) for q in queries)),
-        _stacked([_joined(parts, most) for parts in keys]),
-        _placed(context, targets, most),
-    )
-
-
-def _own_uvs(target: Target) -> Float[Tensor, "patch 3"]:
-    """A novel view's patches are where they are, now."""
-    return F.pad(centers_px(target.places) / target.view.camera.size_px, (0, 1))
+    length = max(len(q) for q in queries)
+    queries, joined = torch.stack([_padded(q, length) for q in queries]), [_joined(parts, most) for parts in keys]
+    keys_values = torch.stack(joined, 2) if len(joined) > 1 else joined[0][:, :, None]  # of one, no copy
+    return Batch(queries, _placed(asking, targets, length), keys_values, _placed(context, targets, most))
 
 
 def _carried(
@@ -97,11 +90,6 @@ def _joined(parts: Sequence[Float[Tensor, "block 2 _ dim"]], length: int) -> Flo
     blocks, two, _, dim = parts[0].shape
     missing = length - sum(part.shape[2] for part in parts)
     return torch.cat([*parts, parts[0].new_zeros(blocks, two, missing, dim)], 2)
-
-
-def _stacked(samples: Sequence[Float[Tensor, "block 2 key dim"]]) -> Float[Tensor, "block 2 sample key dim"]:
-    """All of a batch; of one, no copy."""
-    return torch.stack(list(samples), 2) if len(samples) > 1 else samples[0][:, :, None]
 
 
 def _padded(rows: Tensor, length: int) -> Tensor:

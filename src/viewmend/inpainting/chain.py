@@ -45,10 +45,6 @@ class Chain(Network):
         coarse = self.coarse(views, ray_views or [None] * len(views))
         return self.patches.refine(views, coarse, contexts, top_k)
 
-    def initial_state(self) -> State:
-        """The state before the first view of a stream."""
-        return State()
-
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view; the coarse fill alone where the quality allows no context times."""

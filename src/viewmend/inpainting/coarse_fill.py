@@ -41,10 +41,6 @@ class CoarseFill(Network):
         """More than a fill looks around itself: a crop's border does to it what the black of the view would."""
         return MARGIN_PX
 
-    def initial_state(self) -> State:
-        """The state before the first view of a stream."""
-        return State()
-
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The view with its holes filled; a view without holes comes back at once."""
@@ -76,7 +72,7 @@ def fill(
     `pull_push`ed from the subject's pixels.
     """
     near, _ = _from_near(rgb, ~missing, missing)
-    wide = _opened(missing, THIN_PX)
+    wide = missing & _spread(~_spread(~missing))
     if not bool(wide.any()):
         return near  # nor is anything out of reach: around what is, a square of THIN_PX is missing
     filled, reached = _from_near(rgb, ~missing & subject, missing)
@@ -113,17 +109,11 @@ def _sum_around(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "
     return image
 
 
-def _opened(pixels: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "height width"]:
-    """The pixels that a square of this side, inside of them, can cover; beyond the image all counts as inside."""
-    return pixels & _spread(~_spread(~pixels, size), size)
-
-
-def _spread(pixels: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "height width"]:
-    """Where a square of this odd side, around a pixel, holds any of them."""
-    reach = size // 2
-    for axis, pad in ((0, (0, 0, reach, reach)), (1, (reach, reach))):
+def _spread(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Where a square of `THIN_PX`, around a pixel, holds any of them; there are none beyond the image."""
+    for axis, pad in ((0, (0, 0, REACH_PX, REACH_PX)), (1, (REACH_PX, REACH_PX))):
         around, length = F.pad(pixels, pad), pixels.shape[axis]
-        pixels = torch.stack([around.narrow(axis, i, length) for i in range(size)]).any(0)
+        pixels = torch.stack([around.narrow(axis, i, length) for i in range(THIN_PX)]).any(0)
     return pixels
 
 

@@ -4,6 +4,7 @@ import torch
 from torch import nn
 
 from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.protocol import State
 
 
 class Network(nn.Module):
@@ -11,6 +12,10 @@ class Network(nn.Module):
 
     config: InpainterConfig
     compute_dtype: torch.dtype = torch.float32
+
+    def initial_state(self) -> State:
+        """The state before the first view of a stream."""
+        return State()
 
     def autocast(self) -> torch.autocast:
         """The context in which the layers compute in `compute_dtype`."""

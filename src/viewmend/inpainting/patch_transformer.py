@@ -114,10 +114,6 @@ class PatchTransformer(Network):
             patches = dict(zip(asking, decoded, strict=True))
         return [_prediction(target, patches.get(i)) for i, target in enumerate(targets)]
 
-    def initial_state(self) -> State:
-        """The state before the first view of a stream."""
-        return State()
-
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view (section 9); a view without holes comes back at once."""
         return self.complete(view, view.rgb, context), state
@@ -165,12 +161,11 @@ class PatchTransformer(Network):
         stacks: list[Images] = [target_images(*own, self.config) for own in zip(views, coarse, strict=True)]
         with self.autocast():
             tokens = self.tokeniser(stacks)
-        targets = []
         parts = zip(views, stacks, tokens.split([len(stack.places) for stack in stacks]), strict=True)
-        for view, stack, own in parts:
-            incomplete = any_in_patch(view.error[None] > 0)[tuple(stack.places.unbind(1))]
-            targets.append(Target(view, stack.places, own, stack.channels[0], incomplete))
-        return targets
+        return [
+            Target(view, stack.places, own, stack.channels[0], any_in_patch(view.error[None] > 0)[stack.kept])
+            for view, stack, own in parts
+        ]
 
     def _decode(
         self, targets: Sequence[Target], contexts: Sequence[Sequence[ContextFrame]], top_k: int | None
@@ -179,14 +174,9 @@ class PatchTransformer(Network):
         with self.autocast():
             own = [self.transformer.project_context(t.tokens[~t.incomplete]) for t in targets]
         batch = assemble(targets, contexts, own, self.config)
+        top_k = self.config.top_k if top_k is None else top_k
         with self.autocast():
-            tokens = self.transformer(
-                batch.queries,
-                batch.at,
-                batch.keys_values,
-                batch.context_at,
-                self.config.top_k if top_k is None else top_k,
-            )
+            tokens = self.transformer(batch.queries, batch.at, batch.keys_values, batch.context_at, top_k)
             decoded = self.decoder(tokens[batch.at.present], torch.cat([_pixels(t) for t in targets]))
         return list(decoded.float().split([int(t.incomplete.sum()) for t in targets]))
 

@@ -9,7 +9,6 @@ from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
-from viewmend.views import CompletedView
 
 
 @dataclass(frozen=True)
@@ -54,9 +53,10 @@ def frame_message(
             parts.append(part)
             data.append(encoded)
         if look.depth:
-            part, packed = _depth_part(eye, completed)
-            parts.append(part)
-            data.append(packed)
+            depth = completed.view.depth
+            packed = asdict(pack_depth(depth, depth_stride(*depth.shape)))
+            data.append(packed.pop("data"))
+            parts.append({"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed})
     encode_ms = 1000 * (time.perf_counter() - start)
     times = FrameTimes(**vars(result.times), encode=encode_ms, wait=info.wait_ms)
     first = result.completed[0].view
@@ -72,7 +72,7 @@ def frame_message(
         "cameras": [{k: c[k] for k in keys} for v in result.completed for c in cameras_json(v.view.camera)],
         "chosen": list(first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
-        "holes": round(_hole_fraction(result.completed[0]), 5),
+        "holes": round(float((first.error > 0).sum()) / max(1.0, float((first.mask > 0).sum())), 5),
         "top_k": request.quality.top_k,
         "context_times": request.quality.context_times,
         "stage_ms": times.as_json(),
@@ -80,14 +80,3 @@ def frame_message(
         "parts": parts,
     }
     return pack(header, data), times
-
-
-def _hole_fraction(completed: CompletedView) -> float:
-    """Pixels of E as a share of the subject's."""
-    return float((completed.view.error > 0).sum()) / max(1.0, float((completed.view.mask > 0).sum()))
-
-
-def _depth_part(eye: int, completed: CompletedView) -> tuple[dict[str, Any], bytes]:
-    packed = asdict(pack_depth(completed.view.depth, depth_stride(*completed.view.depth.shape)))
-    data = packed.pop("data")
-    return {"kind": "depth", "eye": eye, "bytes": len(data), "encoding": "u16-delta-zlib", **packed}, data

@@ -198,12 +198,8 @@ class LiveServer:
         if not await self._welcome(socket):
             return
         if not isinstance(supply, PushedFrames) or self._pushing:
-            why = (
-                "another rig is pushing"
-                if self._pushing
-                else "this server shows a recording; start viewmend serve live"
-            )
-            await close_with_error(socket, 4409, why)
+            recording = "this server shows a recording; start viewmend serve live"
+            await close_with_error(socket, 4409, "another rig is pushing" if self._pushing else recording)
             return
         self._pushing = True
         try:

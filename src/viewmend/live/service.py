@@ -140,7 +140,7 @@ class RenderService:
         """The request of the session that has waited longest, which then is the last in turn."""
         viewers = (session for session in self._sessions if isinstance(session, ViewerSession))
         active = sum(bool(viewer.recent) and viewer.recent[-1].at > now - 1 for viewer in viewers)
-        playback = Playback(span, self.edge, rig_frame, self._has_frame, max(1, active))
+        playback = Playback(span, self.edge, rig_frame, lambda at: self.supply.read(at) is not None, max(1, active))
         for session in list(self._sessions):
             try:
                 request = session.next_request(now, playback)
@@ -152,6 +152,3 @@ class RenderService:
                 self._sessions.append(session)
                 return session, request
         return None
-
-    def _has_frame(self, at: int) -> bool:
-        return self.supply.read(at) is not None

@@ -37,16 +37,11 @@ class CaptureScenes:
         frames = {time: frame.select(always) for time, frame in frames.items()}
 
         def cameras(held: str) -> Cameras:
-            return replace(self._without(which, held), longest_px=size_px).cameras.to(self.plan.data_device)
+            if (which, held) not in self._prepared:  # aligned when this camera is first left out
+                self._prepared[which, held] = prepare(capture, [n for n in capture.cameras.names if n != held])
+            return replace(self._prepared[which, held], longest_px=size_px).cameras.to(self.plan.data_device)
 
         return rig_samples(LeaveOneOutFrames(frames, capture.bounds, cameras), self.plan, random)
-
-    def _without(self, which: int, held: str) -> PreparedCapture:
-        """The capture, aligned when this camera is first left out."""
-        if (which, held) not in self._prepared:
-            capture = self.captures[which]
-            self._prepared[which, held] = prepare(capture, [n for n in capture.cameras.names if n != held])
-        return self._prepared[which, held]
 
 
 class MixedScenes:

@@ -2,13 +2,12 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
-from torch.nn.parallel import DistributedDataParallel
+from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from viewmend.inpainting.chain import Chain, build
@@ -174,9 +173,11 @@ class Run:
         for number, batch in enumerate(batches):
             batch = [sample.to(self.own.device) for sample in batch]
             # Each stream draws from its own seed at each step: who computes it does not matter.
-            torch.manual_seed(_step_seed(self.recipe.seed, step, number * self.own.count + self.own.rank))
+            stream = number * self.own.count + self.own.rank
+            torch.manual_seed((self.recipe.seed * 1_000_003 + step) * 1_009 + stream)
             last = number + 1 == len(batches)
-            with nullcontext() if last else _without_meeting(self.shared):
+            # Gradients but the last add up here, and meet those of other processes in its backward pass.
+            with self.shared.no_sync() if isinstance(self.shared, Ddp) and not last else nullcontext():
                 outcome = self.shared(batch)
                 assert isinstance(outcome, StepOutput)
                 total, adversarial, judged = outcome.total, 0.0, 0.0
@@ -185,17 +186,15 @@ class Run:
                     total, adversarial = total + self.recipe.loss.adversarial * term, float(term.detach())
                 self._demand_finite(total.detach(), step, batch)
                 (total / len(batches)).backward()
-            costs.append(_costs(outcome, total, adversarial, judged))
+            image = outcome.image
+            terms = [float(term.detach()) for term in (image.inside, image.outside, total)]
+            costs.append([*terms, adversarial, judged])
         torch.nn.utils.clip_grad_norm_(self.learned, self.recipe.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
             self.adversary.step()
-        return self._mean(costs)
-
-    def _mean(self, costs: list[LossTerms]) -> LossTerms:
-        values = torch.tensor([astuple(cost) for cost in costs], device=self.own.device).mean(0)
-        return LossTerms(*self.own.mean(values).tolist())
+        return LossTerms(*self.own.mean(torch.tensor(costs, device=self.own.device).mean(0)).tolist())
 
     def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample | RayBatch]) -> None:
         if torch.isfinite(total):
@@ -261,22 +260,3 @@ def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tenso
     inner = {name.removeprefix("patches."): weight for name, weight in theirs.items()}
     found = {f"patches.{name}": weight for name, weight in theirs.items()} | inner | theirs
     return {n: w for n, w in found.items() if n in own and own[n].shape == w.shape}
-
-
-def _costs(outcome: StepOutput, total: torch.Tensor, adversarial: float, discriminator: float) -> LossTerms:
-    return LossTerms(
-        inside=float(outcome.image.inside.detach()),
-        outside=float(outcome.image.outside.detach()),
-        total=float(total.detach()),
-        adversarial=adversarial,
-        discriminator=discriminator,
-    )
-
-
-def _without_meeting(module: nn.Module):
-    """Gradients add up here, and meet those of other processes in a later backward pass."""
-    return module.no_sync() if isinstance(module, DistributedDataParallel) else nullcontext()
-
-
-def _step_seed(seed: int, step: int, stream: int) -> int:
-    return (seed * 1_000_003 + step) * 1_009 + stream

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.inpainting.chain import Chain
-from viewmend.inpainting.patch_transformer import PatchTransformer, Prediction
+from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.training.losses import ImageLoss, image_loss
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
@@ -38,17 +38,11 @@ class Objective(nn.Module):
         predictions = self.model(
             [s.view for s in views], [list(s.context) for s in views], ray_views=[s.nearby for s in views]
         )
-        image = patches_loss(predictions, views)
-        completed = tuple(p.completed for p in predictions)
+        image = image_loss(
+            [p.inpainted for p in predictions],
+            [p.coverage for p in predictions],
+            [s.view.error for s in views],
+            [s.truth.float() / 255 for s in views],
+        )
         total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
-        return StepOutput(image, total, completed)
-
-
-def patches_loss(predictions: list[Prediction], samples: list[Sample]) -> ImageLoss:
-    """L_in and L_out of section 8, on Ftilde."""
-    return image_loss(
-        [p.inpainted for p in predictions],
-        [p.coverage for p in predictions],
-        [s.view.error for s in samples],
-        [s.truth.float() / 255 for s in samples],
-    )
+        return StepOutput(image, total, tuple(p.completed for p in predictions))

@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.ray_blend_net import RayBlendNet, RayInputs, look_around
 from viewmend.inpainting.ray_sampling import CELL_CHANNELS, RayFeatures
-from viewmend.training.losses import ImageLoss, mean_loss, pixel_loss
+from viewmend.training.losses import mean_loss, pixel_loss
 from viewmend.training.objective import StepOutput
 from viewmend.training.plan import Recipe
-from viewmend.training.samples import Sample
+from viewmend.training.samples import Sample, to_device
 from viewmend.training.scenes import SceneSource
 
 DARKEST = 0.6
@@ -44,8 +44,7 @@ class RayBatch:
 
     def to(self, device: torch.device | str) -> "RayBatch":
         """The same on `device`."""
-        values = (self.features, self.occupancy, self.around, self.far, self.place, self.truth)
-        return RayBatch(*(value.to(device) for value in values))
+        return to_device(self, device)
 
     def inputs(self) -> RayInputs:
         """The rays as `RayBlendNet` takes them."""
@@ -117,14 +116,10 @@ class RaysObjective(nn.Module):
 
     def forward(self, batch: Sequence[RayBatch]) -> StepOutput:
         """Both terms, the means over the samples."""
-        loss = rays_loss(self.model, [augmented(b) for b in batch] if self.recipe.augment else batch)
+        assert isinstance(self.model.coarse, RayBlendNet), "recipes that train rays have a model that reads them"
+        batch = [augmented(lookups) for lookups in batch] if self.recipe.augment else batch
+        told = RayInputs.cat([lookups.inputs() for lookups in batch])
+        colours = self.model.coarse.mix(told).float().split([len(b.truth) for b in batch])
+        loss = mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])
         weights = self.recipe.loss
         return StepOutput(loss, weights.image * loss.inside + weights.log_error * loss.log_error, ())
-
-
-def rays_loss(model: Chain, batch: Sequence[RayBatch]) -> ImageLoss:
-    """`image_loss` over the looked-up pixels alone: nothing is outside."""
-    assert isinstance(model.coarse, RayBlendNet), "recipes that train rays have a model that reads them"
-    told = RayInputs.cat([lookups.inputs() for lookups in batch])
-    colours = model.coarse.mix(told).float().split([len(b.truth) for b in batch])
-    return mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])

@@ -1,7 +1,8 @@
 """Training pairs through the production pipeline: leave a camera out, hull, render, holes (section 8)."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import UInt8
@@ -36,20 +37,18 @@ class Sample:
 
     def to(self, device: torch.device | str) -> "Sample":
         """The same sample on `device`."""
-        view = replace(
-            self.view,
-            camera=self.view.camera.to(device),
-            rgb=self.view.rgb.to(device),
-            mask=self.view.mask.to(device),
-            error=self.view.error.to(device),
-            depth=self.view.depth.to(device),
-            weights=self.view.weights.to(device),
-            silhouettes=self.view.silhouettes and self.view.silhouettes.to(device),
-        )
-        context = tuple(c.to(device) for c in self.context)
-        nearby = None if self.nearby is None else self.nearby.to(device)
-        previous = None if self.previous is None else self.previous.to(device)
-        return Sample(view, context, nearby, self.truth.to(device), previous)
+        return to_device(self, device)
+
+
+def to_device(value: Any, device: torch.device | str) -> Any:
+    """The tensor, or the tuple or dataclass with all of its tensors, on `device`; anything else as it is."""
+    if isinstance(value, Tensor):
+        return value.to(device)
+    if isinstance(value, tuple):
+        return tuple(to_device(item, device) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{f.name: to_device(getattr(value, f.name), device) for f in fields(value)})
+    return value
 
 
 class LeaveOneOut:

@@ -49,7 +49,8 @@ class Validation:
         """Mend every view, score it, and leave a picture of the first few."""
         if not self._samples:
             self._samples = self._views()
-            self._telea = [_score(_telea(sample), sample) for sample in self._samples]
+            unseen = ContextProvider(lambda *_: None)
+            self._telea = [_score(Telea().step(s.view, unseen, State())[0].rgb, s) for s in self._samples]
         training = model.training
         model.eval()
         device = next(model.parameters()).device
@@ -71,10 +72,6 @@ class Validation:
         scenes = scene_source(plan, "validation", "validation")
         samples = (sample for number in count() for sample in scenes.scene(number))
         return list(islice(samples, self.recipe.validation_views))
-
-
-def _telea(sample: Sample) -> Float[Tensor, "3 height width"]:
-    return Telea().step(sample.view, ContextProvider(lambda *_: None), State())[0].rgb
 
 
 def _score(rgb: Float[Tensor, "3 height width"], sample: Sample) -> float:
