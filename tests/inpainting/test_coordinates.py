@@ -80,9 +80,10 @@ def carried(past_geometry, past_depth):
 def test_past_patches_are_carried_by_the_geometry_asked_for():
     focal = FOCAL_PX / WIDTH * (OFFSETS_M["left"] - OFFSETS_M["novel"])
     past, own, own_counts = carried("own", 4.0)
-    assert torch.allclose(own[:, 0], past.uv[:, 0] + focal / 4.0, atol=1e-4) and own_counts.all()
-    past, current, counts = carried("current", 4.0)
-    assert torch.allclose(current[counts, 0], (past.uv[:, 0] + focal / DISTANCE_M)[counts], atol=1e-4)
+    past_u = past.uv_px[:, 0] / past.camera.size_px[0, 0]
+    assert torch.allclose(own[:, 0], past_u + focal / 4.0, atol=1e-4) and own_counts.all()
+    _, current, counts = carried("current", 4.0)
+    assert torch.allclose(current[counts, 0], (past_u + focal / DISTANCE_M)[counts], atol=1e-4)
     assert counts.float().mean() > 0.7
     assert torch.allclose(own[:, 2], torch.tensor(3 / 8)), "s = (t - tau) / (k_w n_w)"
 

@@ -11,7 +11,7 @@ from viewmend.training.adversarial import (
     generator_loss,
     inpainter_objective,
 )
-from viewmend.training.discriminator import DiscriminatorConfig, build_discriminator
+from viewmend.training.discriminator import Discriminator, DiscriminatorConfig
 
 OBJECTIVES = ("gan", "hinge")
 KINDS = ("image", "clip")
@@ -20,7 +20,7 @@ SIZES = {"image": ((3, 12, 12), (3, 9, 20)), "clip": ((3, 2, 12, 12), (3, 3, 9, 
 
 def tiny(kind):
     torch.manual_seed(0)
-    return build_discriminator(DiscriminatorConfig(kind=kind, width=4, layers=2))
+    return Discriminator(DiscriminatorConfig(kind=kind, width=4, layers=2))
 
 
 def maps(rng):

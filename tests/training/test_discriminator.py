@@ -4,7 +4,7 @@ import pytest
 import torch
 from reference.discriminator_twin import judge_twin
 
-from viewmend.training.discriminator import DiscriminatorConfig, build_discriminator
+from viewmend.training.discriminator import Discriminator, DiscriminatorConfig
 
 KINDS = ("image", "clip")
 SHAPES = {"image": ((3, 21, 18), (3, 16, 30)), "clip": ((3, 3, 21, 18), (3, 2, 16, 30))}
@@ -12,7 +12,7 @@ SHAPES = {"image": ((3, 21, 18), (3, 16, 30)), "clip": ((3, 3, 21, 18), (3, 2, 1
 
 def tiny(kind, **options):
     torch.manual_seed(0)
-    return build_discriminator(DiscriminatorConfig(kind=kind, **({"width": 4, "layers": 3} | options)))
+    return Discriminator(DiscriminatorConfig(kind=kind, **({"width": 4, "layers": 3} | options)))
 
 
 def some(kind, rng):
@@ -89,7 +89,7 @@ def test_a_call_takes_one_step_of_power_iteration_in_training_and_none_otherwise
 
 
 def test_t_patchgan_is_the_published_network():
-    net = build_discriminator(DiscriminatorConfig(kind="clip", width=32, layers=6))
+    net = Discriminator(DiscriminatorConfig(kind="clip", width=32, layers=6))
     assert sum(p.numel() for p in net.parameters()) == 4_461_728
     with torch.no_grad():
         (logits,) = net(list(torch.rand(1, 3, 1, 240, 432)))
@@ -111,7 +111,7 @@ def test_its_state_can_be_saved_and_goes_on(rng):
     net, images = tiny("clip"), some("clip", rng)
     net(images)
     torch.manual_seed(5)
-    other = build_discriminator(DiscriminatorConfig(kind="clip", width=4, layers=3))
+    other = Discriminator(DiscriminatorConfig(kind="clip", width=4, layers=3))
     other.load_state_dict(net.state_dict())
     assert all(torch.equal(a, b) for a, b in zip(net(images), other(images), strict=True))
 

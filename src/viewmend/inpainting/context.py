@@ -36,11 +36,6 @@ class ContextFrame:
         """The camera's name."""
         return self.camera.names[0]
 
-    @property
-    def uv(self) -> Float[Tensor, "patch 2"]:
-        """Centres normalised by the image's size."""
-        return self.uv_px / self.camera.size_px
-
     def lifted_by(self, other: "ContextFrame") -> tuple[Float[Tensor, "patch 3"], Bool[Tensor, "patch"]]:
         """This frame's centres at the depths that the same camera has in `other`: the paper's variant of C_G."""
         rows, cols = other.depths.shape

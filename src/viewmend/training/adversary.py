@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.training.adversarial import Objective, discriminator_objective, inpainter_objective
-from viewmend.training.discriminator import DiscriminatorConfig, build_discriminator
+from viewmend.training.discriminator import Discriminator, DiscriminatorConfig
 from viewmend.training.plan import LossWeights
 from viewmend.training.processes import Processes
 from viewmend.training.samples import Sample
@@ -21,7 +21,7 @@ class Adversary:
         self.kind: Objective = loss.adversarial_kind
         self.of_clips = loss.discriminator == "clip"
         layers = 6 if self.of_clips else 4
-        self.discriminator = build_discriminator(DiscriminatorConfig(kind=loss.discriminator, layers=layers))
+        self.discriminator = Discriminator(DiscriminatorConfig(kind=loss.discriminator, layers=layers))
         self.discriminator.to(own.device)
         self.optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=learning_rate, betas=BETAS)
         self._own = own

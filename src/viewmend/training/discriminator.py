@@ -44,16 +44,35 @@ class DiscriminatorConfig:
         return (3, *(self.width * 2 ** min(layer, 2) for layer in range(self.layers)))
 
 
-class _PatchDiscriminator(nn.Module):
-    """Convolutions from images in [0, 1] to a map of logits; there is nothing in it that mixes images of a batch."""
+class Discriminator(nn.Module):
+    """Convolutions from images in [0, 1] to a map of logits; there is nothing in it that mixes images of a batch.
 
-    def __init__(self, convolutions: Sequence[nn.Module]) -> None:
+    An image has 5 x 5 kernels of stride 2. A clip is T-PatchGAN's: 3 x 5 x 5 kernels, stride 1 in time.
+    """
+
+    def __init__(self, config: DiscriminatorConfig) -> None:
         super().__init__()
-        *hidden, last = convolutions
-        self.convolutions = nn.ModuleList([*(spectral_norm(layer) for layer in hidden), last])
+        C, last = config.channels, config.layers - 1
+        if config.kind == "image":
+            layers = [nn.Conv2d(C[i], C[i + 1], 5, 2, 2, bias=i == last) for i in range(config.layers)]
+        else:
+            # The first is padded by 1 in every dimension, as in the published network.
+            padding = [(1, 1, 1), *[(1, 2, 2)] * last]
+            layers = [
+                nn.Conv3d(C[i], C[i + 1], (3, 5, 5), (1, 2, 2), padding[i], bias=i == last)
+                for i in range(config.layers)
+            ]
+        self.convolutions = nn.ModuleList([*(spectral_norm(layer) for layer in layers[:-1]), layers[-1]])
 
-    def _judge(self, images: Sequence[Tensor]) -> list[Tensor]:
-        """A map for each image; images of one size go through as one batch, which changes nothing but the time."""
+    def forward(self, images: Sequence[Float[Tensor, "3 ... _h _w"]]) -> list[Float[Tensor, "logit ..."]]:
+        """Logits of images, or of clips of any number of frames, in [0, 1], of any sizes from 3 x 3.
+
+        Images of one size go through as one batch, which changes nothing but the time. In training mode each call takes
+        one step of power iteration: judge real and completed images in one call.
+
+        Raises:
+            ValueError: an image is too small.
+        """
         if short := [tuple(image.shape) for image in images if min(image.shape[-2:]) < SHORTEST_PX]:
             raise ValueError(
                 f"expected images of at least {SHORTEST_PX} x {SHORTEST_PX} pixels, got shapes {short}; leave them out"
@@ -75,58 +94,3 @@ class _PatchDiscriminator(nn.Module):
         for number, layer in enumerate(self.convolutions):
             x = layer(x if number == 0 else nn.functional.leaky_relu(x, SLOPE))
         return x
-
-
-class ImageDiscriminator(_PatchDiscriminator):
-    """Says of each place of an image how real it looks, as logits: 5 x 5 kernels, stride 2."""
-
-    def __init__(self, config: DiscriminatorConfig) -> None:
-        C, last = config.channels, config.layers - 1
-        super().__init__([nn.Conv2d(C[i], C[i + 1], 5, 2, 2, bias=i == last) for i in range(config.layers)])
-
-    def forward(self, images: Sequence[Float[Tensor, "3 _h _w"]]) -> list[Float[Tensor, "logit _rows _cols"]]:
-        """Logits of images in [0, 1], of any sizes from 3 x 3.
-
-        In training mode each call takes one step of power iteration: judge real and completed images in one call.
-
-        Raises:
-            ValueError: an image is too small.
-        """
-        return self._judge(images)
-
-
-class ClipDiscriminator(_PatchDiscriminator):
-    """The same for clips, T-PatchGAN: 3 x 5 x 5 kernels, stride 1 in time; (B, C, T, H, W) inside.
-
-    A clip is judged alone: no convolution runs from one clip into the next.
-    """
-
-    def __init__(self, config: DiscriminatorConfig) -> None:
-        C, last = config.channels, config.layers - 1
-        super().__init__(
-            [
-                # The first is padded by 1 in every dimension, as in the published network.
-                nn.Conv3d(C[i], C[i + 1], (3, 5, 5), (1, 2, 2), (1, 1, 1) if i == 0 else (1, 2, 2), bias=i == last)
-                for i in range(config.layers)
-            ]
-        )
-
-    def forward(
-        self, clips: Sequence[Float[Tensor, "3 _time _h _w"]]
-    ) -> list[Float[Tensor, "logit _time _rows _cols"]]:
-        """Logits of clips of any number of frames in [0, 1]; a tensor (B, C, T, H, W) is `list(clips)`.
-
-        In training mode each call takes one step of power iteration: judge real and completed clips in one call.
-
-        Raises:
-            ValueError: a clip is too small.
-        """
-        return self._judge(clips)
-
-
-Discriminator = ImageDiscriminator | ClipDiscriminator
-
-
-def build_discriminator(config: DiscriminatorConfig) -> Discriminator:
-    """The discriminator of this config, untrained."""
-    return ImageDiscriminator(config) if config.kind == "image" else ClipDiscriminator(config)

@@ -21,10 +21,6 @@ class ImageLoss:
     """log10 of the mean squared error in the holes, a tenth of -PSNR. Ours: where nobody can know whether a pixel is
     subject or background, L1 decides for one of them, squares hedge."""
 
-    def total(self, log_error_weight: float) -> Float[Tensor, ""]:
-        """lambda_img (L_in + L_out) with lambda_img = 1, and our term; the paper's has a weight of 0 for it."""
-        return self.inside + self.outside + log_error_weight * self.log_error
-
 
 def weighted_l1(
     predicted: Float[Tensor, "3 height width"],

@@ -40,7 +40,8 @@ def save_run(
     """Write the run; a file that was there is replaced in one move."""
     tensors = {f"{name}/{key}": value for name, m in modules.items() for key, value in m.state_dict().items()}
     for name, optimizer in optimizers.items():
-        tensors |= {f"{name}/{key}": value for key, value in _optimizer_tensors(optimizer).items()}
+        for number, values in optimizer.state_dict()["state"].items():
+            tensors |= {f"{name}/{number}/{key}": torch.as_tensor(value) for key, value in values.items()}
     metadata = {"state": json.dumps(asdict(state)), "recipe": json.dumps(_plain(recipe))}
     write_tensors(folder / FILE, tensors, metadata)
 
@@ -59,7 +60,7 @@ def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimi
         wrote, values = json.loads(metadata["recipe"]), json.loads(metadata["state"])
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
         raise RunError(f"{path}: expected a run to go on with, got {error}; remove the file to start anew") from error
-    mine = json.loads(json.dumps(_plain(recipe)))
+    mine = _plain(recipe)
     other = [key for key in mine if key not in MAY_CHANGE and mine[key] != wrote.get(key)]
     if other:
         raise RunError(
@@ -84,11 +85,6 @@ def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimi
 def _under(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     prefix = f"{name}/"
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
-
-
-def _optimizer_tensors(optimizer: Optimizer) -> dict[str, Tensor]:
-    states = optimizer.state_dict()["state"]
-    return {f"{number}/{key}": torch.as_tensor(v) for number, state in states.items() for key, v in state.items()}
 
 
 def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:

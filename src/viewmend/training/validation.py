@@ -47,6 +47,8 @@ class Validation:
     @torch.no_grad()
     def judge(self, model: nn.Module, step: int) -> ValidationScores:
         """Mend every view, score it, and leave a picture of the first few."""
+        import cv2
+
         if not self._samples:
             self._samples = self._views()
             unseen = ContextProvider(lambda *_: None)
@@ -63,7 +65,8 @@ class Validation:
             fills.append(_score(torch.where(sample.view.error > 0, made.coarse.float().cpu(), completed), sample))
             shown.append(torch.cat([sample.view.rgb, completed, sample.truth / 255], 2))
         model.train(training)
-        _write(self.folder / f"validation-{step:06d}.png", shown[:SHOWN])
+        shown_bgr = picture(shown[:SHOWN]).permute(1, 2, 0).flip(2).numpy()
+        cv2.imwrite(str(self.folder / f"validation-{step:06d}.png"), shown_bgr)
         return ValidationScores(step, *(sum(x) / len(x) for x in (ours, self._telea, fills)))
 
     def _views(self) -> list[Sample]:
@@ -80,14 +83,7 @@ def _score(rgb: Float[Tensor, "3 height width"], sample: Sample) -> float:
     return score
 
 
-def _write(path: Path, rows: list[Float[Tensor, "3 _h _w"]]) -> None:
-    """Rows of rendered, mended and true images, in one picture."""
-    import cv2
-
-    cv2.imwrite(str(path), picture(rows).permute(1, 2, 0).flip(2).numpy())
-
-
 def picture(rows: list[Float[Tensor, "3 _h _w"]]) -> UInt8[Tensor, "3 height width"]:
-    """Rows of three images each, all reduced to one size."""
+    """Rows of rendered, mended and true images, all reduced to one size."""
     same = [F.interpolate(r[None], (TILE_PX, 3 * TILE_PX), mode="bilinear", antialias=True)[0] for r in rows]
     return (torch.cat(same, 1).clamp(0, 1) * 255).round().to(torch.uint8)
