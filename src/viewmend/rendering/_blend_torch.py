@@ -66,13 +66,13 @@ def _sample(
     # Surface at this angle changes its depth by so much from one of the camera's pixels to the next.
     per_pixel = z / camera.K[0, 0, 0] * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
     usable, colour = torch.zeros_like(z), z.new_zeros(3, len(z))
-    for row, column, share, _ in bilinear_taps(uv, width, height):
+    for row, column, weight, _ in bilinear_taps(uv, width, height):
         depth = sources.depth[view, row, column]
-        share = share * ((depth == 0) | (z - depth <= bias_m + config.slope_px * per_pixel))
+        weight = weight * ((depth == 0) | (z - depth <= bias_m + config.slope_px * per_pixel))
         if frame.mask is not None:
-            share = share * (frame.mask[view, row, column] / 255)
-        usable = usable + share
-        colour = colour + share * frame.rgb[view, :, row, column]
+            weight = weight * (frame.mask[view, row, column] / 255)
+        usable = usable + weight
+        colour = colour + weight * frame.rgb[view, :, row, column]
     seen = in_view(uv[None], z[None], camera)[0]
     weight = seen * usable * facing**config.normal_power * agreeing**config.view_power
     return weight, colour / (255 * usable).clamp(min=1e-6)

@@ -27,20 +27,20 @@ class Adversary:
         self._own = own
 
     def judge(
-        self, batch: list[Sample], completed: tuple[Tensor, ...], share: float
+        self, batch: list[Sample], completed: tuple[Tensor, ...], weight: float
     ) -> tuple[Float[Tensor, ""], float]:
-        """L_adv for the inpainter, and what D's own loss was; D's gradients of it, times `share`, add up.
+        """L_adv for the inpainter, and what D's own loss was; D's gradients of it, times `weight`, add up.
 
         completed: Fhat of every view of the batch, clip by clip.
         """
-        return self.judge_images(*self._images(batch, completed), share)
+        return self.judge_images(*self._images(batch, completed), weight)
 
     def judge_images(
-        self, truth: list[Tensor], made: list[Tensor], error: list[Tensor], share: float
+        self, truth: list[Tensor], made: list[Tensor], error: list[Tensor], weight: float
     ) -> tuple[Float[Tensor, ""], float]:
         """The same of F*, Fhat and E as the discriminator takes them."""
         own_loss = discriminator_objective(self.discriminator, truth, made, error, self.kind)
-        (own_loss * share).backward()
+        (own_loss * weight).backward()
         return inpainter_objective(self.discriminator, made, error, self.kind), float(own_loss.detach())
 
     def step(self) -> None:

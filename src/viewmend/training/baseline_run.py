@@ -91,11 +91,11 @@ class BaselineRun(Run):
     def _rate_factor(self, step: int, progress: float) -> float:
         return 1.0 if progress < FULL_RATE else 0.1
 
-    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, share: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, weight: float):
         assert isinstance(outcome, BaselineOutcome)
         truth = [(clip.truth.transpose(0, 1) + 1) / 2 for clip in outcome.clips]
         made = [(images.transpose(0, 1) + 1) / 2 for images in outcome.composed]
-        return adversary.judge_images(truth, made, [clip.holes.float() for clip in outcome.clips], share)
+        return adversary.judge_images(truth, made, [clip.holes.float() for clip in outcome.clips], weight)
 
     def _write_model(self) -> None:
         write_tensors(self.out / TRAINED, self.averaged.state_dict(), {"format": "pt", "network": self.recipe.name})

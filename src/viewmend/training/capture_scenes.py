@@ -45,15 +45,15 @@ class CaptureScenes:
 
 
 class MixedScenes:
-    """Two sources, of which `share` of the scenes come from the first."""
+    """Two sources, of which `fraction` of the scenes come from the first."""
 
-    def __init__(self, first: SceneSource[Sample], second: SceneSource[Sample], share: float, seed: str) -> None:
+    def __init__(self, first: SceneSource[Sample], second: SceneSource[Sample], fraction: float, seed: str) -> None:
         self.first = first
         self.second = second
-        self.share = share
+        self.fraction = fraction
         self.seed = seed
 
     def scene(self, number: int) -> Sequence[Sample]:
         """A scene of either."""
-        source = self.first if Random(f"{self.seed}/which/{number}").random() < self.share else self.second
+        source = self.first if Random(f"{self.seed}/which/{number}").random() < self.fraction else self.second
         return source.scene(number)

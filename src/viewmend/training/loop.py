@@ -158,9 +158,9 @@ class Run:
     def _rate_factor(self, step: int, progress: float) -> float:
         return learning_rate_factor(step, progress, self.recipe.warmup)
 
-    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, share: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, weight: float):
         """See `Adversary.judge`."""
-        return adversary.judge(batch, outcome.completed, share)
+        return adversary.judge(batch, outcome.completed, weight)
 
     def _write_model(self) -> None:
         assert isinstance(self.averaged, NETWORKS)

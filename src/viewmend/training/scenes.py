@@ -147,11 +147,11 @@ def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[
     return samples
 
 
-def _dropouts(frames: Mapping[int, MultiViewFrame], share: float, random: Random) -> dict[int, list[str]]:
-    """One or two cameras that have no frame, at a share of the times."""
+def _dropouts(frames: Mapping[int, MultiViewFrame], fraction: float, random: Random) -> dict[int, list[str]]:
+    """One or two cameras that have no frame, at a fraction of the times."""
     dropped = {}
-    for time, frame in frames.items() if share else ():
+    for time, frame in frames.items() if fraction else ():
         names = frame.cameras.names
-        count = min(random.randint(1, 2), len(names) - FEWEST_CAMERAS) if random.random() < share else 0
+        count = min(random.randint(1, 2), len(names) - FEWEST_CAMERAS) if random.random() < fraction else 0
         dropped[time] = random.sample(names, count) if count > 0 else []
     return dropped
