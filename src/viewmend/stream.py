@@ -23,7 +23,7 @@ from viewmend.inpainting.protocol import (
     crop_margin_px,
 )
 from viewmend.observation import DepthProvider, Observation, observe
-from viewmend.rendering.crop import mesh_crop, subject_crop
+from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.timing import StageTimes, ms_since, now_s
 from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame
@@ -155,18 +155,8 @@ class Stream:
         Raises:
             ValueError: that time is not at hand, its geometry is not a `GeometryProxy`, or no camera is left.
         """
-        observation = self.observation(time)
-        proxy = observation.proxy
-        if not isinstance(proxy, GeometryProxy):
-            got = type(proxy).__name__
-            raise ValueError(
-                f"expected a GeometryProxy to render, got {got}; render the view yourself and mend it then"
-            )
-        crop = mesh_crop(proxy.mesh.vertices, target)
-        camera = target if crop is None else crop.of_camera(target)
-        frame, config = observation.frame, self.config.render
-        view = render_view(frame, proxy, camera, config, exclude=exclude, source_depth=observation.depth)
-        return view if crop is None else crop.uncropped(view, target)
+        part, crop = self._render(target, time, exclude)
+        return part if crop is None else crop.uncropped(part, target)
 
     def mend(
         self,
@@ -189,27 +179,19 @@ class Stream:
         Raises:
             ValueError: the view's time is not at hand, or it names cameras that are not in the frame.
         """
-        now, viewer, quality = self.observation(view.time), viewer or self.viewer(), quality or RenderQuality()
-        _demand_known(view, now.frame)
-        if not quality.mend:
-            return StreamView(CompletedView(view, view.rgb), viewer, StageTimes(geometry=now.pay_geometry()))
-        context = ContextProvider(self._context, quality, exclude, self._memory)
-        start = now_s(view.rgb.device)
-        margin_px = crop_margin_px(self.inpainter, quality)
+        quality = quality or RenderQuality()
+        _demand_known(view, self.observation(view.time).frame)
+        margin_px = crop_margin_px(self.inpainter, quality) if quality.mend else None
         crop = None if margin_px is None else subject_crop(view, margin_px)
-        part = view if crop is None else crop.of_view(view)
-        completed, viewer = self.inpainter.step(part, context, viewer)
-        rgb = completed.rgb
-        if crop is not None:
-            rgb = view.rgb
-            if completed.rgb is not part.rgb:
-                rgb = view.rgb.clone()
-                crop.of_image(rgb).copy_(completed.rgb)
-        inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms
-        self._observations.move_to_end(view.time)
-        self._forget(view.time)
-        times = StageTimes(geometry=now.pay_geometry(), context=context.encoding_ms, inpainting=inpainting_ms)
-        return StreamView(CompletedView(view, rgb), viewer, times)
+        if crop is None:
+            return self._fill(view, viewer, quality, exclude)
+        part = crop.of_view(view)
+        mended = self._fill(part, viewer, quality, exclude)
+        rgb = view.rgb
+        if mended.completed.rgb is not part.rgb:
+            rgb = view.rgb.clone()
+            crop.of_image(rgb).copy_(mended.completed.rgb)
+        return replace(mended, completed=CompletedView(view, rgb))
 
     def view(
         self,
@@ -231,11 +213,54 @@ class Stream:
         Raises:
             ValueError: as `render`'s.
         """
+        quality = quality or RenderQuality()
+        margin_px = crop_margin_px(self.inpainter, quality)
         start = now_s(target.K.device)
-        view = self.render(target, time, exclude)
+        part, crop = self._render(target, time, exclude, margin_px)
+        if crop is not None and margin_px is None and quality.mend:
+            part, crop = crop.uncropped(part, target), None
         rendering_ms = ms_since(start, target.K.device)
-        mended = self.mend(view, viewer, quality, exclude)
-        return replace(mended, times=replace(mended.times, rendering=rendering_ms))
+        mended = self._fill(part, viewer, quality, exclude)
+        completed = mended.completed if crop is None else crop.uncropped_completed(mended.completed, target)
+        return replace(mended, completed=completed, times=replace(mended.times, rendering=rendering_ms))
+
+    def _render(
+        self, target: Cameras, time: int | None, exclude: Sequence[str], margin_px: int | None = None
+    ) -> tuple[IncompleteView, Crop | None]:
+        """The part of the view that shows the subject, and which part that is; None where it is the whole view.
+
+        With a margin it is a part that can be filled on its own.
+        """
+        observation = self.observation(time)
+        frame, proxy = observation.frame, observation.proxy
+        if not isinstance(proxy, GeometryProxy):
+            got = type(proxy).__name__
+            raise ValueError(
+                f"expected a GeometryProxy to render, got {got}; render the view yourself and mend it then"
+            )
+        room = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
+        crop = mesh_crop(proxy.mesh.vertices, target, *room)
+        camera = target if crop is None else crop.of_camera(target)
+        config, depth = self.config.render, observation.depth
+        return render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth), crop
+
+    def _fill(
+        self, view: IncompleteView, viewer: State | None, quality: RenderQuality, exclude: Sequence[str]
+    ) -> StreamView:
+        """A view, or the part of one that matters, completed."""
+        now, viewer = self.observation(view.time), viewer or self.viewer()
+        completed, context = (
+            CompletedView(view, view.rgb),
+            ContextProvider(self._context, quality, exclude, self._memory),
+        )
+        start = now_s(view.rgb.device)
+        if quality.mend:
+            completed, viewer = self.inpainter.step(view, context, viewer)
+        inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms if quality.mend else 0.0
+        self._observations.move_to_end(view.time)
+        self._forget(view.time)
+        times = StageTimes(geometry=now.pay_geometry(), context=context.encoding_ms, inpainting=inpainting_ms)
+        return StreamView(completed, viewer, times)
 
     def _context(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
         return self._observations[time].context(names) if time in self._observations else None

@@ -50,7 +50,7 @@ def test_the_same_picture_as_of_the_whole_view(scene, azimuth, distance, context
 
 def test_the_margin_is_what_patches_look_around_themselves(monkeypatch):
     """The encoder tells the black within a view from what is beyond it."""
-    monkeypatch.setattr(crop, "GRID_PX", 16)
+    monkeypatch.setattr(crop, "grid_px", lambda margin_px: 16)
     net, size = tiny(coarse_fill="none"), {"width": 420, "height": 360}
     incomplete = view(0, (150, 200, 180, 240), **size)
     whole, _ = net.step(incomplete, Rig(**size), net.initial_state())
@@ -85,7 +85,8 @@ def test_what_is_filled_lies_on_the_grid_and_has_its_margin(scene):
     found = subject_crop(view, 30)
     assert found is not None
     assert all(
-        side % crop.GRID_PX == 0 or side in (500, 700) for side in (found.left, found.top, found.right, found.bottom)
+        side % crop.grid_px(30) == 0 or side in (500, 700)
+        for side in (found.left, found.top, found.right, found.bottom)
     )
     rows, columns = torch.nonzero(view.mask > 0).unbind(1)
     assert found.left <= int(columns.min()) - 30 and int(columns.max()) + 30 < found.right
@@ -94,6 +95,13 @@ def test_what_is_filled_lies_on_the_grid_and_has_its_margin(scene):
     again = found.uncropped(part, view.camera)
     for name in ("rgb", "mask", "error", "depth", "weights"):
         assert torch.equal(getattr(again, name), getattr(view, name))
+
+
+@pytest.mark.parametrize(
+    ("margin_px", "expected"), [(1, 16), (8, 16), (16, 16), (17, 32), (57, 64), (64, 64), (65, 128)]
+)
+def test_the_grid_is_the_first_power_of_two_that_holds_the_margin(margin_px, expected):
+    assert crop.grid_px(margin_px) == expected
 
 
 def test_a_crops_camera_sees_the_same_rays(scene):

@@ -9,13 +9,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project
-from viewmend.views import IncompleteView
+from viewmend.views import CompletedView, IncompleteView
 
 BORDER_PX = 2
 """What a rendered crop has around the subject's vertices."""
-GRID_PX = 64
-"""Crops that are filled begin and end at multiples of this: patches then lie as in the whole view, and smooth fills,
-which halve the resolution again and again, halve the same pixels."""
+PATCH_STEP_PX = 16
+"""Patches of a crop lie as in the whole view if it begins at a multiple of this."""
 NEAR_M = 1e-3
 
 
@@ -43,17 +42,27 @@ class Crop:
 
     def uncropped(self, part: IncompleteView, camera: Cameras) -> IncompleteView:
         """The whole view of `camera` again: black, and without subject, around this part."""
+        whole = {name: self._padded(getattr(part, name), camera) for name in _IMAGES}
+        return replace(part, camera=camera, **whole)
+
+    def uncropped_completed(self, part: CompletedView, camera: Cameras) -> CompletedView:
+        """The same of a completed part."""
+        view = self.uncropped(part.view, camera)
+        return CompletedView(view, view.rgb if part.rgb is part.view.rgb else self._padded(part.rgb, camera))
+
+    def _padded(self, image: Tensor, camera: Cameras) -> Tensor:
         width, height = camera.max_size_px
-        around = (self.left, width - self.right, self.top, height - self.bottom)
-        return replace(part, camera=camera, **{name: F.pad(getattr(part, name), around) for name in _IMAGES})
+        return F.pad(image, (self.left, width - self.right, self.top, height - self.bottom))
 
 
 _IMAGES = ("rgb", "mask", "error", "depth", "weights")
 """The fields of a view that are images."""
 
 
-def mesh_crop(vertices: Float[Tensor, "vertex 3"], camera: Cameras) -> Crop | None:
-    """What a surface of these vertices (metres, world) may cover of the camera's image.
+def mesh_crop(
+    vertices: Float[Tensor, "vertex 3"], camera: Cameras, margin_px: int = BORDER_PX, grid_px: int = 1
+) -> Crop | None:
+    """What a surface of these vertices (metres, world) may cover of the camera's image, and this margin around it.
 
     None where that is the whole image, or cannot be told: there are no vertices, or some are not in front.
     """
@@ -64,8 +73,8 @@ def mesh_crop(vertices: Float[Tensor, "vertex 3"], camera: Cameras) -> Crop | No
         return None
     width, height = camera.max_size_px
     (u0, v0), (u1, v1) = (corner[0].tolist() for corner in (uv.amin(1), uv.amax(1)))
-    left, right = _side(u0 - BORDER_PX, u1 + BORDER_PX, width, 1)
-    top, bottom = _side(v0 - BORDER_PX, v1 + BORDER_PX, height, 1)
+    left, right = _side(u0 - margin_px, u1 + margin_px, width, grid_px)
+    top, bottom = _side(v0 - margin_px, v1 + margin_px, height, grid_px)
     return _or_none(Crop(left, top, right, bottom), width, height)
 
 
@@ -76,9 +85,19 @@ def subject_crop(view: IncompleteView, margin_px: int) -> Crop | None:
     rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
     if not len(rows):
         return None
-    left, right = _side(float(columns[0]) - margin_px, float(columns[-1]) + 1 + margin_px, width, GRID_PX)
-    top, bottom = _side(float(rows[0]) - margin_px, float(rows[-1]) + 1 + margin_px, height, GRID_PX)
+    grid = grid_px(margin_px)
+    left, right = _side(float(columns[0]) - margin_px, float(columns[-1]) + 1 + margin_px, width, grid)
+    top, bottom = _side(float(rows[0]) - margin_px, float(rows[-1]) + 1 + margin_px, height, grid)
     return _or_none(Crop(left, top, right, bottom), width, height)
+
+
+def grid_px(margin_px: int) -> int:
+    """What crops that are filled begin and end at multiples of.
+
+    The first power of two, from a patch's step on, that holds the margin: smooth fills halve the resolution again and
+    again, and then mostly halve the same pixels as in the whole view.
+    """
+    return max(PATCH_STEP_PX, 1 << (margin_px - 1).bit_length())
 
 
 def _side(first: float, end: float, size: int, grid: int) -> tuple[int, int]:
