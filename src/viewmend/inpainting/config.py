@@ -63,11 +63,9 @@ class InpainterConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
-        positive = {
-            n: getattr(self, n) for n in ("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w", "num_ray_views")
-        }
-        wrong = [f"{n} = {v}" for n, v in positive.items() if v < 1]
-        wrong += [f"{n} = {getattr(self, n)}" for n in ("n_c", "n_w") if getattr(self, n) < 0]
+        least = dict.fromkeys(("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w", "num_ray_views"), 1)
+        least |= {"n_c": 0, "n_w": 0}
+        wrong = [f"{name} = {getattr(self, name)}" for name, low in least.items() if getattr(self, name) < low]
         if wrong:
             raise ValueError(f"expected positive sizes, got {', '.join(wrong)}")
         if self.dim % (16 * self.heads):

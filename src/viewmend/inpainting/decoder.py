@@ -30,7 +30,7 @@ class Decoder(nn.Module):
         )
         self.refines = config.coarse_fill != "none"
         self.mix = _mix(C // 2 + config.in_channels, C // 2) if self.refines else None
-        self.last = last = nn.Conv2d(C // 2, 3 + self.refines, 3, 1, 1)
+        self.last = nn.Conv2d(C // 2, 3 + self.refines, 3, 1, 1)
         for layer in (*self.layers, self.last):
             if isinstance(layer, nn.ConvTranspose2d):
                 # Each output pixel sees a quarter of the 4 x 4 kernel's taps.
@@ -39,7 +39,7 @@ class Decoder(nn.Module):
                 nn.init.zeros_(layer.bias)
         if config.colour_skip:
             # Detail starts small upon the colours that are copied.
-            last.weight.data.mul_(0.1)
+            self.last.weight.data.mul_(0.1)
 
     def forward(
         self, tokens: Float[Tensor, "patch dim"], pixels: Float[Tensor, "patch channel 28 28"]

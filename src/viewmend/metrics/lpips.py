@@ -53,10 +53,6 @@ class Heads(nn.Module):
             head.model = nn.Sequential(nn.Dropout(), nn.Conv2d(channels, 1, 1, bias=False))
             self.add_module(f"lin{number}", head)
 
-    def weights(self) -> list[Float[Tensor, "1 _channel 1 1"]]:
-        """The weights of each layer's channels."""
-        return list(self.state_dict().values())
-
 
 class Lpips(nn.Module):
     """LPIPS as a map; `load_lpips` makes one with weights, and there is no use for one without."""
@@ -87,9 +83,8 @@ class Lpips(nn.Module):
         if min(image.shape[1:]) < LEAST_PX[self.backbone]:
             return None
         pairs = self.network(torch.stack([image, truth]).float())
-        return [
-            (weight[0] * (x[0] - x[1]).square()).sum(0) for x, weight in zip(pairs, self.heads.weights(), strict=True)
-        ]
+        weights = self.heads.state_dict().values()
+        return [(weight[0] * (x[0] - x[1]).square()).sum(0) for x, weight in zip(pairs, weights, strict=True)]
 
 
 def load_lpips(backbone: Backbone, device: torch.device | str = "cpu") -> Lpips:

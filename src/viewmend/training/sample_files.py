@@ -5,6 +5,7 @@ import json
 import tarfile
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
+from itertools import islice
 from pathlib import Path
 from random import Random
 from typing import Any, Generic, TypeVar
@@ -59,15 +60,10 @@ def sample_from_bytes(data: bytes) -> Sample | RayBatch:
 def write_shards(samples: Iterable[Sample | RayBatch], folder: Path, per_shard: int = 48) -> Iterator[Path]:
     """Tar files of so many samples each, shard-00000.tar and on, every one whole or not there; yields their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    pending: list[Sample | RayBatch] = []
-    number = 0
-    for sample in samples:
-        pending.append(sample)
-        if len(pending) == per_shard:
-            yield _write_shard(pending, folder / f"shard-{number:05d}.tar")
-            pending, number = [], number + 1
-    if pending:
-        yield _write_shard(pending, folder / f"shard-{number:05d}.tar")
+    left = iter(samples)
+    shards = iter(lambda: list(islice(left, per_shard)), [])
+    for number, shard in enumerate(shards):
+        yield _write_shard(shard, folder / f"shard-{number:05d}.tar")
 
 
 def read_shard(path: Path) -> list[Sample | RayBatch]:
