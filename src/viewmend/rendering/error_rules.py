@@ -37,7 +37,7 @@ ErrorRule = Callable[[Evidence], Float[Tensor, "height width"]]
 
 
 def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
-    """1 on the pixels of the proxy that no chosen camera colours: the paper's E, by RIFTCast's threshold."""
+    """1 on the pixels of the proxy that no source view colours: the paper's E, by RIFTCast's threshold."""
     return (evidence.blend.weights.sum(0) < MIN_WEIGHT).to(evidence.mask) * evidence.mask
 
 

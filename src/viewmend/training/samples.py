@@ -22,7 +22,7 @@ class Sample:
 
     view: IncompleteView
     context: tuple[ContextViews, ...]
-    """The chosen cameras, one element a time, the view's own time first."""
+    """The source views, one element a time, the view's own time first."""
     nearby: ContextViews | None
     """What the cameras near the view, the chosen ones first, saw at its time: for an inpainter that reads rays."""
     truth: UInt8[Tensor, "3 height width"]
@@ -82,7 +82,7 @@ class LeaveOneOut:
 
         truth: the held camera at `time`, one view.
         cameras: how many are context at least, and how many `nearby`.
-        widened_px: by how much its holes are larger than what the chosen cameras do not see.
+        widened_px: by how much its holes are larger than what the source views do not see.
         """
         view = render_view(self.frames[time], self.proxy(time), truth.cameras, render)
         if float(view.error.sum()) < min_hole_px:
