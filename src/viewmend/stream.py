@@ -187,11 +187,7 @@ class Stream:
             return self._fill(view, viewer, quality, exclude)
         part = crop.of_view(view)
         mended = self._fill(part, viewer, quality, exclude)
-        rgb = view.rgb
-        if mended.completed.rgb is not part.rgb:
-            rgb = view.rgb.clone()
-            crop.of_image(rgb).copy_(mended.completed.rgb)
-        return replace(mended, completed=CompletedView(view, rgb))
+        return replace(mended, completed=crop.pasted(mended.completed, view))
 
     def view(
         self,

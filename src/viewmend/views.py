@@ -131,11 +131,12 @@ class IncompleteView:
     camera: Cameras
     """The novel view's camera (one view)."""
     rgb: Float[Tensor, "3 height width"]
-    """F, in [0, 1]; black where E is 1 and where there is no subject."""
+    """F, in [0, 1]; black where no camera colours it and where there is no subject."""
     mask: Float[Tensor, "height width"]
     """M, in [0, 1]: 1 where the geometry proxy covers the pixel."""
     error: Float[Tensor, "height width"]
-    """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where F is right."""
+    """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where F is right. By some rules F has a colour there, a
+    wrong one perhaps."""
     depth: Float[Tensor, "height width"]
     """z-depth of the proxy, metres; 0 where there is none."""
     source_views: tuple[str, ...]
@@ -174,4 +175,17 @@ class CompletedView:
 
     view: IncompleteView
     rgb: Float[Tensor, "3 height width"]
-    """Fhat, in [0, 1]; equal to `view.rgb` bit for bit where E is 0."""
+    """Fhat, in [0, 1], upon black; equal to `view.rgb` bit for bit where E is 0."""
+    alpha: Float[Tensor, "height width"] | None = None
+    """How much of each pixel the subject covers, in [0, 1]: `rgb` is multiplied by it. None from an inpainter that
+    does not tell, whose subject is M."""
+    confidence: Float[Tensor, "height width"] | None = None
+    """How sure the inpainter is of each pixel, in [0, 1]; 0 where there is no subject. None where it does not tell."""
+    depth: Float[Tensor, "height width"] | None = None
+    """Refined z-depth of the subject, metres, 0 where there is none. None where the proxy's is all there is."""
+
+    @property
+    def images(self) -> dict[str, Float[Tensor, "*channel height width"]]:
+        """All images that are there, by the names of their fields."""
+        found = {name: getattr(self, name) for name in ("rgb", "alpha", "confidence", "depth")}
+        return {name: image for name, image in found.items() if image is not None}

@@ -5,7 +5,7 @@ import torch
 from inpainting.plates import Rig, tiny, view
 
 from viewmend.inpainting.checkpoint import load_inpainter
-from viewmend.inpainting.protocol import RenderQuality
+from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live.poses import rig_frame, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.rendering import crop
@@ -13,6 +13,7 @@ from viewmend.rendering.crop import Crop, mesh_crop, subject_crop
 from viewmend.rendering.view import render_view
 from viewmend.stream import Stream
 from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.views import CompletedView
 
 
 @pytest.fixture(scope="module")
@@ -110,3 +111,29 @@ def test_a_crops_camera_sees_the_same_rays(scene):
     seen = Crop(16, 0, 40, 30).of_camera(camera)
     assert seen.max_size_px == (24, 30)
     assert float(seen.K[0, 0, 2]) == pytest.approx(float(camera.K[0, 0, 2]) - 16)
+
+
+def test_what_an_inpainter_tells_beside_colours_comes_back_in_the_whole_view(scene):
+    """Around the part that was completed there is no subject, and colours stay as they were rendered."""
+    stream, frame, _ = scene
+
+    class Tells:
+        def initial_state(self):
+            return State()
+
+        def crop_margin_px(self, quality):
+            return 4
+
+        def step(self, view, context, state):
+            rgb = torch.where(view.error > 0, 0.5, view.rgb)
+            return CompletedView(view, rgb, 0.5 * view.mask, view.mask, 2 * view.depth), state
+
+    camera = view_camera(Camera(azimuth=30.0, elevation=8.0, distance=frame.distance_m), frame, (420, 330))
+    telling = Stream(Tells(), stream.config)
+    telling.push(stream.observation().frame, stream.observation().proxy)
+    for completed in (telling.view(camera).completed, telling.mend(telling.render(camera)).completed):
+        assert completed.rgb.shape == (3, 330, 420)
+        assert torch.equal(completed.alpha, 0.5 * completed.view.mask)
+        assert torch.equal(completed.confidence, completed.view.mask)
+        assert torch.equal(completed.depth, 2 * completed.view.depth)
+        assert bool((completed.rgb[:, completed.view.error > 0] == 0.5).all())

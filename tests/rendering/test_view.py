@@ -46,6 +46,15 @@ def test_holes_are_where_the_weights_end():
     assert rows[view.mask[48] > 0][0] == 0 and rows[view.mask[48] > 0][-1] == 1
 
 
+def test_all_asks_for_the_whole_subject_and_keeps_its_colours():
+    cameras = ring(12)[[0]]
+    frame, target = photograph(cameras), camera_at(45, "t", 96)
+    unseen = render_view(frame, BALL, target, RenderConfig(cameras=1))
+    whole = render_view(frame, BALL, target, RenderConfig(cameras=1, error_rule="all"))
+    assert torch.equal(whole.error, whole.mask) and int(unseen.error.sum()) < int(whole.error.sum())
+    assert torch.equal(whole.rgb, unseen.rgb) and torch.equal(whole.weights, unseen.weights)
+
+
 def test_an_unknown_rule_is_named():
     with pytest.raises(ValueError, match="expected an error rule among"):
         error_rule("unsen")

@@ -48,7 +48,17 @@ class Crop:
     def uncropped_completed(self, part: CompletedView, camera: Cameras) -> CompletedView:
         """The same of a completed part."""
         view = self.uncropped(part.view, camera)
-        return CompletedView(view, view.rgb if part.rgb is part.view.rgb else self._padded(part.rgb, camera))
+        images = {name: self._padded(image, camera) for name, image in part.images.items()}
+        return CompletedView(view, **images | ({"rgb": view.rgb} if part.rgb is part.view.rgb else {}))
+
+    def pasted(self, part: CompletedView, view: IncompleteView) -> CompletedView:
+        """`view` completed by this part of it; around it, colours stay, and there is no subject."""
+        images = {name: self._padded(image, view.camera) for name, image in part.images.items()}
+        rgb = view.rgb
+        if part.rgb is not part.view.rgb:
+            rgb = view.rgb.clone()
+            self.of_image(rgb).copy_(part.rgb)
+        return CompletedView(view, **images | {"rgb": rgb})
 
     def _padded(self, image: Tensor, camera: Cameras) -> Tensor:
         width, height = camera.max_size_px

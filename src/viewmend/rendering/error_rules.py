@@ -41,7 +41,12 @@ def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
     return (evidence.blend.weights.sum(0) < MIN_WEIGHT).to(evidence.mask) * evidence.mask
 
 
-ERROR_RULES: dict[str, ErrorRule] = {"unseen": unseen}
+def all_covered(evidence: Evidence) -> Float[Tensor, "height width"]:
+    """1 on every pixel of the proxy: for inpainters that keep what is right by themselves. Ours."""
+    return evidence.mask
+
+
+ERROR_RULES: dict[str, ErrorRule] = {"unseen": unseen, "all": all_covered}
 """The rules by name. A new rule is a function, and a line here."""
 
 

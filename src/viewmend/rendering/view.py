@@ -11,7 +11,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering.blending import BlendConfig, blend
-from viewmend.rendering.error_rules import Evidence, error_rule
+from viewmend.rendering.error_rules import MIN_WEIGHT, Evidence, error_rule
 from viewmend.rendering.selection import select_closest
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
@@ -34,7 +34,7 @@ class RenderConfig:
     blend: BlendConfig = field(default_factory=BlendConfig)
     """How the chosen cameras' colours are weighted."""
     error_rule: str = "unseen"
-    """What counts as missing: 'unseen' marks the pixels that no chosen camera colours."""
+    """What must be mended: 'unseen', the pixels that no chosen camera colours, or 'all' of the subject."""
 
 
 def render_view(
@@ -73,7 +73,7 @@ def render_view(
     blended = blend(target, depth, normals, sources, bias_m, config.blend)
 
     error = error_rule(config.error_rule)(Evidence(mask, depth, blended))
-    coloured = mask * (error < 1)
+    coloured = mask * (blended.weights.sum(0) >= MIN_WEIGHT)
     weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
     seen = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)
     silhouettes = None if seen.mask is None else Silhouettes(seen.mask, seen.cameras)
