@@ -8,17 +8,30 @@ from safetensors import SafetensorError
 from safetensors.torch import save_file
 from torch import Tensor
 
+HALF = ".half-"
+"""How the name of a file begins that is being written."""
 
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+
+def write_atomically(path: Path, write: Callable[[Path], object], durable: bool = False) -> None:
     """`write` a file beside `path`, which then takes its place; nobody ever sees half a file.
 
+    A `durable` file is on the disk before it takes the place: a machine that stops leaves the old file or the new one.
+
     Raises:
-        OSError: it cannot be written; what was at `path` is as it was.
+        OSError: it cannot be written, with the path; what was at `path` is as it was.
     """
-    beside = path.with_name(f".half-{os.getpid()}-{path.name}")
+    beside = path.with_name(f"{HALF}{os.getpid()}-{path.name}")
     try:
         write(beside)
+        if durable:
+            _flush_to_disk(beside)
         beside.replace(path)
+        if durable and os.name == "posix":  # elsewhere folders cannot be opened
+            _flush_to_disk(path.parent)
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         beside.unlink(missing_ok=True)
 
@@ -28,8 +41,15 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
 
     Raises:
         OSError: it cannot be written.
+        FloatingPointError: a number is not finite; what was at `path` is as it was.
     """
     plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+    broken = [key for key, value in plain.items() if value.is_floating_point() and not bool(value.isfinite().all())]
+    if broken:
+        raise FloatingPointError(
+            f"{path}: expected finite numbers, got others in {len(broken)} of {len(plain)} tensors ({broken[0]}); the "
+            "file stays as it was: go on from there, with a lower learning rate"
+        )
 
     def write(beside: Path) -> None:
         try:
@@ -38,4 +58,12 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
             raise OSError(f"{path}: expected room for the file, got: {error}; free some, or write elsewhere") from error
         beside.chmod(0o644)
 
-    write_atomically(path, write)
+    write_atomically(path, write, durable=True)
+
+
+def _flush_to_disk(path: Path) -> None:
+    number = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

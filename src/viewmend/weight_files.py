@@ -46,7 +46,8 @@ def load_weights(
 
     Raises:
         DamagedWeightsError: the file is missing, unreadable or cut short.
-        MismatchedWeightsError: a tensor is missing, unknown or of another shape.
+        MismatchedWeightsError: a tensor is missing, unknown, of another shape or kind of number, or
+            not finite.
     """
     path, weights, own = Path(path), read_weights(path), network.state_dict()
     if rename is not None:
@@ -61,6 +62,8 @@ def load_weights(
         "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),
         "unknown": sorted(weights.keys() - own.keys()),
         "of another shape": reshaped,
+        "of another kind of number": _of_other_numbers(weights, own),
+        "not finite": sorted(key for key, value in weights.items() if not bool(value.isfinite().all())),
     }
     if any(wrong.values()):
         counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
@@ -71,6 +74,11 @@ def load_weights(
         )
     network.load_state_dict(weights, strict=False)
     return network.to(device).eval()
+
+
+def _of_other_numbers(weights: dict[str, Tensor], own: dict[str, Tensor]) -> list[str]:
+    kinds = {key: (value.is_floating_point(), value.is_complex()) for key, value in weights.items()}
+    return sorted(k for k, kind in kinds.items() if k in own and kind != (own[k].is_floating_point(), False))
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:

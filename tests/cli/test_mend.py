@@ -244,3 +244,19 @@ def test_the_page_shows_the_same_pixels(shifted, tmp_path, capsys):
         supply.stop()
     mended = cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1]
     assert mended.std() > 20 and np.abs(picture(view.rgb).astype(int) - mended).max() <= 1
+
+
+def test_a_model_without_finite_colours_is_refused(folder, tmp_path, capsys):
+    (tmp_path / "broken.py").write_text(
+        "import torch\nfrom viewmend.inpainting.coarse_fill import SmoothFill\n\n"
+        "class Broken(SmoothFill):\n"
+        "    def __init__(self, device):\n        super().__init__()\n\n"
+        "    def step(self, view, context, state):\n"
+        "        completed, state = super().step(view, context, state)\n"
+        "        completed.rgb[:, 20:24] = float('nan')\n"
+        "        return completed, state\n"
+    )
+    options = ["--out", str(tmp_path / "out"), "--model", f"{tmp_path}/broken.py:Broken", "--leave-out", "held"]
+    code = main(["mend", str(folder), *options])
+    assert code == 2 and "expected finite colours from Broken" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -85,6 +85,22 @@ def test_weights_of_another_config(saved, changes):
         load_inpainter(saved)
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        (lambda value: value.to(torch.int8), "of another kind of number"),
+        (lambda value: torch.full_like(value, float("nan")), "not finite"),
+        (lambda value: torch.full_like(value, float("-inf")), "not finite"),
+    ],
+)
+def test_weights_that_no_training_leaves_are_refused(saved, spoilt, said):
+    weights = load_file(saved / "model.safetensors")
+    name = sorted(weights)[3]
+    save_file(weights | {name: spoilt(weights[name])}, saved / "model.safetensors")
+    with pytest.raises(MismatchedWeightsError, match=f"1 {said} \\({name}"):
+        load_network(saved)
+
+
 def test_a_config_of_another_version(saved):
     values = json.loads((saved / "config.json").read_text())
     for changed in (values | {"viewmend_format": 99}, values | {"novelty": 1}, {"viewmend_format": 1}, []):

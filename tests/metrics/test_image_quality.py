@@ -99,3 +99,11 @@ def test_mask_iou_counts_pixels():
     assert mask_iou(a, b) == pytest.approx(0.2)
     assert mask_iou(a, a) == 1
     assert math.isclose(mask_iou(a, ~a) or 0, 0)
+
+
+def test_what_is_not_a_number_scores_nothing(pair):
+    image, truth = pair
+    image[0, 3, 4] = math.nan
+    assert math.isnan(psnr(image, truth))
+    assert psnr(image, truth, ~image.isnan().any(0)) > 10, "where it is not looked at it does no harm"
+    assert psnr(torch.full_like(truth, math.inf), truth) == -math.inf

@@ -75,6 +75,9 @@ class Mender:
             frame: the input cameras.
             target: the novel view's camera.
             truth: what a camera there saw (one view), used for scores alone.
+
+        Raises:
+            ValueError: the inpainter gives colours that are not finite.
         """
         if self._viewer is None:
             # Once unseen, so that what is compiled at first use is in no time that is shown.
@@ -83,6 +86,9 @@ class Mender:
             warm.view(target, quality=self._quality, exclude=self._exclude)
         observation = self._stream.push(frame)
         mended = self._stream.view(target, self._viewer, frame.time, self._quality, self._exclude)
+        if not bool(mended.completed.rgb.isfinite().all()):
+            name = type(self._stream.inpainter).__name__
+            raise ValueError(f"expected finite colours from {name}, got others; take another model, or train it again")
         self._viewer = mended.viewer
         iou = _hull_iou(observation)
         if truth is None:

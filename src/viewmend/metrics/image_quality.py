@@ -27,13 +27,14 @@ def psnr(
     """Peak signal to noise ratio in dB over all pixels, or over `pixels` alone (the paper's PSNR in the holes).
 
     The squared error is averaged over pixels and channels, the peak is 1. Equal pixels give `MAX_PSNR_DB`, no pixels
-    None.
+    None, and a colour that is not a number gives NaN.
     """
     squared = (image - truth).double().square().mean(0)
     chosen = squared if pixels is None else squared[pixels]
     if not chosen.numel():
         return None
-    return min(MAX_PSNR_DB, -10 * math.log10(max(float(chosen.mean()), 1e-30)))
+    error = float(chosen.mean())
+    return error if math.isnan(error) else min(MAX_PSNR_DB, -10 * math.log10(max(error, 1e-30)))
 
 
 def ssim_map(
