@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras
@@ -150,6 +150,11 @@ class IncompleteView:
     """The masks of these cameras at the view's time: they say more exactly than the proxy whether a pixel shows the
     subject at all. None where the renderer does not say."""
 
+    @property
+    def holes(self) -> Bool[Tensor, "height width"]:
+        """Pixels of the proxy that no chosen camera colours: the paper's E, whatever the error rule."""
+        return (self.mask > 0) & ~(self.weights > 0).any(0)
+
     def closest_views(self, count: int) -> tuple[str, ...]:
         """Names of this many cameras: the chosen ones, then the closest others."""
         return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
@@ -183,6 +188,11 @@ class CompletedView:
     """How sure the inpainter is of each pixel, in [0, 1]; 0 where there is no subject. None where it does not tell."""
     depth: Float[Tensor, "height width"] | None = None
     """Refined z-depth of the subject, metres, 0 where there is none. None where the proxy's is all there is."""
+
+    @property
+    def opacity(self) -> Float[Tensor, "height width"]:
+        """`alpha`, or M where the inpainter does not tell."""
+        return self.view.mask if self.alpha is None else self.alpha
 
     @property
     def images(self) -> dict[str, Float[Tensor, "*channel height width"]]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from reference import tells_all
 from reference.ball import BallCapture, camera_at
 
 from viewmend.baselines.classical import Telea
@@ -17,12 +18,17 @@ from viewmend.cli import main, serve
 from viewmend.contact_sheet import picture
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.live.renderer import Renderer, RenderRequest
+from viewmend.metrics.image_quality import psnr, ssim_map
 from viewmend.stream import RenderQuality
 
 KEYS = [
-    "frames", "hole_fraction", "psnr_whole", "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg",
+    "frames", "hole_fraction", "mended_fraction", "psnr_whole", "psnr_whole_rendered", "psnr_whole_unseen",
+    "ssim_whole", "psnr_subject", "alpha_iou", "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg",
     "psnr_holes_fg_telea", "hull_iou", "stage_ms",
 ]  # fmt: skip
+
+
+TELLS_ALL = f"{tells_all.__file__}:TellsAll"
 
 
 def rig():
@@ -41,7 +47,8 @@ def folder(tmp_path_factory):
 
 def mend(capsys, folder, out, *arguments):
     """Exit code, JSON and messages."""
-    code = main(["mend", str(folder), "--out", str(out), "--model", "telea", "--json", *map(str, arguments)])
+    model = [] if "--model" in arguments else ["--model", "telea"]
+    code = main(["mend", str(folder), "--out", str(out), "--json", *map(str, arguments), *model])
     said = capsys.readouterr()
     return code, json.loads(said.out) if code == 0 else said.out, said.err
 
@@ -62,6 +69,33 @@ def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, capsys):
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
     assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_whole_subject_may_be_mended(folder, tmp_path, capsys):
+    given = ["--leave-out", "held", "--model", TELLS_ALL]
+    _, unseen, _ = mend(capsys, folder, tmp_path / "a", *given)
+    _, whole, _ = mend(capsys, folder, tmp_path / "b", *given, "--error-rule", "all")
+    assert unseen["psnr_whole_unseen"] == unseen["psnr_whole"] != pytest.approx(whole["psnr_whole"], abs=0.5)
+    assert unseen["mended_fraction"] == unseen["hole_fraction"] == whole["hole_fraction"] < 0.5
+    assert whole["mended_fraction"] == 1
+    same = ["psnr_whole_rendered", "psnr_whole_unseen", "psnr_holes_telea", "psnr_holes", "alpha_iou"]
+    assert {key: whole[key] for key in same} == pytest.approx({key: unseen[key] for key in same}, abs=1e-4)
+    assert whole["psnr_valid"] < unseen["psnr_valid"]
+    asked = [cv2.imread(str(tmp_path / out / "holes" / "000000.png"), 0) > 0 for out in "ab"]
+    assert asked[1][asked[0]].all() and asked[1].sum() > 2 * asked[0].sum()
+
+
+def test_the_whole_view_is_scored(folder, tmp_path, capsys):
+    _, report, _ = mend(capsys, folder, tmp_path / "out", "--leave-out", "held", "--frames", "1:2")
+    prepared = prepare(open_masked(folder), [f"c{n}" for n in range(6)])
+    truth = prepared.read(1).select(["held"])
+    image, mask = truth.rgb[0] / 255 * (truth.mask[0] / 255), truth.mask[0] > 127
+    seen = torch.from_numpy(cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1] / 255).movedim(-1, 0)
+    assert report["psnr_whole"] == pytest.approx(psnr(seen, image), abs=0.02)
+    assert report["psnr_subject"] == pytest.approx(psnr(seen, image, mask), abs=0.02)
+    assert report["ssim_whole"] == pytest.approx(float(ssim_map(seen, image).mean()), abs=1e-3)
+    assert report["alpha_iou"] == pytest.approx(report["hull_iou"]["held"], abs=1e-9)
+    assert report["psnr_whole_rendered"] < report["psnr_whole"]
 
 
 def test_what_the_camera_left_out_saw_changes_scores_alone(folder, tmp_path, capsys):
@@ -125,6 +159,7 @@ def test_poses_come_from_a_file(folder, tmp_path, capsys):
         (["--leave-out", "held", "--context", "0"], "--context of at least 1"),
         (["--leave-out", "held", "--device", "abacus"], "expected a device that is there"),
         (["--leave-out", "held", "--model", "nothing"], "nothing"),
+        (["--leave-out", "held", "--error-rule", "some"], "expected an error rule among"),
         (["--path", "missing.json"], "missing.json"),
     ],
 )

@@ -27,7 +27,7 @@ def case():
     camera = Cameras(("c",), torch.eye(3)[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]))
     view = IncompleteView(
         camera, rgb * (error == 0), torch.ones(HEIGHT, WIDTH), error, torch.ones(HEIGHT, WIDTH), (),
-        torch.zeros(0, HEIGHT, WIDTH), 7,
+        (error == 0).float()[None], 7,
     )  # fmt: skip
     return CompletedView(view, ours), TrueView(truth, mask, None)
 
@@ -48,6 +48,23 @@ def test_by_hand(case):
     assert scores.flicker is scores.change is scores.lpips_alex_whole is None
 
 
+def test_the_whole_view_is_scored_beside_what_was_rendered(case):
+    completed, truth = case
+    scores = score_frame(completed, truth, None, 1.0)
+    assert scores.psnr_whole_rendered == pytest.approx(decibel(50 * 0.25 / 2000), abs=1e-4)
+    assert scores.psnr_subject == pytest.approx(decibel(50 * 0.01 / 1950), abs=1e-4)
+    assert scores.alpha_iou == pytest.approx(1950 / 2000)  # M, where nothing is told
+    alpha = torch.where(truth.mask, 0.51, 0.49)
+    alpha[0] = 0.2
+    assert score_frame(replace(completed, alpha=alpha), truth, None, 1.0).alpha_iou == pytest.approx(1900 / 1950)
+
+
+def test_holes_are_the_same_by_every_error_rule(case):
+    completed, truth = case
+    everything = replace(completed.view, error=completed.view.mask)
+    assert score_frame(replace(completed, view=everything), truth, None, 1.0) == score_frame(*case, None, 1.0)
+
+
 def test_ssim_of_each_reading(case):
     completed, truth = case
     scores = score_frame(completed, truth, None, 1.0)
@@ -63,7 +80,7 @@ def test_ssim_of_each_reading(case):
 
 def test_no_hole_has_no_score_in_holes(case):
     completed, truth = case
-    view = replace(completed.view, error=torch.zeros(HEIGHT, WIDTH))
+    view = replace(completed.view, error=torch.zeros(HEIGHT, WIDTH), weights=torch.ones(1, HEIGHT, WIDTH))
     scores = score_frame(CompletedView(view, truth.rgb), truth, None, 1.0)
     assert scores.psnr_holes is scores.psnr_masked is scores.ssim_holes is scores.ssim_masked is None
     assert scores.ssim_whole == 1 and scores.psnr_whole == 100
@@ -109,7 +126,7 @@ def temporal(case, moving, ours_before, ours_now):
     completed, truth = case
     view = completed.view
     return score_frame(
-        CompletedView(view, ours_now), TrueView(now, truth.mask, source), Before(ours_before, before, view.error), 1.0
+        CompletedView(view, ours_now), TrueView(now, truth.mask, source), Before(ours_before, before, view.holes), 1.0
     )
 
 

@@ -30,6 +30,8 @@ class Options:
     """Width and height of all images."""
     cameras: int = 6
     """Cameras of the ring."""
+    error_rule: str = "unseen"
+    """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject."""
     model: str | None = None
     """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
     json: bool = False
@@ -52,8 +54,10 @@ def run(options: Options) -> int:
     from viewmend.cli.console import print_json, say, track
     from viewmend.cli.demo_output import write_demo
     from viewmend.evaluation.mending import Mender, MendSummary
+    from viewmend.rendering.view import RenderConfig
     from viewmend.studio.stage import Studio, StudioConfig
 
+    render = RenderConfig(error_rule=options.error_rule)
     inpainter = load_named(options.model, "cpu")
     config = StudioConfig(
         seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=FPS
@@ -61,7 +65,7 @@ def run(options: Options) -> int:
     studio = Studio(config)
     say(f"on stage: {studio.performer.description}")
     path = _path(options)
-    mender = Mender(inpainter, 3, studio.bounds)
+    mender = Mender(inpainter, render, studio.bounds)
     summary, steps = MendSummary(), []
     for frame in track(prefetch(studio), "mending", options.frames):
         target = path[frame.time]
@@ -86,17 +90,18 @@ def _path(options: Options) -> "Cameras":
 
 
 def _report(summary: "MendSummary") -> dict[str, object]:
-    fills: tuple[Fill, ...] = ("unfilled", "telea", "ours")
-    metrics: tuple[Metric, ...] = ("psnr_whole", "psnr_holes", "psnr_holes_fg")
+    fills: tuple[Fill, ...] = ("unfilled", "telea", "unseen", "ours")
+    metrics: tuple[Metric, ...] = ("psnr_whole", "psnr_subject", "psnr_holes", "psnr_holes_fg")
     scores = {fill: {metric: summary.mean(fill, metric) for metric in metrics} for fill in fills}
     rest = summary.as_json()
-    return scores | {key: rest[key] for key in ("frames", "hole_fraction", "stage_ms")}
+    kept = ("frames", "hole_fraction", "mended_fraction", "ssim_whole", "alpha_iou", "stage_ms")
+    return scores | {key: rest[key] for key in kept}
 
 
 def _table(summary: "MendSummary", steps: "list[MendStep]") -> list[str]:
     from viewmend.cli.console import in_db
 
-    holes = sum(int((s.completed.view.error > 0).sum()) for s in steps)
+    holes = sum(int(s.completed.view.holes.sum()) for s in steps)
     lines = [f"{len(steps)} frames, {holes} missing pixels; PSNR in dB against the truth:"]
     lines.append("              whole image   holes   holes on the subject")
     rows: list[tuple[str, Fill]] = [("left black", "unfilled"), ("Telea", "telea"), ("viewmend", "ours")]

@@ -33,6 +33,9 @@ class RunOptions:
     """How many cameras of a capture are looked at: all, or a number of them, evenly around; several with commas."""
     closest: int = 3
     """How many of these colour a view: the closest to it."""
+    error_rule: str = "unseen"
+    """What all methods are asked to mend: 'unseen', the pixels that no camera colours; 'all' of the subject, which is
+    for methods that keep by themselves what is right. Scores in the holes are of the same pixels by every rule."""
     frames: int | None = None
     """Frames of each scene, from the first. By default 10 of P and Q, all of a capture."""
     every: int = 1
@@ -155,7 +158,9 @@ def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
     return RunSettings(
         device=options.device,
         precision=options.precision,
-        stream=StreamConfig(render=RenderConfig(cameras=options.closest), memory_mb=None),
+        stream=StreamConfig(
+            render=RenderConfig(cameras=options.closest, error_rule=options.error_rule), memory_mb=None
+        ),
         ssim=options.ssim,
         networks=networks,
     )

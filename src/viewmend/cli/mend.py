@@ -17,11 +17,13 @@ class Options:
     """Render novel views of a capture and fill their holes.
 
     OUT gets the mended views (mended.mp4, or mended/*.png for one view or without PyAV), E (holes/*.png, white where
-    a pixel was missing) and contact_sheet.png. With --leave-out the view is that of a camera whose image and mask are
-    used for nothing else, and is scored against it, black background: PSNR in dB of the whole image, of the pixels
-    that were rendered (valid), and of those that were missing (holes; fg: those inside the true mask), the latter
-    also for OpenCV's Telea fill. PSNRs are means over frames, in the holes over frames with at least 50 such pixels
-    (if there are any); hole_fraction is the holes' share of the hull's pixels.
+    a pixel was to be mended) and contact_sheet.png. With --leave-out the view is that of a camera whose image and mask
+    are used for nothing else, and is scored against it, black background: PSNR in dB of the whole image (also as it
+    was rendered, and with nothing but the holes mended: unseen), of the subject (inside the true mask), of the pixels
+    that a camera coloured (valid), and of those that none did (holes; fg: those inside the true mask), these also for
+    OpenCV's Telea fill; SSIM of the whole image; the IoU of alpha with the true mask. PSNRs are means over frames, in
+    the holes over frames with at least 50 such pixels (if there are any); hole_fraction is the holes' share of the
+    hull's pixels, mended_fraction that of those with E > 0.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
@@ -37,6 +39,9 @@ class Options:
     """Names of the input cameras, with commas; all by default."""
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
+    error_rule: str = "unseen"
+    """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject, for models that keep by
+    themselves what is right."""
     model: str | None = None
     """What fills the holes: a shipped model's name or a model's folder, or any method that `viewmend evaluate` takes
     ('telea', 'reprojection', 'dstt-o-mul', FILE.py:NAME)."""
@@ -74,7 +79,9 @@ def run(options: Options) -> int:
     from viewmend.cli.mend_output import MendOutput
     from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.inpainting.protocol import RenderQuality
+    from viewmend.rendering.view import RenderConfig
 
+    render = RenderConfig(cameras=options.context, error_rule=options.error_rule)
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = _times(options.frames, len(opened.frame_ids))
@@ -84,7 +91,7 @@ def run(options: Options) -> int:
     inputs = [name for name in opened.cameras.names if name not in held]
     capture = prepare(opened, inputs, align=options.align, first=times[0])
     say_alignment(capture.alignment)
-    mender = Mender(inpainter, options.context, capture.bounds, held, RenderQuality(top_k=options.top_k))
+    mender = Mender(inpainter, render, capture.bounds, held, RenderQuality(top_k=options.top_k))
     summary = MendSummary()
     plan, frames, frame = _plan(options, capture, times), prefetch(capture, times), None
     with MendOutput(options.out, fps=capture.fps or 15.0) as output:
@@ -114,8 +121,10 @@ def _in_words(summary: "MendSummary") -> list[str]:
     ]
     if summary.mean("ours", "psnr_whole") is None:
         return lines
-    lines += ["PSNR, dB", f"  whole image           {in_db(summary.mean('ours', 'psnr_whole'))}"]
-    lines.append(f"  rendered pixels       {in_db(summary.mean('ours', 'psnr_valid'))}")
+    whole = [in_db(summary.mean(fill, "psnr_whole")) for fill in ("ours", "unfilled", "unseen")]
+    lines += ["PSNR, dB", f"  whole image           {whole[0]}   rendered {whole[1]}   holes alone mended {whole[2]}"]
+    lines.append(f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}")
+    lines.append(f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}")
     holes: dict[str, Metric] = {"holes": "psnr_holes", "holes on the subject": "psnr_holes_fg"}
     for kind, metric in holes.items():
         ours, telea = summary.mean("ours", metric), summary.mean("telea", metric)

@@ -20,9 +20,9 @@ class MeanScores(Scores):
     """Means of frames' scores; None where there is nothing to average."""
 
     holes_of_hull: float | None
-    """Pixels of E as a share of those that the proxy covers."""
+    """Hole pixels as a share of those that the proxy covers."""
     holes_of_image: float | None
-    """Pixels of E as a share of all."""
+    """Hole pixels as a share of all."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class CellScores:
     scores: MeanScores
     frames: int
     thin_frames: int
-    """Frames left out of the scores in the holes: they have fewer than `ENOUGH_HOLE_PX` pixels of E."""
+    """Frames left out of the scores in the holes: they have fewer than `ENOUGH_HOLE_PX` hole pixels."""
     empty_frames: int
-    """Frames without any pixel of E: thin ones, too."""
+    """Frames without any hole pixel: thin ones, too."""
 
 
 @dataclass(frozen=True)

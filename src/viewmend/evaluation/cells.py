@@ -22,7 +22,7 @@ from viewmend.evaluation.scorers import KINDS, Features
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import identity, make_method
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error)
 """What an .npz file that is not whole raises."""

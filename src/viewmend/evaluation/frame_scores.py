@@ -10,7 +10,7 @@ from torch import Tensor
 from viewmend.evaluation.scorers import SSIM_ONLY, ScoreMap, Scorers
 from viewmend.evaluation.temporal import change, warp_error
 from viewmend.geometry.hull import FOREGROUND
-from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, psnr, ssim_map
+from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, mask_iou, psnr, ssim_map
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 from viewmend.views import CompletedView, MultiViewFrame
 
@@ -19,15 +19,19 @@ from viewmend.views import CompletedView, MultiViewFrame
 class Scores:
     """PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score.
 
-    Each of PSNR, SSIM and LPIPS comes as `whole`, over all pixels; `holes`, over the pixels of E alone (reading a);
-    `holes_fg`, over those of them inside the true mask; and `masked`, of both images blackened outside E, over all
-    pixels of the image (reading b). SSIM and LPIPS over pixels are means of their maps there, seen unmasked.
+    Each of PSNR, SSIM and LPIPS comes as `whole`, over all pixels; `holes`, over `IncompleteView.holes` alone (reading
+    a); `holes_fg`, over those of them inside the true mask; and `masked`, of both images blackened outside the holes,
+    over all pixels of the image (reading b). SSIM and LPIPS over pixels are means of their maps there, seen unmasked.
     """
 
     psnr_holes: float | None
     psnr_holes_fg: float | None
     psnr_masked: float | None
     psnr_whole: float | None
+    psnr_whole_rendered: float | None
+    """`psnr_whole` of the view before anything was mended."""
+    psnr_subject: float | None
+    """PSNR over the pixels inside the true mask."""
     ssim_holes: float | None
     ssim_holes_fg: float | None
     ssim_masked: float | None
@@ -40,14 +44,16 @@ class Scores:
     lpips_vgg_holes_fg: float | None
     lpips_vgg_masked: float | None
     lpips_vgg_whole: float | None
+    alpha_iou: float | None
+    """Overlap of alpha above one half, or of M where the method tells no alpha, with the true mask."""
     flicker: float | None
-    """The error's change from the frame before along the surface's true motion, over E; 0 for the truth."""
+    """The error's change from the frame before along the surface's true motion, over holes; 0 for the truth."""
     warp_error: float | None
-    """The view's own change from the frame before along the true motion, over E (`warp_error`)."""
+    """The view's own change from the frame before along the true motion, over holes (`warp_error`)."""
     warp_error_truth: float | None
     """The truth's."""
     change: float | None
-    """The change from the frame before, in place, over the pixels of E now or then (`change`)."""
+    """The change from the frame before, in place, over the holes of now or then (`change`)."""
     change_truth: float | None
     """The truth's."""
 
@@ -62,9 +68,9 @@ class FrameScores(Scores):
     hull_px: int
     """Pixels that the geometry proxy covers."""
     hole_px: int
-    """Pixels of E (E > 0)."""
+    """Pixels of `IncompleteView.holes`."""
     hole_fg_px: int
-    """Pixels of E inside the true mask."""
+    """Holes inside the true mask."""
     step_ms: float
     """What the inpainter's step took."""
 
@@ -91,7 +97,7 @@ class Before:
 
     completed: Float[Tensor, "3 height width"]
     truth: Float[Tensor, "3 height width"]
-    error: Float[Tensor, "height width"]
+    holes: Bool[Tensor, "height width"]
 
 
 def true_view(frame: MultiViewFrame, backward_flow_px: Float[Tensor, "height width 2"] | None) -> TrueView:
@@ -108,9 +114,9 @@ def score_frame(
     step_ms: float,
     scorers: Scorers = SSIM_ONLY,
 ) -> FrameScores:
-    """All scores of one completed view. Holes are the pixels with E > 0, the same for every method."""
+    """All scores of one completed view. Its holes are the same for every method and every error rule."""
     view, rgb = completed.view, completed.rgb
-    holes = view.error > 0
+    holes = view.holes
     pixels = _Pixels(rgb, truth.rgb, holes, holes & truth.mask)
     height, width = holes.shape
     return FrameScores(
@@ -124,6 +130,9 @@ def score_frame(
         psnr_holes_fg=psnr(rgb, truth.rgb, pixels.holes_fg),
         psnr_masked=psnr(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None,
         psnr_whole=psnr(rgb, truth.rgb),
+        psnr_whole_rendered=psnr(view.rgb, truth.rgb),
+        psnr_subject=psnr(rgb, truth.rgb, truth.mask),
+        alpha_iou=mask_iou(completed.opacity > 0.5, truth.mask),
         **_by_map("ssim", partial(similarity, window=scorers.ssim), pixels),
         **_by_map("lpips_alex", scorers.lpips_alex, pixels),
         **_by_map("lpips_vgg", scorers.lpips_vgg, pixels),
@@ -163,8 +172,8 @@ def _temporal(completed: CompletedView, truth: TrueView, before: Before | None) 
     found: dict[str, float | None] = dict.fromkeys(TEMPORAL)
     if before is None:
         return found
-    holes = completed.view.error > 0
-    now_or_then = holes | (before.error > 0)
+    holes = completed.view.holes
+    now_or_then = holes | before.holes
     now, then, true_now, true_then = completed.rgb, before.completed, truth.rgb, before.truth
     found["change"] = change(now, then, now_or_then, ENOUGH_HOLE_PX)
     found["change_truth"] = change(true_now, true_then, now_or_then, ENOUGH_HOLE_PX)
@@ -199,6 +208,13 @@ def similarity(
         assert part is not None, "the part is at least a window wide"
         inner[rows.start : rows.stop - 2 * half, columns.start : columns.stop - 2 * half] = part
     return found
+
+
+def mean_similarity(
+    image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"], window: SsimWindow = "gaussian"
+) -> float | None:
+    """SSIM of whole images; None where they are smaller than the window."""
+    return _mean(similarity(image, truth, window))
 
 
 def _reach(at: Tensor, length: int, size: int) -> slice:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import mean, median
 from typing import Literal
 
@@ -10,11 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.baselines.classical import Telea
+from viewmend.evaluation.frame_scores import mean_similarity
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
+from viewmend.metrics.image_quality import mask_iou
 from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
 from viewmend.observation import Observation
 from viewmend.rendering.view import RenderConfig
@@ -22,17 +24,23 @@ from viewmend.stream import Stream, StreamConfig
 from viewmend.timing import StageTimes
 from viewmend.views import CompletedView, MultiViewFrame
 
-Fill = Literal["unfilled", "telea", "ours"]
-Metric = Literal["psnr_whole", "psnr_valid", "psnr_holes", "psnr_holes_fg"]
+Fill = Literal["unfilled", "telea", "unseen", "ours"]
+Metric = Literal["psnr_whole", "psnr_subject", "psnr_valid", "psnr_holes", "psnr_holes_fg"]
 
 
 @dataclass(frozen=True)
 class Scores:
-    """The same view filled in three ways, against the truth."""
+    """The same view filled in several ways, against the truth."""
 
     unfilled: ViewScores
     telea: ViewScores
+    unseen: ViewScores
+    """Only the holes are mended, by the method that mends `ours`; the same where the error rule asks for no more."""
     ours: ViewScores
+    ssim_whole: float | None
+    """SSIM of `ours`."""
+    alpha_iou: float | None
+    """Overlap of alpha above one half, or of M where the method tells no alpha, with the true mask."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +65,17 @@ class Mender:
     def __init__(
         self,
         inpainter: ViewInpainter,
-        context: int = 3,
+        render: RenderConfig | None = None,
         bounds: Bounds | None = None,
         exclude: Sequence[str] = (),
         quality: RenderQuality | None = None,
     ):
-        self._config = StreamConfig(render=RenderConfig(cameras=context), memory_mb=None)
+        self._config = StreamConfig(render=render or RenderConfig(), memory_mb=None)
         self._stream = Stream(inpainter, self._config, bounds)
         self._exclude = exclude
         self._quality = quality
         self._viewer: State | None = None
+        self._viewer_of_holes: State | None = None
 
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
         """The next view of the stream; the same frame may be looked at many times.
@@ -93,25 +102,38 @@ class Mender:
         iou = _hull_iou(observation)
         if truth is None:
             return MendStep(frame, mended.completed, None, None, iou, mended.times)
-        image, scores = _judge(mended.completed, truth)
+        image, scores = _judge(mended.completed, self._holes_mended(mended.completed), truth)
         if scores.ours.hull_iou is not None:
             iou[truth.cameras.names[0]] = scores.ours.hull_iou
         return MendStep(frame, mended.completed, image, scores, iou, mended.times)
 
+    def _holes_mended(self, completed: CompletedView) -> CompletedView:
+        """The same view with nothing but its holes mended, as a stream of its own."""
+        if self._config.render.error_rule == "unseen":
+            return completed
+        view = replace(completed.view, error=completed.view.holes.to(completed.rgb))
+        mended = self._stream.mend(view, self._viewer_of_holes, self._quality, self._exclude)
+        self._viewer_of_holes = mended.viewer
+        return mended.completed
 
-def _judge(completed: CompletedView, truth: MultiViewFrame) -> tuple[Float[Tensor, "3 height width"], Scores]:
+
+def _judge(
+    completed: CompletedView, holes_mended: CompletedView, truth: MultiViewFrame
+) -> tuple[Float[Tensor, "3 height width"], Scores]:
     """The true image on black, and the scores against it."""
     view = completed.view
     height, width = view.mask.shape
     assert truth.mask is not None, "frames without masks are refused"
     mask = truth.mask[0, :height, :width]
-    image = truth.rgb[0, :, :height, :width] / 255 * (mask / 255)
+    image, subject = truth.rgb[0, :, :height, :width] / 255 * (mask / 255), mask > FOREGROUND
     baseline = Telea()
-    filled, _ = baseline.step(view, ContextProvider(lambda *_: None), baseline.initial_state())
-    unfilled, telea, ours = (
-        score_view(view, rgb, image, mask > FOREGROUND) for rgb in (view.rgb, filled.rgb, completed.rgb)
+    filled, _ = baseline.step(
+        replace(view, error=view.holes.to(view.rgb)), ContextProvider(lambda *_: None), baseline.initial_state()
     )
-    return image, Scores(unfilled, telea, ours)
+    fills = (view.rgb, filled.rgb, holes_mended.rgb, completed.rgb)
+    unfilled, telea, unseen, ours = (score_view(view, rgb, image, subject) for rgb in fills)
+    ssim = mean_similarity(completed.rgb, image)
+    return image, Scores(unfilled, telea, unseen, ours, ssim, mask_iou(completed.opacity > 0.5, subject))
 
 
 def _hull_iou(observation: Observation) -> dict[str, float]:
@@ -128,7 +150,7 @@ class MendSummary:
         self.frames = 0
         self.hull_iou: dict[str, list[float]] = {}
         """The IoU of each camera, frame by frame."""
-        self._hull_px = self._holes_px = 0
+        self._hull_px = self._holes_px = self._mended_px = 0
         self._scores: list[Scores] = []
         self._times: list[StageTimes] = []
 
@@ -137,7 +159,8 @@ class MendSummary:
         view = step.completed.view
         self.frames += 1
         self._hull_px += int((view.mask > 0.5).sum())
-        self._holes_px += int((view.error > 0).sum())
+        self._holes_px += int(view.holes.sum())
+        self._mended_px += int(((view.mask > 0.5) & (view.error > 0)).sum())
         if step.scores is not None:
             self._scores.append(step.scores)
         for name, iou in step.hull_iou.items():
@@ -154,7 +177,13 @@ class MendSummary:
         return {
             "frames": self.frames,
             "hole_fraction": self.hole_fraction,
+            "mended_fraction": self._mended_px / self._hull_px if self._hull_px else None,
             "psnr_whole": self.mean("ours", "psnr_whole"),
+            "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
+            "psnr_whole_unseen": self.mean("unseen", "psnr_whole"),
+            "ssim_whole": mean_over_frames([s.ssim_whole for s in self._scores]),
+            "psnr_subject": self.mean("ours", "psnr_subject"),
+            "alpha_iou": mean_over_frames([s.alpha_iou for s in self._scores]),
             "psnr_valid": self.mean("ours", "psnr_valid"),
             "psnr_holes": self.mean("ours", "psnr_holes"),
             "psnr_holes_telea": self.mean("telea", "psnr_holes"),

@@ -13,11 +13,13 @@ from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
 RULES = (
     "One camera is left out, with its mask; its view is carved and rendered from the others, and completed as a "
     "stream: one frame at a time, from past frames only. All methods complete the same rendered views.",
-    "Holes are the pixels with E > 0, not dilated, the same for compositing and for scores. The truth is the left-out "
-    "camera's image on black.",
-    'Each score has four readings: "whole", over all pixels; "holes", over the pixels of E alone (a); "in mask", over '
-    'those of them inside the true mask; "masked", of both images blackened outside E, over all pixels (b). SSIM and '
-    'LPIPS in "holes" and "in mask" are means of their maps there, of unmasked images.',
+    "Holes are the proxy's pixels that no camera in use colours, not dilated: E by the rule 'unseen', and the same for "
+    "scores whatever the methods were asked to mend. The truth is the left-out camera's image on black.",
+    'Each score has four readings: "whole", over all pixels; "holes", over the holes alone (a); "in mask", over '
+    'those of them inside the true mask; "masked", of both images blackened outside the holes, over all pixels (b). '
+    'SSIM and LPIPS in "holes" and "in mask" are means of their maps there, of unmasked images.',
+    '"Rendered" is the PSNR over all pixels before anything is mended, "subject" that inside the true mask; "alpha '
+    "IoU\" is the overlap of alpha above one half (without alpha: of the proxy's mask) with the true mask.",
     "SSIM: Gaussian window of 11 x 11 pixels, sigma 1.5, unless the setting says another; mean of the channels; only "
     "windows that lie in the image.",
     "LPIPS 0.1 of AlexNet and VGG16. VFID: I3D's Mixed_5c, a mean vector for each video of up to 16 frames in [0, 1], "
@@ -29,9 +31,9 @@ RULES = (
     "frames, as in the paper, and is no fair rival.",
     f"The gain over {REFERENCE} is the mean over the scenes in which both have a score.",
     '"Flicker" is how much the error, completed view minus truth, differs from that of the frame before, warped by the '
-    "true motion of the surface: mean absolute difference over E, in 255ths; the truth has 0.",
-    '"Warp" is the mean absolute difference from the frame before, warped in the same way, over E '
-    '(in 255ths); "change" is that in place, over the pixels of E now or then. The truth is not 0 in '
+    "true motion of the surface: mean absolute difference over the holes, in 255ths; the truth has 0.",
+    '"Warp" is the mean absolute difference from the frame before, warped in the same way, over the holes '
+    '(in 255ths); "change" is that in place, over the holes of now or then. The truth is not 0 in '
     "either: see its row.",
     "Milliseconds are the inpainter's step alone (not hull and rendering), with its caches as in production, over the "
     "frames with holes: FPS by their mean, median, 95th percentile. Each stream's first step is run twice and the "

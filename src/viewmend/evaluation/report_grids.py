@@ -13,7 +13,10 @@ COLUMNS = (
     ("masked", "psnr_masked", 1, 2),
     ("SSIM masked", "ssim_masked", 1, 5),
     ("whole, dB", "psnr_whole", 1, 2),
+    ("rendered", "psnr_whole_rendered", 1, 2),
     ("SSIM whole", "ssim_whole", 1, 4),
+    ("subject, dB", "psnr_subject", 1, 2),
+    ("alpha IoU", "alpha_iou", 1, 4),
     ("flicker", "flicker", 255, 2),
     ("warp", "warp_error", 255, 2),
     ("change", "change", 255, 2),
@@ -41,7 +44,8 @@ def setting_lines(report: Report) -> list[str]:
     settings = report.settings
     lines = [
         f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
-        f"{settings.stream.render.cameras} closest cameras; SSIM {settings.ssim}."
+        f"{settings.stream.render.cameras} closest cameras; error rule {settings.stream.render.error_rule}; "
+        f"SSIM {settings.ssim}."
     ]
     return lines + [
         f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "

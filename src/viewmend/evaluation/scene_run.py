@@ -113,7 +113,7 @@ def _moments(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Moment
         stream.bounds = frame.bounds
         observation = stream.push(frame.inputs)
         view = stream.render(frame.truth.cameras)
-        holes = int((view.error > 0).sum())
+        holes = int(view.holes.sum())
         last = _Moment(observation, view, true_view(frame.truth, frame.backward_flow_px), last, holes > most)
         yield last
         most, last = max(most, holes), replace(last, before=None)
@@ -132,7 +132,7 @@ class _Shown:
     def add(self, moment: _Moment) -> None:
         """One more time."""
         view, truth = moment.view, moment.truth
-        self.videos.add(truth.rgb, view.error > 0)
+        self.videos.add(truth.rgb, view.holes)
         if moment.largest:
             self.pictures = picture(view.rgb), picture(view.error[None]), picture(truth.rgb)
         if len(self._truth) < FILM_FRAMES:
@@ -181,10 +181,10 @@ class _Stream:
         rgb, before = mended.completed.rgb, None
         _check(rgb, view)
         if moment.before is not None and self._last is not None:
-            before = Before(self._last, moment.before.truth.rgb, moment.before.view.error)
+            before = Before(self._last, moment.before.truth.rgb, moment.before.view.holes)
         ms = mended.times.context + mended.times.inpainting
         self._scores.append(score_frame(mended.completed, moment.truth, before, ms, self._scorers))
-        self._videos.add(rgb, view.error > 0)
+        self._videos.add(rgb, view.holes)
         if len(self._frames) < FILM_FRAMES:
             self._frames.append(picture(rgb))
         self._viewer, self._last = mended.viewer, rgb

@@ -19,12 +19,14 @@ class ViewScores:
 
     psnr_whole: float
     """All pixels."""
+    psnr_subject: float | None
+    """Pixels inside the true mask."""
     psnr_valid: float | None
-    """Hull pixels outside E: what the renderer coloured."""
+    """Hull pixels that the renderer coloured."""
     psnr_holes: float | None
-    """Pixels of E."""
+    """Hull pixels that it did not: `IncompleteView.holes`, whatever the error rule."""
     psnr_holes_fg: float | None
-    """Pixels of E inside the true mask; the rest should have become background."""
+    """Holes inside the true mask; the rest should have become background."""
     hull_px: int
     holes_px: int
     holes_fg_px: int
@@ -39,12 +41,13 @@ def score_view(
     true_mask: Bool[Tensor, "height width"],
 ) -> ViewScores:
     """Compare `rgb`, a completion of `view`, with the true image, whose background is black."""
-    hull, holes = view.mask > 0.5, view.error > 0
+    hull, holes = view.mask > 0.5, view.holes
     holes_fg = holes & true_mask
     whole = psnr(rgb, truth)
     assert whole is not None, "images have pixels"
     return ViewScores(
         psnr_whole=whole,
+        psnr_subject=psnr(rgb, truth, true_mask),
         psnr_valid=psnr(rgb, truth, hull & ~holes),
         psnr_holes=psnr(rgb, truth, holes),
         psnr_holes_fg=psnr(rgb, truth, holes_fg),

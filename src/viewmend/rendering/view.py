@@ -36,6 +36,9 @@ class RenderConfig:
     error_rule: str = "unseen"
     """What must be mended: 'unseen', the pixels that no chosen camera colours, or 'all' of the subject."""
 
+    def __post_init__(self) -> None:
+        error_rule(self.error_rule)
+
 
 def render_view(
     frame: MultiViewFrame,
