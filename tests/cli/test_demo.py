@@ -19,7 +19,7 @@ def test_the_demo_renders_mends_and_scores(tmp_path, capsys):
     assert report["ours"] == report["telea"]
     assert report["telea"]["psnr_holes_fg"] > report["unfilled"]["psnr_holes_fg"] + 1
     assert set(report["stage_ms"]) == {"geometry", "context", "rendering", "inpainting"}
-    assert {f.name for f in (tmp_path / "a").iterdir()} == {"demo.mp4", "contact_sheet.png"}
+    assert {f.name for f in (tmp_path / "a").iterdir()} == {".viewmend", "demo.mp4", "contact_sheet.png"}
     video = cv2.VideoCapture(str(tmp_path / "a" / "demo.mp4"))
     read, panel = video.read()
     assert read and int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3

@@ -65,7 +65,7 @@ def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, capsys):
     holes = np.stack([cv2.imread(str(f), 0) for f in sorted((tmp_path / "out" / "holes").iterdir())])
     assert holes.shape == (2, 48, 48) and set(np.unique(holes)) <= {0, 255}
     assert report["hole_fraction"] == pytest.approx((holes > 0).sum() / 2 / 900, rel=0.3)
-    assert {f.name for f in (tmp_path / "out").iterdir()} == {"mended.mp4", "holes", "contact_sheet.png"}
+    assert {f.name for f in (tmp_path / "out").iterdir()} == {".viewmend", "mended.mp4", "holes", "contact_sheet.png"}
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
     assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
@@ -221,11 +221,15 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, capsys)
     notes.parent.mkdir()
     notes.write_text("precious")
     code, _, err = mend(capsys, folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
-    assert code == 2 and "pictures of an earlier run, got 'notes.txt'" in err and notes.read_text() == "precious"
+    assert (
+        code == 2
+        and "notes.txt: expected no such file, or one that an earlier run made" in err
+        and notes.read_text() == "precious"
+    )
     notes.unlink()
     for _ in range(2):  # its own results are
         assert mend(capsys, folder, tmp_path, "--leave-out", "held", "--frames", "0:1")[0] == 0
-    assert {f.name for f in tmp_path.iterdir()} == {"holes", "mended", "contact_sheet.png"}
+    assert {f.name for f in tmp_path.iterdir()} == {".viewmend", "holes", "mended", "contact_sheet.png"}
 
 
 def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, capsys):

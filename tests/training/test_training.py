@@ -79,6 +79,15 @@ def test_going_on_is_as_if_the_run_had_not_been_stopped(loss, tiny, tmp_path):
     assert len(reported) == 2, "a finished run has nothing left to do"
 
 
+def test_a_run_that_is_asked_to_stop_loses_no_step(tiny, tmp_path):
+    train(replace(tiny, checkpoint_every=100), tmp_path / "whole")
+    reported = []
+    train(replace(tiny, checkpoint_every=100), tmp_path / "parts", None, reported.append, None, lambda: bool(reported))
+    assert [entry.step for entry in reported] == [1]
+    train(replace(tiny, checkpoint_every=100), tmp_path / "parts", report=reported.append)
+    assert [entry.step for entry in reported] == [1, 2, 3, 4] and same_weights(tmp_path / "whole", tmp_path / "parts")
+
+
 def test_a_run_goes_on_only_with_its_own_recipe_and_a_whole_file(tiny, tmp_path):
     train(replace(tiny, steps=1), tmp_path)
     with pytest.raises(RunError, match="differs in batch, learning_rate"):
@@ -87,6 +96,46 @@ def test_a_run_goes_on_only_with_its_own_recipe_and_a_whole_file(tiny, tmp_path)
     (tmp_path / FILE).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(RunError, match=r"run\.safetensors: expected a run to go on with"):
         train(tiny, tmp_path)
+
+
+def test_the_checkpoint_before_the_last_is_kept_and_used_without_the_last(tiny, tmp_path):
+    train(tiny, tmp_path / "whole")
+    train(tiny, tmp_path / "parts")
+    (tmp_path / "parts" / FILE).write_bytes(b"damaged")
+    with pytest.raises(RunError, match=r"put run\.previous\.safetensors in its place"):
+        train(tiny, tmp_path / "parts")
+    (tmp_path / "parts" / FILE).unlink()
+    reported = []
+    train(tiny, tmp_path / "parts", report=reported.append)
+    assert [entry.step for entry in reported] == [3, 4] and same_weights(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_weights_that_are_not_finite_never_replace_good_ones(tiny, tmp_path, monkeypatch):
+    train(replace(tiny, steps=2), tmp_path)
+    before = {name: (tmp_path / name).read_bytes() for name in (FILE, "model.safetensors")}
+    monkeypatch.setattr(torch.optim.AdamW, "step", lambda self: self.param_groups[0]["params"][0].data.fill_(torch.inf))
+    with pytest.raises(FloatingPointError, match="expected finite numbers"):
+        train(replace(tiny, steps=3), tmp_path)
+    assert {name: (tmp_path / name).read_bytes() for name in before} == before
+
+
+def test_somebody_elses_log_is_not_touched(tiny, tmp_path):
+    (tmp_path / "log.jsonl").write_text('{"mine": 1}\n{"step": 7}\n')
+    with pytest.raises(ValueError, match=r"log\.jsonl: expected no such file"):
+        train(tiny, tmp_path)
+    assert [f.name for f in tmp_path.iterdir()] == ["log.jsonl"]
+    assert (tmp_path / "log.jsonl").read_text() == '{"mine": 1}\n{"step": 7}\n'
+
+
+def test_a_run_that_ended_before_its_first_checkpoint_begins_again(tiny, tmp_path):
+    def end(progress):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tiny, tmp_path, report=end)
+    assert len(log_of(tmp_path)) == 1 and not (tmp_path / FILE).exists()
+    train(tiny, tmp_path)
+    assert [entry["step"] for entry in log_of(tmp_path)] == [1, 2, 3, 4]
 
 
 def test_a_run_whose_values_do_not_fit_is_one_clear_error(tiny, tmp_path):

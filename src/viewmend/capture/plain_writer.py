@@ -6,6 +6,7 @@ import re
 import shutil
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from glob import escape
 from pathlib import Path
 from typing import Literal
 
@@ -47,6 +48,9 @@ def write_capture(
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.parent / f".{out.name}.unfinished-{os.getpid()}"
+    for left in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
+        if not _is_running(left.name.rpartition("-")[2]):
+            shutil.rmtree(left, ignore_errors=True)
     try:
         writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png", video)
         writer.write(range(len(source.frame_ids)) if progress is None else progress(range(len(source.frame_ids))))
@@ -55,6 +59,19 @@ def write_capture(
         unfinished.rename(out)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _is_running(process: str) -> bool:
+    """Whether a process of this machine has that number; True where it cannot be found out."""
+    if os.name != "posix" or not process.isdigit():
+        return True
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 class _Writer:

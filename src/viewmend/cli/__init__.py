@@ -7,16 +7,20 @@ nothing heavy (no torch, cv2, rich): help must be instant. Results go to standar
 error (`console.py`); with `--json`, standard output is one JSON value.
 
 What a user can get wrong is a ValueError (`CaptureError` is one) or an OSError and ends here as one line on standard
-error with exit code 2; any other exception is our mistake and shows its traceback, exit code 1.
+error with exit code 2; any other exception is our mistake and shows its traceback, exit code 1. Ctrl-C ends with 130,
+SIGTERM with 143; either way what was begun is removed.
 """
 
 import importlib
+import re
 import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from viewmend import __version__
+from viewmend.cli.console import say
+from viewmend.cli.signals import ended_by_sigterm
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command is None:
         names = ", ".join(c.name for c in COMMANDS)
         return _fail(f"expected a command among {names}, got '{arguments[0]}'; see viewmend --help")
-    return _run(command, arguments[len(command.name.split()) :])
+    empty = [n for n, word in enumerate(arguments) if not word.strip() or re.fullmatch(r"--[\w-]+=\s*", word)]
+    if empty:
+        before = arguments[empty[0] - (not arguments[empty[0]].strip())]
+        return _fail(f"expected a value after '{before.rstrip('= ')}', got an empty one; is a variable unset?")
+    with ended_by_sigterm():
+        return _run(command, arguments[len(command.name.split()) :])
 
 
 def _run(command: Command, arguments: list[str]) -> int:
@@ -76,7 +85,7 @@ def _run(command: Command, arguments: list[str]) -> int:
     except SystemExit as exit_request:  # tyro's: 0 after --help, 2 after a wrong option
         return exit_request.code if isinstance(exit_request.code, int) else 2
     except KeyboardInterrupt:
-        print("viewmend: interrupted", file=sys.stderr)
+        say("viewmend: interrupted")
         return 130
     except BrokenPipeError:  # the reader of our output left: nothing to say, and nobody to say it to
         sys.stderr.close()
@@ -92,7 +101,7 @@ def _run(command: Command, arguments: list[str]) -> int:
 
 
 def _fail(message: str) -> int:
-    print("viewmend: error:", " ".join(message.split()), file=sys.stderr)
+    say(f"viewmend: error: {' '.join(message.split())}")
     return 2
 
 

@@ -48,21 +48,23 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; 1 if an evaluation failed, else 0."""
-    from viewmend.cli.console import say
+    from viewmend.cli.console import say, show
+    from viewmend.cli.evaluating import report_folder
     from viewmend.evaluation.ablation_report import Ablation, markdown, plots, to_json
     from viewmend.evaluation.report_plot import require_matplotlib
 
     require_matplotlib()  # now, and not after days of training
     recipes = _recipes(options)
-    _make_samples(options, next(iter(recipes.values())))
-    trained = _train(options, recipes)
-    cells = _evaluate(options, trained)
-    ablation = Ablation.of(trained, cells)
-    options.out.joinpath("ablation.md").write_text(markdown(ablation), encoding="utf-8")
-    options.out.joinpath("ablation.json").write_text(to_json(ablation), encoding="utf-8")
-    options.out.joinpath("ablation.svg").write_text(plots(ablation), encoding="utf-8")
+    with report_folder(options.out):
+        _make_samples(options, next(iter(recipes.values())))
+        trained = _train(options, recipes)
+        cells = _evaluate(options, trained)
+        ablation = Ablation.of(trained, cells)
+        options.out.joinpath("ablation.md").write_text(markdown(ablation), encoding="utf-8")
+        options.out.joinpath("ablation.json").write_text(to_json(ablation), encoding="utf-8")
+        options.out.joinpath("ablation.svg").write_text(plots(ablation), encoding="utf-8")
     say(f"wrote {options.out}")
-    print(markdown(ablation), end="")
+    show(markdown(ablation).rstrip())
     return 1 if any(cell.error is not None for cell in cells) else 0
 
 

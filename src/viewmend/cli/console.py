@@ -11,17 +11,23 @@ from typing import TypeVar
 _Item = TypeVar("_Item")
 QUIET_S = 2.0
 """A bar appears only after this long: what is quick needs none."""
+BEAT_S = 30.0
+"""Seconds between lines that say how far a command is, where there is no terminal for a bar."""
 
 
 def track(items: Iterable[_Item], description: str, total: int | None = None) -> Iterator[_Item]:
-    """Pass `items` on, with a progress bar on standard error once two seconds went by, if that is a terminal.
+    """Pass `items` on, with a progress bar on standard error once two seconds went by.
 
-    `total` is the number of items; it is found by `len` where it is not given. A bar of an unknown total pulses.
+    Where that is no terminal, a line every half minute says how far it is. `total` is the number of items; it is found
+    by `len` where it is not given. A bar of an unknown total pulses.
     """
     if total is None and hasattr(items, "__len__"):
         total = len(items)  # pyright: ignore[reportArgumentType]
     if not sys.stderr.isatty():
-        yield from items
+        with Heartbeat(description) as heartbeat:
+            for done, item in enumerate(items):
+                heartbeat.text = f"{description}: {done}{'' if total is None else f' of {total}'}"
+                yield item
         return
     start, bar, task = time.monotonic(), None, None
     try:
@@ -48,9 +54,13 @@ def _bar():
 
 @contextlib.contextmanager
 def busy(description: str) -> Iterator[None]:
-    """Say what is going on once two seconds went by, if there is a terminal: for work that cannot be counted."""
+    """Say what is going on once two seconds went by, for work that cannot be counted.
+
+    Where there is no terminal, a line every half minute says it.
+    """
     if not sys.stderr.isatty():
-        yield
+        with Heartbeat(description):
+            yield
         return
     from rich.console import Console
 
@@ -65,9 +75,43 @@ def busy(description: str) -> Iterator[None]:
         status.stop()
 
 
+class Heartbeat:
+    """Says its text on standard error every half minute; a context manager."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, daemon=True)
+
+    def __enter__(self) -> "Heartbeat":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _beat(self) -> None:
+        while not self._ended.wait(BEAT_S):
+            say(self.text)
+
+
 def say(message: str) -> None:
     """A line for the person who watches, on standard error."""
-    print(message, file=sys.stderr, flush=True)
+    print(printable(message), file=sys.stderr, flush=True)
+
+
+def show(text: str) -> None:
+    """Lines of a result, on standard output."""
+    print("\n".join(map(printable, text.split("\n"))), flush=True)
+
+
+def printable(text: str) -> str:
+    """The text with all that is no visible character or space escaped.
+
+    Names come from files and folders that others made: no such name moves a cursor, hides a line or turns one around.
+    """
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def print_json(value: object) -> None:

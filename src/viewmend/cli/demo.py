@@ -51,9 +51,10 @@ def run(options: Options) -> int:
         raise ValueError(f"expected a positive --{wrong[0]}, got {getattr(options, wrong[0])}; see --help")
     from viewmend.capture.prefetch import prefetch
     from viewmend.cli.checks import load_named
-    from viewmend.cli.console import print_json, say, track
-    from viewmend.cli.demo_output import write_demo
+    from viewmend.cli.console import print_json, say, show, track
+    from viewmend.cli.demo_output import RESULTS, write_demo
     from viewmend.evaluation.mending import Mender, MendSummary
+    from viewmend.output_folder import OutputFolder
     from viewmend.rendering.view import RenderConfig
     from viewmend.studio.stage import Studio, StudioConfig
 
@@ -67,16 +68,20 @@ def run(options: Options) -> int:
     path = _path(options)
     mender = Mender(inpainter, render, studio.bounds)
     summary, steps = MendSummary(), []
-    for frame in track(prefetch(studio), "mending", options.frames):
-        target = path[frame.time]
-        steps.append(mender.mend(frame, target, studio.truth(target, frame.time)))
-        summary.add(steps[-1])
-    for file in write_demo(options.out, steps, FPS):
-        say(f"wrote {file}")
+    with OutputFolder(options.out) as folder:
+        folder.demand_own(*RESULTS)
+        for frame in track(prefetch(studio), "mending", options.frames):
+            target = path[frame.time]
+            steps.append(mender.mend(frame, target, studio.truth(target, frame.time)))
+            summary.add(steps[-1])
+        files = write_demo(folder.draft, steps, FPS)
+        folder.publish(*RESULTS)
+    for file in files:
+        say(f"wrote {options.out / file.name}")
     if options.json:
         print_json(_report(summary))
     else:
-        print("\n".join(_table(summary, steps)))
+        show("\n".join(_table(summary, steps)))
     return 0
 
 

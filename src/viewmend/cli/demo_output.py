@@ -14,6 +14,7 @@ from viewmend.cli.mend_output import SHEET_ROWS, holes_marked, sheet_row
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.evaluation.mending import MendStep
 
+RESULTS = ("demo.mp4", "frames", "contact_sheet.png")
 APART = 4
 """Frames of the sheet are at least so many apart."""
 

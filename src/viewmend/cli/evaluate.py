@@ -30,11 +30,13 @@ class Options(RunOptions):
 
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
-    from viewmend.cli.evaluating import evaluate, write_report
+    from viewmend.cli.console import show
+    from viewmend.cli.evaluating import evaluate, report_folder, write_report
     from viewmend.evaluation.report_data import report_json
     from viewmend.evaluation.report_markdown import summary
 
-    found = evaluate(options, options.sets, options.methods)
-    write_report(options, found)
-    print(report_json(found.report) if options.json else summary(found.report), end="")
+    with report_folder(options.out):
+        found = evaluate(options, options.sets, options.methods)
+        write_report(options, found)
+    show((report_json(found.report) if options.json else summary(found.report)).rstrip())
     return 1 if found.failed else 0

@@ -1,5 +1,6 @@
 """What the commands that evaluate share: their options, the scenes that these mean, and the run."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -8,11 +9,15 @@ from typing import TYPE_CHECKING, Literal
 from viewmend.cli.checks import check_device
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from viewmend.evaluation.cells import Cell, CellStore
     from viewmend.evaluation.report import Report
     from viewmend.evaluation.scene_run import RunSettings
     from viewmend.leave_one_out.scenes import LeaveOneOutScene
 
+WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
+"""What is written besides cells, models and samples."""
 POSITIVE = ("frames", "every", "scenes", "size", "jobs", "closest", "shown")
 
 
@@ -74,6 +79,25 @@ class Evaluated:
     def failed(self) -> bool:
         """Whether any cell failed."""
         return any(cell.error is not None for cell in self.cells)
+
+
+@contextmanager
+def report_folder(out: Path) -> "Iterator[None]":
+    """OUT for this run alone; a folder of cells from before there were manifests is ours.
+
+    Raises:
+        ValueError: another run writes there, or somebody else's file has the name of one that will be written.
+    """
+    from viewmend.output_folder import OutputFolder
+
+    cells = any((out / "cells").glob("*--*--*.json"))
+    with OutputFolder(out) as folder:
+        if folder.listed or not cells:
+            folder.demand_own(*WRITTEN)
+        try:
+            yield
+        finally:
+            folder.made(*WRITTEN)
 
 
 def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evaluated:

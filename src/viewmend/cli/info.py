@@ -33,7 +33,7 @@ def run(options: Options) -> int:
     """Run the command; the exit code."""
     from dataclasses import asdict
 
-    from viewmend.cli.console import print_json
+    from viewmend.cli.console import print_json, show
     from viewmend.inpainting.description import describe_model
 
     if _is_model(options.target):
@@ -47,7 +47,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(description)
     else:
-        print("\n".join(lines))
+        show("\n".join(lines))
     return 0
 
 

@@ -75,7 +75,7 @@ def run(options: Options) -> int:
     from viewmend.capture.prepare import prepare
     from viewmend.cli.alignment import say_alignment
     from viewmend.cli.checks import load_named
-    from viewmend.cli.console import print_json, say, track
+    from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import MendOutput
     from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.inpainting.protocol import RenderQuality
@@ -106,7 +106,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(summary.as_json())
     else:
-        print("\n".join(_in_words(summary)))
+        show("\n".join(_in_words(summary)))
     return 0
 
 

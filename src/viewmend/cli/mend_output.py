@@ -1,9 +1,6 @@
 """The files of `viewmend mend`: mended views, holes, and a contact sheet. All of them, or none."""
 
-import contextlib
-import re
 import shutil
-import tempfile
 from pathlib import Path
 
 import torch
@@ -14,10 +11,11 @@ from viewmend.capture.images import read_rgb, write_image
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.evaluation.mending import MendStep
 from viewmend.geometry.hull import FOREGROUND
+from viewmend.output_folder import OutputFolder
 from viewmend.views import IncompleteView
 
 SHEET_ROWS = 4
-PICTURE = re.compile(r"\d{6}\.png")
+RESULTS = ("mended", "mended.mp4", "holes", "contact_sheet.png")
 HOLE_COLOUR = (1.0, 0.0, 1.0)
 DIFFERENCE_GAIN = 3.0
 
@@ -29,23 +27,25 @@ class MendOutput:
     """
 
     def __init__(self, out: Path, fps: float):
-        """Begin.
-
-        Raises:
-            ValueError: `out` has a folder `mended` or `holes` that no earlier run left.
-            OSError: `out` cannot be made.
-        """
-        self._out, self._fps = out, fps
-        self._new = not out.exists()
-        for name in ("mended", "holes"):
-            _demand_pictures(out / name)
-        out.mkdir(parents=True, exist_ok=True)
-        self._draft = Path(tempfile.mkdtemp(dir=out, prefix=".mend."))
+        self._folder, self._fps = OutputFolder(out), fps
+        self._draft = self._folder.draft
         self._count = 0
         self._rows: list[list[Tile]] = []
         self._stride = 1
 
     def __enter__(self) -> "MendOutput":
+        """Begin.
+
+        Raises:
+            ValueError: files lie there that no earlier run made, or another run writes there.
+            OSError: the folder cannot be made.
+        """
+        self._folder.__enter__()
+        try:
+            self._folder.demand_own(*RESULTS)
+        except ValueError:
+            self._folder.__exit__()
+            raise
         return self
 
     def add(self, step: MendStep) -> None:
@@ -66,12 +66,9 @@ class MendOutput:
                 write_image(self._draft / "contact_sheet.png", contact_sheet(self._rows, 260, 400))
                 if self._count > 1:
                     self._to_video()
-                self._publish()
+                self._folder.publish(*RESULTS)
         finally:
-            shutil.rmtree(self._draft, ignore_errors=True)
-            if self._new:
-                with contextlib.suppress(OSError):  # it holds what was made
-                    self._out.rmdir()
+            self._folder.__exit__()
 
     def _to_video(self) -> None:
         """Replace the mended pictures by a video, where PyAV is installed."""
@@ -83,22 +80,6 @@ class MendOutput:
         except ImportError:
             return
         shutil.rmtree(self._draft / "mended")
-
-    def _publish(self) -> None:
-        for name in ("mended", "mended.mp4", "holes", "contact_sheet.png"):
-            old, new = self._out / name, self._draft / name
-            if old.exists():
-                old.rename(self._draft / f"old-{name}")
-            if new.exists():
-                new.rename(old)
-
-
-def _demand_pictures(folder: Path) -> None:
-    """ValueError if there is anything that is not a picture of an earlier run, which may be replaced."""
-    others = [file.name for file in folder.iterdir() if not PICTURE.fullmatch(file.name)] if folder.is_dir() else []
-    if others or (folder.exists() and not folder.is_dir()):
-        what = f"'{others[0]}' in it" if others else "a file"
-        raise ValueError(f"{folder}: expected none, or pictures of an earlier run, got {what}; choose another --out")
 
 
 def sheet_row(step: MendStep) -> list[Tile]:

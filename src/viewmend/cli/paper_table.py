@@ -37,7 +37,8 @@ class Options(RunOptions):
 
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
-    from viewmend.cli.evaluating import evaluate, write_report
+    from viewmend.cli.console import show
+    from viewmend.cli.evaluating import evaluate, report_folder, write_report
     from viewmend.evaluation.paper_tables import NO_FIGURES, OURS, TABLES, PaperRow, ablation_models, paper_grid
     from viewmend.evaluation.report_markdown import written
     from viewmend.methods import method_names
@@ -58,17 +59,18 @@ def run(options: Options) -> int:
         methods = {OURS: (first,)}
         rows += [PaperRow("not in the paper", name, NO_FIGURES) for name in (*others, *RIVALS)]
     names = [name for row in rows for name in methods.get(row.method, (row.method,))]
-    found = evaluate(options, sets, ",".join(dict.fromkeys(names)))
-    write_report(options, found)
-    grid = paper_grid(rows, found.report, methods)
-    text = _text(options.table, sets, written(grid), found.report)
-    stem = options.out / f"table{options.table}"
-    stem.with_suffix(".md").write_text(text, encoding="utf-8")
-    stem.with_suffix(".json").write_text(
-        json.dumps([dict(zip(grid.heads, r, strict=True)) for r in grid.rows], indent=1)
-    )
-    stem.with_suffix(".csv").write_text("\n".join(_csv_line(line) for line in (grid.heads, *grid.rows)) + "\n")
-    print(text, end="")
+    with report_folder(options.out):
+        found = evaluate(options, sets, ",".join(dict.fromkeys(names)))
+        write_report(options, found)
+        grid = paper_grid(rows, found.report, methods)
+        text = _text(options.table, sets, written(grid), found.report)
+        stem = options.out / f"table{options.table}"
+        stem.with_suffix(".md").write_text(text, encoding="utf-8")
+        stem.with_suffix(".json").write_text(
+            json.dumps([dict(zip(grid.heads, r, strict=True)) for r in grid.rows], indent=1)
+        )
+        stem.with_suffix(".csv").write_text("\n".join(_csv_line(line) for line in (grid.heads, *grid.rows)) + "\n")
+    show(text.rstrip())
     return 1 if found.failed else 0
 
 

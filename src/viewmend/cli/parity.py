@@ -29,7 +29,7 @@ def run(options: Options) -> int:
 
     from viewmend.baselines.parity import TOLERANCE, check
     from viewmend.cli.checks import check_device
-    from viewmend.cli.console import busy, print_json
+    from viewmend.cli.console import busy, print_json, show
 
     if not options.files:
         raise ValueError("expected one or more parity files, got none; see viewmend evaluate parity --help")
@@ -41,11 +41,10 @@ def run(options: Options) -> int:
         results.append({"file": str(path), **asdict(result), "passed": result.passed})
         if not options.json:
             verdict = "passed" if result.passed else f"FAILED: above {TOLERANCE:g}"
-            print(
+            show(
                 f"{path}: {result.name}, {result.frames} frames, seed {result.seed}: largest difference "
                 f"{result.difference:.2e} (means {result.mean_difference:.2e}, standard deviations "
-                f"{result.std_difference:.2e}): {verdict}",
-                flush=True,
+                f"{result.std_difference:.2e}): {verdict}"
             )
     if options.json:
         print_json(results)

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from viewmend.training.logs import Progress
     from viewmend.training.loop import Run
 
-LINE_EVERY = 20
-"""Steps between lines where there is no terminal."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -44,12 +41,13 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
 
 
 def run(options: Options) -> int:
-    """Train, with a bar on a terminal, else a line every twenty steps."""
+    """Train, with a bar on a terminal, else a line every half minute; Ctrl-C and SIGTERM end it with a checkpoint."""
     import os
 
     import torch
 
     from viewmend.cli.console import say
+    from viewmend.cli.signals import stop_requests
     from viewmend.inpainting.chain import build
     from viewmend.training.loop import NETWORKS, fitting_weights, train
 
@@ -62,11 +60,14 @@ def run(options: Options) -> int:
         if 0 < fitting < count:
             begun = recipe_options.started_from(recipe, options.start)
             say(f"{fitting} of {count} tensors begin as {begun} has them, the others at random")
-    with _Reporter(recipe.steps) as reporter:
+    with _Reporter(recipe.steps) as reporter, stop_requests() as stopped:
         try:
-            train(recipe, options.out, start, reporter.report, kind)
+            train(recipe, options.out, start, reporter.report, kind, stopped)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
+    if stopped():
+        say(f"{options.out}: stopped after step {reporter.last}, which is kept; the same command goes on from there")
+        return 130
     if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
         say(f"wrote {options.out}" if reporter.steps else f"{options.out}: this run was finished before; nothing to do")
     return 0
@@ -87,14 +88,17 @@ def _start(options: Options) -> "tuple[nn.Module | None, type[Run]]":
 
 
 class _Reporter:
-    """Shows a run: a bar where there is a terminal, else a line now and then."""
+    """Shows a run: a bar where there is a terminal, else a line every half minute."""
 
     def __init__(self, total: int) -> None:
         import sys
 
-        self.steps = 0
+        from viewmend.cli.console import Heartbeat
+
+        self.steps = self.last = 0
         self._total = total
         self._live = sys.stderr.isatty()
+        self._heartbeat = Heartbeat("making the first samples")
 
     def __enter__(self) -> "_Reporter":
         if self._live:
@@ -105,21 +109,22 @@ class _Reporter:
             self._bar = Progress(*columns, console=Console(stderr=True))
             self._bar.start()
             self._task = self._bar.add_task("training", total=1.0, text="making the first samples")
+        else:
+            self._heartbeat.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._live:
             self._bar.stop()
+        else:
+            self._heartbeat.__exit__()
 
     def report(self, progress: "Progress") -> None:
         """One more step."""
-        from viewmend.cli.console import say
-
-        self.steps += 1
+        self.steps, self.last = self.steps + 1, progress.step
+        self._heartbeat.text = _line(progress)
         if self._live:
             self._bar.update(self._task, completed=progress.progress, text=_line(progress))
-        elif progress.step % LINE_EVERY == 0:
-            say(_line(progress))
 
 
 def _line(progress: "Progress") -> str:

@@ -25,7 +25,7 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; 1 if a file is not what it should be, else 0."""
-    from viewmend.cli.console import print_json
+    from viewmend.cli.console import print_json, show
     from viewmend.metrics.weights import places
 
     if options.files:
@@ -37,12 +37,12 @@ def run(options: Options) -> int:
     else:
         for line in found:
             where = line["path"] or f"wanted as {line['files']}, from {line['source']}"
-            print(f"{line['name']}: {line['status']}: {where}")
-            print(f"    {line['what']}; licence: {line['licence']}; {line['hash']}")
+            show(f"{line['name']}: {line['status']}: {where}")
+            show(f"    {line['what']}; licence: {line['licence']}; {line['hash']}")
             if line["said"]:
-                print(f"    {line['said']}")
+                show(f"    {line['said']}")
         if not options.files:
-            print("looked in: " + ", ".join(str(place) for place in places()))
+            show("looked in: " + ", ".join(str(place) for place in places()))
     return 1 if any(line["status"] == "wrong" for line in found) else 0
 
 

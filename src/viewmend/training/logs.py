@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from viewmend.atomic_writes import write_atomically
 from viewmend.training.schedule import Pace
 from viewmend.training.validation import ValidationScores
 
@@ -49,7 +50,8 @@ class Log:
             return
         path = out / "log.jsonl"
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-        path.write_text("".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step))
+        kept = "".join(line for line in lines if line.endswith("\n") and not _is_later(line, step))
+        write_atomically(path, lambda beside: beside.write_text(kept))
         self._file = path.open("a")
         try:
             from torch.utils.tensorboard import SummaryWriter  # type: ignore[attr-defined]
@@ -87,3 +89,11 @@ class Log:
         if self._board is not None:
             for name, value in values.items():
                 self._board.add_scalar(name, value, step)
+
+
+def _is_later(line: str, step: int) -> bool:
+    """Whether a line of the log is of a later step; one that says no step stays."""
+    try:
+        return json.loads(line)["step"] > step
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return False

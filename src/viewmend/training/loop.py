@@ -1,7 +1,7 @@
 """The training loop: batches, steps, averaged weights, logs, checkpoints."""
 
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.checkpoint import save_inpainter
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.output_folder import OutputFolder
 from viewmend.training.adversary import Adversary
 from viewmend.training.logs import Log, LossTerms, Progress
 from viewmend.training.model_card import model_card
@@ -22,7 +23,7 @@ from viewmend.training.plan import Recipe
 from viewmend.training.processes import Processes, processes
 from viewmend.training.ray_batches import RayBatch, RaysObjective
 from viewmend.training.replay import ReplayPosition, SampleReplay
-from viewmend.training.run_files import FILE, RunError, RunState, load_run, save_run
+from viewmend.training.run_files import FILE, PREVIOUS, RunState, last_checkpoint, load_run, save_run
 from viewmend.training.sample_files import sample_to_bytes
 from viewmend.training.samples import Sample
 from viewmend.training.schedule import Schedule, learning_rate_factor
@@ -30,8 +31,8 @@ from viewmend.training.sources import training_source
 from viewmend.training.validation import Validation
 
 NETWORKS = (Chain, PatchTransformer)
-OWN_FILES = ("model.safetensors", "config.json", "README.md")
-"""What a run writes besides its log and itself, and another may have lying there."""
+MADE = ("model.safetensors", "config.json", "README.md", "log.jsonl", "validation-*.png", "not-finite-*", "tensorboard")
+"""What a run writes besides itself, and another may have lying there."""
 
 
 def train(
@@ -40,6 +41,7 @@ def train(
     start: nn.Module | None = None,
     report: Callable[[Progress], None] | None = None,
     kind: "type[Run] | None" = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Path:
     """Run a recipe, or go on with the run that `out` holds; under torchrun, with all of its processes.
 
@@ -52,17 +54,34 @@ def train(
         start: a model to begin with: its weights, wherever the recipe's model has one of the same name and shape.
         report: told of each step, in the first process.
         kind: what runs; a subclass trains something else than our model.
+        stopped: asked after each step in every process; once it is true anywhere, the run ends with a checkpoint.
 
     Raises:
         RunError: `out` holds a run of another recipe, or a damaged one.
-        FloatingPointError: a loss is not finite; the batch is saved in `out`.
+        ValueError: another run writes there, or files lie there that no run made, and no run to go on with.
+        FloatingPointError: a loss is not finite, and the batch is saved in `out`; or a weight is not, and the last
+            checkpoint stays.
     """
-    with processes() as own:
+    with processes() as own, _claimed(out) if own.first else nullcontext():
         run = (kind or Run)(recipe, out, start, own)
-        for progress in run.steps():
+        for progress in run.steps(stopped):
             if report is not None and own.first:
                 report(progress)
     return out
+
+
+@contextmanager
+def _claimed(out: Path) -> Iterator[None]:
+    """The folder of a run, for this one alone.
+
+    Raises:
+        ValueError: another run writes there, or somebody else's files lie there and no run to go on with.
+    """
+    with OutputFolder(out) as folder:
+        if last_checkpoint(out) is None:
+            folder.demand_own(*MADE)
+        folder.made(FILE, PREVIOUS, *MADE, *(f"{pattern}/*" for pattern in MADE[-2:]), changing=True)
+        yield
 
 
 class Run:
@@ -73,12 +92,6 @@ class Run:
 
     def __init__(self, recipe: Recipe, out: Path, start: nn.Module | None, own: Processes) -> None:
         out.mkdir(parents=True, exist_ok=True)
-        others = [name for name in OWN_FILES if (out / name).exists()]
-        if others and not (out / FILE).exists():
-            raise RunError(
-                f"{out}: expected an empty folder, or a run to go on with ({FILE}), got {', '.join(others)} of "
-                "something else; choose another folder"
-            )
         torch.manual_seed(recipe.seed)
         self.recipe, self.out, self.own = recipe, out, own
         self.model = self._make_model(start).to(own.device)
@@ -93,19 +106,19 @@ class Run:
         if self.adversary is not None:
             self._modules["discriminator"] = self.adversary.discriminator
             self._optimizers["discriminator_optimizer"] = self.adversary.optimizer
-        if (out / FILE).exists():
-            self.state = load_run(out, recipe, self._modules, self._optimizers)
+        if last := last_checkpoint(out):
+            self.state = load_run(last, recipe, self._modules, self._optimizers)
         self.shared = own.wrap_ddp(self.objective)
         self.streams = self._streams()
         self.validation = self._make_validation() if recipe.validate_every and own.first else None
 
-    def steps(self) -> Iterator[Progress]:
-        """Make all steps that are left; yields after each."""
+    def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
+        """Make all steps that are left, or those until `stopped`; yields after each."""
         schedule = Schedule(self.recipe, self.state.elapsed_s)
         with Log(self.out, self.state.step, self.own.first) as log:
             step = begun = self.state.step
             while True:
-                at = self.own.furthest(schedule.progress(step))
+                at = self.own.furthest(1.0 if stopped() else schedule.progress(step))
                 if at >= 1:
                     break
                 schedule.wait()

@@ -1,5 +1,6 @@
 """Batches that follow from the recipe, the seed and the step alone, so that a run can go on where it was."""
 
+import signal
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -86,6 +87,11 @@ class _Numbered(Dataset[tuple[int, Sequence[Item] | Exception]]):
             return index, error
 
 
+def _ignore_interrupts(_: int) -> None:
+    """Ctrl-C reaches all processes of a terminal; the first says what it means."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Iterator[tuple[int, int, Item]]:
     """(scene, number, sample) of all scenes from `first` on."""
     numbered = _Numbered(scenes)
@@ -99,6 +105,7 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
                 sampler=count(first),  # pyright: ignore[reportArgumentType]
                 num_workers=workers,
                 prefetch_factor=2,
+                worker_init_fn=_ignore_interrupts,
             )
         )
     else:

@@ -10,11 +10,12 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from viewmend.atomic_writes import write_tensors
+from viewmend.atomic_writes import HALF, write_tensors
 from viewmend.training.plan import Recipe
 from viewmend.training.replay import ReplayPosition
 
-FILE = "run.safetensors"
+FILE, PREVIOUS = "run.safetensors", "run.previous.safetensors"
+"""The last checkpoint, and the one before it."""
 MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_every", "validate_every", "validation_views")
 """Parts of a recipe that a run may go on with another value of."""
 
@@ -37,29 +38,37 @@ class RunState:
 def save_run(
     folder: Path, recipe: Recipe, state: RunState, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
 ) -> None:
-    """Write the run; a file that was there is replaced in one move."""
+    """Write the run; the checkpoint that was there becomes the previous one."""
     tensors = {f"{name}/{key}": value for name, m in modules.items() for key, value in m.state_dict().items()}
     for name, optimizer in optimizers.items():
         for number, values in optimizer.state_dict()["state"].items():
             tensors |= {f"{name}/{number}/{key}": torch.as_tensor(value) for key, value in values.items()}
     metadata = {"state": json.dumps(asdict(state)), "recipe": json.dumps(_plain(recipe))}
-    write_tensors(folder / FILE, tensors, metadata)
+    next_one = folder / f"{HALF}{FILE}"
+    write_tensors(next_one, tensors, metadata)
+    if (folder / FILE).exists():
+        (folder / FILE).replace(folder / PREVIOUS)
+    next_one.replace(folder / FILE)
 
 
-def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]) -> RunState:
+def last_checkpoint(folder: Path) -> Path | None:
+    """The newest checkpoint that a run left; None where there is none."""
+    return next((folder / name for name in (FILE, PREVIOUS) if (folder / name).exists()), None)
+
+
+def load_run(path: Path, recipe: Recipe, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]) -> RunState:
     """Put a run's values into the modules and optimizers that its recipe makes.
 
     Raises:
         RunError: the file is damaged, or another recipe wrote it.
     """
-    path = folder / FILE
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata()
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         wrote, values = json.loads(metadata["recipe"]), json.loads(metadata["state"])
     except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{path}: expected a run to go on with, got {error}; remove the file to start anew") from error
+        raise RunError(f"{path}: expected a run to go on with, got {error}; {_way_on(path)}") from error
     mine = _plain(recipe)
     other = [key for key in mine if key not in MAY_CHANGE and mine[key] != wrote.get(key)]
     if other:
@@ -77,9 +86,14 @@ def load_run(folder: Path, recipe: Recipe, modules: dict[str, nn.Module], optimi
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         said = " ".join(str(error).split())[:200]
         raise RunError(
-            f"{path}: expected a run of this version, got one whose values do not fit ({said}); remove the file to "
-            "start anew"
+            f"{path}: expected a run of this version, got one whose values do not fit ({said}); {_way_on(path)}"
         ) from error
+
+
+def _way_on(path: Path) -> str:
+    if path.name == FILE and path.with_name(PREVIOUS).exists():
+        return f"remove the file to start anew, or put {PREVIOUS} in its place to go on from the checkpoint before"
+    return "remove the file to start anew"
 
 
 def _under(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -1,0 +1,76 @@
+"""What people are told: progress without a terminal, names that others chose, signals."""
+
+import os
+import signal
+import subprocess
+import sys
+from time import sleep
+
+import pytest
+
+from viewmend.cli import console, main, signals
+from viewmend.cli.console import busy, printable, say, show, track
+
+
+def test_names_of_others_move_no_cursor(capsys):
+    name = "a\x1b[2Jb\rc\u202ed\x00e\ud800f\ng"
+    say(name)
+    show(f"{name}\nüber 日本")
+    said = capsys.readouterr()
+    assert said.err == "a\\x1b[2Jb\\rc\\u202ed\\x00e\\ud800f\\ng\n"
+    assert said.out.splitlines()[1:] == ["g", "über 日本"] and "\x1b" not in said.out
+    assert printable("plain text") == "plain text"
+
+
+def test_an_error_is_one_line_whatever_it_names(capsys):
+    assert main(["info", "no\x1b]0;such\x07\u202efolder"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said[:-1].isprintable() and "\\x1b]0;such\\x07\\u202efolder" in said
+
+
+def test_progress_is_said_without_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(console, "BEAT_S", 0.05)
+    for _ in track(range(2), "counting"):
+        sleep(0.12)
+    with busy("thinking"):
+        sleep(0.12)
+    said = capsys.readouterr().err.splitlines()
+    assert {"counting: 0 of 2", "counting: 1 of 2", "thinking"} <= set(said)
+    sleep(0.12)
+    assert capsys.readouterr().err == "", "an end is an end"
+
+
+@pytest.mark.parametrize("arguments", [["mend", "x", "--out", ""], ["mend", "x", "--out="], ["info", " "]])
+def test_an_empty_value_is_refused(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert "got an empty one; is a variable unset?" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys):
+    before = signal.getsignal(number)
+    with signals.stop_requests() as stopped:
+        assert not stopped()
+        os.kill(os.getpid(), number)
+        assert stopped() and "with a checkpoint" in capsys.readouterr().err
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+            sleep(1)
+    assert signal.getsignal(number) == before
+
+
+def test_sigterm_lets_a_command_clean_up(tmp_path):
+    program = (
+        "import pathlib, sys, time\n"
+        "from viewmend.cli import signals\n"
+        "with signals.ended_by_sigterm():\n"
+        "    try:\n        print('begun', flush=True)\n        time.sleep(20)\n"
+        "    finally:\n        pathlib.Path(sys.argv[1]).write_text('cleaned')\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "a")], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"begun\n"
+        process.terminate()
+        assert process.wait(20) == 143
+    assert (tmp_path / "a").read_text() == "cleaned"

@@ -1,0 +1,121 @@
+"""One run at a time, and nobody's files are replaced but our own."""
+
+import subprocess
+import sys
+
+import pytest
+
+from viewmend.output_folder import OutputFolder
+
+NAMES = ("pictures", "sheet.png")
+
+
+def published(out, pictures=("0", "1")):
+    with OutputFolder(out) as folder:
+        (folder.draft / "pictures").mkdir()
+        for name in pictures:
+            (folder.draft / "pictures" / f"{name}.png").write_text(f"picture {name} of {len(pictures)}")
+        (folder.draft / "sheet.png").write_text(f"sheet of {len(pictures)}")
+        folder.publish(*NAMES)
+
+
+def seen(out):
+    return sorted(p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file() and ".viewmend" not in p.parts)
+
+
+def test_what_a_run_made_the_next_one_replaces(tmp_path):
+    published(tmp_path / "out", ("0", "1", "2"))
+    (tmp_path / "out/mine.txt").write_text("mine")
+    published(tmp_path / "out")
+    assert seen(tmp_path / "out") == ["mine.txt", "pictures/0.png", "pictures/1.png", "sheet.png"]
+    assert (tmp_path / "out/sheet.png").read_text() == "sheet of 2"
+
+
+@pytest.mark.parametrize("name", ["pictures/000123.png", "pictures/0.png", "pictures/deep/a.txt", "sheet.png"])
+@pytest.mark.parametrize("before", [True, False], ids=["after a run", "before any"])
+def test_what_somebody_put_there_stays(name, before, tmp_path):
+    if before:
+        published(tmp_path)
+    path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("precious")
+    there = seen(tmp_path)
+    with pytest.raises(ValueError, match=f"{name}: expected no such file, or one that an earlier run made"):
+        published(tmp_path)
+    assert path.read_text() == "precious" and seen(tmp_path) == there
+
+
+@pytest.mark.parametrize("name", ["pictures", "sheet.png"])
+def test_links_are_nobodys_results(name, tmp_path):
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).symlink_to(tmp_path / "theirs")
+    with pytest.raises(ValueError, match="expected no such file"):
+        published(tmp_path / "out")
+
+
+def test_two_runs_never_write_to_one_folder(tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from viewmend.output_folder import OutputFolder\n"
+        "OutputFolder(Path(sys.argv[1])).__enter__()\n"
+    )
+    with OutputFolder(tmp_path):
+        other = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, check=False)
+        assert other.returncode == 1 and b"got one in use" in other.stderr
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False).returncode == 0
+
+
+def test_what_a_killed_run_left_is_removed(tmp_path):
+    program = (
+        "import os, sys; from pathlib import Path; from viewmend.output_folder import OutputFolder as F\n"
+        "from viewmend.atomic_writes import write_atomically\n"
+        "folder = F(Path(sys.argv[1])).__enter__()\n"
+        "(folder.draft / 'a').write_text('half')\n"
+        "write_atomically(folder.path / 'b', lambda path: (path.write_text('half'), os.kill(os.getpid(), 9)))\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False).returncode == -9
+    left = [p.name for p in tmp_path.rglob("*") if p.is_file()]
+    assert "a" in left and any(name.startswith(".half-") and name.endswith("-b") for name in left)
+    with OutputFolder(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_in_which_nothing_was_made_is_gone(tmp_path):
+    with pytest.raises(OSError, match="broken"), OutputFolder(tmp_path / "out") as folder:
+        (folder.draft / "a").write_text("half")
+        raise OSError("broken")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_that_change_are_known_by_their_names(tmp_path):
+    with OutputFolder(tmp_path) as folder:
+        folder.made("log.jsonl", "shown-*.png", changing=True)
+    for name in ("log.jsonl", "shown-3.png"):
+        (tmp_path / name).write_text("anything")
+    with OutputFolder(tmp_path) as folder:
+        folder.demand_own("*")
+        (tmp_path / "notes").write_text("mine")
+        with pytest.raises(ValueError, match="notes: expected"):
+            folder.demand_own("*")
+
+
+def test_files_are_listed_once_they_are_made(tmp_path):
+    with OutputFolder(tmp_path) as folder:
+        assert not folder.listed
+        (tmp_path / "report.md").write_text("a")
+        folder.made("report.*")
+    with OutputFolder(tmp_path) as folder:
+        assert folder.listed
+        folder.demand_own("report.*")
+        (tmp_path / "report.md").write_text("edited")
+        with pytest.raises(ValueError, match="report"):
+            folder.demand_own("report.*")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "[" * 100_000, '{"files": 3}', '{"files": {"sheet.png": 3}}'])
+def test_a_damaged_manifest_knows_nothing(text, tmp_path):
+    published(tmp_path)
+    (tmp_path / ".viewmend/files.json").write_text(text)
+    with pytest.raises(ValueError, match="expected no such file"):
+        published(tmp_path)
