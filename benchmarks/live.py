@@ -36,7 +36,7 @@ def served(size: tuple[int, int], budget_ms: float | None, device: str):
     supply = ReadAhead(lambda: Studio(config), generated=True)
     renderer = Renderer(supply, load_inpainter("small", device), device=device)
     service, settings = RenderService(renderer, supply), ServerConfig(port=0, budget_ms=budget_ms)
-    server = Server(LiveServer(service, settings), settings, pushes=False)
+    server = Server(LiveServer(service, settings), settings)
     with server.bound() as url:
         thread = threading.Thread(target=server.run_bound)
         thread.start()

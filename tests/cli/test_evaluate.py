@@ -25,7 +25,7 @@ def test_a_report_is_written_in_every_form_and_a_second_run_says_the_same(tmp_pa
     assert cli.main(command) == 0
     first = json.loads(capsys.readouterr().out)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        "cells", "sheets", "report.md", "report.csv", "report.json", "report.html",
+        ".viewmend", "cells", "sheets", "report.md", "report.csv", "report.json", "report.html",
     }  # fmt: skip
     assert cli.main(command) == 0
     assert json.loads(capsys.readouterr().out) == first

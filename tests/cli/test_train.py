@@ -92,7 +92,7 @@ def test_a_model_that_lies_there_is_not_overwritten(capture, model, tmp_path, ca
     before = (out / "model.safetensors").read_bytes()
     command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
     assert main(command) == 2
-    assert "config.json: expected no such file, or one that an earlier run made" in capsys.readouterr().err
+    assert "model.safetensors: expected no such file, or one that an earlier run made" in capsys.readouterr().err
     assert (out / "model.safetensors").read_bytes() == before
 
 

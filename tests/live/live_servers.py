@@ -36,13 +36,13 @@ class Running:
 
 
 @contextlib.contextmanager
-def running(supply=None, inpainter=None, pushes=False, ready=True, **config) -> Iterator[Running]:
+def running(supply=None, inpainter=None, ready=True, **config) -> Iterator[Running]:
     """A server on a free port, stopped at the end."""
     supply = supply or ReadAhead(lambda: BallCapture(CAMERAS, 3))
     settings = ServerConfig(**({"port": 0, "budget_ms": None} | config))
     service = RenderService(Renderer(supply, inpainter or SmoothFill(), PIPELINE), supply)
     live = LiveServer(service, settings)
-    server = Server(live, settings, pushes)
+    server = Server(live, settings)
     with server.bound() as url:
         thread = threading.Thread(target=server.run_bound)
         thread.start()

@@ -10,6 +10,7 @@ import time
 
 import pytest
 from live_servers import running, wait_until
+from starlette.requests import HTTPConnection
 from test_server import get
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -154,7 +155,7 @@ def test_disconnects_in_the_middle_of_a_frame():
 
 def test_requests_that_never_end_are_cut_off(monkeypatch):
     monkeypatch.setattr(listener, "SILENT_S", 0.5)
-    with running(token="secret") as server:
+    with running(token="a long secret indeed") as server:
         port = int(server.url.rsplit(":", 1)[1])
         whole = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
         posted = b"POST /path.mp4 HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
@@ -168,25 +169,28 @@ def test_requests_that_never_end_are_cut_off(monkeypatch):
         kept_open = asked.sock
         for _ in range(8):  # for longer than SILENT_S, on one connection
             time.sleep(0.25)
-            asked.request("GET", "/health?token=secret")
+            asked.request("GET", "/health?token=a+long+secret+indeed")
             assert asked.getresponse().read() and asked.sock is kept_open
         asked.close()
 
 
 def test_a_token_may_have_any_sign():
-    with running(token="a+b&c#d/e f%") as server, Client(server.ws, token="a+b&c#d/e f%") as viewer:
+    with running(token="a+b&c#d/e f%, and more") as server, Client(server.ws, token="a+b&c#d/e f%, and more") as viewer:
         assert viewer.messages["welcome"]
 
 
 def test_strangers_and_the_token():
-    with running(token="sesame") as server:
+    with running(token="open sesame, open") as server:
         assert get(f"{server.url}/health")[0] == 401
         assert get(f"{server.url}/health?token=wrong")[0] == 401
-        assert get(f"{server.url}/health?token=sesame")[0] == 200
-        assert get(f"{server.url}/health", {"Authorization": "Bearer sesame"})[0] == 200
+        assert get(f"{server.url}/health?token=open+sesame,+open")[0] == 200
+        assert get(f"{server.url}/health", {"Authorization": "Bearer open sesame, open"})[0] == 200
         assert get(f"{server.url}/page/nothing.js")[0] == 404
-        with connect(f"{server.ws}/ws", **SOON) as nobody:
-            assert closing(nobody) == 4401
+        for query in ("", "?token=wrong"):
+            with pytest.raises(InvalidStatus, match="401"):
+                connect(f"{server.ws}/ws{query}", **SOON).__enter__()
+        with pytest.raises(ConnectionError, match=r"refuses \(401\): .*expected the token"):
+            Client(server.ws, token="another long secret").__enter__()
         assert still_serves(server)
 
 
@@ -207,11 +211,52 @@ def test_pages_of_others_are_refused(ball):
         assert greet(ours)["type"] == "welcome"
 
 
+@pytest.mark.parametrize(
+    "host", ["[::1].evil.com", "localhost:80@evil.com", "localhost/", "127.0.0.1.evil.com", "", "[::1", "localhost:x"]
+)
+def test_hosts_are_parsed_and_not_matched(ball, host):
+    port = ball.url.rsplit(":", 1)[1]
+    answer = exchange(ball, f"GET /health HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+    assert answer.startswith(b"HTTP/1.1 403")
+    assert get(f"{ball.url}/health", {"Origin": f"http://{host}:{port}"})[0] == 403
+
+
+@pytest.mark.parametrize("host", ["LOCALHOST", "[::1]:80", "127.0.0.2", "Localhost:8008"])
+def test_this_machine_has_many_names(ball, host):
+    assert get(f"{ball.url}/health", {"Host": host, "Origin": f"http://{host.lower()}"})[0] == 200
+    assert get(f"{ball.url}/health", {"Host": host, "Origin": f"http://{host}.evil.com"})[0] == 403
+
+
+def test_an_origin_has_the_port_of_its_scheme():
+    guard = Guard("0.0.0.0", "x" * 16)
+
+    def refused(host, origin):
+        headers = [(b"host", host.encode()), (b"origin", origin.encode())]
+        return guard.foreign_origin(HTTPConnection({"type": "http", "headers": headers})) is not None
+
+    assert not refused("rig.example", "https://rig.example:443") and not refused("rig.example:80", "http://RIG.example")
+    assert refused("rig.example", "https://rig.example:8008") and refused("rig.example", "file://rig.example")
+    assert refused("rig.example:80", "https://rig.example")
+
+
+def exchange(server, sent, wait_s=10.0):
+    """What a connection is answered until its end."""
+    with socket.create_connection(("127.0.0.1", int(server.url.rsplit(":", 1)[1])), timeout=wait_s) as raw:
+        raw.sendall(sent)
+        answer = b""
+        with contextlib.suppress(ConnectionResetError):
+            while b"\r\n\r\n" not in answer and (more := raw.recv(65536)):
+                answer += more
+    return answer
+
+
 def test_beyond_this_machine_a_token_is_demanded():
     for host in ("0.0.0.0", "192.168.1.4", "::"):
         with pytest.raises(ValueError, match=f"expected --token with --host {host}"):
             Guard(host, None)
-        Guard(host, "x")
+        Guard(host, "x" * 16)
+    with pytest.raises(ValueError, match="at least 16 signs, got 15"):
+        Guard("127.0.0.1", "x" * 15)
     Guard("127.0.0.1", None)
     Guard("::1", None)
 

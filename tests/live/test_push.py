@@ -16,9 +16,11 @@ from test_server import get, truth
 from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
+from viewmend.live import push
 from viewmend.live.client import Client
+from viewmend.live.door import Visitor
 from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import pack
+from viewmend.live.protocol import ProtocolError, pack, unpack
 from viewmend.live.publisher import Publisher
 from viewmend.live.pushed import PushedFrames
 
@@ -31,7 +33,7 @@ def publisher(server, cameras=CAMERAS, **options):
 
 
 def test_what_is_pushed_is_seen_at_the_edge_and_can_be_sought():
-    with running(PushedFrames(), pushes=True, ready=False) as server:
+    with running(PushedFrames(), ready=False) as server:
         assert json.loads(get(f"{server.url}/health")[2])["status"] == "loading"
         with Client(server.ws) as viewer, publisher(server) as rig:
             assert [rig.push(photograph(CAMERAS)) for _ in range(3)] == [0, 1, 2]
@@ -49,7 +51,7 @@ def test_what_is_pushed_is_seen_at_the_edge_and_can_be_sought():
 
 
 def test_a_rig_that_goes_is_missed_and_another_one_may_come():
-    with running(PushedFrames(), pushes=True, ready=False) as server, Client(server.ws) as viewer:
+    with running(PushedFrames(), ready=False) as server, Client(server.ws) as viewer:
         with publisher(server) as rig:
             rig.push(photograph(CAMERAS))
             viewer.frame(viewer.look(width=32, height=32))
@@ -92,7 +94,7 @@ def rig_message(**changes):
     ],
 )
 def test_rigs_that_cannot_be_are_refused(message):
-    with running(PushedFrames(), pushes=True, ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
+    with running(PushedFrames(), ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
         bad.send(message)
         answer = json.loads(bad.recv(timeout=10))
         assert answer["type"] == "error" and "expected" in answer["message"] and closing(bad) == 4400
@@ -123,7 +125,7 @@ HUGE_PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + CHUNK + struct.pack(">
     ],
 )
 def test_frames_that_cannot_be_end_the_rig_and_nothing_else(message):
-    with running(PushedFrames(), pushes=True, ready=False) as server:
+    with running(PushedFrames(), ready=False) as server:
         with connect(f"{server.ws}/push", **SOON) as bad:
             bad.send(rig_message())
             assert json.loads(bad.recv(timeout=10))["type"] == "taken"
@@ -136,7 +138,7 @@ def test_frames_that_cannot_be_end_the_rig_and_nothing_else(message):
 
 
 def test_an_empty_stage_is_said_and_passes():
-    with running(PushedFrames(), pushes=True, ready=False) as server, Client(server.ws) as viewer:
+    with running(PushedFrames(), ready=False) as server, Client(server.ws) as viewer:
         frame = photograph(CAMERAS)
         with publisher(server) as rig:
             rig.push(frame)
@@ -150,7 +152,7 @@ def test_an_empty_stage_is_said_and_passes():
 def test_frames_without_masks_are_refused_where_they_are_pushed():
     frame = replace(photograph(CAMERAS), mask=None)
     with (
-        running(PushedFrames(), pushes=True, ready=False) as server,
+        running(PushedFrames(), ready=False) as server,
         publisher(server) as rig,
         pytest.raises(ValueError, match="expected a frame with masks"),
     ):
@@ -164,3 +166,47 @@ def test_memory_of_a_live_rig_is_bounded():
         supply.push(photograph(CAMERAS))
     assert supply.span.end == 20 and 15 <= supply.span.first < 20
     assert supply.read(supply.span.first) is not None and supply.read(supply.span.first - 1) is None
+
+
+def test_cameras_of_odd_shapes_are_counted_as_they_are_kept():
+    """Four of 16 x 16,000 and of 16,000 x 16 pixels have a million pixels, and would lie in a tensor of a billion."""
+    shapes = [(16, 16_000), (16_000, 16)] * 2
+    odd = [c | {"width": w, "height": h} for c, (w, h) in zip(cameras_json(CAMERAS), shapes, strict=False)]
+    with running(PushedFrames(), ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
+        bad.send(rig_message(cameras=odd))
+        assert "cameras x widest x highest" in json.loads(bad.recv(timeout=10))["message"] and closing(bad) == 4400
+
+
+def test_an_image_is_judged_by_its_head(monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(ProtocolError, match="expected rgb of 48 x 48 pixels, got 100000 x 100000"):
+        push._decoded(HUGE_PNG, "c0", "rgb", CAMERAS)
+    jpeg = cv2.imencode(".jpg", np.zeros((40, 64), np.uint8))[1].tobytes()
+    with pytest.raises(ProtocolError, match="got 64 x 40"):
+        push._decoded(jpeg, "c0", "mask", CAMERAS)
+
+
+class Present(Visitor):
+    gone = False
+
+
+class Departed(Visitor):
+    gone = True
+
+
+def test_work_of_a_rig_that_is_gone_is_dropped(monkeypatch):
+    gone = Departed()
+    monkeypatch.setattr(push, "_decoded", lambda *_: pytest.fail("decoded"))
+    assert push._frame(frame_message(), CAMERAS, gone) is None
+
+
+def test_an_image_comes_once():
+    image = cv2.imencode(".png", np.zeros((48, 48), np.uint8))[1].tobytes()
+    entry = {"camera": "c0", "kind": "mask", "bytes": len(image)}
+    with pytest.raises(ProtocolError, match="one image of each camera and kind"):
+        push._frame(pack({"images": [entry] * 100}, [image] * 100), CAMERAS, Present())
+
+
+def test_a_header_is_small():
+    with pytest.raises(ProtocolError, match="at most 1000000 bytes, got one of 1000001"):
+        unpack(b"VMF1" + struct.pack("<I", 1_000_001) + b" " * 1_000_001, "images")

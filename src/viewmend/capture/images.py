@@ -1,6 +1,7 @@
 """Image files: colours, masks and depths, decoded from bytes and encoded to them."""
 
 import functools
+import io
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from viewmend.capture.errors import CaptureError
 DEPTH_UNITS_PER_M = 1000
 """Depth is stored in whole millimetres, 16 bit."""
 MAX_DEPTH_M = 65.535
+MAX_PIXELS = 2**27
+"""The most pixels of one image; its head is asked, before anything is decoded."""
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits, and would be read as black."""
 
@@ -79,6 +82,17 @@ def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
     return depth.astype(np.float32) / DEPTH_UNITS_PER_M
 
 
+def told_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height as the head of image data tells them, without decoding; None where it tells none."""
+    import imagesize
+
+    try:
+        width, height = imagesize.get(io.BytesIO(data))
+    except Exception:  # of foreign bytes it raises almost anything
+        return None
+    return (int(width), int(height)) if width > 0 and height > 0 else None
+
+
 def _decode(path: Path, where: str, flags: int) -> np.ndarray:
     import cv2
 
@@ -86,6 +100,11 @@ def _decode(path: Path, where: str, flags: int) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
+    if (told := told_size(data)) is not None and told[0] * told[1] > MAX_PIXELS:
+        raise CaptureError(
+            f"{where}: expected an image of at most {MAX_PIXELS / 1e6:.0f} million pixels, got {told[0]} x {told[1]}; "
+            "make it smaller"
+        )
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _is_complete(data) else None
     except cv2.error:  # it claims more pixels than OpenCV takes

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -11,6 +12,8 @@ from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS
 if TYPE_CHECKING:
     from viewmend.capture.source import CaptureSource
     from viewmend.live.frames import FrameSupply
+
+TOKEN_VARIABLE = "VIEWMEND_TOKEN"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +33,10 @@ class Options:
     host: str = "127.0.0.1"
     """Address to bind to; another than this machine's own needs --token."""
     token: str | None = None
-    """What viewers must know."""
+    """What viewers must know, 16 signs or more. Who lists this machine's processes sees it here, not in --token-file or
+    in the variable VIEWMEND_TOKEN."""
+    token_file: Path | None = None
+    """A file whose first line is the token."""
     model: str | None = None
     """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
     fps: float | None = None
@@ -84,10 +90,11 @@ def run(options: Options) -> int:
     from viewmend.stream import StreamConfig
 
     set_up()
+    token = _token(options)
     config = ServerConfig(
         host=options.host,
         port=options.port,
-        token=options.token,
+        token=token,
         budget_ms=options.budget_ms or None,
         model=options.model or "small",
         limits=Limits(viewers=options.viewers),
@@ -96,11 +103,26 @@ def run(options: Options) -> int:
     inpainter = load_named(options.model, options.device)
     stream = StreamConfig(render=RenderConfig(cameras=options.context), memory_mb=options.memory_mb / 2)
     renderer = Renderer(supply, inpainter, stream, options.device)
-    server = Server(LiveServer(RenderService(renderer, supply), config), config, pushes=options.source == "live")
+    server = Server(LiveServer(RenderService(renderer, supply), config), config)
     with server.bound() as address:
-        say(f"open {address}/{token_query(options.token)}   (Ctrl-C stops it)")
+        say(f"open {address}/{token_query(token)}   (Ctrl-C stops it)")
         server.run_bound()
     return 0
+
+
+def _token(options: Options) -> str | None:
+    """The token from the option, the file or the environment; None where none is given."""
+    import os
+
+    given = options.token or os.environ.get(TOKEN_VARIABLE)
+    if options.token_file is not None:
+        if options.token is not None:
+            raise ValueError("expected --token or --token-file, got both; give one of them")
+        with options.token_file.open(encoding="utf-8") as file:
+            given = file.readline(4096).strip()
+        if not given:
+            raise ValueError(f"{options.token_file}: expected the token in its first line, got nothing")
+    return given or None
 
 
 def _check(options: Options) -> None:

@@ -18,14 +18,18 @@ class ServerSocket:
 
     def __init__(self, url: str, token: str | None) -> None:
         try:  # an extra: without it, the names of this module are there all the same
-            from websockets.exceptions import ConnectionClosed
+            from websockets.exceptions import ConnectionClosed, InvalidStatus
             from websockets.sync.client import connect
         except ImportError:
             raise ImportError("a connection needs websockets: pip install 'viewmend[live]'") from None
         self._closed = ConnectionClosed
         self._open = contextlib.ExitStack()
         address = f"{url}{token_query(token)}"
-        self._socket = self._open.enter_context(connect(address, max_size=None, compression=None))
+        try:
+            self._socket = self._open.enter_context(connect(address, max_size=None, compression=None))
+        except InvalidStatus as refused:
+            said = bytes(refused.response.body or b"").decode(errors="replace")
+            raise ConnectionError(f"the server refuses ({refused.response.status_code}): {said[:400]}") from None
 
     def send(self, message: str | bytes) -> None:
         """Send a message. If the connection is closed already, `receive` says why."""

@@ -88,6 +88,7 @@ class ViewerConnection:
         self._frame: bytes | None = None
         self._faults = FaultLimit()
         self._rate = RateLimit(registry.limits.messages_per_s)
+        self._rig: dict[str, Any] | None = None
         self._session = ViewerSession(self._deliver, self._report_error, registry.budget_ms)
 
     async def run(self) -> None:
@@ -203,12 +204,11 @@ class ViewerConnection:
 
     async def _send_status(self) -> None:
         """Send rig, state and statistics when they are due, and end a connection that does not answer."""
-        rig, last, state_at, stats_at = None, None, 0.0, time.monotonic()
+        last, state_at, stats_at = None, 0.0, time.monotonic()
         while True:
             now = time.monotonic()
-            if self._service.ready and self._service.renderer.rig_json is not rig:
-                rig = self._service.renderer.rig_json
-                self._send_soon({"type": "rig"} | (rig or {}))
+            if self._service.ready:
+                self._send_new_rig()
             source = self._registry.source_json()
             own = self._session.state_json(self._service.supply.span, self._service.edge)
             shown = (source, {key: own[key] for key in own if key not in ("time", "behind")})
@@ -222,6 +222,11 @@ class ViewerConnection:
                 raise ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect")
             await asyncio.sleep(TICK_S)
 
+    def _send_new_rig(self) -> None:
+        if (rig := self._service.renderer.rig_json) is not None and rig is not self._rig:
+            self._rig = rig
+            self._send_soon({"type": "rig"} | rig)
+
     def _send_soon(self, message: dict[str, Any]) -> None:
         """Queue a message, in place of one of its type that is still waiting."""
         self._pending[message["type"]] = message
@@ -229,6 +234,7 @@ class ViewerConnection:
 
     def _deliver(self, message: bytes) -> None:
         def put() -> None:
+            self._send_new_rig()  # which is written before the frame
             self._frame = message
             self._wake_writer.set()
 

@@ -1,11 +1,17 @@
 """Who may connect, and how often they may send."""
 
+import asyncio
 import hmac
+import re
 import time
 from collections import deque
 from ipaddress import ip_address
 
 from starlette.requests import HTTPConnection
+
+TOKEN_LENGTH = 16
+WRONG_TOKEN_S = 0.5
+"""Seconds until a wrong token is answered."""
 
 
 def is_loopback(host: str) -> bool:
@@ -23,8 +29,14 @@ class Guard:
         """Guard a server.
 
         Raises:
-            ValueError: the address is not loopback's and there is no token.
+            ValueError: the address is not loopback's and there is no token, or the token is short.
         """
+        if token is not None and len(token) < TOKEN_LENGTH:
+            raise ValueError(
+                f"expected a token of at least {TOKEN_LENGTH} signs, got {len(token)}: it is all that keeps strangers "
+                "out; choose a long random one, for example that of python -c 'import secrets; "
+                "print(secrets.token_urlsafe())'"
+            )
         if not is_loopback(host) and not token:
             raise ValueError(
                 f"expected --token with --host {host}: whoever reaches that address could watch; choose a long random "
@@ -40,10 +52,11 @@ class Guard:
         this machine has that name as `Host`. A plain link to us may be anywhere.
         """
         host = connection.headers.get("host", "")
-        if self._local and not is_loopback(_name(host)):
+        place = _place(host, 80)
+        if place is None or (self._local and not is_loopback(place[0])):
             return f"expected a request to localhost, got one to '{host[:60]}'; open the address that was printed"
         origin = connection.headers.get("origin")
-        if origin is not None and not origin.endswith(f"://{host}"):
+        if origin is not None and not _same_place(origin, host):
             return f"expected a request of our own page, got one of '{origin[:60]}'"
         site = connection.headers.get("sec-fetch-site", "none")
         followed = connection.headers.get("sec-fetch-dest") == "document"
@@ -51,19 +64,30 @@ class Guard:
             return f"expected a request of our own page, got a {site[:20]} one"
         return None
 
-    def lacks_token(self, connection: HTTPConnection) -> bool:
-        """Whether the token is wanted and not given."""
+    async def lacks_token(self, connection: HTTPConnection) -> bool:
+        """Whether the token is wanted and not given. Who gives a wrong one waits for the answer."""
         if not self.token:
             return False
         scheme, _, given = connection.headers.get("authorization", "").partition(" ")
         if scheme.lower() != "bearer":
             given = connection.query_params.get("token", "")
-        return not hmac.compare_digest(given.encode(errors="replace"), self.token.encode())
+        lacks = not hmac.compare_digest(given.encode(errors="replace"), self.token.encode())
+        if lacks and given:
+            await asyncio.sleep(WRONG_TOKEN_S)
+        return lacks
 
 
-def _name(host: str) -> str:
-    """A `Host` header without its port."""
-    return host[1:].split("]")[0] if host.startswith("[") else host.rsplit(":", 1)[0]
+def _place(host: str, port: int) -> tuple[str, int] | None:
+    """Name and port of a `Host` header, in lower case; `port` where it has none, None where it is no such header."""
+    found = re.fullmatch(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::(\d{1,5}))?", host.lower(), re.ASCII)
+    return found and (found[1] or found[2], int(found[3] or port))
+
+
+def _same_place(origin: str, host: str) -> bool:
+    """Whether a page of this `Origin` is one that was served under this `Host`."""
+    scheme, _, place = origin.partition("://")
+    port = {"http": 80, "https": 443}.get(scheme.lower())
+    return port is not None and None is not _place(host, port) == _place(place, port)
 
 
 class RateLimit:

@@ -8,30 +8,34 @@ from weakref import WeakKeyDictionary
 
 import uvicorn
 
+from viewmend.live.door import HttpDoor, SocketDoor, Visitor
 from viewmend.live.server import LiveServer, ServerConfig
 
-PUSH_BYTES = 64_000_000
+CONNECTIONS = 512
+"""All connections at a time; who asks beyond is told to come again."""
+SEND_BYTES = 256_000
+"""What the system holds of each connection that was not read yet; Linux doubles it."""
 SILENT_S = 10.0
 """Seconds after which a connection without a whole request is closed."""
 
 
 class Server(uvicorn.Server):
-    """A uvicorn that also closes connections that ask for nothing."""
+    """A uvicorn behind `door`, which also closes connections that ask for nothing, or do not read what they get."""
 
-    def __init__(self, server: LiveServer, config: ServerConfig, pushes: bool) -> None:
-        """Set up; `pushes` allows messages as large as a rig's frames."""
+    def __init__(self, server: LiveServer, config: ServerConfig) -> None:
+        """Set up."""
         self._socket: socket.socket | None = None
         super().__init__(
             uvicorn.Config(
                 server.app(),
                 host=config.host,
                 port=config.port,
-                ws="websockets-sansio",
-                ws_max_size=PUSH_BYTES if pushes else 4 * config.limits.max_message_bytes,
+                http=HttpDoor,
+                ws=SocketDoor,
                 ws_ping_interval=5.0,
                 ws_ping_timeout=10.0,
                 ws_per_message_deflate=False,
-                limit_concurrency=256,
+                limit_concurrency=CONNECTIONS,
                 timeout_graceful_shutdown=5,
                 log_level="warning",
                 access_log=False,
@@ -50,7 +54,10 @@ class Server(uvicorn.Server):
         """
         config = self.config
         family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
-        with socket.socket(family, socket.SOCK_STREAM) as listener:
+        with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
+            # What nobody reads is small, and that somebody reads slowly is seen; inherited by what is accepted.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES)
+            # With its protocol named, asyncio sets TCP_NODELAY on what is accepted: small answers leave at once.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 listener.bind((config.host, config.port))
@@ -71,7 +78,21 @@ class Server(uvicorn.Server):
         """Called ten times a second."""
         if counter % 10 == 0:
             self._close_silent()
+            self._close_unread()
         return await super().on_tick(counter)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End; nobody is waited for who is no viewer, or does not read."""
+        for connection in list(self.server_state.connections):
+            if isinstance(connection, Visitor) and not (connection.admitted and connection.has_read_all):
+                connection.transport.abort()
+        await super().shutdown(sockets)
+
+    def _close_unread(self) -> None:
+        now = time.monotonic()
+        for connection in list(self.server_state.connections):
+            if isinstance(connection, Visitor) and not connection.reads(now):
+                connection.transport.abort()
 
     def _close_silent(self) -> None:
         now = time.monotonic()

@@ -20,6 +20,8 @@ MODES = ("rendered", "holes", "mended", "depth", "coverage")
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
 MAX_PARTS = 512
+HEADER_BYTES = 1_000_000
+"""The largest JSON of a rig, or at the beginning of a binary message."""
 
 Kind = TypeVar("Kind")
 Integer = Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
@@ -227,8 +229,8 @@ def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tupl
     if len(message) < 8 or message[:4] != MAGIC:
         raise ProtocolError(f"expected a message that begins with {MAGIC.decode()}, got {message[:4]!r}")
     start = 8 + struct.unpack("<I", message[4:8])[0]
-    if start > len(message):
-        raise ProtocolError("expected a whole header, got a message that ends in it")
+    if start > min(len(message), 8 + HEADER_BYTES):
+        raise ProtocolError(f"expected a whole header of at most {HEADER_BYTES} bytes, got one of {start - 8}")
     header: dict[str, Any] = read_message(message[8:start], dict[str, Any])
     parts: list[_Part] = read_message(header.get(listed), Annotated[list[_Part], Meta(max_length=MAX_PARTS)])
     sizes = [part.bytes for part in parts]

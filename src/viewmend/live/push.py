@@ -10,18 +10,31 @@ from jaxtyping import UInt8
 from msgspec import Meta, Struct
 from starlette.websockets import WebSocket
 
+from viewmend.capture.images import told_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import rigid
 from viewmend.json_input import one_of
 from viewmend.live.connection import close_with_error
-from viewmend.live.protocol import VERSION, Point, ProtocolError, Rotation, check_rotation, read_message, unpack
+from viewmend.live.door import Visitor, admit, visitor_of
+from viewmend.live.protocol import (
+    HEADER_BYTES,
+    VERSION,
+    Point,
+    ProtocolError,
+    Rotation,
+    check_rotation,
+    read_message,
+    unpack,
+)
 from viewmend.live.pushed import PushedFrames
 from viewmend.views import MultiViewFrame
 
 MAX_CAMERAS = 128
 MAX_PIXELS = 64_000_000
-"""Pixels of all cameras together."""
+"""Cameras x widest x highest: a frame's images lie in one tensor."""
+IMAGE_BYTES = 65_536
+"""What an image may take besides four bytes a pixel: no JPEG and PNG of a camera need more."""
 SILENT_S = 30.0
 ImageSide = Annotated[int, Meta(ge=8, le=16384)]
 
@@ -40,11 +53,14 @@ async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
             return
         try:
             if cameras is None:
-                cameras = _begin(message.get("text") or "", supply)
+                cameras = await asyncio.to_thread(_begin, message.get("text") or "", supply)
+                admit(socket, _frame_bytes(cameras))
                 await socket.send_text(json.dumps({"type": "taken", "frame": None}))
                 continue
             # On a thread: other viewers' messages need not wait while images are decoded.
-            frame = await asyncio.to_thread(_frame, message.get("bytes") or b"", cameras)
+            frame = await asyncio.to_thread(_frame, message.get("bytes") or b"", cameras, visitor_of(socket))
+            if frame is None:
+                return
             number = supply.push(frame)
         except ValueError as error:
             await close_with_error(socket, 4400, str(error))
@@ -98,8 +114,11 @@ class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
             raise ProtocolError("expected cameras of different names, got one twice; rename it")
         if self.up is not None and sum(x * x for x in self.up) < 1e-12:
             raise ProtocolError("expected 'up' as a direction, got no length; leave it away")
-        if sum(camera.width * camera.height for camera in self.cameras) > MAX_PIXELS:
-            raise ProtocolError(f"expected at most {MAX_PIXELS} pixels in all; push smaller images")
+        widest, highest = max(camera.width for camera in self.cameras), max(camera.height for camera in self.cameras)
+        if (pixels := len(self.cameras) * widest * highest) > MAX_PIXELS:
+            raise ProtocolError(
+                f"expected cameras x widest x highest of at most {MAX_PIXELS} pixels, got {pixels}; push smaller images"
+            )
 
 
 class ImagePart(Struct, frozen=True):
@@ -123,8 +142,16 @@ def _begin(text: str, supply: PushedFrames) -> Cameras:
     return Cameras(tuple(c.name for c in rig.cameras), K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
 
 
-def _frame(message: bytes, cameras: Cameras) -> MultiViewFrame:
+def _frame_bytes(cameras: Cameras) -> int:
+    """The largest message that a frame of this rig may be."""
+    images = 4 * int(cameras.size_px.prod(1).sum()) + IMAGE_BYTES * len(cameras)
+    return 8 + HEADER_BYTES + images
+
+
+def _frame(message: bytes, cameras: Cameras, rig: Visitor) -> MultiViewFrame | None:
     """One time from its JPEGs and PNGs; cameras of which one of the two is missing are left out.
+
+    None once the rig is gone, whose work is dropped.
 
     Raises:
         ProtocolError: an image of an unknown camera, of another size, or none at all.
@@ -132,7 +159,11 @@ def _frame(message: bytes, cameras: Cameras) -> MultiViewFrame:
     header, parts = unpack(message, "images")
     images: dict[tuple[str, str], np.ndarray] = {}
     listed: list[ImagePart] = read_message(header["images"], list[ImagePart])
+    if len({(entry.camera, entry.kind) for entry in listed}) < len(listed):
+        raise ProtocolError("expected one image of each camera and kind, got one twice; send it once")
     for entry, data in zip(listed, parts, strict=True):
+        if rig.gone:
+            return None
         if entry.camera not in cameras.names:
             raise ProtocolError(f"expected a camera among {list(cameras.names)}, got '{entry.camera[:40]}'")
         images[entry.camera, entry.kind] = _decoded(data, entry.camera, entry.kind, cameras)
@@ -156,6 +187,8 @@ def _decoded(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.nd
     width, height = cameras.size_px[cameras.names.index(name)].tolist()
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
         raise ProtocolError(f"camera '{name}': expected JPEG or PNG as {kind}, got {data[:4]!r}")
+    if (told := told_size(data)) is not None and told != (width, height):
+        raise ProtocolError(f"camera '{name}': expected {kind} of {width} x {height} pixels, got {told[0]} x {told[1]}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -14,11 +14,12 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
 from viewmend.capture.video_writer import can_write_mp4
-from viewmend.live.connection import SessionRegistry, ViewerConnection, close_with_error
+from viewmend.live.connection import SessionRegistry, ViewerConnection
+from viewmend.live.door import admit
 from viewmend.live.guard import Guard
 from viewmend.live.metrics_text import metrics_text
 from viewmend.live.page_files import HEADERS, page_files
-from viewmend.live.protocol import Limits, ProtocolError
+from viewmend.live.protocol import HEADER_BYTES, Limits, ProtocolError
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import PushedFrames
 from viewmend.live.render_jobs import PathJob, PictureJob, RenderJob, Result, parse_path, parse_query
@@ -29,6 +30,7 @@ PICTURE_S = 60.0
 EXPORT_S = 3600.0
 PICTURES_AT_ONCE = 4
 BODY_BYTES, BODY_S = 1_000_000, 10.0
+TOKEN_WANTED = "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +96,11 @@ class LiveServer:
             foreign = self._guard.foreign_origin(request)
             if foreign:
                 return _refusal(403, foreign)
-            if needs_token and self._guard.lacks_token(request):
-                return _refusal(401, "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN")
+            if await self._guard.lacks_token(request):
+                if needs_token:
+                    return _refusal(401, TOKEN_WANTED)
+            else:
+                admit(request)
             try:
                 return await answer(request)
             except ProtocolError as error:
@@ -179,18 +184,19 @@ class LiveServer:
             job.done.cancel()
 
     async def _welcome(self, socket: WebSocket) -> bool:
-        """Accept a socket. One of a foreign page is closed without a word, one without the token with an error."""
-        if self._guard.foreign_origin(socket):
-            await socket.close()
-            return False
-        await socket.accept()
-        if self._guard.lacks_token(socket):
-            await close_with_error(socket, 4401, "expected ?token=TOKEN")
-            return False
-        return True
+        """Whether a socket may be accepted; a foreign page's, or one without the token, is refused in its handshake."""
+        if foreign := self._guard.foreign_origin(socket):
+            await socket.send_denial_response(_refusal(403, foreign))
+        elif await self._guard.lacks_token(socket):
+            await socket.send_denial_response(_refusal(401, TOKEN_WANTED))
+        else:
+            return True
+        return False
 
     async def _viewer(self, socket: WebSocket) -> None:
         if await self._welcome(socket):
+            admit(socket, 4 * self._config.limits.max_message_bytes)
+            await socket.accept()
             await ViewerConnection(socket, self.registry).run()
 
     async def _push(self, socket: WebSocket) -> None:
@@ -199,10 +205,13 @@ class LiveServer:
             return
         if not isinstance(supply, PushedFrames) or self._pushing:
             recording = "this server shows a recording; start viewmend serve live"
-            await close_with_error(socket, 4409, "another rig is pushing" if self._pushing else recording)
+            reason = "another rig is pushing" if self._pushing else recording
+            await socket.send_denial_response(_refusal(409, reason))
             return
         self._pushing = True
         try:
+            admit(socket, HEADER_BYTES)
+            await socket.accept()
             await receive_rig(socket, supply)
         except (WebSocketDisconnect, RuntimeError):  # gone, maybe while its frame was decoded
             pass

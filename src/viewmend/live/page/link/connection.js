@@ -64,7 +64,7 @@ export class Connection extends EventTarget {
     if ("picture" in news) this.dispatchEvent(new CustomEvent("picture", { detail: news.picture }));
     else if ("text" in news) this.#receive(JSON.parse(news.text));
     else if ("trouble" in news) this.dispatchEvent(new CustomEvent("trouble", { detail: news.trouble }));
-    else if ("closed" in news) this.#closed(news.closed.code, news.closed.reason);
+    else if ("closed" in news) void this.#ended(news.closed.code, news.closed.reason);
     else {
       this.socket = "open";
       this.send({ type: "hello", version: VERSION, codecs: this.codecs });
@@ -78,6 +78,13 @@ export class Connection extends EventTarget {
       this.#status("open", "Connected");
     }
     this.dispatchEvent(new CustomEvent("message", { detail: message }));
+  }
+
+  /** A refused handshake says nothing to a page: whether it is the token, /health says. @param {number} code @param {string} reason */
+  async #ended(code, reason) {
+    if (code !== 1006 || this.socket !== "opening") return this.#closed(code, reason);
+    const health = await fetch(address("/health", this.token)).catch(() => null);
+    return this.#closed(health?.status === 401 ? 4401 : code, reason);
   }
 
   /** @param {number} code @param {string} reason */
