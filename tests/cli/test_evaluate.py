@@ -2,13 +2,16 @@
 
 import hashlib
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from viewmend import cli
 from viewmend.baselines.dstt import DSTT
+from viewmend.cli import evaluating
 from viewmend.cli.evaluating import RunOptions, scenes_of
+from viewmend.evaluation import report_markdown
 from viewmend.metrics.weights import PLACES_VARIABLE
 
 QUICK = ("--frames", "1", "--scenes", "1", "--size", "128", "--methods", "nearest,unfilled")
@@ -112,3 +115,12 @@ def test_weights_loads_a_file_that_has_no_published_hash(tmp_path, capsys):
     path.write_bytes(path.read_bytes()[:1000])
     assert cli.main(["weights", str(path)]) == 1
     assert "do not read" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("failed", [True, False])
+def test_a_failed_cell_fails_the_command(failed, tmp_path, monkeypatch):
+    found = SimpleNamespace(report=None, failed=failed)
+    monkeypatch.setattr(evaluating, "evaluate", lambda *_: found)
+    monkeypatch.setattr(evaluating, "write_report", lambda *_: None)
+    monkeypatch.setattr(report_markdown, "summary", lambda _: "")
+    assert cli.main(["evaluate", "P", "--out", str(tmp_path)]) == int(failed)

@@ -290,6 +290,8 @@ def test_rates_and_patience(monkeypatch):
     assert sum(rate.allows() for _ in range(100)) in (19, 20)
     now[0] += 0.5
     assert sum(rate.allows() for _ in range(100)) in (4, 5, 6)
+    now[0] += 1000
+    assert sum(rate.allows() for _ in range(100)) in (19, 20), "a long silence saves up no more than a short one"
     patience = FaultLimit(3, 10.0)
     assert [patience.exceeded() for _ in range(3)] == [False, False, True]
     now[0] += 20

@@ -7,7 +7,7 @@ import pytest
 from live_servers import CAMERAS, wait_until
 from reference.ball import BallCapture
 
-from viewmend.live.frames import ReadAhead
+from viewmend.live.frames import FrameCache, ReadAhead
 
 
 class Slow(BallCapture):
@@ -104,3 +104,13 @@ def test_failures_are_said_and_tried_again():
     wait_until(lambda: supply.status.state == "ready")
     assert supply.status.error is None and supply.span.fps == 0
     supply.stop()
+
+
+@pytest.mark.parametrize(("by_last_use", "left"), [(True, [0, 3, 4]), (False, [2, 3, 4])])
+def test_what_was_used_last_is_dropped_last(by_last_use, left):
+    frame = BallCapture(CAMERAS, 1).read(0)
+    cache = FrameCache(3.5e-6 * (frame.rgb.numel() + frame.mask.numel()), by_last_use)
+    for time in range(5):
+        cache.put(time, frame)
+        assert cache.get(0) is not None or not by_last_use
+    assert [time for time in range(5) if time in cache] == left

@@ -7,7 +7,8 @@ import torch
 from reference.ball import camera_at, photograph, proxy, ring
 
 from viewmend.geometry.mesh import Mesh
-from viewmend.rendering.error_rules import error_rule
+from viewmend.rendering.blending import Blend
+from viewmend.rendering.error_rules import Evidence, error_rule
 from viewmend.rendering.view import RenderConfig, render_view
 
 BALL = proxy()
@@ -44,6 +45,12 @@ def test_holes_are_where_the_weights_end():
     rows = view.error[48]
     # The camera is at the left: the ball's right rim is turned away from it.
     assert rows[view.mask[48] > 0][0] == 0 and rows[view.mask[48] > 0][-1] == 1
+
+
+@pytest.mark.parametrize(("weight", "missing"), [(0.0, 1.0), (0.9e-5, 1.0), (1.1e-5, 0.0), (1.0, 0.0)])
+def test_a_pixel_is_seen_from_a_hundred_thousandth_on(weight, missing):
+    blend = Blend(torch.zeros(3, 1, 1), torch.full((2, 1, 1), weight / 2), torch.zeros(1, 1))
+    assert error_rule("unseen")(Evidence(mask=torch.ones(1, 1), depth=torch.ones(1, 1), blend=blend)).item() == missing
 
 
 def test_all_asks_for_the_whole_subject_and_keeps_its_colours():

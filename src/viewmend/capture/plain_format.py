@@ -1,6 +1,7 @@
 """A plain capture's `cameras.json`, format "plain-capture/1": parsed strictly, in this project's conventions."""
 
 import difflib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -81,7 +82,7 @@ class CalibrationFile(Struct, frozen=True, kw_only=True):
         if len(self.cameras) < 2:
             raise _wrong("cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras")
         for key, names in (("frames", self.frames), ("cameras", tuple(camera.name for camera in self.cameras))):
-            twice = sorted({name for name in names if names.count(name) > 1}) if len(set(names)) < len(names) else []
+            twice = sorted(name for name, count in Counter(names).items() if count > 1)[:5]
             if twice:
                 raise _wrong(key, "different names", f"{twice} more than once", "rename or remove the duplicates")
 

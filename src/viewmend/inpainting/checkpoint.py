@@ -11,7 +11,8 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
-from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError, load_weights
+from viewmend.json_input import read_json
+from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError, load_weights, read_weights
 
 FORMAT = 2
 """Grows when an older program could no longer read what is written. Format 1, of one network with switches, is read."""
@@ -62,6 +63,13 @@ def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -
     """The networks alone, without temporal accumulation, in evaluation mode. Raises as `load_inpainter` does."""
     folder = _folder(name_or_path)
     version, config = _read_config(folder / CONFIG)
+    with torch.device("meta"):  # nothing is allocated that the file cannot hold
+        wanted = sum(weight.numel() for weight in build(config).parameters())
+    if wanted > (there := (folder / WEIGHTS).stat().st_size):
+        read_weights(folder / WEIGHTS)  # which says that they are damaged, if they are
+        raise MismatchedWeightsError(
+            f"{folder}: expected the {wanted} weights of its {CONFIG}, got {there} bytes of {WEIGHTS}; copy both files"
+        )
     network = build(config)
     rename = _renamed if version == 1 and isinstance(network, Chain) else None
     return load_weights(network, folder / WEIGHTS, device, rename=rename)
@@ -109,7 +117,7 @@ def _folder(name_or_path: str | Path) -> Path:
 
 def _read_config(path: Path) -> tuple[int, InpainterConfig]:
     try:
-        values = json.loads(path.read_text())
+        values = read_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DamagedWeightsError(f"{path}: expected JSON, got {error}; copy the file again") from error
     version = values.pop("viewmend_format", None) if isinstance(values, dict) else None

@@ -3,8 +3,13 @@
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
+from viewmend.json_input import typed
+
 ENCODER_GROUPS = (1, 1, 1, 1, 1, 2, 4, 8, 1)
 """Groups of the encoder's nine convolutions."""
+LARGEST = 65_536
+"""The largest size; what a file claims is not allocated blindly."""
+MAX_BLOCKS = 256
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +70,12 @@ class InpainterConfig:
         object.__setattr__(self, "widths", tuple(self.widths))
         least = dict.fromkeys(("dim", "heads", "groups", "blocks", "ffn_ratio", "k_w", "num_ray_views"), 1)
         least |= {"n_c": 0, "n_w": 0}
-        wrong = [f"{name} = {getattr(self, name)}" for name, low in least.items() if getattr(self, name) < low]
+        wrong = [f"{n} = {getattr(self, n)}" for n, low in least.items() if not low <= getattr(self, n) <= LARGEST]
+        wrong += [f"widths of {width}" for width in self.widths if not 0 < width <= LARGEST]
         if wrong:
-            raise ValueError(f"expected positive sizes, got {', '.join(wrong)}")
+            raise ValueError(f"expected positive sizes of at most {LARGEST}, got {', '.join(wrong)}")
+        if self.groups * self.blocks > MAX_BLOCKS:
+            raise ValueError(f"expected at most {MAX_BLOCKS} blocks in all, got {self.groups} x {self.blocks}")
         if self.dim % (16 * self.heads):
             raise ValueError(
                 f"expected dim to be a multiple of 16 x heads (three axes of rotated pairs), got dim {self.dim} "
@@ -122,9 +130,7 @@ class InpainterConfig:
             raise ValueError(
                 f"expected the keys of InpainterConfig, unknown {unknown}; was this written by a newer version?"
             )
-        if "widths" in values:
-            values["widths"] = tuple(values["widths"])
-        return cls(**values)
+        return typed(values, cls)
 
 
 def _renamed(values: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,10 @@ from torch import Tensor
 
 from viewmend.capture.errors import CaptureError
 
+CHANNELS = frozenset(f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotation"))
+MAX_TRANSFORMS = 5_000_000
+"""Frames x joints."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -55,6 +59,10 @@ def read_bvh(path: Path) -> Motion:
         raise CaptureError(f"{path}: expected a BVH file with HIERARCHY and MOTION; export the motion as BVH")
     joints = _hierarchy(path, head.split())
     step, values = _frames(path, body, sum(len(j.channels) for j in joints))
+    if len(values) * len(joints) > MAX_TRANSFORMS:
+        raise CaptureError(
+            f"{path}: expected at most {MAX_TRANSFORMS} frames x joints, got {len(values)} x {len(joints)}; cut it"
+        )
     return _motion(joints, step, values)
 
 
@@ -82,14 +90,23 @@ def _hierarchy(path: Path, words: list[str]) -> list[_Joint]:
                 place += 3
             elif word == "CHANNELS":
                 count = int(words[place + 1])
-                joints[-1].channels = tuple(w.lower() for w in words[place + 2 : place + 2 + count])
+                joints[-1].channels = _channels(words[place + 2 : place + 2 + count], count)
                 place += 1 + count
             place += 1
     except (IndexError, ValueError) as error:
         raise CaptureError(f"{path}: its HIERARCHY breaks off near word {place} ({error}); export it again") from error
     if not joints or sum(j.parent < 0 for j in joints) != 1:
         raise CaptureError(f"{path}: expected one ROOT, found {sum(j.parent < 0 for j in joints)}; export one skeleton")
+    if not all(len(j.offset) == 3 and all(abs(x) < 1e9 for x in j.offset) for j in joints):
+        raise CaptureError(f"{path}: expected three finite numbers after each OFFSET, got others; export it again")
     return joints
+
+
+def _channels(words: list[str], count: int) -> tuple[str, ...]:
+    channels = tuple(word.lower() for word in words)
+    if len(channels) != count or not CHANNELS.issuperset(channels):
+        raise ValueError(f"expected {count} channels among {', '.join(sorted(CHANNELS))}, got {' '.join(words)[:80]}")
+    return channels
 
 
 def _frames(path: Path, body: str, channels: int) -> tuple[float, np.ndarray]:
@@ -102,7 +119,8 @@ def _frames(path: Path, body: str, channels: int) -> tuple[float, np.ndarray]:
         raise CaptureError(
             f"{path}: expected 'Frames:', 'Frame Time:' and numbers ({error}); export it again"
         ) from error
-    if count < 1 or not step > 0 or values.size != count * channels or not np.isfinite(values).all():
+    fits = channels >= 1 and values.size == count * channels and bool((np.abs(values) < 1e9).all())
+    if count < 1 or not 0 < step < 1e6 or not fits:
         raise CaptureError(
             f"{path}: expected {count} frames of {channels} finite numbers at a positive frame time, got "
             f"{values.size} numbers at {step} s; the file is cut short or damaged, export it again"

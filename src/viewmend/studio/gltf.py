@@ -1,5 +1,6 @@
 """glTF 2.0 characters: reads a .glb or .gltf into skinned, textured geometry and a tree of nodes."""
 
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,11 @@ from torch import Tensor
 from viewmend.capture.errors import CaptureError
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.studio.gltf_document import Document, read_document
+
+MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, struct.error)
+"""What indices, types and shapes raise that do not fit one another."""
+MAX_VERTICES = 20_000_000
+"""Vertices of all parts, each counted where it stands."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +59,20 @@ def load_character(path: Path) -> Character:
 
     Raises:
         CaptureError: the file is missing, cut short, not glTF 2.0, needs an extension that this reader
-            lacks (compressed meshes), or has no triangles or no skin.
+            lacks (compressed meshes), has no triangles or no skin, or has parts that do not fit one another.
     """
+    try:
+        return _load(path)
+    except CaptureError:
+        raise
+    except MISFITS as error:
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        raise CaptureError(
+            f"{path}: expected a glTF character, got parts that do not fit one another ({said}); export the file again"
+        ) from error
+
+
+def _load(path: Path) -> Character:
     document = read_document(path)
     order, parent_of = _tree(document)
     position = {node: place for place, node in enumerate(order)}
@@ -141,6 +159,8 @@ class _Parts:
         attributes, read = primitive["attributes"], self.document.accessor
         vertices = read(attributes["POSITION"]).astype(np.float32)
         n = len(vertices)
+        if self.count + n > MAX_VERTICES:
+            raise CaptureError(f"{self.document.path}: expected at most {MAX_VERTICES} vertices, got more; simplify it")
         faces = (read(primitive["indices"]).reshape(-1) if "indices" in primitive else np.arange(n)).astype(np.int64)
         if len(faces) % 3 or (len(faces) and faces.max() >= n):
             raise CaptureError(
@@ -212,6 +232,9 @@ class _Parts:
         def floats(values: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
+        for node in nodes:
+            if not all(bool(part.isfinite().all()) for part in (node.translation, node.rotation, node.scale)):
+                raise CaptureError(f"{self.document.path}: node {node.name} is no finite transform; export it again")
         return Character(
             nodes=nodes,
             vertices=floats(joined["vertices"]),

@@ -1,16 +1,24 @@
 """The container of glTF 2.0: JSON, binary buffers, typed accessors and images."""
 
 import base64
-import json
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
+from viewmend.capture.images import told_size
+from viewmend.capture.plain_format import stays_inside
+from viewmend.json_input import read_json
+
+MAX_BYTES = 2 * 10**9
+"""The largest file that is read."""
+MAX_TEXELS = 2**26
+"""The most pixels of a texture."""
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -27,7 +35,7 @@ class Document:
     def entry(self, kind: str, index: int) -> Mapping[str, Any]:
         """`json[kind][index]`, or a CaptureError that says what is missing."""
         entries = self.json.get(kind, [])
-        if not 0 <= index < len(entries):
+        if type(index) is not int or not 0 <= index < len(entries):
             raise CaptureError(
                 f"{self.path}: expected {kind} number {index}, the file has {len(entries)}; export it again"
             )
@@ -36,8 +44,8 @@ class Document:
     def view(self, index: int) -> bytes:
         """The bytes of a buffer view."""
         entry = self.entry("bufferViews", index)
-        start, length = entry.get("byteOffset", 0), entry["byteLength"]
-        data = self.buffers[entry["buffer"]]
+        start, length = _count(entry.get("byteOffset", 0)), _count(entry["byteLength"])
+        data = self.buffers[_count(entry["buffer"])]
         if start + length > len(data):
             raise CaptureError(
                 f"{self.path}: expected at least {start + length} bytes of binary data, found {len(data)}: "
@@ -52,8 +60,13 @@ class Document:
             raise CaptureError(f"{self.path}: sparse accessors are not supported; export without shape keys")
         dtype, width = np.dtype(_COMPONENTS[entry["componentType"]]), _WIDTHS[entry["type"]]
         data = self.view(entry["bufferView"])
-        stride = self.entry("bufferViews", entry["bufferView"]).get("byteStride", dtype.itemsize * width)
-        offset, count = entry.get("byteOffset", 0), entry["count"]
+        stride = _count(self.entry("bufferViews", entry["bufferView"]).get("byteStride", dtype.itemsize * width))
+        offset, count = _count(entry.get("byteOffset", 0)), _count(entry["count"])
+        if stride < dtype.itemsize * width:
+            raise CaptureError(
+                f"{self.path}: expected a byteStride of at least {dtype.itemsize * width} for accessor {index}, got "
+                f"{stride}; export it again"
+            )
         if count and offset + stride * (count - 1) + dtype.itemsize * width > len(data):
             raise CaptureError(
                 f"{self.path}: accessor {index} wants {count} elements, its view has only {len(data)} bytes: "
@@ -85,6 +98,11 @@ class Document:
 
         entry = self.entry("images", index)
         data = self.view(entry["bufferView"]) if "bufferView" in entry else _resource(self.path, entry["uri"])
+        size = told_size(data) or (0, 0)
+        if size[0] * size[1] > MAX_TEXELS:
+            raise CaptureError(
+                f"{self.path}: expected images of at most {MAX_TEXELS} pixels, got {size[0]} x {size[1]}; shrink it"
+            )
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
         if image is None:
             raise CaptureError(
@@ -107,9 +125,11 @@ def read_document(path: Path) -> Document:
     else:
         raise CaptureError(f"{path}: expected a glTF binary that starts with 'glTF', got {data[:4]!r}; export a .glb")
     try:
-        document = json.loads(text)
+        document = read_json(text)
     except ValueError as error:
         raise CaptureError(f"{path}: its JSON part does not parse ({error}); export the file again") from error
+    if not isinstance(document, dict):
+        raise CaptureError(f"{path}: expected JSON keys, got a {type(document).__name__}; export it again")
     version = str(document.get("asset", {}).get("version", "none"))
     if not version.startswith("2"):
         raise CaptureError(f"{path}: expected glTF version 2.0, got {version}; export it as glTF 2.0")
@@ -139,10 +159,26 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
 def _resource(path: Path, uri: str) -> bytes:
     if uri.startswith("data:"):
         return base64.b64decode(uri.partition(",")[2])
-    return _read(path.parent / uri)
+    file = path.parent / unquote(uri)
+    if not stays_inside(unquote(uri)) or not file.resolve().is_relative_to(path.parent.resolve()):
+        raise CaptureError(f"{path}: expected files in its own folder, got '{uri[:200]}'; move the file there")
+    return _read(file)
+
+
+def _count(value: object) -> int:
+    """A number of bytes or things.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if type(value) is not int or value < 0:
+        raise ValueError(f"expected a whole number from 0 on, got {str(value)[:40]}")
+    return value
 
 
 def _read(path: Path) -> bytes:
+    if path.exists() and not (path.is_file() and path.stat().st_size <= MAX_BYTES):
+        raise CaptureError(f"{path}: expected a file of at most {MAX_BYTES // 10**6} MB, got another; check the path")
     try:
         return path.read_bytes()
     except OSError as error:

@@ -67,7 +67,7 @@ def load_run(path: Path, recipe: Recipe, modules: dict[str, nn.Module], optimize
             metadata = file.metadata()
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         wrote, values = json.loads(metadata["recipe"]), json.loads(metadata["state"])
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise RunError(f"{path}: expected a run to go on with, got {error}; {_way_on(path)}") from error
     mine = _plain(recipe)
     other = [key for key in mine if key not in MAY_CHANGE and mine[key] != wrote.get(key)]
