@@ -9,7 +9,7 @@ import urllib.request
 
 import pytest
 
-from viewmend.cli import main
+from viewmend.cli import main, serve
 
 
 @pytest.mark.parametrize(
@@ -62,3 +62,18 @@ def test_one_command_and_a_picture(sent):
         finally:
             if server.poll() is None:
                 server.kill()
+
+
+def test_a_token_need_not_be_among_the_arguments(tmp_path, monkeypatch):
+    file = tmp_path / "token"
+    file.write_text("from a file, long enough\nand more\n")
+    assert serve._token(serve.Options()) is None
+    monkeypatch.setenv("VIEWMEND_TOKEN", "from the environment")
+    assert serve._token(serve.Options()) == "from the environment"
+    assert serve._token(serve.Options(token_file=file)) == "from a file, long enough"
+    assert serve._token(serve.Options(token="from the arguments")) == "from the arguments"
+    with pytest.raises(ValueError, match="got both"):
+        serve._token(serve.Options(token="from the arguments", token_file=file))
+    file.write_text("\n")
+    with pytest.raises(ValueError, match="expected the token in its first line"):
+        serve._token(serve.Options(token_file=file))

@@ -119,6 +119,27 @@ def test_weights_that_are_not_finite_never_replace_good_ones(tiny, tmp_path, mon
     assert {name: (tmp_path / name).read_bytes() for name in before} == before
 
 
+def test_averages_follow_slowly(tiny, tmp_path):
+    with processes() as own:
+        run = Run(replace(tiny, ema=0.9, learning_rate=0.01), tmp_path, None, own)
+        seen = [[weight.detach().clone() for weight in run.model.parameters()] for _ in islice(run.steps(), 2)]
+        for average, first, second in zip(run.averaged.parameters(), *seen, strict=True):
+            assert torch.allclose(average, 0.9 * first + 0.1 * second, atol=1e-6)
+        assert any(float((a - b).abs().max()) > 1e-3 for a, b in zip(*seen, strict=True))
+
+
+def test_gradients_are_clipped(tiny, tmp_path):
+    """By so much here that Adam's own epsilon outweighs them."""
+    moved = {}
+    for norm in (1e-12, 1.0):
+        with processes() as own:
+            run = Run(replace(tiny, max_grad_norm=norm, weight_decay=0.0), tmp_path / str(norm), None, own)
+            before = [weight.detach().clone() for weight in run.learned]
+            list(islice(run.steps(), 1))
+            moved[norm] = max(float((a.detach() - b).abs().max()) for a, b in zip(run.learned, before, strict=True))
+    assert moved[1e-12] < 0.01 * moved[1.0]
+
+
 def test_somebody_elses_log_is_not_touched(tiny, tmp_path):
     (tmp_path / "log.jsonl").write_text('{"mine": 1}\n{"step": 7}\n')
     with pytest.raises(ValueError, match=r"log\.jsonl: expected no such file"):
