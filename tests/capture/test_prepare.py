@@ -26,7 +26,7 @@ class Shifted(BallCapture):
     def read(self, time):
         frame = replace(photograph(self.true_cameras, time), cameras=self.cameras, depth=None)
         if self.spoiled:
-            frame.rgb[0], frame.mask[0] = 200, 255
+            frame.rgb[0], frame.mask[0] = 200, frame.mask[0].roll(2, -1)  # too little for its camera to be left out
         return frame
 
 

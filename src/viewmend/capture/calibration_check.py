@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from viewmend.capture.diagnosis import Finding, diagnose
 from viewmend.contact_sheet import Tile, contact_sheet, in_rows, picture
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
@@ -39,6 +40,8 @@ class CalibrationCheck:
     """1 where the hull covers a pixel."""
     iou: dict[str, float]
     """Intersection over union of silhouette and mask, per camera; empty without masks."""
+    findings: tuple[Finding, ...] = ()
+    """What is wrong, in words."""
 
 
 def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> CalibrationCheck:
@@ -53,7 +56,7 @@ def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> Calibrati
     covered = proxy.depth(frame.cameras) > 0
     iou = silhouette_iou(covered, frame.mask).nan_to_num(1.0).tolist()  # where both are empty, they agree
     scores = dict(zip(frame.cameras.names, iou, strict=True))
-    return CalibrationCheck(frame, bounds or proxy.bounds, proxy, covered.float(), scores)
+    return CalibrationCheck(frame, bounds or proxy.bounds, proxy, covered.float(), scores, diagnose(frame, bounds))
 
 
 def check_picture(

@@ -48,6 +48,8 @@ class CaptureDescription:
     hull_iou_mean: float | None
     hull_iou_min: float | None
     cameras: tuple[CameraDescription, ...]
+    findings: tuple[str, ...] = ()
+    """What is wrong with masks and calibration, in words; () for a good capture."""
 
 
 def describe_capture(capture: PlainCapture, check: CalibrationCheck) -> CaptureDescription:
@@ -75,6 +77,7 @@ def describe_capture(capture: PlainCapture, check: CalibrationCheck) -> CaptureD
         hull_iou_mean=sum(iou) / len(iou) if iou else None,
         hull_iou_min=min(iou, default=None),
         cameras=tuple(_describe_camera(capture, check, view) for view in range(len(cameras))),
+        findings=tuple(finding.text for finding in check.findings),
     )
 
 

@@ -1,11 +1,13 @@
 """A capture as everybody looks at it: opened, aligned on its input cameras alone, images no larger than wanted.
 
 `mend`, `serve`, evaluation and training all take their frames from here, so that they see the same pixels. Colours
-stay as the files store them: 8 bit RGB.
+stay as the files store them: 8 bit RGB. What is wrong with a capture is refused, or said once through the logger
+`viewmend`; Python prints that to standard error unless a program arranges otherwise.
 """
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -13,6 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.capture.diagnosis import Finding, diagnose, faulty_masks
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.plain import PlainCapture, open_capture
 from viewmend.capture.source import CaptureSource
@@ -31,6 +34,11 @@ class PreparedCapture:
     """The shift of all images that was found in the input cameras' masks; None where none was looked for."""
     longest_px: int | None = None
     """Images are reduced to at most this length of their longer side; None leaves them as they are."""
+    inputs: tuple[str, ...] | None = None
+    """Cameras that may be looked at; None for all."""
+    left_out: tuple[str, ...] = ()
+    """Cameras that disagree with all others, and are absent from every frame."""
+    _said: set[str] = field(default_factory=set, compare=False, repr=False)
 
     @property
     def cameras(self) -> Cameras:
@@ -64,8 +72,23 @@ class PreparedCapture:
         return self.source.bounds
 
     def read(self, time: int) -> MultiViewFrame:
-        """All cameras that are there at index `time`, with `cameras`' calibration; errors are the source's."""
-        frame = reduced(self.source.read(time), self.longest_px)
+        """All cameras that are there and right at index `time`, with `cameras`' calibration.
+
+        A camera whose mask is inverted, or empty by mistake, is left out for that time, and named once.
+
+        Raises:
+            CaptureError: the source cannot be read, half of the masks are inverted, or no camera is left.
+        """
+        frame = self.source.read(time).without(self.left_out)
+        named = self.cameras.names if self.inputs is None else self.inputs
+        found = faulty_masks(frame, named, self.bounds)
+        _refuse_or_warn(f"{self.name}: frame '{self.frame_ids[time]}'", found, self._said)
+        wrong = [finding.camera for finding in found if finding.camera]
+        if len(wrong) == len(frame.cameras):
+            raise CaptureError(
+                f"{self.name}: expected one right mask or more, got none at {self.frame_ids[time]}; redo it"
+            )
+        frame = reduced(frame.without(wrong), self.longest_px)
         return replace(frame, cameras=self.cameras.select(frame.cameras.names))
 
 
@@ -89,7 +112,7 @@ def prepare(
         first: index of the first frame that will be used.
 
     Raises:
-        CaptureError: a frame cannot be read.
+        CaptureError: a frame cannot be read, or the first one says that masks or calibration are wrong altogether.
         ValueError: the masks agree on no subject.
 
     Examples:
@@ -99,7 +122,30 @@ def prepare(
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 32, 32])
     """
-    return PreparedCapture(source, _alignment(source, inputs, first) if align else None, longest_px)
+    named = None if inputs is None else tuple(inputs)
+    frame = _first_masked(source, named, first)
+    if frame is None:
+        return PreparedCapture(source, None, longest_px, named)
+    said: set[str] = set()
+    found = diagnose(frame, source.bounds)
+    _refuse_or_warn(f"{source.name}: frame '{source.frame_ids[frame.time]}'", found, said)
+    left_out = tuple(finding.camera for finding in found if finding.camera and finding.always)
+    frame = frame.without([finding.camera for finding in found if finding.camera])
+    alignment = None
+    if align and frame.mask is not None and len(frame.cameras) >= 2:
+        alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
+    return PreparedCapture(source, alignment, longest_px, named, left_out, said)
+
+
+def _refuse_or_warn(where: str, found: Sequence[Finding], said: set[str]) -> None:
+    """CaptureError for the first fatal finding; the others are logged, each camera's once."""
+    for finding in found:
+        if finding.fatal:
+            raise CaptureError(f"{where}: {finding.text}")
+        key = finding.camera or finding.text
+        if key not in said:
+            said.add(key)
+            logging.getLogger("viewmend").warning("%s: %s", where, finding.text)
 
 
 def open_masked(path: Path | str, cameras: Sequence[str] | None = None, held: int = 0) -> PlainCapture:
@@ -158,11 +204,12 @@ def _reduced_cameras(cameras: Cameras, longest_px: int | None) -> Cameras:
     return concatenate_cameras([cameras[view].resized(*size) for view, size in enumerate(sizes)])
 
 
-def _alignment(source: CaptureSource, inputs: Sequence[str] | None, first: int) -> Alignment | None:
+def _first_masked(source: CaptureSource, inputs: Sequence[str] | None, first: int) -> MultiViewFrame | None:
+    """The inputs at the first time from `first` on at which two of them are there, with any foreground."""
     for time in range(first, len(source.frame_ids)):
         frame = source.read(time)
         if inputs is not None:
             frame = frame.select([name for name in inputs if name in frame.cameras.names])
         if len(frame.cameras) >= 2 and frame.mask is not None and bool((frame.mask > 0).any()):
-            return shared_offset(frame.mask, frame.cameras, source.bounds)
+            return frame
     return None

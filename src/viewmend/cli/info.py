@@ -116,6 +116,8 @@ def _capture_in_words(capture: "CaptureDescription") -> list[str]:
     lines.append("")
     names = max(len(camera.name) for camera in capture.cameras)
     lines += [f"  {camera.name:<{names}}  {_camera(camera)}" for camera in capture.cameras]
+    if capture.findings:
+        lines += ["", "  wrong:", *(f"  - {text}" for text in capture.findings)]
     return lines
 
 

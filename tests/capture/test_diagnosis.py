@@ -1,0 +1,147 @@
+"""Each mistake that a capture can have: what is said of it, and what a command does."""
+
+import json
+import logging
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from viewmend.capture.diagnosis import diagnose
+from viewmend.capture.plain import open_capture
+from viewmend.capture.plain_writer import write_capture
+from viewmend.capture.prepare import prepare
+from viewmend.cli import main
+from viewmend.studio.stage import Studio, StudioConfig
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    path = tmp_path_factory.mktemp("diagnosis") / "studio"
+    write_capture(Studio(StudioConfig(seed=2, cameras=8, frames=2, size_px=96)), path, images="png")
+    return path
+
+
+@pytest.fixture
+def folder(good, tmp_path):
+    import shutil
+
+    return shutil.copytree(good, tmp_path / "studio")
+
+
+def change_cameras(folder, change, names=None):
+    description = json.loads((folder / "cameras.json").read_text())
+    for camera in description["cameras"]:
+        if names is None or camera["name"] in names:
+            R, t = change(np.array(camera["R"]), np.array(camera["t"]))
+            camera["R"], camera["t"] = R.tolist(), t.tolist()
+    (folder / "cameras.json").write_text(json.dumps(description))
+
+
+def change_masks(folder, change, camera="*"):
+    for file in folder.glob(f"mask/{camera}/*.png"):
+        cv2.imwrite(str(file), change(cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)))
+
+
+def names_of(folder):
+    return [camera["name"] for camera in json.loads((folder / "cameras.json").read_text())["cameras"]]
+
+
+def flipped(R, t):
+    return np.diag([1, -1, -1]) @ R, np.diag([1, -1, -1]) @ t
+
+
+POSES = {
+    "camera-to-world;": lambda R, t: (R.T, -R.T @ t),
+    "OpenGL axes": flipped,
+    "camera-to-world of OpenGL axes": lambda R, t: (R.T @ np.diag([1, -1, -1]), -R.T @ t),
+    "R is camera-to-world (transposed)": lambda R, t: (R.T, t),
+    "t is the camera's centre": lambda R, t: (R, -R.T @ t),
+    "check metres_per_unit": lambda R, t: (R, 100 * t),
+}
+
+
+def test_a_good_capture_has_no_findings(good):
+    capture = open_capture(good)
+    assert diagnose(capture.read(0), capture.bounds) == ()
+
+
+@pytest.mark.parametrize("said", POSES)
+def test_wrong_poses_are_named_and_refused(folder, capsys, tmp_path, said):
+    change_cameras(folder, POSES[said])
+    arguments = ["mend", str(folder), "--out", str(tmp_path / "out"), "--path", "orbit", "--model", "telea"]
+    assert main(arguments) == 2
+    assert said in capsys.readouterr().err
+    main(["info", str(folder)])
+    assert said in capsys.readouterr().out
+
+
+def test_swapped_cameras_are_named_and_refused(folder):
+    first, _, second, *_ = names_of(folder)
+    file = folder / "cameras.json"
+    description = json.loads(file.read_text())
+    a, b = (next(c for c in description["cameras"] if c["name"] == name) for name in (first, second))
+    for key in ("K", "R", "t"):
+        a[key], b[key] = b[key], a[key]
+    file.write_text(json.dumps(description))
+    with pytest.raises(ValueError, match=f"'{first}' and '{second}' are swapped"):
+        prepare(open_capture(folder))
+
+
+def test_inverted_masks_are_refused(folder):
+    change_masks(folder, lambda mask: 255 - mask)
+    with pytest.raises(ValueError, match="inverted"):
+        prepare(open_capture(folder))
+
+
+@pytest.mark.parametrize(("said", "change"), [("empty", lambda mask: 0 * mask), ("inverted", lambda mask: 255 - mask)])
+def test_one_bad_mask_is_named_once_and_its_camera_left_out(folder, caplog, said, change):
+    name = names_of(folder)[3]
+    change_masks(folder, change, name)
+    with caplog.at_level(logging.WARNING):
+        capture = prepare(open_capture(folder), align=False)
+        frames = [capture.read(0), capture.read(1)]
+    assert all(name not in frame.cameras.names and len(frame.cameras) == 7 for frame in frames)
+    assert len(caplog.messages) == 1 and f"camera '{name}': its mask is {said}" in caplog.messages[0]
+
+
+def test_an_empty_mask_at_one_time_costs_that_time_alone(folder):
+    name = names_of(folder)[3]
+    file = sorted(folder.glob(f"mask/{name}/*.png"))[1]
+    cv2.imwrite(str(file), np.zeros((96, 96), np.uint8))
+    capture = prepare(open_capture(folder), align=False)
+    assert [name in capture.read(time).cameras.names for time in (0, 1)] == [True, False]
+
+
+def test_an_empty_mask_is_right_where_the_subject_is_out_of_view(folder):
+    name = names_of(folder)[3]
+    change_masks(folder, lambda mask: 0 * mask, name)
+    change_cameras(folder, lambda R, t: (np.diag([-1, 1, -1]) @ R, np.diag([-1, 1, -1]) @ t), [name])
+    assert name in prepare(open_capture(folder), align=False).read(0).cameras.names
+
+
+def test_one_camera_that_disagrees_is_named_and_left_out(folder, caplog):
+    name = names_of(folder)[5]
+    change_cameras(folder, flipped, [name])
+    capture = prepare(open_capture(folder), align=False)
+    assert name not in capture.read(1).cameras.names
+    assert f"camera '{name}' disagrees" in caplog.text
+
+
+def test_a_held_out_camera_judges_nobody_and_is_named(folder, caplog):
+    held, *inputs = names_of(folder)
+    source = open_capture(folder)
+    before = prepare(source, inputs, align=False).read(0)
+    change_masks(folder, lambda mask: 255 - mask, held)
+    after = prepare(open_capture(folder), inputs, align=False).read(0)
+    assert before.cameras.names == after.cameras.names and "scores against it mean nothing" in caplog.text
+    masks = [frame.without([held]).mask for frame in (before, after)]
+    assert masks[0] is not None and masks[1] is not None and torch.equal(masks[0], masks[1])
+
+
+def test_a_subject_of_another_unit_is_named(folder, caplog):
+    file = folder / "cameras.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"metres_per_unit": 0.01}))
+    prepare(open_capture(folder), align=False)
+    assert "check metres_per_unit" in caplog.text
