@@ -18,6 +18,9 @@ MANY_ARGUMENTS: set[str] = {
     "viewmend/geometry/_hull_numba.py:judge",
     "viewmend/geometry/_hull_numba.py:occupied_blocks",
     "viewmend/geometry/_rasterize_numba.py:draw_band",
+    "viewmend/inpainting/sweep/_lookup_numba.py:_sample",
+    "viewmend/inpainting/sweep/_lookup_numba.py:look_up_camera",
+    "viewmend/inpainting/sweep/_lookup_numba.py:look_up_silhouette",
     "viewmend/rendering/_blend_numba.py:_blend_rows",
     "viewmend/rendering/_blend_numba.py:_weigh",
 }

@@ -149,8 +149,10 @@ def _train_one(job: "tuple[Recipe, Path]") -> None:
 def _with_top_k(source: Path, target: Path, top_k: int) -> None:
     """The same model that prunes its context to `top_k` tokens."""
     from viewmend.inpainting.checkpoint import load_network, save_inpainter
+    from viewmend.training.loop import NETWORKS
 
     model = load_network(source)
+    assert isinstance(model, NETWORKS), "variants have a transformer"
     model.config = replace(model.config, top_k=top_k)
     save_inpainter(model, target, f"# {target.name}\n\n{source.name} with top_k {top_k}.\n")
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import tyro
 
+from viewmend.inpainting.config import InpainterConfig
 from viewmend.training.plan import DataPlan, Recipe
 from viewmend.training.recipes import RECIPES, for_model
 
@@ -54,6 +55,8 @@ def _named(name: str, start: str | None) -> "Recipe | BaselineRecipe":
         from viewmend.inpainting.checkpoint import load_config
 
         model = load_config(start or "small")
+        if not isinstance(model, InpainterConfig):
+            raise ValueError(f"expected a model with a transformer for finetune, got '{start}'; go on with `views`")
         return replace(recipe, model=model, data=for_model(model, recipe.data))
     from viewmend.baselines.published import NETWORKS
     from viewmend.training.baseline_run import baseline_recipe

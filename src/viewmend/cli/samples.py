@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Annotated
 
 from viewmend.cli import recipe_options
-from viewmend.training.plan import FLAT, Recipe
+from viewmend.training.plan import FLAT, Recipe, WholeViewRecipe
+
+SAMPLES_A_SHARD, SCENES_A_SHARD = 48, 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,6 +19,7 @@ class Options:
 
     They are the recipe's own kind of samples (small by default), made once for many runs of `viewmend train --shards`.
     Of a recipe that trains rays alone, some pixels' rays are written, looked up: thousands of scenes fit in memory.
+    Of one that trains whole views (views), scenes are written, compressed, and a run that was stopped goes on.
     Every value of the recipe is an option, as in `viewmend train`.
     """
 
@@ -39,18 +42,46 @@ def run(options: Options) -> int:
     from viewmend.cli.console import say, track
     from viewmend.training.replay import samples_in_order
     from viewmend.training.sample_files import write_shards
-    from viewmend.training.sources import training_source
+    from viewmend.training.sources import stored_source, training_source
 
     if options.count < 1:
         raise ValueError(f"expected a count of at least 1, got {options.count}")
-    if any(options.out.glob("shard-*.tar")):
-        raise ValueError(f"{options.out}: expected no samples yet, found shards; choose another --out, or remove them")
     recipe = options.recipe
-    source = training_source(recipe, f"{recipe.seed}/0")
+    whole = isinstance(recipe, WholeViewRecipe)
+    there = len(list(options.out.glob("shard-*.tar")))
+    if there and not whole:
+        raise ValueError(f"{options.out}: expected no samples yet, found shards; choose another --out, or remove them")
+    if whole:
+        _demand_same(options.out, recipe)
+    per_shard = SCENES_A_SHARD if whole else SAMPLES_A_SHARD
+    first = there * per_shard
+    count = options.count - first
+    if count <= 0:
+        say(f"{options.out}: {first} samples are there already")
+        return 0
+    seed = f"{recipe.seed}/0"
+    source = stored_source(recipe, seed) if whole else training_source(recipe, seed)
     began = time.monotonic()
-    samples = islice((s for _, _, s in samples_in_order(source, 0, recipe.workers)), options.count)
-    shards = list(write_shards(track(samples, "samples", options.count), options.out))
-    rate = options.count / (time.monotonic() - began)
+    samples = islice((s for _, _, s in samples_in_order(source, first, recipe.workers)), count)
+    shards = list(write_shards(track(samples, "samples", count), options.out, per_shard, there))
+    rate = count / (time.monotonic() - began)
     size_mb = sum(path.stat().st_size for path in shards) / 1e6
-    say(f"wrote {options.count} samples, {len(shards)} shards, {size_mb:.0f} MB to {options.out}: {rate:.1f} samples/s")
+    say(f"wrote {count} samples, {len(shards)} shards, {size_mb:.0f} MB to {options.out}: {rate:.1f} samples/s")
     return 0
+
+
+def _demand_same(out: Path, recipe: Recipe) -> None:
+    """Write down what the folder's scenes are made by, or compare with what was.
+
+    Raises:
+        ValueError: they are made by another plan or seed.
+    """
+    plan, file = f"seed {recipe.seed}, {recipe.data}\n", out / "plan.txt"
+    if not file.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        file.write_text(plan)
+    elif file.read_text() != plan:
+        raise ValueError(
+            f"{out}: expected scenes of the same plan and seed, got {file.read_text().strip()}; give the options that "
+            "they were begun with, or choose another --out"
+        )

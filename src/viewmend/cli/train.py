@@ -79,10 +79,13 @@ def _start(options: Options) -> "tuple[nn.Module | None, type[Run]]":
     from viewmend.inpainting.checkpoint import load_network
     from viewmend.training.baseline_run import BaselineRun
     from viewmend.training.loop import Run
+    from viewmend.training.plan import WholeViewRecipe
+    from viewmend.training.whole_view_run import WholeViewRun
 
     name = recipe_options.started_from(options.recipe, options.start)
     if options.recipe.name not in NETWORKS:
-        return load_network(name) if name is not None else None, Run
+        kind = WholeViewRun if isinstance(options.recipe, WholeViewRecipe) else Run
+        return load_network(name) if name is not None else None, kind
     weights = "" if name == "pretrained" else f"@{name}"
     return load_baseline(options.recipe.name, weights) if name is not None else None, BaselineRun
 

@@ -10,12 +10,17 @@ from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.sweep.config import SweepConfig
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
 from viewmend.json_input import read_json
 from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError, load_weights, read_weights
 
 FORMAT = 2
 """Grows when an older program could no longer read what is written. Format 1, of one network with switches, is read."""
+Mender = Chain | PatchTransformer | SweepNet
+NETWORK, SWEEP = "network", "sweep"
+"""Key and value of config.json that tell a `SweepNet`; without it, a `Chain` or a `PatchTransformer`."""
 PRECISIONS = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 SHIPPED = Path(__file__).parents[1] / "weights"
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
@@ -32,7 +37,7 @@ def shipped_models() -> tuple[str, ...]:
 
 def load_inpainter(
     name_or_path: str | Path, device: torch.device | str = "cpu", precision: str = "float32"
-) -> Chain | PatchTransformer | TemporalAccumulation:
+) -> Mender | TemporalAccumulation:
     """The inpainter in this folder, or the shipped one of this name, ready for `Stream`.
 
     Args:
@@ -55,42 +60,47 @@ def load_inpainter(
         raise ValueError(f"expected --precision float32 or bfloat16, got '{precision}'")
     network = load_network(name_or_path, device)
     set_compute_dtype(network, PRECISIONS[precision])
-    weight = network.config.temporal_accumulation
+    weight = 0.0 if isinstance(network, SweepNet) else network.config.temporal_accumulation
     return TemporalAccumulation(network, weight) if weight else network
 
 
-def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -> Chain | PatchTransformer:
+def load_network(name_or_path: str | Path, device: torch.device | str = "cpu") -> Mender:
     """The networks alone, without temporal accumulation, in evaluation mode. Raises as `load_inpainter` does."""
     folder = _folder(name_or_path)
     version, config = _read_config(folder / CONFIG)
     with torch.device("meta"):  # nothing is allocated that the file cannot hold
-        wanted = sum(weight.numel() for weight in build(config).parameters())
+        wanted = sum(weight.numel() for weight in _built(config).parameters())
     if wanted > (there := (folder / WEIGHTS).stat().st_size):
         read_weights(folder / WEIGHTS)  # which says that they are damaged, if they are
         raise MismatchedWeightsError(
             f"{folder}: expected the {wanted} weights of its {CONFIG}, got {there} bytes of {WEIGHTS}; copy both files"
         )
-    network = build(config)
+    network = _built(config)
     rename = _renamed if version == 1 and isinstance(network, Chain) else None
     return load_weights(network, folder / WEIGHTS, device, rename=rename)
 
 
-def load_config(name_or_path: str | Path) -> InpainterConfig:
+def load_config(name_or_path: str | Path) -> InpainterConfig | SweepConfig:
     """The config of an inpainter, without its weights. Raises as `load_inpainter` does."""
     return _read_config(_folder(name_or_path) / CONFIG)[1]
 
 
-def save_inpainter(network: Chain | PatchTransformer, folder: str | Path, card: str) -> None:
+def save_inpainter(network: Mender, folder: str | Path, card: str) -> None:
     """Writes the three files; each is whole or not there, also when the machine stops halfway.
 
     `card` is the model card in Markdown: what trained the model and what it scores.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"viewmend_format": FORMAT} | network.config.to_dict()
+    kind = {NETWORK: SWEEP} if isinstance(network, SweepNet) else {}
+    config = {"viewmend_format": FORMAT} | kind | network.config.to_dict()
     write_atomically(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
     write_atomically(folder / CARD, lambda path: path.write_text(card))
     write_tensors(folder / WEIGHTS, network.state_dict(), {"format": "pt"})
+
+
+def _built(config: InpainterConfig | SweepConfig) -> Mender:
+    return SweepNet(config) if isinstance(config, SweepConfig) else build(config)
 
 
 def _renamed(key: str) -> str:
@@ -115,7 +125,7 @@ def _folder(name_or_path: str | Path) -> Path:
     return folder
 
 
-def _read_config(path: Path) -> tuple[int, InpainterConfig]:
+def _read_config(path: Path) -> tuple[int, InpainterConfig | SweepConfig]:
     try:
         values = read_json(path.read_bytes())
     except (OSError, ValueError) as error:
@@ -126,6 +136,9 @@ def _read_config(path: Path) -> tuple[int, InpainterConfig]:
             f"{path}: expected viewmend_format 1 or {FORMAT}, got {version}; use the version of viewmend that wrote it"
         )
     try:
-        return version, InpainterConfig.from_dict(values)
+        kind = values.pop(NETWORK, "chain")
+        if kind not in ("chain", SWEEP):
+            raise ValueError(f"expected the network 'chain' or '{SWEEP}', got {kind!r}")
+        return version, SweepConfig.from_dict(values) if kind == SWEEP else InpainterConfig.from_dict(values)
     except (TypeError, ValueError) as error:
         raise MismatchedWeightsError(f"{path}: {error}") from error

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from viewmend.atomic_writes import write_atomically
 from viewmend.training.schedule import Pace
-from viewmend.training.validation import ValidationScores
+from viewmend.training.validation import ValidationScores, WholeViewScores
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Log:
         rates["learning_rate"] = progress.learning_rate
         self._plot(progress.step, {f"rate/{n}": v for n, v in rates.items()})
 
-    def validated(self, judgement: ValidationScores) -> None:
+    def validated(self, judgement: ValidationScores | WholeViewScores) -> None:
         """What the averaged weights scored after a step."""
         self._write({"step": judgement.step, "validation": asdict(judgement)})
         self._plot(judgement.step, {f"validation/{n}": v for n, v in asdict(judgement).items() if n != "step"})

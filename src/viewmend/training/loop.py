@@ -21,11 +21,10 @@ from viewmend.training.model_card import model_card
 from viewmend.training.objective import Objective, StepOutput
 from viewmend.training.plan import Recipe
 from viewmend.training.processes import Processes, processes
-from viewmend.training.ray_batches import RayBatch, RaysObjective
+from viewmend.training.ray_batches import RaysObjective
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import FILE, PREVIOUS, RunState, last_checkpoint, load_run, save_run
-from viewmend.training.sample_files import sample_to_bytes
-from viewmend.training.samples import Sample
+from viewmend.training.sample_files import Trained, sample_to_bytes
 from viewmend.training.schedule import Schedule, learning_rate_factor
 from viewmend.training.sources import training_source
 from viewmend.training.validation import Validation
@@ -179,7 +178,7 @@ class Run:
         assert isinstance(self.averaged, NETWORKS)
         save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
 
-    def _step(self, step: int, batches: list[list[Sample | RayBatch]]) -> LossTerms:
+    def _step(self, step: int, batches: list[list[Trained]]) -> LossTerms:
         """One step of all weights, with the mean of the streams' gradients."""
         self.optimizer.zero_grad(set_to_none=True)
         costs = []
@@ -209,7 +208,7 @@ class Run:
             self.adversary.step()
         return LossTerms(*self.own.mean(torch.tensor(costs, device=self.own.device).mean(0)).tolist())
 
-    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Sample | RayBatch]) -> None:
+    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Trained]) -> None:
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -221,7 +220,7 @@ class Run:
             "lower the learning rate and begin with the last checkpoint"
         )
 
-    def _streams(self) -> list[SampleReplay[Sample | RayBatch]]:
+    def _streams(self) -> list[SampleReplay[Trained]]:
         """This process's streams: numbers rank, rank + count and so on."""
         recipe, own = self.recipe, self.own
         count = max(recipe.streams, own.count)

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.sweep.config import SweepConfig
 
 FLAT = tyro.conf.arg(name="")
 """On the command line, the fields are options without a prefix."""
@@ -91,6 +92,30 @@ class LossWeights:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ViewLossWeights:
+    """The terms that the reader of whole views is taught by. A weight of 0 switches a term off. Ours."""
+
+    colour: float = 1.0
+    """L1 of colours upon black."""
+    holes: float = 1.0
+    """How much more pixels count that no source view coloured."""
+    log_error: float = 0.15
+    """Weight of log10 of a window's squared error."""
+    gradient: float = 0.5
+    """L1 of the differences between neighbours, which keeps textures sharp."""
+    cell_colour: float = 0.5
+    """L1 of the mean over places."""
+    alpha: float = 0.5
+    """L1 of alpha, and a third of its cross-entropy."""
+    place: float = 0.1
+    """Cross-entropy of the surface's place."""
+    visible: float = 0.1
+    """What is lost by trusting cameras that do not see the surface."""
+    confidence: float = 0.05
+    """Cross-entropy of whether a pixel is right."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Recipe:
     """A named training run."""
 
@@ -151,3 +176,11 @@ class Recipe:
             )
         if self.part == "rays" and self.loss.adversarial:
             raise ValueError("expected no adversarial loss for rays alone, whose pixels are no image")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WholeViewRecipe(Recipe):
+    """A run that trains a `SweepNet` on stored scenes. Its `part` and `loss` say nothing."""
+
+    model: SweepConfig = field(default_factory=SweepConfig)  # pyright: ignore[reportIncompatibleVariableOverride]
+    view_loss: Annotated[ViewLossWeights, tyro.conf.arg(name="loss")] = field(default_factory=ViewLossWeights)

@@ -7,7 +7,7 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.config import base as base_model
 from viewmend.inpainting.config import paper as paper_model
 from viewmend.inpainting.config import small as small_model
-from viewmend.training.plan import DataPlan, LossWeights, Recipe
+from viewmend.training.plan import DataPlan, LossWeights, Recipe, WholeViewRecipe
 
 
 def small(data: DataPlan) -> Recipe:
@@ -44,6 +44,23 @@ def small_rays(data: DataPlan) -> Recipe:
         replay_size=600,
         pixels_per_view=64,
         learning_rate=1e-3,
+        ema=0.998,
+    )
+
+
+def views(data: DataPlan) -> WholeViewRecipe:
+    """The reader of whole views, on stored scenes: every pixel of the subject, with alpha and depth."""
+    plan = replace(data, cameras=(5, 20), times=(0,), held_cameras=5, ray_views=8, sizes_px=(224, 320, 416, 576))
+    return WholeViewRecipe(
+        name="views",
+        data=replace(plan, hull_resolution=128, imperfect_fraction=0.8, rough_fraction=0.5, min_hole_px=0),
+        steps=20_000,
+        minutes=60.0,
+        batch=4,
+        new_per_batch=1,
+        replay_size=48,
+        learning_rate=1e-3,
+        warmup=100,
         ema=0.998,
     )
 
@@ -106,6 +123,7 @@ def for_model(model: InpainterConfig, data: DataPlan, sizes_px: tuple[int, ...] 
 RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {
     "small": small,
     "small_rays": small_rays,
+    "views": views,
     "base": base,
     "paper": paper,
     "finetune": finetune,

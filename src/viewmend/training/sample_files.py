@@ -15,13 +15,21 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from viewmend.atomic_writes import write_atomically
+from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.inpainting.sweep.lookup import Scale
+from viewmend.inpainting.sweep.pyramids import Pyramid, Rig
 from viewmend.training.ray_batches import RayBatch
 from viewmend.training.samples import Sample
+from viewmend.training.stored_scenes import StoredScene, StoredView
+from viewmend.training.whole_views import WholeView
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
-PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, RayBatch)
-KINDS = {kind.__name__: kind for kind in PARTS}
+PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, Bounds, RayBatch)
+STORED = (StoredScene, StoredView, WholeView, Rig, Scale, Pyramid)
+Trained = Sample | RayBatch | WholeView
+Stored = Trained | StoredScene
+KINDS = {kind.__name__: kind for kind in (*PARTS, *STORED)}
 """The dataclasses that a sample is made of, and what is looked up of one."""
 STRUCTURE = "structure"
 """Name of the tensor that holds the sample without its tensors, as JSON."""
@@ -31,7 +39,7 @@ class ShardError(ValueError):
     """Samples that cannot be read: which file, what was expected, what came, the next step."""
 
 
-def sample_to_bytes(sample: Sample | RayBatch) -> bytes:
+def sample_to_bytes(sample: Stored) -> bytes:
     """A safetensors file with the sample's tensors, and the rest of it as JSON in a tensor of bytes."""
     tensors: dict[str, torch.Tensor] = {}
     structure = json.dumps(_taken_apart(sample, tensors)).encode()
@@ -39,7 +47,7 @@ def sample_to_bytes(sample: Sample | RayBatch) -> bytes:
     return save(tensors)
 
 
-def sample_from_bytes(data: bytes) -> Sample | RayBatch:
+def sample_from_bytes(data: bytes) -> Stored:
     """Inverse of `sample_to_bytes`.
 
     Raises:
@@ -52,35 +60,40 @@ def sample_from_bytes(data: bytes) -> Sample | RayBatch:
         raise ShardError(
             f"expected a sample, got {len(data)} bytes that do not read ({error}); make it again"
         ) from error
-    if not isinstance(sample, Sample | RayBatch):
+    if not isinstance(sample, Stored):
         raise ShardError(f"expected a sample, got a {type(sample).__name__}; make it again")
     return sample
 
 
-def write_shards(samples: Iterable[Sample | RayBatch], folder: Path, per_shard: int = 48) -> Iterator[Path]:
-    """Tar files of so many samples each, shard-00000.tar and on, every one whole or not there; yields their paths."""
+def write_shards(samples: Iterable[Stored], folder: Path, per_shard: int = 48, first: int = 0) -> Iterator[Path]:
+    """Tar files of so many samples each, shard-00000.tar (or number `first`) and on; yields their paths.
+
+    Every file is whole or not there.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     left = iter(samples)
     shards = iter(lambda: list(islice(left, per_shard)), [])
-    for number, shard in enumerate(shards):
+    for number, shard in enumerate(shards, first):
         yield _write_shard(shard, folder / f"shard-{number:05d}.tar")
 
 
-def read_shard(path: Path) -> list[Sample | RayBatch]:
-    """All samples of a shard.
+def read_shard(path: Path, member: int | None = None) -> list[Stored]:
+    """All samples of a shard; or this one alone, none where there are fewer.
 
     Raises:
         ShardError: the file is damaged.
     """
     try:
         with tarfile.open(path) as tar:
-            files = [tar.extractfile(member) for member in tar.getmembers()]
+            members = tar.getmembers()
+            wanted = members if member is None else members[member : member + 1]
+            files = [tar.extractfile(each) for each in wanted]
             return [sample_from_bytes(file.read()) for file in files if file is not None]
     except (tarfile.TarError, OSError, ShardError) as error:
         raise ShardError(f"{path}: expected a tar of samples ({error}); make this shard again") from error
 
 
-Kind = TypeVar("Kind", bound=Sample | RayBatch)
+Kind = TypeVar("Kind", bound=Stored)
 
 
 class ShardScenes(Generic[Kind]):
@@ -126,7 +139,40 @@ class ShardScenes(Generic[Kind]):
         return Random(f"{self.seed}/{number}").sample(samples, len(samples))
 
 
-def _write_shard(samples: list[Sample | RayBatch], path: Path) -> Path:
+class StoredShards:
+    """Shards of stored scenes, one scene at a time; shard by shard, in another order each time all were used."""
+
+    def __init__(self, folder: Path, seed: str) -> None:
+        """Find the shards.
+
+        Raises:
+            ShardError: the folder has none, or the first is damaged.
+        """
+        self.paths = sorted(folder.glob("*.tar"))
+        self.seed = seed
+        if not self.paths:
+            raise ShardError(f"{folder}: expected tar files, found none; make some with `viewmend samples views --out`")
+        self.scenes_a_shard = len(read_shard(self.paths[0]))
+
+    def scene(self, number: int) -> list[StoredScene]:
+        """One scene; none where a shard has fewer than the first.
+
+        Raises:
+            ShardError: its shard is damaged, or holds something else.
+        """
+        turn, position = divmod(number, len(self.paths) * self.scenes_a_shard)
+        shard, member = divmod(position, self.scenes_a_shard)
+        order = Random(f"{self.seed}/shards/{turn}").sample(self.paths, len(self.paths))
+        found = read_shard(order[shard], member)
+        if not all(isinstance(scene, StoredScene) for scene in found):
+            raise ShardError(
+                f"{order[shard]}: expected stored scenes, got {type(found[0]).__name__}; make some with `viewmend "
+                "samples views --out`"
+            )
+        return [scene for scene in found if isinstance(scene, StoredScene)]
+
+
+def _write_shard(samples: list[Stored], path: Path) -> Path:
     def write(beside: Path) -> None:
         with tarfile.open(beside, "w") as tar:
             for number, sample in enumerate(samples):

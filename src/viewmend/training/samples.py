@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -29,6 +29,10 @@ class Sample:
     """F*, background black."""
     previous: "Sample | None" = None
     """The same camera one frame before, for losses over time."""
+    alpha: UInt8[Tensor, "height width"] | None = None
+    """How much of each pixel the subject truly covers, in 255ths; None where nobody knows."""
+    depth: Float[Tensor, "height width"] | None = None
+    """True z-depth, metres, 0 where there is no surface; None where nobody knows."""
 
     @property
     def clip(self) -> tuple["Sample", ...]:

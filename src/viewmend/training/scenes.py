@@ -52,6 +52,11 @@ class StudioScenes:
 
     def scene(self, number: int) -> list[Sample]:
         """At each time some cameras of a random stage are left out in turn, and see the truth."""
+        rig, random = self.rig(number)
+        return rig_samples(rig, self.plan, random)
+
+    def rig(self, number: int) -> tuple[LeaveOneOutFrames, Random]:
+        """What the stage of scene `number` saw, and what draws anything else about the scene."""
         random = Random(f"{self.seed}/{number}")
         studio = Studio(random_stage(self.plan, random, self.split))
 
@@ -59,7 +64,7 @@ class StudioScenes:
             return studio.truth(studio.true_cameras.select([held]), time)
 
         frames = {time: studio.read(time) for time in self.plan.times}
-        return rig_samples(LeaveOneOutFrames(frames, None, lambda held: studio.cameras, truth), self.plan, random)
+        return LeaveOneOutFrames(frames, None, lambda held: studio.cameras, truth), random
 
 
 def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> StudioConfig:

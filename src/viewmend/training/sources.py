@@ -3,24 +3,40 @@
 from viewmend.capture.prepare import open_masked
 from viewmend.leave_one_out.splits import Split, recordings
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
-from viewmend.training.plan import DataPlan, Recipe
+from viewmend.training.plan import DataPlan, Recipe, WholeViewRecipe
 from viewmend.training.ray_batches import RayBatch, RayBatchScenes
-from viewmend.training.sample_files import ShardScenes
+from viewmend.training.sample_files import ShardScenes, StoredShards, Trained
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import SceneSource, StudioScenes
+from viewmend.training.stored_scenes import StoredSamples, StoredScene, StudioStore
+from viewmend.training.whole_views import WholeViewScenes
 
 
-def training_source(recipe: Recipe, seed: str) -> SceneSource[Sample | RayBatch]:
+def training_source(recipe: Recipe, seed: str) -> SceneSource[Trained]:
     """A stream's scenes, as the recipe's part needs them.
 
     Raises:
         CaptureError, ShardError: what its plan names cannot be used.
     """
+    if isinstance(recipe, WholeViewRecipe):
+        return WholeViewScenes(StoredSamples(stored_source(recipe, seed), recipe.data, seed), seed)
     if recipe.part != "rays":
         return scene_source(recipe.data, seed)
     shards = recipe.data.shards
     scenes = scene_source(recipe.data, seed) if shards is None else ShardScenes(shards, seed, (Sample, RayBatch))
     return RayBatchScenes(scenes, seed, recipe.pixels_per_view)
+
+
+def stored_source(recipe: Recipe, seed: str, split: Split = "training") -> SceneSource[StoredScene]:
+    """Scenes of whole views, compressed: from shards where they are given, else made.
+
+    Raises:
+        ShardError: the shards cannot be used.
+        ValueError: the plan names what is kept for tests.
+    """
+    if recipe.data.shards is not None and split == "training":
+        return StoredShards(recipe.data.shards, seed)
+    return StudioStore(StudioScenes(recipe.data, seed, split))
 
 
 def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneSource[Sample]:

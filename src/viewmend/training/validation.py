@@ -34,6 +34,21 @@ class ValidationScores:
     """What the coarse fill scores, before any patch."""
 
 
+@dataclass(frozen=True)
+class WholeViewScores:
+    """Means over the validation's views, PSNR in dB: of the subject's box, upon black."""
+
+    step: int
+    rendered: float
+    """As the source views show it."""
+    read: float
+    """With every pixel of the proxy read."""
+    subject: float
+    """The same, within the true silhouette."""
+    holes: float
+    """The same, where no source view has a colour."""
+
+
 class Validation:
     """Fixed views of a recipe's kind of data, made when they are first asked for."""
 
@@ -47,8 +62,6 @@ class Validation:
     @torch.no_grad()
     def judge(self, model: nn.Module, step: int) -> ValidationScores:
         """Mend every view, score it, and leave a picture of the first few."""
-        import cv2
-
         if not self._samples:
             self._samples = self._views()
             unseen = ContextProvider(lambda *_: None)
@@ -65,8 +78,7 @@ class Validation:
             fills.append(_score(torch.where(sample.view.error > 0, made.coarse.float().cpu(), completed), sample))
             shown.append(torch.cat([sample.view.rgb, completed, sample.truth / 255], 2))
         model.train(training)
-        shown_bgr = picture(shown[:SHOWN]).permute(1, 2, 0).flip(2).numpy()
-        cv2.imwrite(str(self.folder / f"validation-{step:06d}.png"), shown_bgr)
+        write_picture(shown[:SHOWN], self.folder / f"validation-{step:06d}.png")
         return ValidationScores(step, *(sum(x) / len(x) for x in (ours, self._telea, fills)))
 
     def _views(self) -> list[Sample]:
@@ -81,6 +93,13 @@ def _score(rgb: Float[Tensor, "3 height width"], sample: Sample) -> float:
     score = psnr(rgb, sample.truth.float() / 255, sample.view.error > 0)
     assert score is not None, "samples have holes"
     return score
+
+
+def write_picture(rows: list[Float[Tensor, "3 _h _w"]], path: Path) -> None:
+    """Writes `picture`."""
+    import cv2
+
+    cv2.imwrite(str(path), picture(rows).permute(1, 2, 0).flip(2).numpy())
 
 
 def picture(rows: list[Float[Tensor, "3 _h _w"]]) -> UInt8[Tensor, "3 height width"]:

@@ -1,0 +1,268 @@
+"""A reader of whole views: places along every ray are weighed, then cameras are blended at the best one. Ours.
+
+A plane sweep in the interval behind the proxy. At half the resolution each place along a ray is judged by what the
+cameras show there, and convolutions over the view decide among places (as over cost volumes, in MVSNet and ENeRF). At
+full resolution cameras are looked up at the depth that was found: textures stay sharp, and neighbours agree.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.inpainting.coarse_fill import fill
+from viewmend.inpainting.decoder import blend
+from viewmend.inpainting.network import Network
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
+from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
+from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
+from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
+from viewmend.inpainting.sweep.pyramids import Rig
+from viewmend.inpainting.sweep.unet import UNet
+from viewmend.views import CompletedView, IncompleteView
+
+CELL_PX = 2
+"""Side of the cells in which places are judged."""
+SHOWN_CHANNELS = 7
+"""RGB of the guess, M, what is coloured, the largest of the source views' shares, and what is read."""
+CHOICES = 4
+"""What a pixel may show: trusted cameras at its depth, the most trusted of them alone, the places' mean, the guess."""
+TOLD_CHANNELS = 27
+"""Each pixel has at full resolution: the choices' colours, two differences and two masks of them, what the lookup says
+of the place, and how sure its depth is."""
+JOINT = 0.03
+"""Pixels whose depth differs from their cell's by less than so many subject sizes are of its surface."""
+LEAST_MASK = 0.1
+MARGIN_PX = 16
+
+
+class Swept(NamedTuple):
+    """What was decided for the cells of a view."""
+
+    cells: Int[Tensor, "cell 2"]
+    """Row and column."""
+    depth: Float[Tensor, "rows columns"]
+    """The proxy's nearest z-depth in each cell that is read, metres, else 0."""
+    logits: Float[Tensor, "cell place"]
+    """How much speaks for each place being the surface."""
+    weighed: Weighed
+    """What was made of each place."""
+    decided: Float[Tensor, "1 feature rows columns"]
+
+
+class Reading(NamedTuple):
+    """What was read of a view, pixel by pixel."""
+
+    pixels: Int[Tensor, "pixel 2"]
+    """Row and column."""
+    rgb: Float[Tensor, "pixel 3"]
+    """Upon black."""
+    alpha: Float[Tensor, "pixel"]
+    confidence: Float[Tensor, "pixel"]
+    """Probability that no channel is off by a tenth."""
+    depth: Float[Tensor, "pixel"]
+    """z-depth, metres."""
+    trust: Float[Tensor, "pixel view"]
+    """Shares of the cameras."""
+    swept: Swept
+
+
+class SweepNet(Network):
+    """Reads the pixels of the proxy that must be mended, and tells their alpha, confidence and depth."""
+
+    config: SweepConfig  # pyright: ignore
+
+    def __init__(self, config: SweepConfig | None = None) -> None:
+        super().__init__()
+        config = config or SweepConfig()
+        self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.places = PlaceNet(config.width, config.place_channels)
+        self.decide = UNet(len(OFFSETS) * config.place_channels + SHOWN_CHANNELS + 2, config.features)
+        self.logits = nn.Conv2d(config.features, len(OFFSETS), 1)
+        self.pixels = PlaceNet(config.width, config.place_channels)
+        told, fine = config.features + TOLD_CHANNELS + config.place_channels, config.fine_features
+        self.finish = nn.Sequential(
+            *(nn.Conv2d(told, fine, 3, padding=1), nn.ReLU(), nn.Conv2d(fine, fine, 3, padding=1), nn.ReLU()),
+            nn.Conv2d(fine, CHOICES + 2, 3, padding=1),
+        )
+
+    def forward(
+        self,
+        view: IncompleteView,
+        rig: Rig,
+        scale: Scale | None = None,
+        read: Bool[Tensor, "height width"] | None = None,
+    ) -> Reading:
+        """What the pixels of a view show.
+
+        Args:
+            view: of which E is not looked at.
+            rig: the cameras.
+            scale: the whole view's, where this is a part of it.
+            read: which pixels of the proxy; None for all.
+        """
+        scale = scale or Scale.of(view)
+        covered, coloured = view.mask > 0, view.weights.sum(0) > 0
+        read = covered if read is None else read & covered
+        guess = fill(view.rgb, covered & ~coloured, covered)
+        flags = torch.stack([view.mask, coloured.float(), view.weights.amax(0), read.float()])
+        shown = torch.cat([guess, flags])
+        swept = self._sweep(view, rig, scale, read, shown)
+        return self._blend(view, rig, scale, torch.nonzero(read), shown, swept)
+
+    def crop_margin_px(self, quality: RenderQuality) -> int:
+        """What is around the subject tells where its outline is."""
+        return MARGIN_PX
+
+    @torch.no_grad()
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+        """The view with all of E read; a view without E comes back at once."""
+        read = (view.error > 0) & (view.mask > 0)
+        names = view.closest_views(self.config.num_views)
+        seen = context(view.time, names) if names and bool(read.any()) else None
+        if seen is None:
+            return CompletedView(view, view.rgb), state
+        found, E = self(view, Rig.of(seen, view.silhouettes), read=read), view.error
+        rgb, alpha, confidence, depth = (
+            scattered(values, found.pixels, view.mask.shape)
+            for values in (found.rgb, found.alpha[:, None], found.confidence[:, None], found.depth[:, None])
+        )
+        return CompletedView(
+            view,
+            blend(view.rgb, E, rgb, read.to(E)),
+            torch.where(read, E * alpha[0] + (1 - E) * view.mask, view.mask),
+            torch.where(read, E * confidence[0] + (1 - E), view.mask),
+            torch.where(read, depth[0] * (alpha[0] > 0.5), view.depth),
+        ), state
+
+    def _sweep(
+        self,
+        view: IncompleteView,
+        rig: Rig,
+        scale: Scale,
+        read: Bool[Tensor, "height width"],
+        shown: Float[Tensor, "7 height width"],
+    ) -> Swept:
+        """Every place along the rays of cells, judged by itself and by its neighbours."""
+        depth = nearest_depth(view.depth * read)
+        cells = torch.nonzero(depth > 0)
+        along = depth[tuple(cells.T)][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
+        middles = CELL_PX * (cells.flip(1).double() + 0.5)
+        places = look_up(Rays(view.camera, middles, along), rig, view.source_views, float(CELL_PX), scale)
+        front = nearest_depth(view.depth)
+        beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
+        means = F.avg_pool2d(shown[None], CELL_PX, ceil_mode=True)[0]
+        with self.autocast():
+            weighed = self.places(places)
+            volume = scattered(weighed.features.flatten(1), cells, depth.shape)
+            told = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(volume)
+            decided = self.decide(torch.cat([volume, told])[None])
+            logits = self.logits(decided)[0, :, cells[:, 0], cells[:, 1]].T.float() + weighed.score.float()
+        return Swept(cells, depth, logits, weighed, decided)
+
+    def _blend(
+        self,
+        view: IncompleteView,
+        rig: Rig,
+        scale: Scale,
+        pixels: Int[Tensor, "pixel 2"],
+        shown: Float[Tensor, "7 height width"],
+        swept: Swept,
+    ) -> Reading:
+        """The cameras at the depth of each pixel, and what of them it shows."""
+        place, offset, certain = self._depth_offset(pixels, swept)
+        cell = index_image(swept.cells, swept.depth.shape)[tuple((pixels // CELL_PX).T)]
+        own, front = view.depth[tuple(pixels.T)], swept.depth[tuple(swept.cells.T)][cell]
+        front = torch.where((own - front).abs() < JOINT * scale.size_m, own, front)
+        depth = front + scale.size_m * offset
+        uv, at = pixels.flip(1).double() + 0.5, depth.detach()[:, None]
+        found = look_up(Rays(view.camera, uv, at), rig, view.source_views, 1.0, scale)
+        before = swept.weighed.trust[cell, place]
+        with self.autocast():
+            weighed = self.pixels(found, before[:, None])
+        sharp = _straight(weighed.colour[:, 0], weighed.mask[:, 0])
+        best = weighed.trust[:, 0].argmax(1)
+        best = found.features[torch.arange(len(best)), 0, best] if len(best) else found.features.sum((1, 2))
+        single = _straight(best[:, COLOUR], best[:, MASK])
+        shares = swept.logits.softmax(1)[..., None]
+        means = torch.cat([(shares * part).sum(1) for part in (swept.weighed.colour, swept.weighed.mask)], 1)
+        means = _finer(means, swept, pixels)
+        soft = _straight(means[:, :3], means[:, 3:])
+        here = shown[:, pixels[:, 0], pixels[:, 1]].T
+        guess = here[:, :3]
+        told = [sharp, single, soft, guess, sharp - guess, weighed.mask[:, 0], means[:, 3:], here[:, 4:6]]
+        told += [found.stats[:, 0, 3:6].mean(1, keepdim=True), found.stats[:, 0, 6:], certain[:, None]]
+        told += [(sharp - single).abs().mean(1, keepdim=True), offset[:, None], weighed.features[:, 0]]
+        out = self._finish(torch.cat(told, 1), pixels, view.mask.shape, swept.decided)
+        choice = out[:, :CHOICES].softmax(1)
+        straight = (choice[..., None] * torch.stack([sharp, single, soft, guess], 1)).sum(1)
+        alpha = (out[:, CHOICES] + 4 * (weighed.mask[:, 0, 0] - 0.5)).sigmoid()
+        confidence = out[:, CHOICES + 1].sigmoid()
+        return Reading(pixels, alpha[:, None] * straight, alpha, confidence, depth, weighed.trust[:, 0], swept)
+
+    def _depth_offset(
+        self, pixels: Int[Tensor, "pixel 2"], swept: Swept
+    ) -> tuple[Int[Tensor, "pixel"], Float[Tensor, "pixel"], Float[Tensor, "pixel"]]:
+        """The most probable place of each pixel, the mean offset about it in subject sizes, and its probability."""
+        shares = _finer(swept.logits.softmax(1), swept, pixels)
+        place = shares.argmax(1)
+        around = torch.stack([place - 1, place, place + 1], 1).clamp(0, len(OFFSETS) - 1)
+        weight = shares.gather(1, around) + 1e-6
+        offset = (weight * weight.new_tensor(OFFSETS)[around]).sum(1) / weight.sum(1)
+        return place, offset, shares.amax(1)
+
+    def _finish(
+        self,
+        told: Float[Tensor, "pixel told"],
+        pixels: Int[Tensor, "pixel 2"],
+        shape: torch.Size,
+        decided: Float[Tensor, "1 feature rows columns"],
+    ) -> Float[Tensor, "pixel output"]:
+        """What convolutions over the view make of its pixels."""
+        with self.autocast():
+            near = F.interpolate(decided, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
+            image = scattered(told.to(near), pixels, shape)[None]
+            image = torch.cat([near[:, :, : shape[0], : shape[1]], image], 1)
+            out = self.finish(image.contiguous(memory_format=torch.channels_last))
+        return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
+
+
+def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
+    """The smallest depth in each cell, metres, of the pixels that have any; 0 where none has."""
+    height, width = depth.shape
+    far = F.pad(torch.where(depth > 0, depth, torch.inf), (0, width % 2, 0, height % 2), value=torch.inf)
+    nearest = -F.max_pool2d(-far[None], CELL_PX)[0]
+    return torch.where(nearest.isfinite(), nearest, 0.0)
+
+
+def scattered(
+    values: Shaped[Tensor, "point channel"], at: Int[Tensor, "point 2"], shape: torch.Size
+) -> Shaped[Tensor, "channel rows columns"]:
+    """An image of this shape with the values at rows and columns, zeros elsewhere."""
+    image = values.new_zeros(shape[0] * shape[1], values.shape[1])
+    return image.index_copy(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
+
+
+def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
+    """An image with the index of the point at each row and column; -1 where there is none."""
+    image = torch.full(shape, -1, dtype=torch.long, device=at.device)
+    image[tuple(at.T)] = torch.arange(len(at), device=at.device)
+    return image
+
+
+def _finer(
+    values: Float[Tensor, "cell channel"], swept: Swept, pixels: Int[Tensor, "pixel 2"]
+) -> Float[Tensor, "pixel channel"]:
+    """The cells' values at pixels, bilinearly; nothing comes from cells that were not read."""
+    whole = F.pad(values, (0, 1), value=1.0)
+    image = scattered(whole, swept.cells, swept.depth.shape)[None]
+    fine = F.interpolate(image, scale_factor=CELL_PX, mode="bilinear", align_corners=False)[0]
+    at = fine[:, pixels[:, 0], pixels[:, 1]].T
+    return at[:, :-1] / at[:, -1:].clamp_min(1e-6)
+
+
+def _straight(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
+    """Colours upon black as they are without it."""
+    return (colour / mask.clamp_min(LEAST_MASK)).clamp(0, 1)

@@ -1,0 +1,226 @@
+"""The reader of whole views: lookups equal their slow twins, reading touches E alone, and depends on nothing else."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from viewmend.inpainting.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
+from viewmend.inpainting.protocol import ContextProvider, State
+from viewmend.inpainting.ray_sampling import sample_along_rays, subject_size_m
+from viewmend.inpainting.sweep import _lookup_torch, lookup
+from viewmend.inpainting.sweep._lookup_numba import look_up_numba
+from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
+from viewmend.inpainting.sweep.lookup import Rays, Scale, look_up
+from viewmend.inpainting.sweep.place_net import PlaceNet
+from viewmend.inpainting.sweep.pyramids import Rig, halved, silhouette_pyramids
+from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth, scattered
+from viewmend.rendering.crop import Crop
+from viewmend.rendering.view import RenderConfig
+from viewmend.stream import Stream, StreamConfig
+from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.views import Silhouettes
+
+SMALL = SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A stream with one camera left out, its view by the rule `all`, and what four cameras saw."""
+    studio = Studio(StudioConfig(seed=7, cameras=7, frames=1, size_px=(96, 83)))
+    frame = studio.read(0)
+    held, net = frame.cameras.names[2], SweepNet(SMALL)
+    stream = Stream(net, StreamConfig(render=RenderConfig(error_rule="all"), memory_mb=None))
+    observation = stream.push(frame.without([held]))
+    view = stream.render(frame.cameras.select([held]))
+    seen = observation.context(view.closest_views(4))
+    return stream, view, Rig.of(seen, view.silhouettes)
+
+
+def rays_of(view):
+    pixels = torch.nonzero(view.mask > 0)
+    z = view.depth[tuple(pixels.T)][:, None] + float(subject_size_m(view)) * torch.tensor(OFFSETS)
+    return pixels, Rays(view.camera, pixels.flip(1).double() + 0.5, z)
+
+
+def test_lookups_are_what_a_ray_reader_sees_at_the_finest_scale(scene, monkeypatch):
+    """At full resolution colours, masks, angles and silhouettes are those of `sample_along_rays`."""
+    _, view, rig = scene
+    monkeypatch.setattr(lookup, "_eyes", finest(lookup._eyes))
+    pixels, rays = rays_of(view)
+    found = look_up(rays, rig, view.source_views, 1.0, Scale.of(view)).features
+    wanted = sample_along_rays(view, pixels, rig.views, OFFSETS)
+    assert len(pixels) > 500
+    seen = wanted.features
+    close = {"atol": 0.011, "rtol": 0}  # products with the mask are rounded to bytes
+    torch.testing.assert_close(found[..., :3], seen.colour, **close)
+    torch.testing.assert_close(found[..., 3:4], seen.mask, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[..., 6:7], seen.viewing_cosine, atol=1e-4, rtol=0)
+    torch.testing.assert_close(found[..., 7:8], seen.is_source, atol=0, rtol=0)
+    torch.testing.assert_close(found[..., 8:9], seen.in_view, atol=0, rtol=0)
+    least = look_up(rays, rig, view.source_views, 1.0, Scale.of(view)).stats[..., 6:8]
+    torch.testing.assert_close(least, torch.cat(wanted.consistency[:2], -1), atol=1e-4, rtol=0)
+
+
+def finest(eyes):
+    def made(cameras, pyramids, step_m, middle):
+        found = eyes(cameras, pyramids, step_m, middle)
+        return found._replace(fine=tuple(lookup.Level(p.levels[0], 1.0) for p in pyramids))
+
+    return made
+
+
+@pytest.mark.parametrize("step_px", [1.0, 5.0])
+def test_both_kernels_find_the_same(scene, step_px, monkeypatch):
+    _, view, rig = scene
+    _, rays = rays_of(view)
+    rays = rays._replace(z_m=torch.where(torch.rand(rays.z_m.shape) < 0.1, 0.0, rays.z_m))
+    fast = look_up(rays, rig, view.source_views, step_px, Scale.of(view))
+    used = []
+
+    def slow_kernel(*told):
+        used.append(told)
+        return _lookup_torch.look_up_torch(*told)
+
+    monkeypatch.setattr("viewmend.inpainting.sweep._lookup_numba.look_up_numba", slow_kernel)
+    slow = look_up(rays, rig, view.source_views, step_px, Scale.of(view))
+    assert used and look_up_numba is not slow_kernel
+    scales = {level.scale for level in (*used[0][1].fine, *used[0][1].wide)}
+    assert max(scales) == {1.0: 1.0, 5.0: 0.25}[step_px], "levels follow the rays"
+    for name, one, other in zip(fast._fields, fast, slow, strict=True):
+        off = (one - other).abs()
+        flips = (off > 1e-3).float().mean()  # the proxy's nearest pixel, where a position is between two
+        assert float(flips) < 2e-3, name
+        assert float(off.median()) < 1e-6, name
+    assert float(fast.prior.sum(2).max()) <= 1 + 1e-5 and float(fast.stats[..., 3:6].max()) > 0.1
+
+
+def test_levels_are_means_and_black_around():
+    image = torch.zeros(7, 9, 1, dtype=torch.uint8)
+    image[1:-1, 1:-1, 0] = torch.randint(0, 256, (5, 7), dtype=torch.uint8)
+    half = halved(image)
+    assert half.shape == (5, 6, 1) and int(half[0].sum() + half[-1].sum() + half[:, 0].sum() + half[:, -1].sum()) == 0
+    inner = image[..., 0].int()
+    assert int(half[1, 1, 0]) == (int(inner[1:3, 1:3].sum()) + 2) // 4
+    assert int(half[3, 4, 0]) == (int(inner[5, 7]) + 2) // 4, "an odd side is made up for by black"
+
+
+def test_the_subjects_size_is_measured_at_a_coarse_level():
+    mask = torch.zeros(1, 64, 64, dtype=torch.uint8)
+    mask[0, 8:40, 16:48] = 255
+    cameras = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).cameras.select(["cam00"])
+    (pyramid,) = silhouette_pyramids(Silhouettes(mask, cameras))
+    assert pyramid.subject_px == pytest.approx(32)
+    assert [pyramid.level(px) for px in (0.3, 1.0, 1.5, 4.0, 1e9)] == [0, 0, 1, 2, len(pyramid.levels) - 1]
+
+
+def test_trust_adds_up_and_blind_cameras_get_none(scene):
+    _, view, rig = scene
+    _, rays = rays_of(view)
+    torch.manual_seed(0)
+    places = look_up(rays, rig, view.source_views, 1.0, Scale.of(view))
+    places.features[..., 1, :] = 0
+    with torch.no_grad():
+        weighed = PlaceNet(8, 4)(places)
+    total, anyone = weighed.trust.sum(2), places.features[..., 8].sum(2) > 0
+    torch.testing.assert_close(total, anyone.float())
+    assert float(weighed.trust[..., 1].abs().max()) == 0
+    mean = (weighed.trust[..., None] * places.features).sum(2)
+    torch.testing.assert_close(weighed.colour, mean[..., :3])
+    torch.testing.assert_close(weighed.mask, mean[..., 3:4])
+
+
+def test_only_e_is_read_and_everything_is_told(scene):
+    stream, view, _ = scene
+    torch.manual_seed(0)
+    error = view.error * (torch.rand_like(view.error) < 0.3)
+    mended = stream.mend(replace(view, error=error)).completed
+    kept = error == 0
+    assert torch.equal(mended.rgb[:, kept], view.rgb[:, kept])
+    assert bool((mended.rgb[:, ~kept] != view.rgb[:, ~kept]).any())
+    assert torch.equal(mended.alpha[kept], view.mask[kept]) and torch.equal(mended.depth[kept], view.depth[kept])
+    for image in (mended.rgb, mended.alpha, mended.confidence):
+        assert float(image.min()) >= 0 and float(image.max()) <= 1 + 1e-6
+    assert float(mended.confidence[view.mask == 0].abs().max()) == 0
+    moved = mended.depth[~kept & (mended.alpha > 0.5)] - view.depth[~kept & (mended.alpha > 0.5)]
+    size = float(subject_size_m(view))
+    within = (moved > (OFFSETS[0] - 0.04) * size) & (moved < (OFFSETS[-1] + 0.04) * size)
+    assert float(within.float().mean()) > 0.95, "but where a cell is of a nearer surface"
+
+
+def test_soft_e_blends(scene):
+    stream, view, _ = scene
+    whole, half, none = (stream.mend(replace(view, error=share * view.error)).completed for share in (1.0, 0.5, 0.0))
+    torch.testing.assert_close(half.rgb, (whole.rgb + view.rgb) / 2)
+    torch.testing.assert_close(half.alpha, (whole.alpha + view.mask) / 2)
+    assert none.rgb is view.rgb and none.alpha is None
+
+
+def test_what_a_part_reads_it_reads_by_the_whole_views_scale(scene):
+    stream, view, rig = scene
+    net, scale, part = stream.inpainter, Scale.of(view), Crop(0, 16, 96, 83)
+    with torch.no_grad():
+        whole, read, other = net(view, rig, scale), net(part.of_view(view), rig, scale), net(part.of_view(view), rig)
+    depth = scattered(whole.depth[:, None], whole.pixels, view.mask.shape)[0, 32:]
+    mine = scattered(read.depth[:, None], read.pixels, torch.Size((67, 96)))[0, 16:]
+    assert float((depth - mine).abs().median()) < 1e-3 * scale.size_m
+    assert not torch.equal(other.depth, read.depth)
+
+
+def test_colours_come_from_the_cameras(scene):
+    """A reader that trusts its lookups shows another person where cameras do."""
+    stream, view, rig = scene
+    frame = rig.views.frame
+    green = torch.zeros_like(frame.rgb)
+    green[:, 1] = 255
+    other = Rig.of(replace(rig.views, frame=replace(frame, rgb=green)), view.silhouettes)
+    net = stream.inpainter
+    blind = replace(view, rgb=torch.zeros_like(view.rgb))
+    with torch.no_grad():
+        read = net(blind, other)
+    assert float(read.rgb[:, 0].max()) == 0 and float(read.rgb[:, 1].mean()) > 5 * float(read.rgb[:, 2].max())
+
+
+def test_cells_have_the_nearest_depth():
+    depth = torch.tensor([[0.0, 3.0, 0.0], [2.0, 5.0, 0.0], [0.0, 0.0, 4.0]])
+    assert nearest_depth(depth).tolist() == [[2.0, 0.0], [0.0, 4.0]]
+
+
+def test_without_cameras_nothing_is_mended(scene):
+    stream, view, _ = scene
+    completed, state = stream.inpainter.step(view, ContextProvider(lambda *_: None), State())
+    assert completed.rgb is view.rgb and completed.alpha is None and state == State()
+
+
+def test_it_is_written_and_loads_and_reads_the_same(scene, tmp_path):
+    stream, view, rig = scene
+    net = stream.inpainter
+    save_inpainter(net, tmp_path / "model", "# card")
+    again = load_inpainter(tmp_path / "model")
+    assert isinstance(again, SweepNet) and again.config == SMALL
+    assert torch.equal(again(view, rig).rgb, net(view, rig).rgb)
+    config = tmp_path / "model" / "config.json"
+    config.write_text(config.read_text().replace('"sweep"', '"sweeping"'))
+    with pytest.raises(MismatchedWeightsError, match="expected the network 'chain' or 'sweep', got 'sweeping'"):
+        load_inpainter(tmp_path / "model")
+
+
+@pytest.mark.parametrize("values", [{"width": 0}, {"width": 2.5}, {"depth": 3}, {"features": True}, {"width": 10**9}])
+def test_impossible_sizes_are_refused(values):
+    with pytest.raises(ValueError, match="expected whole numbers of"):
+        SweepConfig.from_dict(values)
+
+
+@pytest.mark.gpu
+def test_cuda_reads_what_the_cpu_reads(scene):
+    stream, view, rig = scene
+    net = stream.inpainter
+    expected = net(view, rig)
+    import copy
+
+    from viewmend.training.samples import to_device
+
+    on_gpu = to_device(view, "cuda")
+    got = copy.deepcopy(net).cuda()(on_gpu, Rig.of(rig.views.to("cuda"), on_gpu.silhouettes))
+    off = (got.rgb.cpu() - expected.rgb).abs().amax(1)
+    assert float((off > 0.02).float().mean()) < 0.01
