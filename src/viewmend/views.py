@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
 
@@ -160,6 +161,12 @@ class IncompleteView:
         return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
 
 
+FAINT = 1 / 16
+"""Opacity below which a pixel's own colour, divided by it, would be noise."""
+NEAR_PX = 4
+"""How far a faint pixel looks for colours."""
+
+
 @dataclass(frozen=True)
 class CompletedView:
     """A novel view without holes: Fhat = E * Ftilde + (1 - E) * F (section 1).
@@ -193,6 +200,20 @@ class CompletedView:
     def opacity(self) -> Float[Tensor, "height width"]:
         """`alpha`, or M where the inpainter does not tell."""
         return self.view.mask if self.alpha is None else self.alpha
+
+    @property
+    def straight_rgb(self) -> Float[Tensor, "3 height width"]:
+        """Fhat divided by `opacity`, in [0, 1]: colours without the black that they lie upon.
+
+        Where there is next to no opacity it is the colour of what is near, so that nothing dark bleeds in when the
+        picture is scaled or compressed; black far from the subject. `rgb + (1 - opacity) * background` lays the view
+        over another background.
+        """
+        opacity = self.opacity[None]
+        near = F.avg_pool2d(torch.cat([self.rgb, opacity])[None], 2 * NEAR_PX + 1, 1, NEAR_PX)[0]
+        tiny = torch.finfo(near.dtype).tiny
+        spread, own = near[:3] / near[3:].clamp(min=tiny), self.rgb / opacity.clamp(min=FAINT)
+        return torch.where(opacity < FAINT, spread, own).clamp(0, 1)
 
     @property
     def images(self) -> dict[str, Float[Tensor, "*channel height width"]]:

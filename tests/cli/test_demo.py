@@ -23,8 +23,8 @@ def test_the_demo_renders_mends_and_scores(tmp_path, capsys):
     video = cv2.VideoCapture(str(tmp_path / "a" / "demo.mp4"))
     read, panel = video.read()
     assert read and int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
-    # Four panels of 72 pixels with gaps, their captions above.
-    assert panel.shape == (LABEL_PX + 72 + 2 * GAP_PX, 4 * (72 + GAP_PX) + GAP_PX, 3)
+    # Three panels of 72 pixels with gaps, their captions above.
+    assert panel.shape == (LABEL_PX + 72 + 2 * GAP_PX, 3 * (72 + GAP_PX) + GAP_PX, 3)
     captions = panel[GAP_PX : GAP_PX + LABEL_PX]
     assert captions.max() > 150
 

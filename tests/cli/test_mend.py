@@ -4,6 +4,7 @@ import json
 import shutil
 from time import sleep
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -12,14 +13,17 @@ from reference import tells_all
 from reference.ball import BallCapture, camera_at
 
 from viewmend.baselines.classical import Telea
+from viewmend.capture.images import write_depth
 from viewmend.capture.plain_writer import write_capture
 from viewmend.capture.prepare import open_masked, prepare
 from viewmend.cli import main, serve
+from viewmend.cli.mend_output import depth_picture_m
 from viewmend.contact_sheet import picture
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.live.renderer import Renderer, RenderRequest
 from viewmend.metrics.image_quality import psnr, ssim_map
 from viewmend.stream import RenderQuality
+from viewmend.views import CompletedView, IncompleteView
 
 KEYS = [
     "frames", "hole_fraction", "mended_fraction", "psnr_whole", "psnr_whole_rendered", "psnr_whole_unseen",
@@ -65,7 +69,9 @@ def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, capsys):
     holes = np.stack([cv2.imread(str(f), 0) for f in sorted((tmp_path / "out" / "holes").iterdir())])
     assert holes.shape == (2, 48, 48) and set(np.unique(holes)) <= {0, 255}
     assert report["hole_fraction"] == pytest.approx((holes > 0).sum() / 2 / 900, rel=0.3)
-    assert {f.name for f in (tmp_path / "out").iterdir()} == {".viewmend", "mended.mp4", "holes", "contact_sheet.png"}
+    assert {f.name for f in (tmp_path / "out").iterdir()} == {
+        ".viewmend", "mended.mp4", "compared.mp4", "holes", "rendered", "truth", "contact_sheet.png",
+    }  # fmt: skip
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
     assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
@@ -96,6 +102,51 @@ def test_the_whole_view_is_scored(folder, tmp_path, capsys):
     assert report["ssim_whole"] == pytest.approx(float(ssim_map(seen, image).mean()), abs=1e-3)
     assert report["alpha_iou"] == pytest.approx(report["hull_iou"]["held"], abs=1e-9)
     assert report["psnr_whole_rendered"] < report["psnr_whole"]
+
+
+def pictures(folder, flags=cv2.IMREAD_COLOR_RGB):
+    return np.stack([cv2.imread(str(file), flags) for file in sorted(folder.iterdir())])
+
+
+def test_rendered_views_and_the_truth_lie_beside_the_mended_ones(folder, tmp_path, capsys):
+    mend(capsys, folder, tmp_path, "--leave-out", "held", "--frames", "1:2")
+    rendered, mended, truth = (pictures(tmp_path / name)[0] for name in ("rendered", "mended", "truth"))
+    holes = pictures(tmp_path / "holes", 0)[0] > 0
+    assert (rendered[holes] == 0).all() and (mended[holes] > 0).any() and (rendered == mended)[~holes].all()
+    true = prepare(open_masked(folder), [f"c{n}" for n in range(6)]).read(1).select(["held"])
+    assert np.abs(truth - picture(true.rgb[0] / 255 * (true.mask[0] / 255)).astype(int)).max() <= 1
+    mend(capsys, folder, tmp_path, "--path", "orbit")  # nobody knows its truth
+    assert not (tmp_path / "truth").exists() and (tmp_path / "compared.mp4").exists()
+
+
+def test_the_subject_is_cut_out_without_dark_fringes(folder, tmp_path, capsys):
+    mend(capsys, folder, tmp_path, "--leave-out", "held", "--model", TELLS_ALL, "--error-rule", "all", "--alpha")
+    cut = pictures(tmp_path / "cutout", cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]].astype(int)
+    alpha = cut[..., 3:]
+    assert cut.shape == (2, 48, 48, 4) and (alpha == 0).any() and ((alpha > 20) & (alpha < 200)).any()
+    near = (alpha > 0)[..., 0]
+    assert np.abs(cut[near][:, :3] - np.array(tells_all.COLOUR) * 255).max() < 10
+    with av.open(str(tmp_path / "cutout.webm")) as film:
+        decoder = av.CodecContext.create("libvpx-vp9", "r")
+        frames = [f.to_ndarray(format="rgba") for p in film.demux(film.streams.video[0]) for f in decoder.decode(p)]
+    assert len(frames) == 2 and np.abs(frames[1][..., 3] - cut[1, ..., 3]).mean() < 4
+
+
+def test_depth_is_written_in_millimetres(folder, tmp_path, capsys):
+    given = ["--leave-out", "held", "--depth", "--frames", "1:2"]
+    for out, model in (("proxy", "telea"), ("own", TELLS_ALL)):
+        mend(capsys, folder, tmp_path / out, *given, "--model", model)
+    proxy, own = (pictures(tmp_path / out / "depth", cv2.IMREAD_UNCHANGED)[0].astype(int) for out in ("proxy", "own"))
+    assert proxy.dtype == int and 1000 < proxy.max() < 9000 and proxy[0, 0] == own[0, 0] == 0
+    assert np.abs(proxy - own - 100)[proxy > 0].max() <= 1  # what the model tells, a hand nearer
+
+
+def test_depth_beyond_what_sixteen_bits_hold_is_the_largest(tmp_path):
+    camera, blank = camera_at(0, "c"), torch.zeros(1, 4)
+    view = IncompleteView(camera, blank.expand(3, 1, 4), blank, blank, blank, (), blank[None][:0], 0)
+    told = CompletedView(view, view.rgb, depth=torch.tensor([[0.0, 2.0, 65.6, 500.0]]))
+    write_depth(tmp_path / "d.png", depth_picture_m(told))
+    assert cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED).tolist() == [[0, 2000, 65535, 65535]]
 
 
 def test_what_the_camera_left_out_saw_changes_scores_alone(folder, tmp_path, capsys):
@@ -229,7 +280,14 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, capsys)
     notes.unlink()
     for _ in range(2):  # its own results are
         assert mend(capsys, folder, tmp_path, "--leave-out", "held", "--frames", "0:1")[0] == 0
-    assert {f.name for f in tmp_path.iterdir()} == {".viewmend", "holes", "mended", "contact_sheet.png"}
+    assert {f.name for f in tmp_path.iterdir()} == {
+        ".viewmend",
+        "holes",
+        "mended",
+        "rendered",
+        "truth",
+        "contact_sheet.png",
+    }
 
 
 def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, capsys, caplog):

@@ -38,6 +38,20 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
+def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
+    """An 8-bit image file with alpha, as its pixels are stored.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or has other channels.
+    """
+    import cv2
+
+    bgra = _decode(path, where, cv2.IMREAD_UNCHANGED)
+    if bgra.dtype != np.uint8 or bgra.ndim != 3 or bgra.shape[2] != 4:
+        raise CaptureError(f"{where}: expected RGB and alpha of 8 bit, got {bgra.dtype} of shape {bgra.shape}")
+    return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
+
+
 def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
     """An 8-bit mask file of any number of channels: alpha where it is used, else the largest colour.
 
@@ -126,10 +140,10 @@ def _is_complete(data: bytes) -> bool:
 
 def write_image(
     path: Path,
-    image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width 3"],
+    image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width channel"],
     jpeg_quality: int = 95,
 ) -> None:
-    """Write an RGB or grey image; the suffix (.png, .jpg, ...) says how.
+    """Write a grey image, RGB, or RGB and straight alpha; the suffix (.png, .jpg, ...) says how.
 
     Raises:
         ValueError: the suffix names no image format.
@@ -140,7 +154,8 @@ def write_image(
     # 4:4:4: coloured edges of cloth are what an inpainter is judged by.
     jpeg = (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
     options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)
-    _encode(path, cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image, options)
+    swapped = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    _encode(path, cv2.cvtColor(image, swapped[image.shape[2]]) if image.ndim == 3 else image, options)
 
 
 def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> None:

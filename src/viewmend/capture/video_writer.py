@@ -1,4 +1,4 @@
-"""Writing MP4 files, with PyAV (the extra `viewmend[video]`)."""
+"""Writing MP4 and WebM files, with PyAV (the extra `viewmend[video]`)."""
 
 from collections.abc import Iterable
 from fractions import Fraction
@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 Picture = UInt8[np.ndarray, "height width 3"]
+CutOut = UInt8[np.ndarray, "height width 4"]
+"""RGB and alpha; colours are not multiplied by it."""
 
 
 class VideoWriter:
@@ -71,6 +73,30 @@ def write_mp4(file: Path | BytesIO, frames: Iterable[Picture], fps: float) -> No
     with VideoWriter(file, fps) as video:
         for frame in frames:
             video.add(frame)
+
+
+def write_webm(file: Path, frames: Iterable[CutOut], fps: float) -> None:
+    """All frames as a WebM of VP9 with alpha, which browsers and editors lay over what is behind.
+
+    Raises:
+        ImportError: PyAV is not installed.
+    """
+    try:
+        import av
+    except ImportError:
+        raise ImportError("writing videos needs PyAV; install it, or viewmend's extra 'video'") from None
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(file, "w", format="webm") as container:
+        stream = container.add_stream("libvpx-vp9", rate=Fraction(fps).limit_denominator(1001))
+        stream.pix_fmt = "yuva420p"
+        # Alpha is a second picture beside the first: VP9's frames that are never shown would part the two.
+        stream.options = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
+        stream.metadata["alpha_mode"] = "1"
+        for n, rgba in enumerate(frames):
+            if not n:
+                stream.height, stream.width = rgba.shape[:2]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(rgba), format="rgba")))
+        container.mux(stream.encode(None))
 
 
 def can_write_mp4() -> bool:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class Options:
     """Render and mend a moving procedural scene, seen by six cameras, from a camera that moves; needs nothing.
 
-    OUT gets demo.mp4 (rendered, holes marked, mended, truth, side by side) and contact_sheet.png; the table compares
+    OUT gets demo.mp4 (rendered, mended, truth, side by side) and contact_sheet.png; the table compares
     the holes left black, OpenCV's Telea and the shipped model with the truth.
     """
 

@@ -1,4 +1,4 @@
-"""The files of `viewmend demo`: a video of all stages side by side, and a contact sheet."""
+"""The files of `viewmend demo`: a film of whole views side by side, and a contact sheet."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,8 +10,8 @@ from viewmend.atomic_writes import write_atomically
 from viewmend.capture.images import write_image
 from viewmend.capture.video_writer import write_mp4
 from viewmend.cli.console import say
-from viewmend.cli.mend_output import SHEET_ROWS, holes_marked, sheet_row
-from viewmend.contact_sheet import Tile, contact_sheet, picture
+from viewmend.cli.mend_output import SHEET_ROWS, sheet_row, side_by_side
+from viewmend.contact_sheet import contact_sheet, picture
 from viewmend.evaluation.mending import MendStep
 
 RESULTS = ("demo.mp4", "frames", "contact_sheet.png")
@@ -35,7 +35,7 @@ def write_demo(out: Path, steps: Sequence[MendStep], fps: float) -> list[Path]:
 def _worth_seeing(steps: Sequence[MendStep]) -> list[int]:
     """A few frames with many holes, some frames apart, in order of time."""
     chosen: list[int] = []
-    for n in sorted(range(len(steps)), key=lambda n: -float(steps[n].completed.view.error.sum())):
+    for n in sorted(range(len(steps)), key=lambda n: -int(steps[n].completed.view.holes.sum())):
         if len(chosen) < SHEET_ROWS and all(abs(n - other) >= APART for other in chosen):
             chosen.append(n)
     return sorted(chosen)
@@ -44,13 +44,8 @@ def _worth_seeing(steps: Sequence[MendStep]) -> list[int]:
 def _panel(step: MendStep) -> UInt8[np.ndarray, "height width 3"]:
     view = step.completed.view
     assert step.truth is not None, "the studio knows the truth"
-    tiles = [
-        Tile("rendered", picture(view.rgb)),
-        Tile("holes", picture(holes_marked(view))),
-        Tile("mended", picture(step.completed.rgb)),
-        Tile("truth", picture(step.truth)),
-    ]
-    return contact_sheet([tiles], view.rgb.shape[2])
+    images = {"rendered": view.rgb, "mended": step.completed.rgb, "truth": step.truth}
+    return side_by_side({name: picture(image) for name, image in images.items()})
 
 
 def _write_video(file: Path, panels: Sequence[UInt8[np.ndarray, "height width 3"]], fps: float) -> Path:

@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 class Options:
     """Render novel views of a capture and fill their holes.
 
-    OUT gets the mended views (mended.mp4, or mended/*.png for one view or without PyAV), E (holes/*.png, white where
-    a pixel was to be mended) and contact_sheet.png. With --leave-out the view is that of a camera whose image and mask
-    are used for nothing else, and is scored against it, black background: PSNR in dB of the whole image (also as it
-    was rendered, and with nothing but the holes mended: unseen), of the subject (inside the true mask), of the pixels
-    that a camera coloured (valid), and of those that none did (holes; fg: those inside the true mask), these also for
-    OpenCV's Telea fill; SSIM of the whole image; the IoU of alpha with the true mask. PSNRs are means over frames, in
-    the holes over frames with at least 50 such pixels (if there are any); hole_fraction is the holes' share of the
-    hull's pixels, mended_fraction that of those with E > 0.
+    OUT gets the mended views (mended.mp4, or mended/*.png for one view or without PyAV), the views as they were
+    rendered (rendered/*.png), E (holes/*.png, white where a pixel was to be mended), the truth of a camera that is
+    left out (truth/*.png), all beside each other (compared.mp4) and contact_sheet.png.
+
+    With --leave-out the view is that of a camera whose image and mask are used for nothing else, and is scored against
+    it, black background: PSNR in dB of the whole image (also as it was rendered, and with nothing but the holes mended:
+    unseen), of the subject (inside the true mask), of the pixels that a camera coloured (valid), and of those that none
+    did (holes; fg: those inside the true mask), these also for OpenCV's Telea fill; SSIM of the whole image; the IoU of
+    alpha with the true mask. PSNRs are means over frames, in the holes over frames with at least 50 such pixels (if
+    there are any); hole_fraction is the holes' share of the hull's pixels, mended_fraction that of those with E > 0.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
@@ -52,6 +54,12 @@ class Options:
     align: bool = True
     """Take the calibration as it is. By default a shift of all images against it (a wrong convention for pixel
     centres, say) is looked for in the masks of the input cameras' first frame, and undone where they then agree."""
+    alpha: bool = False
+    """Also cut the subject out: cutout/*.png, RGB and alpha (colours not multiplied by it), and cutout.webm, VP9 with
+    alpha, where a film is written. Alpha is the proxy's mask where the model does not tell."""
+    depth: bool = False
+    """Also write z-depth, depth/*.png: 16 bit, millimetres, 0 where there is no subject, 65535 for 65.535 m and
+    farther. It is the proxy's where the model tells none of its own."""
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
     json: bool = False
@@ -94,7 +102,7 @@ def run(options: Options) -> int:
     mender = Mender(inpainter, render, capture.bounds, held, RenderQuality(top_k=options.top_k))
     summary = MendSummary()
     plan, frames, frame = _plan(options, capture, times), prefetch(capture, times), None
-    with MendOutput(options.out, fps=capture.fps or 15.0) as output:
+    with MendOutput(options.out, capture.fps or 15.0, options.alpha, options.depth) as output:
         for time, target in track(plan, "mending"):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)

@@ -1,21 +1,26 @@
-"""The files of `viewmend mend`: mended views, holes, and a contact sheet. All of them, or none."""
+"""The files of `viewmend mend`: views as rendered, mended and true, and a contact sheet. All of them, or none."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from viewmend.capture.images import read_rgb, write_image
+from viewmend.capture.images import MAX_DEPTH_M, read_rgb, read_rgba, write_depth, write_image
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.evaluation.mending import MendStep
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.output_folder import OutputFolder
-from viewmend.views import IncompleteView
+from viewmend.views import CompletedView, IncompleteView
 
 SHEET_ROWS = 4
-RESULTS = ("mended", "mended.mp4", "holes", "contact_sheet.png")
+RESULTS = (
+    *("mended", "holes", "rendered", "truth", "cutout", "depth"),
+    *("mended.mp4", "compared.mp4", "cutout.webm", "contact_sheet.png"),
+)
 HOLE_COLOUR = (1.0, 0.0, 1.0)
 DIFFERENCE_GAIN = 3.0
 
@@ -26,8 +31,20 @@ class MendOutput:
     Until then they lie in a hidden folder of it, which an error removes.
     """
 
-    def __init__(self, out: Path, fps: float):
-        self._folder, self._fps = OutputFolder(out), fps
+    def __init__(self, out: Path, fps: float, alpha: bool = False, depth: bool = False):
+        """Begin.
+
+        Args:
+            out: where to write.
+            fps: of the films.
+            alpha: write cutout/*.png, RGB and straight alpha, and cutout.webm.
+            depth: write depth/*.png, see `depth_picture_m`.
+
+        Raises:
+            ValueError: `out` has results of something else.
+            OSError: `out` cannot be made.
+        """
+        self._folder, self._fps, self._alpha, self._depth = OutputFolder(out), fps, alpha, depth
         self._draft = self._folder.draft
         self._count = 0
         self._rows: list[list[Tile]] = []
@@ -50,9 +67,14 @@ class MendOutput:
 
     def add(self, step: MendStep) -> None:
         """Write one view and, of a few spread over the run, remember a row of the sheet."""
-        number = f"{self._count:06d}.png"
-        write_image(self._draft / "mended" / number, picture(step.completed.rgb))
-        write_image(self._draft / "holes" / number, picture(step.completed.view.error[None]))
+        completed, number = step.completed, f"{self._count:06d}.png"
+        shown = {"mended": completed.rgb, "holes": completed.view.error[None], "rendered": completed.view.rgb}
+        for name, image in (shown if step.truth is None else shown | {"truth": step.truth}).items():
+            write_image(self._draft / name / number, picture(image))
+        if self._alpha:
+            write_image(self._draft / "cutout" / number, cutout(completed))
+        if self._depth:
+            write_depth(self._draft / "depth" / number, depth_picture_m(completed))
         if self._count % self._stride == 0:
             if len(self._rows) == SHEET_ROWS:
                 self._rows, self._stride = self._rows[::2], 2 * self._stride
@@ -65,51 +87,74 @@ class MendOutput:
             if kind is None and self._count:
                 write_image(self._draft / "contact_sheet.png", contact_sheet(self._rows, 260, 400))
                 if self._count > 1:
-                    self._to_video()
+                    self._to_films()
                 self._folder.publish(*RESULTS)
         finally:
             self._folder.__exit__()
 
-    def _to_video(self) -> None:
-        """Replace the mended pictures by a video, where PyAV is installed."""
-        from viewmend.capture.video_writer import write_mp4
+    def _to_films(self) -> None:
+        """Make films of the pictures, where PyAV is installed; that of the mended ones replaces them."""
+        from viewmend.capture.video_writer import write_mp4, write_webm
 
-        files = sorted((self._draft / "mended").glob("*.png"))
         try:
-            write_mp4(self._draft / "mended.mp4", (read_rgb(file, str(file)) for file in files), self._fps)
+            write_mp4(self._draft / "mended.mp4", self._read("mended"), self._fps)
         except ImportError:
             return
+        kinds = [name for name in ("rendered", "mended", "truth") if (self._draft / name).is_dir()]
+        sides = zip(*(self._read(name) for name in kinds), strict=True)
+        panels = (side_by_side(dict(zip(kinds, images, strict=True))) for images in sides)
+        write_mp4(self._draft / "compared.mp4", panels, self._fps)
+        if self._alpha:
+            cut = (read_rgba(file, str(file)) for file in self._pictures("cutout"))
+            write_webm(self._draft / "cutout.webm", cut, self._fps)
         shutil.rmtree(self._draft / "mended")
+
+    def _pictures(self, name: str) -> list[Path]:
+        return sorted((self._draft / name).glob("*.png"))
+
+    def _read(self, name: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+        return (read_rgb(file, str(file)) for file in self._pictures(name))
+
+
+def cutout(completed: CompletedView) -> UInt8[np.ndarray, "height width 4"]:
+    """The subject alone: colours as they are, not multiplied by the alpha that comes fourth."""
+    return np.dstack([picture(completed.straight_rgb), picture(completed.opacity[None])[..., 0]])
+
+
+def depth_picture_m(completed: CompletedView) -> Float32[np.ndarray, "height width"]:
+    """Refined z-depth of the subject, else the proxy's, metres; 0 where there is none, 65.535 from there on."""
+    depth = completed.view.depth if completed.depth is None else completed.depth
+    return depth.clamp(max=MAX_DEPTH_M).float().cpu().numpy()
+
+
+def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "_height _width 3"]:
+    """Whole views in their own size, with their names above."""
+    width = max(image.shape[1] for image in pictures.values())
+    return contact_sheet([[Tile(name, image) for name, image in pictures.items()]], width)
 
 
 def sheet_row(step: MendStep) -> list[Tile]:
-    """Input cameras, rendered, holes marked, mended, truth and difference; cut to the subject."""
-    view, rgb = step.completed.view, step.completed.rgb
-    box = _box(view.mask > 0)
+    """Input cameras, rendered, holes, mended, what the inpainter tells, truth, differences; cut to the subject."""
+    completed, view, truth = step.completed, step.completed.view, step.truth
+    box = _box(view.mask > 0 if truth is None else (view.mask > 0) | (truth > 0).any(0))
     tiles = []
     for name in view.source_views:
         own = step.frame.select([name])
         assert own.mask is not None, "frames without masks are refused"
         tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > FOREGROUND)]))
-    tiles += [
-        Tile(f"rendered, frame {view.time}", picture(view.rgb)[box]),
-        Tile("holes", picture(holes_marked(view))[box]),
-        Tile("mended", picture(rgb)[box]),
-    ]
-    if step.truth is None:
-        return tiles
-    difference = (DIFFERENCE_GAIN * (rgb - step.truth).abs()).clamp(0, 1)
-    return [
-        *tiles,
-        Tile("truth", picture(step.truth)[box]),
-        Tile(f"difference x{DIFFERENCE_GAIN:.0f}", picture(difference)[box]),
-    ]
+    images = {f"rendered, frame {view.time}": view.rgb, "holes": _holes_marked(view), "mended": completed.rgb}
+    images |= {name: image[None] for name, image in completed.images.items() if name in ("alpha", "confidence")}
+    if truth is not None:
+        images["truth"] = truth
+        for name, rgb in {"rendered": view.rgb, "mended": completed.rgb}.items():
+            images[f"{name} - truth, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(0, 1)
+    return tiles + [Tile(name, picture(image)[box]) for name, image in images.items()]
 
 
-def holes_marked(view: IncompleteView) -> Float[Tensor, "3 height width"]:
-    """F with the pixels of E in magenta."""
+def _holes_marked(view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    """F with its holes in magenta."""
     colour = torch.tensor(HOLE_COLOUR, device=view.rgb.device)[:, None, None]
-    return torch.lerp(view.rgb, colour.expand_as(view.rgb), view.error)
+    return torch.where(view.holes, colour, view.rgb)
 
 
 def _box(mask: Tensor) -> tuple[slice, slice]:
