@@ -1,0 +1,42 @@
+#!/usr/bin/env bash
+# The campaign for the reader of whole views: scenes, then training; both go on where they stopped.
+#
+#   benchmarks/campaign.sh generate DIR PERFORMERS MOTIONS [SCENES]   one core, 2.4 views a second, 2 MB a scene
+#   benchmarks/campaign.sh train DIR NAME MINUTES [options of viewmend train views]
+#
+# One of eight characters and motions is put aside, and never drawn: a validation of one's own may have them.
+set -euo pipefail
+export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MKL_NUM_THREADS=1
+task=$1 folder=$2
+shift 2
+mkdir -p "$folder"
+
+put_apart() {  # SOURCE SUFFIX NAME REST: links to seven of eight files in NAME, to the others in NAME-val
+    mkdir -p "$folder/$3" "$folder/$3-val"
+    local number=0
+    for file in "$1"/*"$2"; do
+        number=$((number + 1))
+        local where=$3
+        [ $((number % 8)) != "$4" ] || where=$3-val
+        ln -sfn "$(realpath "$file")" "$folder/$where/"
+    done
+}
+
+case $task in
+generate)
+    put_apart "$1" .glb people 3
+    put_apart "$2" .bvh motions 5
+    cd "$folder"
+    exec viewmend samples views --out shards --count "${3:-10400}" --performers people --motions motions
+    ;;
+train)
+    name=$1 minutes=$2
+    shift 2
+    cd "$folder"
+    exec viewmend train views --shards shards --out "$name" --minutes "$minutes" --workers 0 --validation-views 16 "$@"
+    ;;
+*)
+    echo "expected generate or train, got $task; see the head of this file" >&2
+    exit 2
+    ;;
+esac
