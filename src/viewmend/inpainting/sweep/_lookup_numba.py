@@ -99,15 +99,6 @@ def premultiplied(rgb, mask, depth, out):
                 out[row + 1, column + 1, 4] = 255
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-@no_type_check
-def _taps(u, v, scale, rows, columns):
-    """First tap, and the weights right of and below it, at a level of a pyramid with a border."""
-    x, y = u * scale + 0.5, v * scale + 0.5
-    left, top = min(floor(x), columns - 2), min(floor(y), rows - 2)
-    return left, top, x - left, y - top
-
-
 # Inlined: handing over so many arrays costs as much as the work.
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
@@ -202,17 +193,37 @@ def compare_cameras(first, end, found, prior, stats):
                     found[ray, place, view, 14 + c] = inside * (found[ray, place, view, c] - mean)
 
 
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@no_type_check
+def _first_channel(image, x, y):
+    """The first channel of an image with a border, as `_sample`."""
+    left, top = min(floor(x), image.shape[1] - 2), min(floor(y), image.shape[0] - 2)
+    right, below = x - left, y - top
+    upper = (1 - right) * image[top, left, 0] + right * image[top, left + 1, 0]
+    lower = (1 - right) * image[top + 1, left, 0] + right * image[top + 1, left + 1, 0]
+    return (1 / 255) * ((1 - below) * upper + below * lower)
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@no_type_check
+def _lower(least, ray, place, first, value):
+    """A value among the two smallest of a place, if it is."""
+    if value < least[ray, place, first]:
+        least[ray, place, first + 1], least[ray, place, first] = least[ray, place, first], value
+    elif value < least[ray, place, first + 1]:
+        least[ray, place, first + 1] = value
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def look_up_silhouette(first, end, uv, z, rays, P, size, fine, coarse, scales, least):
+def look_up_silhouette(first, end, uv, z, rays, P, size, fine, wide, scales, least):
     """Lowers the two smallest masks, and the two smallest means around, at every place that this camera has in view."""
-    fine_scale, coarse_scale = scales
+    fine_scale, wide_scale = scales
     columns, rows = np.float32(size[0]), np.float32(size[1])
     viewer, world_from_pixel = rays[0], rays[1:]
     b0 = P[0, 0] * viewer[0] + P[0, 1] * viewer[1] + P[0, 2] * viewer[2] + P[0, 3]
     b1 = P[1, 0] * viewer[0] + P[1, 1] * viewer[1] + P[1, 2] * viewer[2] + P[1, 3]
     b2 = P[2, 0] * viewer[0] + P[2, 1] * viewer[1] + P[2, 2] * viewer[2] + P[2, 3]
-    inv = 1.0 / 255.0
     for ray in range(first, end):
         dx = world_from_pixel[0, 0] * uv[ray, 0] + world_from_pixel[0, 1] * uv[ray, 1] + world_from_pixel[0, 2]
         dy = world_from_pixel[1, 0] * uv[ray, 0] + world_from_pixel[1, 1] * uv[ray, 1] + world_from_pixel[1, 2]
@@ -228,21 +239,5 @@ def look_up_silhouette(first, end, uv, z, rays, P, size, fine, coarse, scales, l
             u, v = (a0 * t + b0) / w, (a1 * t + b1) / w
             if not (u >= 0 and v >= 0 and u < columns and v < rows):
                 continue
-            left, top, right, below = _taps(u, v, fine_scale, fine.shape[0], fine.shape[1])
-            value = inv * (
-                (1 - below) * ((1 - right) * fine[top, left, 0] + right * fine[top, left + 1, 0])
-                + below * ((1 - right) * fine[top + 1, left, 0] + right * fine[top + 1, left + 1, 0])
-            )
-            if value < least[ray, place, 0]:
-                least[ray, place, 1], least[ray, place, 0] = least[ray, place, 0], value
-            elif value < least[ray, place, 1]:
-                least[ray, place, 1] = value
-            left, top, right, below = _taps(u, v, coarse_scale, coarse.shape[0], coarse.shape[1])
-            value = inv * (
-                (1 - below) * ((1 - right) * coarse[top, left, 0] + right * coarse[top, left + 1, 0])
-                + below * ((1 - right) * coarse[top + 1, left, 0] + right * coarse[top + 1, left + 1, 0])
-            )
-            if value < least[ray, place, 2]:
-                least[ray, place, 3], least[ray, place, 2] = least[ray, place, 2], value
-            elif value < least[ray, place, 3]:
-                least[ray, place, 3] = value
+            _lower(least, ray, place, 0, _first_channel(fine, u * fine_scale + 0.5, v * fine_scale + 0.5))
+            _lower(least, ray, place, 2, _first_channel(wide, u * wide_scale + 0.5, v * wide_scale + 0.5))
