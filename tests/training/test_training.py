@@ -19,7 +19,7 @@ from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.training import loop
 from viewmend.training.loop import Run, train
-from viewmend.training.plan import DataPlan, LossWeights
+from viewmend.training.plan import DataPlan, LossWeights, WholeViewRecipe
 from viewmend.training.processes import processes
 from viewmend.training.recipes import RECIPES, small, small_rays
 from viewmend.training.run_files import FILE, RunError
@@ -271,9 +271,11 @@ def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, 
 def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
     for name, make in RECIPES.items():
         recipe = make(plan)
-        assert recipe.name == name and recipe.data.ray_views == (
-            recipe.model.num_ray_views if recipe.model.coarse_fill == "rays" else 0
-        )
+        if isinstance(recipe, WholeViewRecipe):
+            cameras = recipe.model.num_views
+        else:
+            cameras = recipe.model.num_ray_views if recipe.model.coarse_fill == "rays" else 0
+        assert recipe.name == name and recipe.data.ray_views == cameras
     assert small(plan).part == "patches" and small_rays(plan).part == "rays"
     parameters = sum(p.numel() for p in build(RECIPES["base"](plan).model).parameters())
     assert parameters < 40e6

@@ -19,6 +19,8 @@ MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, 
 """What indices, types and shapes raise that do not fit one another."""
 MAX_VERTICES = 20_000_000
 """Vertices of all parts, each counted where it stands."""
+HEAVIEST = 65535.0
+"""Weights are divided by their sum, so that whole numbers of 16 bit will do; what is heavier is none."""
 
 
 @dataclass(frozen=True)
@@ -208,6 +210,8 @@ class _Parts:
                 f"{len(entry['joints'])}, found {len(joints)} and {len(weights)} up to joint "
                 f"{joints.max(initial=0)}; export the file again"
             )
+        if not bool(((weights >= 0) & (weights <= HEAVIEST)).all()):
+            raise CaptureError(f"{self.document.path}: expected weights of joints in [0, 1]; export the file again")
         return joints + self.first_joint[key], weights / np.maximum(weights.sum(1, keepdims=True), 1e-8)
 
     def _add_joints(self, key: tuple[str, int], nodes: list[int], binds: np.ndarray) -> None:
