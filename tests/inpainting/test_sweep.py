@@ -14,7 +14,7 @@ from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.lookup import Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet
 from viewmend.inpainting.sweep.pyramids import Rig, halved, silhouette_pyramids
-from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth, scattered
+from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth, rim_depth, scattered
 from viewmend.rendering.crop import Crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
@@ -141,8 +141,9 @@ def test_only_e_is_read_and_everything_is_told(scene):
     assert torch.equal(mended.alpha[kept], view.mask[kept]) and torch.equal(mended.depth[kept], view.depth[kept])
     for image in (mended.rgb, mended.alpha, mended.confidence):
         assert float(image.min()) >= 0 and float(image.max()) <= 1 + 1e-6
-    assert float(mended.confidence[view.mask == 0].abs().max()) == 0
-    moved = mended.depth[~kept & (mended.alpha > 0.5)] - view.depth[~kept & (mended.alpha > 0.5)]
+    assert float(mended.confidence[kept & (view.mask == 0)].abs().max()) == 0
+    read = ~kept & (mended.alpha > 0.5)
+    moved = mended.depth[read] - rim_depth(view.depth)[read]
     size = float(subject_size_m(view))
     within = (moved > (OFFSETS[0] - 0.04) * size) & (moved < (OFFSETS[-1] + 0.04) * size)
     assert float(within.float().mean()) > 0.95, "but where a cell is of a nearer surface"
@@ -224,3 +225,37 @@ def test_cuda_reads_what_the_cpu_reads(scene):
     got = copy.deepcopy(net).cuda()(on_gpu, Rig.of(rig.views.to("cuda"), on_gpu.silhouettes))
     off = (got.rgb.cpu() - expected.rgb).abs().amax(1)
     assert float((off > 0.02).float().mean()) < 0.01
+
+
+def test_the_rim_is_as_far_as_what_is_nearest_to_the_viewer_there():
+    depth = torch.zeros(9, 12)
+    depth[4, 4], depth[4, 5] = 3.0, 2.0
+    rim = rim_depth(depth)
+    assert rim[4, 4] == 3 and rim[4, 5] == 2, "what has a depth keeps it"
+    assert rim[2, 2] == 3 and rim[6, 7] == 2 and rim[4, 3] == 2, "two pixels about the proxy"
+    assert int((rim > 0).sum()) == 5 * 6
+
+
+def test_the_rule_all_asks_for_the_rim_too(scene):
+    """The subject may reach beyond the proxy: what is read there has an alpha of its own."""
+    stream, view, rig = scene
+    rim = (view.mask == 0) & (view.error > 0)
+    assert int(rim.sum()) > 50 and torch.equal(rim, (rim_depth(view.depth) > 0) & (view.mask == 0))
+    torch.manual_seed(0)
+    with torch.no_grad():
+        found = SweepNet(SMALL)(view, rig)
+    assert int(rim[tuple(found.pixels.T)].sum()) == int(rim.sum())
+    completed = stream.mend(view).completed
+    assert bool((completed.alpha[rim] > 0).all()) and not bool((completed.alpha[~rim & (view.mask == 0)] > 0).any())
+
+
+def test_what_pixels_guess_is_what_the_coarse_fill_makes_of_holes(scene):
+    _, view, rig = scene
+    for net in (SweepNet(SMALL), SweepNet(replace(SMALL, coarse_fill="rays"))):
+        guess = net.coarse_guess(view, rig.views)
+        wanted = net.coarse([replace(view, error=view.holes.float())], [rig.views])[0]
+        torch.testing.assert_close(guess, wanted, atol=1e-6, rtol=0)
+        torch.manual_seed(0)
+        with torch.no_grad():
+            assert torch.equal(net(view, rig).rgb, net(view, rig, guess=guess).rgb)
+            assert not torch.equal(net(view, rig).rgb, net(view, rig, guess=1 - guess).rgb)

@@ -9,8 +9,9 @@ import torch
 
 from viewmend.cli import main
 from viewmend.geometry.cameras import project, unproject
+from viewmend.inpainting.checkpoint import load_network, save_inpainter
 from viewmend.inpainting.sweep.config import SweepConfig
-from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth
+from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth, rim_depth
 from viewmend.leave_one_out.scenes import LeaveOneOutFrames
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
@@ -22,7 +23,15 @@ from viewmend.training.scenes import StudioScenes
 from viewmend.training.stored_scenes import StoredSamples, StudioStore, store
 from viewmend.training.whole_view_objective import WholeViewObjective, _visible
 from viewmend.training.whole_view_run import WholeViewRun
-from viewmend.training.whole_views import WINDOW_PX, WholeView, WholeViewScenes, random_part, random_window, recoloured
+from viewmend.training.whole_views import (
+    WINDOW_PX,
+    WholeView,
+    WholeViewScenes,
+    random_part,
+    random_window,
+    recoloured,
+    untrained,
+)
 
 PLAN = DataPlan(sizes_px=(96,), cameras=(5, 6), times=(0,), held_cameras=2, ray_views=4, hull_resolution=48)
 MODEL = SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8)
@@ -45,7 +54,7 @@ def stored(studio):
 
 @pytest.fixture(scope="module")
 def whole(stored):
-    return WholeView.of(stored.sample(0, RULE, 4))
+    return WholeView.of(stored.sample(0, RULE, 4), SweepNet(MODEL))
 
 
 @pytest.fixture(scope="session")
@@ -115,9 +124,8 @@ def test_a_part_to_be_read_lies_in_the_subject(whole):
     parts = [random_part(whole) for _ in range(40)]
     read = [part for part in parts if part is not None]
     assert 4 < len(read) < 24
-    assert all(bool((whole.view.mask[part] > 0).all()) for part in read)
-    missing = (whole.view.weights.sum(0) == 0) & (whole.view.mask > 0)
-    assert all(bool(part[missing].all()) for part in read), "what is missing is always read"
+    assert all(bool((rim_depth(whole.view.depth)[part] > 0).all()) for part in read)
+    assert all(bool(part[whole.view.holes].all()) for part in read), "what is missing is always read"
 
 
 def test_other_colours_are_those_of_cameras_view_and_truth_alike(stored):
@@ -181,6 +189,35 @@ def test_every_weight_learns(whole):
     assert float(output.image.outside) > 0 and float(output.image.log_error) < 0
 
 
+def test_holes_are_guessed_by_the_reader_of_rays_of_another_model(stored, tmp_path):
+    """Its weights come from the checkpoint that is named, are not trained, and fill the whole view, not its windows."""
+    recipe = WholeViewRecipe(name="views", model=replace(MODEL, num_views=8, coarse_fill="rays"), steps=1)
+    net, small = untrained(replace(recipe, bfloat16=False)), load_network("small")
+    assert torch.equal(net.coarse.choose.weight, small.coarse.choose.weight)
+    assert not any(weight.requires_grad for weight in net.coarse.parameters())
+    assert all(weight.requires_grad for name, weight in net.named_parameters() if not name.startswith("coarse."))
+    sample = stored.sample(0, RULE, 4)
+    whole = WholeView.of(sample, net)
+    holes = whole.view.holes
+    assert int(holes.sum()) > 30 and torch.equal(whole.guess[:, ~holes], whole.view.rgb[:, ~holes])
+    wanted = small.coarse([replace(whole.view, error=holes.float())], [sample.nearby])[0]
+    torch.testing.assert_close(whole.guess, wanted, atol=1e-5, rtol=0)
+    torch.manual_seed(3)
+    window = random_window(whole)
+    height, width = window.guess.shape[1:]
+    parts = whole.guess.unfold(1, height, 1).unfold(2, width, 1)
+    assert bool((parts == window.guess[:, None, None]).all(-1).all(-1).all(0).any())
+    save_inpainter(SweepNet(MODEL), tmp_path, "")
+    with pytest.raises(ValueError, match="with a RayBlendNet"):
+        untrained(replace(recipe, coarse_from=str(tmp_path)))
+
+
+def test_a_reader_of_other_sizes_is_no_beginning(view_shards, tmp_path):
+    recipe = WholeViewRecipe(name="views", model=MODEL, data=replace(PLAN, shards=view_shards), steps=1, workers=0)
+    with pytest.raises(ValueError, match="of the recipe's sizes"):
+        train(recipe, tmp_path, start=SweepNet(replace(MODEL, width=12)), kind=WholeViewRun)
+
+
 def test_a_run_goes_on_where_it_stopped(view_shards, tmp_path):
     recipe = WholeViewRecipe(
         name="views",
@@ -221,7 +258,8 @@ def test_scenes_are_numbered_through_all_shards(view_shards, tmp_path):
 
 def test_a_number_always_gives_the_same_views(view_shards):
     source, other = (
-        WholeViewScenes(StoredSamples(StoredShards(view_shards, "0"), PLAN, seed), seed) for seed in ("0", "1")
+        WholeViewScenes(StoredSamples(StoredShards(view_shards, "0"), PLAN, seed), seed, SweepNet(MODEL))
+        for seed in ("0", "1")
     )
     first, again, third = source.scene(1), source.scene(1), other.scene(1)
     assert len(first) == 2

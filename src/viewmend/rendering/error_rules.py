@@ -5,11 +5,14 @@ from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.rendering.blending import Blend
 
 MIN_WEIGHT = 1e-5
 """Sum of raw weights below which a pixel has no colour (RIFTCast)."""
+RIM_PX = 2
+"""How far beyond the proxy the subject may be: silhouettes and grids cut off that much."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Evidence:
 
 
 ErrorRule = Callable[[Evidence], Float[Tensor, "height width"]]
-"""From the evidence to E, in [0, 1]: 0 outside the mask, 1 where the blend has no colour."""
+"""From the evidence to E, in [0, 1]: 1 on the pixels of the proxy where the blend has no colour."""
 
 
 def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
@@ -42,8 +45,8 @@ def unseen(evidence: Evidence) -> Float[Tensor, "height width"]:
 
 
 def all_covered(evidence: Evidence) -> Float[Tensor, "height width"]:
-    """1 on every pixel of the proxy: for inpainters that keep what is right by themselves. Ours."""
-    return evidence.mask
+    """1 on the proxy and on a rim about it: for inpainters that keep what is right by themselves. Ours."""
+    return F.max_pool2d(evidence.mask[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
 
 
 ERROR_RULES: dict[str, ErrorRule] = {"unseen": unseen, "all": all_covered}

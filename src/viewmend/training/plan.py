@@ -97,7 +97,7 @@ class ViewLossWeights:
 
     colour: float = 1.0
     """L1 of colours upon black."""
-    holes: float = 1.0
+    holes: float = 2.0
     """How much more pixels count that no source view coloured."""
     log_error: float = 0.15
     """Weight of log10 of a window's squared error."""
@@ -183,4 +183,6 @@ class WholeViewRecipe(Recipe):
     """A run that trains a `SweepNet` on stored scenes. Its `part` and `loss` say nothing."""
 
     model: SweepConfig = field(default_factory=SweepConfig)  # pyright: ignore[reportIncompatibleVariableOverride]
+    coarse_from: str = "small"
+    """The model whose `RayBlendNet` fills what no source view coloured, where the net has such a coarse fill."""
     view_loss: Annotated[ViewLossWeights, tyro.conf.arg(name="loss")] = field(default_factory=ViewLossWeights)

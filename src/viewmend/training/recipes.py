@@ -7,6 +7,7 @@ from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.config import base as base_model
 from viewmend.inpainting.config import paper as paper_model
 from viewmend.inpainting.config import small as small_model
+from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.training.plan import DataPlan, LossWeights, Recipe, WholeViewRecipe
 
 
@@ -53,6 +54,7 @@ def views(data: DataPlan) -> WholeViewRecipe:
     plan = replace(data, cameras=(5, 20), times=(0,), held_cameras=5, ray_views=8, sizes_px=(224, 320, 416, 576))
     return WholeViewRecipe(
         name="views",
+        model=SweepConfig(coarse_fill="rays"),
         data=replace(plan, hull_resolution=128, imperfect_fraction=0.8, rough_fraction=0.5, min_hole_px=0),
         steps=20_000,
         minutes=60.0,

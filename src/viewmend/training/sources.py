@@ -9,17 +9,18 @@ from viewmend.training.sample_files import ShardScenes, StoredShards, Trained
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import SceneSource, StudioScenes
 from viewmend.training.stored_scenes import StoredSamples, StoredScene, StudioStore
-from viewmend.training.whole_views import WholeViewScenes
+from viewmend.training.whole_views import WholeViewScenes, untrained
 
 
 def training_source(recipe: Recipe, seed: str) -> SceneSource[Trained]:
     """A stream's scenes, as the recipe's part needs them.
 
     Raises:
-        CaptureError, ShardError: what its plan names cannot be used.
+        CaptureError, ShardError, WeightsError: what its plan names cannot be used.
     """
     if isinstance(recipe, WholeViewRecipe):
-        return WholeViewScenes(StoredSamples(stored_source(recipe, seed), recipe.data, seed), seed)
+        samples = StoredSamples(stored_source(recipe, seed), recipe.data, seed)
+        return WholeViewScenes(samples, seed, untrained(recipe))
     if recipe.part != "rays":
         return scene_source(recipe.data, seed)
     shards = recipe.data.shards

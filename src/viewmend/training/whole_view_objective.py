@@ -42,11 +42,11 @@ class WholeViewObjective(nn.Module):
 
     def _terms(self, window: WholeView) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The weighted sum, L1 in the holes and elsewhere, and the logarithmic error."""
-        reading = self.model(window.view, window.rig, window.scale, random_part(window))
+        reading = self.model(window.view, window.rig, window.scale, random_part(window), window.guess)
         at, weights = tuple(reading.pixels.T), self.weights
         truth, alpha = window.truth / 255, window.alpha[at] / 255
         off = reading.rgb - truth[:, at[0], at[1]].T
-        hole = (window.view.weights.sum(0) == 0)[at].float()
+        hole = window.view.holes[at].float()
         weight = 1 + weights.holes * hole
         colour = (weight * off.abs().mean(1)).sum() / weight.sum()
         log_error = (off.square().mean() + LEAST_SQUARE).log10()

@@ -9,17 +9,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from viewmend.inpainting.checkpoint import save_inpainter
-from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.sweep.sweep_net import SweepNet, scattered
 from viewmend.metrics.image_quality import psnr
-from viewmend.training.loop import Run
+from viewmend.training.loop import Run, fitting_weights
 from viewmend.training.model_card import model_card
 from viewmend.training.plan import WholeViewRecipe
 from viewmend.training.scenes import StudioScenes
 from viewmend.training.stored_scenes import StoredSamples, StudioStore
 from viewmend.training.validation import SHOWN, WholeViewScores, write_picture
 from viewmend.training.whole_view_objective import WholeViewObjective
-from viewmend.training.whole_views import WholeView, WholeViewScenes
+from viewmend.training.whole_views import WholeView, WholeViewScenes, untrained
 
 
 class WholeViewRun(Run):
@@ -28,10 +27,16 @@ class WholeViewRun(Run):
     recipe: WholeViewRecipe
 
     def _make_model(self, start: nn.Module | None) -> nn.Module:
-        model = SweepNet(self.recipe.model)
+        model = untrained(self.recipe)
         if start is not None:
-            model.load_state_dict(start.state_dict())
-        set_compute_dtype(model, torch.bfloat16 if self.recipe.bfloat16 else torch.float32)
+            fitting = fitting_weights(model, start)
+            own = [name for name in model.state_dict() if not name.startswith("coarse.")]
+            if absent := [name for name in own if name not in fitting]:
+                raise ValueError(
+                    f"expected a reader of whole views of the recipe's sizes to begin with, got none of {absent[0]}; "
+                    "begin without, or choose another model"
+                )
+            model.load_state_dict(model.state_dict() | {name: fitting[name] for name in own})
         return model.train()
 
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
@@ -62,8 +67,9 @@ class WholeViewValidation:
         self._views = self._views or self._made()
         scores, shown = [], []
         for own in self._views:
+            own = own.to(next(model.parameters()).device)
             view, truth = own.view, own.truth / 255
-            reading = model(view, own.rig, own.scale)
+            reading = model(view, own.rig, own.scale, guess=own.guess)
             rgb = scattered(reading.rgb, reading.pixels, view.mask.shape)
             subject, holes = own.alpha > 127, (view.mask > 0) & (view.weights.sum(0) == 0)
             ways = ((view.rgb, None), (rgb, None), (rgb, subject), (rgb, holes))
@@ -75,7 +81,7 @@ class WholeViewValidation:
     def _made(self) -> list[WholeView]:
         plan = replace(self.recipe.data, held_cameras=1, performers=None, motions=None, data_device="cpu")
         store = StudioStore(StudioScenes(plan, "validation", "validation"))
-        scenes = WholeViewScenes(StoredSamples(store, plan, "validation"), "validation")
+        scenes = WholeViewScenes(StoredSamples(store, plan, "validation"), "validation", untrained(self.recipe))
         made = (view for number in count() for view in scenes.scene(number))
         return list(islice(made, self.recipe.validation_views))
 

@@ -8,9 +8,14 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.inpainting.checkpoint import load_network
+from viewmend.inpainting.network import set_compute_dtype
+from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.sweep.lookup import Scale
 from viewmend.inpainting.sweep.pyramids import Rig
+from viewmend.inpainting.sweep.sweep_net import SweepNet, rim_depth
 from viewmend.rendering.crop import Crop, subject_crop
+from viewmend.training.plan import WholeViewRecipe
 from viewmend.training.samples import Sample, to_device
 from viewmend.training.scenes import SceneSource
 from viewmend.views import IncompleteView
@@ -38,6 +43,8 @@ class WholeView:
     view: IncompleteView
     rig: Rig
     scale: Scale
+    guess: Float[Tensor, "3 height width"]
+    """`SweepNet.coarse_guess` of the whole view."""
     truth: UInt8[Tensor, "3 height width"]
     """F*, background black."""
     alpha: UInt8[Tensor, "height width"]
@@ -46,8 +53,8 @@ class WholeView:
     """True z-depth, metres, 0 where there is no surface."""
 
     @classmethod
-    def of(cls, sample: Sample) -> "WholeView":
-        """A sample that knows alpha and depth, and the cameras near it."""
+    def of(cls, sample: Sample, net: SweepNet) -> "WholeView":
+        """A sample that knows alpha and depth, and the cameras near it; `net` makes the guess."""
         assert sample.nearby is not None and sample.alpha is not None and sample.depth is not None, "a stored scene's"
         view, truth, alpha, depth = sample.view, sample.truth, sample.alpha, sample.depth
         scale, rig = Scale.of(view), Rig.of(sample.nearby, view.silhouettes)
@@ -55,7 +62,7 @@ class WholeView:
         if crop is not None:
             view = crop.of_view(view)
             truth, alpha, depth = (crop.of_image(image).contiguous() for image in (truth, alpha, depth))
-        return cls(view, rig, scale, truth, alpha, depth)
+        return cls(view, rig, scale, net.coarse_guess(view, rig.views), truth, alpha, depth)
 
     def to(self, device: torch.device | str) -> "WholeView":
         """The same on `device`."""
@@ -63,27 +70,51 @@ class WholeView:
 
     def part(self, crop: Crop) -> "WholeView":
         """A part of the view, with the same cameras."""
-        truth, alpha, depth = (crop.of_image(image) for image in (self.truth, self.alpha, self.depth))
-        return replace(self, view=crop.of_view(self.view), truth=truth, alpha=alpha, depth=depth)
+        guess, truth, alpha, depth = (crop.of_image(i) for i in (self.guess, self.truth, self.alpha, self.depth))
+        return replace(self, view=crop.of_view(self.view), guess=guess, truth=truth, alpha=alpha, depth=depth)
 
     @property
     def wrong(self) -> Bool[Tensor, "height width"]:
-        """Which pixels of the proxy show another colour than they should."""
-        return ((self.view.rgb - self.truth / 255).abs().amax(0) > WRONG) & (self.view.mask > 0)
+        """Which pixels of the proxy and its rim show another colour than they should."""
+        return ((self.view.rgb - self.truth / 255).abs().amax(0) > WRONG) & (rim_depth(self.view.depth) > 0)
 
 
 class WholeViewScenes:
     """A source's samples as whole views, most with other colours; the same for the same number."""
 
-    def __init__(self, scenes: SceneSource[Sample], seed: str) -> None:
+    def __init__(self, scenes: SceneSource[Sample], seed: str, net: SweepNet) -> None:
+        """`net` makes the guesses."""
         self.scenes = scenes
         self.seed = seed
+        self.net = net
 
     def scene(self, number: int) -> list[WholeView]:
         """Views of scene `number` that show anything."""
         random = Random(f"{self.seed}/colours/{number}")
         samples = [s for s in self.scenes.scene(number) if int((s.view.mask > 0).sum()) >= LEAST_PX]
-        return [WholeView.of(recoloured(s, random) if random.random() < RECOLOURED else s) for s in samples]
+        return [WholeView.of(recoloured(s, random) if random.random() < RECOLOURED else s, self.net) for s in samples]
+
+
+def untrained(recipe: WholeViewRecipe) -> SweepNet:
+    """The recipe's net before it learns anything; its `RayBlendNet` is that of a checkpoint.
+
+    Raises:
+        WeightsError: there is no such checkpoint.
+        ValueError: it has no `RayBlendNet`, or one of other sizes.
+    """
+    net = SweepNet(recipe.model)
+    if recipe.model.coarse_fill == "rays":
+        filled = load_network(recipe.coarse_from)
+        weights = net.coarse.state_dict()
+        found = {} if isinstance(filled, PatchTransformer) else filled.coarse.state_dict()
+        if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in weights.items()}:
+            raise ValueError(
+                f"expected a model with a RayBlendNet to fill holes, got '{recipe.coarse_from}' without one that fits; "
+                "name another by --coarse-from, or give --model.coarse-fill smooth"
+            )
+        net.coarse.load_state_dict(found)
+    set_compute_dtype(net, torch.bfloat16 if recipe.bfloat16 else torch.float32)
+    return net
 
 
 def recoloured(sample: Sample, random: Random) -> Sample:
@@ -117,11 +148,10 @@ def random_part(window: WholeView) -> Bool[Tensor, "height width"] | None:
     """Which pixels are read: sometimes those about wrong ones alone, as an error rule would ask; None for all."""
     if float(torch.rand(())) > SPARSE:
         return None
-    missing = window.view.weights.sum(0) == 0
-    by_chance = torch.rand(missing.shape) < 0.01 * float(torch.rand(()))
+    by_chance = torch.rand(window.view.mask.shape) < 0.01 * float(torch.rand(()))
     around = int(torch.randint(5, ()))
-    some = (window.wrong | missing | by_chance).float()
-    read = (F.max_pool2d(some[None], 2 * around + 1, 1, around)[0] > 0) & (window.view.mask > 0)
+    some = (window.wrong | window.view.holes | by_chance).float()
+    read = (F.max_pool2d(some[None], 2 * around + 1, 1, around)[0] > 0) & (rim_depth(window.view.depth) > 0)
     return read if bool(read.any()) else None
 
 

@@ -5,6 +5,7 @@ cameras show there, and convolutions over the view decide among places (as over 
 full resolution cameras are looked up at the depth that was found: textures stay sharp, and neighbours agree.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -12,16 +13,18 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.inpainting.coarse_fill import fill
+from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
+from viewmend.inpainting.ray_blend_net import RayBlendNet
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.unet import UNet
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.rendering.error_rules import RIM_PX
+from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 CELL_PX = 2
 """Side of the cells in which places are judged."""
@@ -78,6 +81,8 @@ class SweepNet(Network):
         super().__init__()
         config = config or SweepConfig()
         self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.coarse = RayBlendNet(config.num_views) if config.coarse_fill == "rays" else SmoothFill()
+        self.coarse.requires_grad_(False)
         self.places = PlaceNet(config.width, config.place_channels)
         self.decide = UNet(len(OFFSETS) * config.place_channels + SHOWN_CHANNELS + 2, config.features)
         self.logits = nn.Conv2d(config.features, len(OFFSETS), 1)
@@ -94,6 +99,7 @@ class SweepNet(Network):
         rig: Rig,
         scale: Scale | None = None,
         read: Bool[Tensor, "height width"] | None = None,
+        guess: Float[Tensor, "3 height width"] | None = None,
     ) -> Reading:
         """What the pixels of a view show.
 
@@ -101,25 +107,32 @@ class SweepNet(Network):
             view: of which E is not looked at.
             rig: the cameras.
             scale: the whole view's, where this is a part of it.
-            read: which pixels of the proxy; None for all.
+            read: which pixels of the proxy and of the rim about it; None for all.
+            guess: its part of the `coarse_guess` of the whole view.
         """
         scale = scale or Scale.of(view)
-        covered, coloured = view.mask > 0, view.weights.sum(0) > 0
-        read = covered if read is None else read & covered
-        guess = fill(view.rgb, covered & ~coloured, covered)
+        depth, coloured = rim_depth(view.depth), view.weights.sum(0) > 0
+        read = depth > 0 if read is None else read & (depth > 0)
+        guess = self.coarse_guess(view, rig.views) if guess is None else guess
         flags = torch.stack([view.mask, coloured.float(), view.weights.amax(0), read.float()])
         shown = torch.cat([guess, flags])
+        view = replace(view, depth=depth)
         swept = self._sweep(view, rig, scale, read, shown)
         return self._blend(view, rig, scale, torch.nonzero(read), shown, swept)
 
+    @torch.no_grad()
+    def coarse_guess(self, view: IncompleteView, seen: ContextViews) -> Float[Tensor, "3 height width"]:
+        """The whole view, with what no source view coloured filled by what the cameras show or by its surroundings."""
+        return self.coarse([replace(view, error=view.holes.to(view.error))], [seen])[0].float()
+
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """What is around the subject tells where its outline is."""
-        return MARGIN_PX
+        return max(MARGIN_PX, self.coarse.crop_margin_px(quality))
 
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        """The view with all of E read; a view without E comes back at once."""
-        read = (view.error > 0) & (view.mask > 0)
+        """The view with all of E read, on the proxy and its rim; a view without E comes back at once."""
+        read = (view.error > 0) & (rim_depth(view.depth) > 0)
         names = view.closest_views(self.config.num_views)
         seen = context(view.time, names) if names and bool(read.any()) else None
         if seen is None:
@@ -227,6 +240,13 @@ class SweepNet(Network):
             image = torch.cat([near[:, :, : shape[0], : shape[1]], image], 1)
             out = self.finish(image.contiguous(memory_format=torch.channels_last))
         return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
+
+
+def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """The depth, metres, with a rim of `RIM_PX` about the proxy that has the smallest depth near it; 0 elsewhere."""
+    far = torch.where(depth > 0, depth, torch.inf)
+    near = -F.max_pool2d(-far[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
+    return torch.where(depth > 0, depth, torch.where(near.isfinite(), near, 0.0))
 
 
 def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
