@@ -10,6 +10,9 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
 
+RIM_PX = 2
+"""How far beyond the proxy the subject may be: silhouettes and grids cut off that much."""
+
 
 @dataclass(frozen=True)
 class MultiViewFrame:

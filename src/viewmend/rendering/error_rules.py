@@ -8,11 +8,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.rendering.blending import Blend
+from viewmend.views import RIM_PX
 
 MIN_WEIGHT = 1e-5
 """Sum of raw weights below which a pixel has no colour (RIFTCast)."""
-RIM_PX = 2
-"""How far beyond the proxy the subject may be: silhouettes and grids cut off that much."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.unet import UNet
-from viewmend.rendering.error_rules import RIM_PX
-from viewmend.views import CompletedView, ContextViews, IncompleteView
+from viewmend.views import RIM_PX, CompletedView, ContextViews, IncompleteView
 
 CELL_PX = 2
 """Side of the cells in which places are judged."""
