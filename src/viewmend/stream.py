@@ -22,6 +22,7 @@ from viewmend.inpainting.protocol import (
     ViewInpainter,
     crop_margin_px,
 )
+from viewmend.inpainting.wrong import wrong_error
 from viewmend.observation import DepthProvider, Observation, observe
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.view import RenderConfig, render_view
@@ -238,7 +239,11 @@ class Stream:
         crop = mesh_crop(proxy.mesh.vertices, target, *room)
         camera = target if crop is None else crop.of_camera(target)
         config, depth = self.config.render, observation.depth
-        return render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth), crop
+        view = render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth)
+        if config.error_rule == "wrong":
+            context = ContextProvider(self._context, None, exclude, self._memory)
+            view = replace(view, error=wrong_error(view, self.inpainter, context, config.wrong_fraction))
+        return view, crop
 
     def _fill(
         self, view: IncompleteView, viewer: State | None, quality: RenderQuality, exclude: Sequence[str]

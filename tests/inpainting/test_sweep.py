@@ -10,11 +10,13 @@ from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.inpainting.ray_sampling import sample_along_rays, subject_size_m
 from viewmend.inpainting.sweep import _lookup_torch, lookup
 from viewmend.inpainting.sweep._lookup_numba import look_up_numba
+from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
+from viewmend.inpainting.sweep.error_net import ErrorMap, most_wrong
 from viewmend.inpainting.sweep.lookup import Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet
 from viewmend.inpainting.sweep.pyramids import Rig, halved, silhouette_pyramids
-from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth, rim_depth, scattered
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.rendering.crop import Crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
@@ -259,3 +261,63 @@ def test_what_pixels_guess_is_what_the_coarse_fill_makes_of_holes(scene):
         with torch.no_grad():
             assert torch.equal(net(view, rig).rgb, net(view, rig, guess=guess).rgb)
             assert not torch.equal(net(view, rig).rgb, net(view, rig, guess=1 - guess).rgb)
+
+
+@pytest.fixture(scope="module")
+def teller():
+    torch.manual_seed(4)
+    return SweepNet(replace(SMALL, error_features=8))
+
+
+@torch.no_grad()
+def test_errors_are_told_on_the_proxy_and_its_rim(scene, teller):
+    _, view, rig = scene
+    found = teller.errors(view, rig)
+    there = rim_depth(view.depth) > 0
+    for image in found:
+        assert image.shape == view.mask.shape and not bool(image[~there].any())
+        assert float(image[there].min()) > 0 and float(image.max()) < 1 and float(image[there].std()) > 1e-3
+    blank = replace(view, rgb=0 * view.rgb)
+    assert not torch.equal(teller.errors(blank, rig).wrong, found.wrong)
+    other = replace(view, error=0 * view.error)
+    assert torch.equal(teller.errors(other, rig).wrong, found.wrong), "E is what it is for"
+
+
+def test_most_is_gained_first_and_holes_always(scene):
+    _, view, _ = scene
+    gain = torch.rand(view.mask.shape, generator=torch.Generator().manual_seed(0)) * (rim_depth(view.depth) > 0)
+    hull, holes = int((view.mask > 0).sum()), view.holes
+    error = most_wrong(view, ErrorMap(gain, gain), 0.3)
+    chosen = error > 0
+    assert int(holes.sum()) < 0.3 * hull and int(chosen.sum()) == int(0.3 * hull)
+    assert bool(chosen[holes].all()) and float(gain[chosen & ~holes].min()) >= float(gain[~chosen].max())
+    assert set(error.unique().tolist()) == {0.0, 1.0}
+    assert torch.equal(most_wrong(view, ErrorMap(gain, gain), 1e-6) > 0, holes), "though that is more"
+    nothing = most_wrong(view, ErrorMap(gain, 1e-5 * gain), 0.3) > 0
+    assert torch.equal(nothing, holes), "what hardly changes is left"
+
+
+def test_the_rule_wrong_asks_the_inpainter_or_the_shipped_model(scene, teller):
+    """E of a stream: what the model that fills takes for wrong; where it cannot tell, the model for whole views."""
+    stream, view, _ = scene
+    frame = stream.observation().frame
+    config = StreamConfig(render=RenderConfig(error_rule="wrong", wrong_fraction=0.5))
+    own = Stream(teller, config)
+    own.push(frame, stream.observation().proxy)
+    narrowed = own.render(view.camera)
+    chosen = narrowed.error > 0
+    hull = int((view.mask > 0).sum())
+    assert bool(chosen[view.holes].all()) and not bool(chosen[view.error == 0].any())
+    assert int(view.holes.sum()) < int(chosen.sum()) <= int(0.5 * hull)
+    mended = own.view(view.camera).completed
+    assert torch.equal(mended.rgb[:, ~chosen], view.rgb[:, ~chosen])
+    with pytest.raises(ValueError, match="a model that predicts errors"):
+        silent = Stream(SweepNet(SMALL), config)
+        silent.push(frame, stream.observation().proxy)
+        silent.render(view.camera)
+
+
+@pytest.mark.parametrize("fraction", [0.0, -1.0, 1.5, float("nan")])
+def test_an_impossible_fraction_is_refused(fraction):
+    with pytest.raises(ValueError, match="expected a wrong_fraction above 0"):
+        RenderConfig(wrong_fraction=fraction)

@@ -10,8 +10,9 @@ import torch
 from viewmend.cli import main
 from viewmend.geometry.cameras import project, unproject
 from viewmend.inpainting.checkpoint import load_network, save_inpainter
+from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth
 from viewmend.inpainting.sweep.config import SweepConfig
-from viewmend.inpainting.sweep.sweep_net import SweepNet, nearest_depth, rim_depth
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.leave_one_out.scenes import LeaveOneOutFrames
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
@@ -34,7 +35,7 @@ from viewmend.training.whole_views import (
 )
 
 PLAN = DataPlan(sizes_px=(96,), cameras=(5, 6), times=(0,), held_cameras=2, ray_views=4, hull_resolution=48)
-MODEL = SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8)
+MODEL = SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8, error_features=8)
 RULE = RenderConfig(error_rule="all")
 
 
@@ -161,7 +162,9 @@ def test_who_sees_the_surface_is_known(whole, studio):
     assert int(behind.sum()) < 0.3 * int(seen.sum())
 
 
-@pytest.mark.parametrize("term", ["colour", "log_error", "gradient", "cell_colour", "alpha", "place", "visible"])
+@pytest.mark.parametrize(
+    "term", ["colour", "log_error", "gradient", "cell_colour", "alpha", "place", "visible", "errors"]
+)
 def test_each_term_alone_can_be_learned(whole, term):
     """A few steps on one view lower it."""
     torch.manual_seed(0)
@@ -210,6 +213,22 @@ def test_holes_are_guessed_by_the_reader_of_rays_of_another_model(stored, tmp_pa
     save_inpainter(SweepNet(MODEL), tmp_path, "")
     with pytest.raises(ValueError, match="with a RayBlendNet"):
         untrained(replace(recipe, coarse_from=str(tmp_path)))
+
+
+def test_what_is_wrong_can_be_learned_alone(view_shards, tmp_path):
+    """The reader stays bit for bit; a model without an `ErrorNet`, or an untrained one, is refused."""
+    torch.manual_seed(0)
+    data = replace(PLAN, shards=view_shards)
+    recipe = WholeViewRecipe(name="views", model=MODEL, data=data, steps=3, workers=0, part="errors", bfloat16=False)
+    recipe = replace(recipe, validate_every=0, batch=1, new_per_batch=1, warmup=1)
+    start = SweepNet(replace(MODEL, error_features=0))
+    with pytest.raises(ValueError, match="a trained reader and an ErrorNet"):
+        train(recipe, tmp_path / "none", kind=WholeViewRun)
+    trained = load_network(train(recipe, tmp_path / "run", start=start, kind=WholeViewRun))
+    assert all(torch.equal(trained.state_dict()[name], weight) for name, weight in start.state_dict().items())
+    again = train(replace(recipe, steps=1), tmp_path / "more", start=trained, kind=WholeViewRun)
+    moved = load_network(again).errors.tell.weight - trained.errors.tell.weight
+    assert 0 < float(moved.detach().abs().max()) < 0.1, "it begins with what there is"
 
 
 def test_a_reader_of_other_sizes_is_no_beginning(view_shards, tmp_path):

@@ -34,10 +34,15 @@ class RenderConfig:
     blend: BlendConfig = field(default_factory=BlendConfig)
     """How the chosen cameras' colours are weighted."""
     error_rule: str = "unseen"
-    """What must be mended: 'unseen', the pixels that no chosen camera colours, or 'all' of the subject."""
+    """What must be mended: 'unseen', the pixels that no chosen camera colours, 'all' of the subject, or what a model
+    takes for 'wrong'."""
+    wrong_fraction: float = 0.15
+    """Rule 'wrong': at most this part of the proxy's pixels is mended, where most is to be gained; holes are always."""
 
     def __post_init__(self) -> None:
         error_rule(self.error_rule)
+        if not 0 < self.wrong_fraction <= 1:
+            raise ValueError(f"expected a wrong_fraction above 0 and up to 1, got {self.wrong_fraction}")
 
 
 def render_view(

@@ -78,7 +78,10 @@ class Log:
     def validated(self, judgement: ValidationScores | WholeViewScores) -> None:
         """What the averaged weights scored after a step."""
         self._write({"step": judgement.step, "validation": asdict(judgement)})
-        self._plot(judgement.step, {f"validation/{n}": v for n, v in asdict(judgement).items() if n != "step"})
+        self._plot(
+            judgement.step,
+            {f"validation/{n}": v for n, v in asdict(judgement).items() if n != "step" and v is not None},
+        )
 
     def _write(self, values: Mapping[str, object]) -> None:
         if self._file is not None:

@@ -111,6 +111,8 @@ class ViewLossWeights:
     """Cross-entropy of the surface's place."""
     visible: float = 0.1
     """What is lost by trusting cameras that do not see the surface."""
+    errors: float = 0.5
+    """Cross-entropies of the `ErrorNet`: which pixels are wrong, and by how much the reader changes them."""
     confidence: float = 0.05
     """Cross-entropy of whether a pixel is right."""
 
@@ -180,9 +182,11 @@ class Recipe:
 
 @dataclass(frozen=True, kw_only=True)
 class WholeViewRecipe(Recipe):
-    """A run that trains a `SweepNet` on stored scenes. Its `part` and `loss` say nothing."""
+    """A run that trains a `SweepNet` on stored scenes. Its `loss` says nothing."""
 
     model: SweepConfig = field(default_factory=SweepConfig)  # pyright: ignore[reportIncompatibleVariableOverride]
+    part: Literal["all", "errors"] = "all"  # pyright: ignore[reportIncompatibleVariableOverride]
+    """What is trained: all, or the `ErrorNet` alone."""
     coarse_from: str = "small"
     """The model whose `RayBlendNet` fills what no source view coloured, where the net has such a coarse fill."""
     view_loss: Annotated[ViewLossWeights, tyro.conf.arg(name="loss")] = field(default_factory=ViewLossWeights)

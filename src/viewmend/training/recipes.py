@@ -54,7 +54,7 @@ def views(data: DataPlan) -> WholeViewRecipe:
     plan = replace(data, cameras=(5, 20), times=(0,), held_cameras=5, ray_views=8, sizes_px=(224, 320, 416, 576))
     return WholeViewRecipe(
         name="views",
-        model=SweepConfig(coarse_fill="rays"),
+        model=SweepConfig(coarse_fill="rays", error_features=24),
         data=replace(plan, hull_resolution=128, imperfect_fraction=0.8, rough_fraction=0.5, min_hole_px=0),
         steps=20_000,
         minutes=60.0,

@@ -47,6 +47,8 @@ class WholeViewScores:
     """The same, within the true silhouette."""
     holes: float
     """The same, where no source view has a colour."""
+    wrong: float | None = None
+    """With a small part read of what an `ErrorNet` takes for wrong."""
 
 
 class Validation:

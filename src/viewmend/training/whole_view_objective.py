@@ -13,8 +13,9 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project, unproject
 from viewmend.geometry.sampling import in_view
+from viewmend.inpainting.sweep.cells import CELL_PX, nearest_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS
-from viewmend.inpainting.sweep.sweep_net import CELL_PX, Reading, SweepNet, nearest_depth, scattered
+from viewmend.inpainting.sweep.sweep_net import Reading, SweepNet
 from viewmend.training.losses import LEAST_SQUARE, ImageLoss
 from viewmend.training.objective import StepOutput
 from viewmend.training.plan import ViewLossWeights
@@ -24,6 +25,8 @@ SEEN = 0.02
 """A camera sees a point if its true depth there is no farther off, in subject sizes."""
 SURE = 0.1
 """A pixel is right where no channel is farther off."""
+GAIN = 4.0
+"""Gains are small numbers: their cross-entropy counts so many times."""
 
 
 class WholeViewObjective(nn.Module):
@@ -56,8 +59,20 @@ class WholeViewObjective(nn.Module):
         total = total + weights.alpha * ((reading.alpha - alpha).abs().mean() + 0.3 * _entropy(reading.alpha, alpha))
         total = total + weights.confidence * _entropy(reading.confidence, right)
         total = total + self._cell_terms(window, reading)
+        total = total + weights.errors * self._error_terms(window, reading, off)
         inside = (hole * off.detach().abs().mean(1)).sum() / hole.sum().clamp_min(1)
         return total, inside, colour.detach(), log_error.detach()
+
+    def _error_terms(self, window: WholeView, reading: Reading, off: Float[Tensor, "pixel 3"]) -> Float[Tensor, ""]:
+        """What the `ErrorNet` is taught, of the pixels that were read: it need not know why."""
+        if self.model.errors is None:
+            return off.new_zeros(())
+        at = tuple(reading.pixels.T)
+        found = self.model.errors(window.view, window.rig, window.scale)
+        rendered = window.view.rgb[:, *at].T
+        wrong = ((rendered - (reading.rgb.detach() - off.detach())).abs().amax(1) > SURE).float()
+        gain = (rendered - reading.rgb.detach()).square().mean(1)
+        return _entropy(found.wrong[at], wrong) + GAIN * _entropy(found.gain[at], gain)
 
     def _cell_terms(self, window: WholeView, reading: Reading) -> Float[Tensor, ""]:
         """What cells are taught: mean colour, the surface's place, and who sees it."""
@@ -111,7 +126,7 @@ def _visible(window: WholeView, reading: Reading, z: Float[Tensor, "cell"]) -> B
 
 
 def _entropy(chance: Float[Tensor, "pixel"], truth: Float[Tensor, "pixel"]) -> Float[Tensor, ""]:
-    return F.binary_cross_entropy(chance.clamp(1e-4, 1 - 1e-4), truth)
+    return F.binary_cross_entropy(chance.clamp(1e-4, 1 - 1e-4), truth.clamp(0, 1))
 
 
 def _mean(values: Float[Tensor, "cell"], where: Bool[Tensor, "cell"]) -> Float[Tensor, ""]:

@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from viewmend.inpainting.checkpoint import save_inpainter
-from viewmend.inpainting.sweep.sweep_net import SweepNet, scattered
+from viewmend.inpainting.sweep.cells import scattered
+from viewmend.inpainting.sweep.error_net import most_wrong
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.loop import Run, fitting_weights
 from viewmend.training.model_card import model_card
@@ -19,6 +21,9 @@ from viewmend.training.stored_scenes import StoredSamples, StudioStore
 from viewmend.training.validation import SHOWN, WholeViewScores, write_picture
 from viewmend.training.whole_view_objective import WholeViewObjective
 from viewmend.training.whole_views import WholeView, WholeViewScenes, untrained
+
+WRONG_FRACTION = 0.15
+"""Part of the proxy that the rule `wrong` may have read."""
 
 
 class WholeViewRun(Run):
@@ -30,13 +35,22 @@ class WholeViewRun(Run):
         model = untrained(self.recipe)
         if start is not None:
             fitting = fitting_weights(model, start)
-            own = [name for name in model.state_dict() if not name.startswith("coarse.")]
+            own = [name for name in model.state_dict() if not name.startswith(("coarse.", "errors."))]
             if absent := [name for name in own if name not in fitting]:
                 raise ValueError(
                     f"expected a reader of whole views of the recipe's sizes to begin with, got none of {absent[0]}; "
                     "begin without, or choose another model"
                 )
-            model.load_state_dict(model.state_dict() | {name: fitting[name] for name in own})
+            errors = {name: weight for name, weight in fitting.items() if name.startswith("errors.")}
+            model.load_state_dict(model.state_dict() | {name: fitting[name] for name in own} | errors)
+        if self.recipe.part == "errors":
+            if model.errors is None or start is None:
+                raise ValueError(
+                    "expected a trained reader and an ErrorNet to train alone, got none; give --from and "
+                    "--model.error-features 24"
+                )
+            model.requires_grad_(False)
+            model.errors.requires_grad_(True)
         return model.train()
 
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
@@ -72,7 +86,10 @@ class WholeViewValidation:
             reading = model(view, own.rig, own.scale, guess=own.guess)
             rgb = scattered(reading.rgb, reading.pixels, view.mask.shape)
             subject, holes = own.alpha > 127, (view.mask > 0) & (view.weights.sum(0) == 0)
-            ways = ((view.rgb, None), (rgb, None), (rgb, subject), (rgb, holes))
+            ways = [(view.rgb, None), (rgb, None), (rgb, subject), (rgb, holes)]
+            if model.errors is not None:
+                error = most_wrong(view, model.errors(view, own.rig, own.scale), WRONG_FRACTION)
+                ways.append((torch.where(error > 0, rgb, view.rgb), None))
             scores.append([_psnr(image, truth, where) for image, where in ways])
             shown.append(torch.cat([view.rgb, rgb, truth], 2))
         write_picture(shown[:SHOWN], self.folder / f"validation-{step:06d}.png")

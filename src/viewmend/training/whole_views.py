@@ -11,9 +11,10 @@ from torch.nn import functional as F
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.sweep.cells import rim_depth
 from viewmend.inpainting.sweep.lookup import Scale
 from viewmend.inpainting.sweep.pyramids import Rig
-from viewmend.inpainting.sweep.sweep_net import SweepNet, rim_depth
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.rendering.crop import Crop, subject_crop
 from viewmend.training.plan import WholeViewRecipe
 from viewmend.training.samples import Sample, to_device

@@ -23,6 +23,8 @@ class SweepConfig:
     """Channels of the convolutions at half the resolution; coarser scales have more."""
     fine_features: int = 32
     """Channels of the convolutions at full resolution."""
+    error_features: int = 0
+    """Channels of the `ErrorNet`; 0 for a model without."""
     coarse_fill: CoarseFillName = "smooth"
     """What holes may show beside the cameras: what `SmoothFill` or `RayBlendNet` makes of them, not trained here."""
 
@@ -42,7 +44,8 @@ class SweepConfig:
         if values.get("coarse_fill", fills[0]) not in fills:
             raise ValueError(f"expected coarse_fill among {list(fills)}, got {values['coarse_fill']!r}")
         sizes = {name: value for name, value in values.items() if name != "coarse_fill"}
-        wrong = [name for name, value in sizes.items() if type(value) is not int or not 0 < value <= 1024]
+        least = {"error_features": 0}
+        wrong = [n for n, size in sizes.items() if type(size) is not int or not least.get(n, 1) <= size <= 1024]
         if unknown or wrong:
             raise ValueError(
                 f"expected whole numbers of {[f.name for f in fields(cls)]}, got {unknown or wrong}; was this written "

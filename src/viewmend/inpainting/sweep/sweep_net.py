@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -18,15 +18,15 @@ from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
 from viewmend.inpainting.ray_blend_net import RayBlendNet
+from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
+from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet
 from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.unet import UNet
-from viewmend.views import RIM_PX, CompletedView, ContextViews, IncompleteView
+from viewmend.views import CompletedView, ContextViews, IncompleteView
 
-CELL_PX = 2
-"""Side of the cells in which places are judged."""
 SHOWN_CHANNELS = 7
 """RGB of the guess, M, what is coloured, the largest of the source views' shares, and what is read."""
 CHOICES = 4
@@ -82,6 +82,7 @@ class SweepNet(Network):
         self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
         self.coarse = RayBlendNet(config.num_views) if config.coarse_fill == "rays" else SmoothFill()
         self.coarse.requires_grad_(False)
+        self.errors = ErrorNet(config.error_features) if config.error_features else None
         self.places = PlaceNet(config.width, config.place_channels)
         self.decide = UNet(len(OFFSETS) * config.place_channels + SHOWN_CHANNELS + 2, config.features)
         self.logits = nn.Conv2d(config.features, len(OFFSETS), 1)
@@ -123,6 +124,22 @@ class SweepNet(Network):
     def coarse_guess(self, view: IncompleteView, seen: ContextViews) -> Float[Tensor, "3 height width"]:
         """The whole view, with what no source view coloured filled by what the cameras show or by its surroundings."""
         return self.coarse([replace(view, error=view.holes.to(view.error))], [seen])[0].float()
+
+    @torch.no_grad()
+    def error_map(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
+        """How wrong each pixel seems to be, for the rule `wrong`; None where no camera may be looked at.
+
+        Raises:
+            ValueError: this model was trained without an `ErrorNet`.
+        """
+        if self.errors is None:
+            raise ValueError(
+                "expected a model that predicts errors for the rule 'wrong', got one without; give --error-rule all, "
+                "or train it with --model.error-features 24"
+            )
+        names = view.closest_views(self.config.num_views)
+        seen = context(view.time, names) if names else None
+        return None if seen is None else self.errors(view, Rig.of(seen, view.silhouettes))
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """What is around the subject tells where its outline is."""
@@ -239,36 +256,6 @@ class SweepNet(Network):
             image = torch.cat([near[:, :, : shape[0], : shape[1]], image], 1)
             out = self.finish(image.contiguous(memory_format=torch.channels_last))
         return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
-
-
-def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """The depth, metres, with a rim of `RIM_PX` about the proxy that has the smallest depth near it; 0 elsewhere."""
-    far = torch.where(depth > 0, depth, torch.inf)
-    near = -F.max_pool2d(-far[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
-    return torch.where(depth > 0, depth, torch.where(near.isfinite(), near, 0.0))
-
-
-def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
-    """The smallest depth in each cell, metres, of the pixels that have any; 0 where none has."""
-    height, width = depth.shape
-    far = F.pad(torch.where(depth > 0, depth, torch.inf), (0, width % 2, 0, height % 2), value=torch.inf)
-    nearest = -F.max_pool2d(-far[None], CELL_PX)[0]
-    return torch.where(nearest.isfinite(), nearest, 0.0)
-
-
-def scattered(
-    values: Shaped[Tensor, "point channel"], at: Int[Tensor, "point 2"], shape: torch.Size
-) -> Shaped[Tensor, "channel rows columns"]:
-    """An image of this shape with the values at rows and columns, zeros elsewhere."""
-    image = values.new_zeros(shape[0] * shape[1], values.shape[1])
-    return image.index_copy(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
-
-
-def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
-    """An image with the index of the point at each row and column; -1 where there is none."""
-    image = torch.full(shape, -1, dtype=torch.long, device=at.device)
-    image[tuple(at.T)] = torch.arange(len(at), device=at.device)
-    return image
 
 
 def _finer(
