@@ -14,7 +14,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.inpainting.protocol import Memory
-from viewmend.own_pages import to_own_pages
+from viewmend.own_pages import size_bytes, to_own_pages
 from viewmend.timing import ms_since, now_s
 from viewmend.views import ContextViews, MultiViewFrame
 
@@ -57,7 +57,7 @@ class Observation:
     geometry_ms: float = 0.0
     """What the proxy took, until the first view has paid for it."""
     encoded: Memory = field(default_factory=dict, repr=False)
-    """What the inpainter encoded of the images, by camera name."""
+    """What was encoded of the images, as a context provider remembers it."""
     depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False)
     """The proxy's depth in the cameras that were asked for, by name."""
 
@@ -86,12 +86,10 @@ class Observation:
     @property
     def size(self) -> int:
         """Bytes, without what is too small to count."""
-        tensors: list[Tensor | None] = [self.frame.rgb, self.frame.mask, *self.depths.values()]
+        made = [self.frame.rgb, self.frame.mask, *self.depths.values(), *self.encoded.values()]
         if isinstance(self.proxy, GeometryProxy):
-            tensors += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
-        for encoded in self.encoded.values():
-            tensors += [value for value in getattr(encoded, "__dict__", {}).values() if isinstance(value, Tensor)]
-        return sum(t.numel() * t.element_size() for t in tensors if t is not None)
+            made += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
+        return size_bytes(made)
 
 
 def observe(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig) -> Observation:

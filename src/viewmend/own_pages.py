@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def to_own_pages(value: T) -> T:
-    """The tensor, or the dataclass of such, with copies of what is large and on the CPU in pages of its own.
+    """The tensor, or the dataclass or tuple of such, with copies of what is large and on the CPU in pages of its own.
 
     They go back to the system with the copy. LossTerms about a millisecond for 3 MB.
     """
@@ -33,8 +33,19 @@ def _moved(value: Any) -> Any:
             return value
         pages = mmap.mmap(-1, size, **PRIVATE)
         return torch.frombuffer(pages, dtype=value.dtype).view(value.shape).copy_(value)
+    if type(value) is tuple:
+        return tuple(map(_moved, value))
     if not is_dataclass(value) or isinstance(value, type):
         return value
     parts = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
     moved = {name: new for name, part in parts.items() if (new := _moved(part)) is not part}
     return replace(value, **moved) if moved else value
+
+
+def size_bytes(value: Any) -> int:
+    """Bytes of the tensors in a tensor, a dataclass, or a tuple or list of such."""
+    if isinstance(value, torch.Tensor):
+        return value.numel() * value.element_size()
+    if is_dataclass(value) and not isinstance(value, type):
+        value = [getattr(value, f.name) for f in fields(value)]
+    return sum(map(size_bytes, value)) if isinstance(value, (tuple, list)) else 0

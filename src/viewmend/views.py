@@ -113,6 +113,11 @@ class Silhouettes:
     """Foreground, 0 to 255."""
     cameras: Cameras
 
+    def select(self, names: Sequence[str]) -> "Silhouettes":
+        """The masks of these cameras, in this order; ValueError for an unknown name."""
+        index = [self.cameras.names.index(name) for name in names]
+        return Silhouettes(self.mask[index], self.cameras.select(names))
+
     def to(self, device: torch.device | str) -> "Silhouettes":
         """The same on `device`."""
         return Silhouettes(self.mask.to(device), self.cameras.to(device))

@@ -8,7 +8,7 @@ import torch
 from viewmend.inpainting.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
 from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.inpainting.ray_sampling import sample_along_rays, subject_size_m
-from viewmend.inpainting.sweep import _lookup_torch, lookup
+from viewmend.inpainting.sweep import _lookup_torch, lookup, pyramids
 from viewmend.inpainting.sweep._lookup_numba import look_up_numba
 from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
@@ -321,3 +321,17 @@ def test_the_rule_wrong_asks_the_inpainter_or_the_shipped_model(scene, teller):
 def test_an_impossible_fraction_is_refused(fraction):
     with pytest.raises(ValueError, match="expected a wrong_fraction above 0"):
         RenderConfig(wrong_fraction=fraction)
+
+
+def test_pyramids_of_a_time_are_made_once_for_all_views(scene, monkeypatch):
+    stream, view, _ = scene
+    stream = Stream(stream.inpainter, stream.config)
+    observation = stream.push(scene[0].observation().frame)
+    before, halvings, whole = observation.size, [], pyramids.halved
+    monkeypatch.setattr(pyramids, "halved", lambda image: halvings.append(image.shape) or whole(image))
+    first = stream.mend(view).completed
+    made = len(halvings)
+    assert made > 4 and observation.size > before + 1.3 * view.silhouettes.mask.numel(), "and its memory is counted"
+    assert torch.equal(stream.mend(view).completed.rgb, first.rgb) and len(halvings) == made
+    stream.mend(replace(view, candidate_views=view.candidate_views[::-1]))
+    assert made < len(halvings) < 2 * made, "only the camera that nobody needed before"

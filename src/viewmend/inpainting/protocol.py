@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from viewmend.own_pages import to_own_pages
 from viewmend.timing import ms_since, now_s
@@ -11,8 +11,9 @@ from viewmend.views import CompletedView, ContextViews, IncompleteView
 ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]
 """views(time, names): these cameras at that time with the proxy's depth; fewer where some have no frame, None where
 none has."""
-Memory = dict[str, Any]
-"""What was encoded of one time, by camera name."""
+Memory = dict[Any, Any]
+"""What was encoded of one time, by camera name, and what else is made of a time, by kind and camera name."""
+T = TypeVar("T")
 REMEMBERED_TIMES = 34
 """Times that a provider with a memory of its own keeps: the view's own, and k_w n_w + n_c before it."""
 
@@ -103,6 +104,24 @@ class ContextProvider:
                 memories[views.frame.time].update({name: to_own_pages(result) for name, result in pairs})
             self.encoding_ms += ms_since(start, device)
         return [memory[name] for memory in memories.values() for name in names if name in memory]
+
+    def remembered(
+        self, time: int, kind: str, names: Sequence[str], make: Callable[[Sequence[str]], Sequence[T]]
+    ) -> list[T]:
+        """What was made of each of these cameras at this time, for this view or an earlier one.
+
+        Args:
+            time: which one.
+            kind: tells it from what others make of the cameras.
+            names: the cameras.
+            make: is called with the names that no view needed before, and gives one result for each.
+        """
+        memory = self._memory(time)
+        absent = [name for name in names if (kind, name) not in memory]
+        if absent:
+            pairs = zip(absent, make(absent), strict=True)
+            memory.update({(kind, name): to_own_pages(made) for name, made in pairs})
+        return [memory[kind, name] for name in names]
 
     def _remembered(self, time: int) -> Memory:
         memory = self._own.setdefault(time, {})

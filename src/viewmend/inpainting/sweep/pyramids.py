@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.threads import parallel_for
+from viewmend.inpainting.protocol import ContextProvider
 from viewmend.views import ContextViews, Silhouettes
 
 SMALLEST_PX = 4
@@ -41,11 +42,24 @@ class Rig:
     silhouette_pyramids: tuple[Pyramid, ...]
 
     @classmethod
-    def of(cls, views: ContextViews, silhouettes: Silhouettes | None) -> "Rig":
-        """With pyramids made anew; `silhouettes` are the views' own where there are none."""
+    def of(cls, views: ContextViews, silhouettes: Silhouettes | None, context: ContextProvider | None = None) -> "Rig":
+        """Cameras with their pyramids.
+
+        Args:
+            views: the cameras that may be looked at.
+            silhouettes: of all cameras; None for the views' own.
+            context: remembers pyramids, and has those that were made for earlier views of the time.
+        """
         if silhouettes is None:
             silhouettes = Silhouettes(_masks(views), views.frame.cameras)
-        return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
+        if context is None:
+            return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
+        time, names, all_names = views.frame.time, views.frame.cameras.names, silhouettes.cameras.names
+        pyramids = context.remembered(time, "views", names, lambda new: view_pyramids(views.select(new)))
+        masks = context.remembered(
+            time, "silhouettes", all_names, lambda new: silhouette_pyramids(silhouettes.select(new))
+        )
+        return cls(views, tuple(pyramids), silhouettes, tuple(masks))
 
     def first(self, count: int) -> "Rig":
         """With so many of the cameras; all silhouettes stay."""

@@ -139,7 +139,7 @@ class SweepNet(Network):
             )
         names = view.closest_views(self.config.num_views)
         seen = context(view.time, names) if names else None
-        return None if seen is None else self.errors(view, Rig.of(seen, view.silhouettes))
+        return None if seen is None else self.errors(view, Rig.of(seen, view.silhouettes, context))
 
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """What is around the subject tells where its outline is."""
@@ -153,7 +153,7 @@ class SweepNet(Network):
         seen = context(view.time, names) if names and bool(read.any()) else None
         if seen is None:
             return CompletedView(view, view.rgb), state
-        found, E = self(view, Rig.of(seen, view.silhouettes), read=read), view.error
+        found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read), view.error
         rgb, alpha, confidence, depth = (
             scattered(values, found.pixels, view.mask.shape)
             for values in (found.rgb, found.alpha[:, None], found.confidence[:, None], found.depth[:, None])
