@@ -21,8 +21,9 @@ from viewmend.inpainting.protocol import (
     State,
     ViewInpainter,
     crop_margin_px,
+    own_error_rule,
 )
-from viewmend.inpainting.wrong import wrong_error
+from viewmend.inpainting.wrong import narrowed
 from viewmend.observation import DepthProvider, Observation, observe
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.view import RenderConfig, render_view
@@ -108,6 +109,11 @@ class Stream:
         self._observations: OrderedDict[int, Observation] = OrderedDict()
 
     @property
+    def error_rule(self) -> str:
+        """What E is by: as configured, else what the inpainter is made for."""
+        return self.config.render.error_rule or own_error_rule(self.inpainter)
+
+    @property
     def times(self) -> tuple[int, ...]:
         """The times at hand, in order."""
         return tuple(sorted(self._observations))
@@ -156,7 +162,7 @@ class Stream:
         Raises:
             ValueError: that time is not at hand, its geometry is not a `GeometryProxy`, or no camera is left.
         """
-        part, crop = self._render(target, time, exclude)
+        part, crop = self._render(target, time, exclude, self._read_fraction(RenderQuality()))
         return part if crop is None else crop.uncropped(part, target)
 
     def mend(
@@ -181,7 +187,8 @@ class Stream:
             ValueError: the view's time is not at hand, or it names cameras that are not in the frame.
         """
         quality = quality or RenderQuality()
-        _demand_known(view, self.observation(view.time).frame)
+        view.demand_cameras(self.observation(view.time).frame.cameras.names)
+        view = self._narrowed(view, quality.read_fraction if quality.mend else None, exclude)
         margin_px = crop_margin_px(self.inpainter, quality) if quality.mend else None
         crop = None if margin_px is None else subject_crop(view, margin_px)
         if crop is None:
@@ -213,7 +220,8 @@ class Stream:
         quality = quality or RenderQuality()
         margin_px = crop_margin_px(self.inpainter, quality)
         start = now_s(target.K.device)
-        part, crop = self._render(target, time, exclude, margin_px)
+        fraction = self._read_fraction(quality) if quality.mend else None
+        part, crop = self._render(target, time, exclude, fraction, margin_px)
         if crop is not None and margin_px is None and quality.mend:
             part, crop = crop.uncropped(part, target), None
         rendering_ms = ms_since(start, target.K.device)
@@ -221,13 +229,25 @@ class Stream:
         completed = mended.completed if crop is None else crop.uncropped_completed(mended.completed, target)
         return replace(mended, completed=completed, times=replace(mended.times, rendering=rendering_ms))
 
-    def _render(
-        self, target: Cameras, time: int | None, exclude: Sequence[str], margin_px: int | None = None
-    ) -> tuple[IncompleteView, Crop | None]:
-        """The part of the view that shows the subject, and which part that is; None where it is the whole view.
+    def _read_fraction(self, quality: RenderQuality) -> float | None:
+        """The part of the proxy that may be mended; None for all that the rule asks."""
+        allowed = self.config.render.wrong_fraction if self.error_rule == "wrong" else None
+        return min((part for part in (quality.read_fraction, allowed) if part is not None), default=None)
 
-        With a margin it is a part that can be filled on its own.
-        """
+    def _narrowed(self, view: IncompleteView, fraction: float | None, exclude: Sequence[str]) -> IncompleteView:
+        """The view with E where most is to be gained."""
+        context = ContextProvider(self._context, None, exclude, self._memory)
+        return view if fraction is None else narrowed(view, self.inpainter, context, fraction)
+
+    def _render(
+        self,
+        target: Cameras,
+        time: int | None,
+        exclude: Sequence[str],
+        fraction: float | None,
+        margin_px: int | None = None,
+    ) -> tuple[IncompleteView, Crop | None]:
+        """The part of the view that shows the subject, or that can be filled on its own with a margin; and which."""
         observation = self.observation(time)
         frame, proxy = observation.frame, observation.proxy
         if not isinstance(proxy, GeometryProxy):
@@ -238,22 +258,17 @@ class Stream:
         room = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
         crop = mesh_crop(proxy.mesh.vertices, target, *room)
         camera = target if crop is None else crop.of_camera(target)
-        config, depth = self.config.render, observation.depth
+        config, depth = replace(self.config.render, error_rule=self.error_rule), observation.depth
         view = render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth)
-        if config.error_rule == "wrong":
-            context = ContextProvider(self._context, None, exclude, self._memory)
-            view = replace(view, error=wrong_error(view, self.inpainter, context, config.wrong_fraction))
-        return view, crop
+        return self._narrowed(view, fraction, exclude), crop
 
     def _fill(
         self, view: IncompleteView, viewer: State | None, quality: RenderQuality, exclude: Sequence[str]
     ) -> StreamView:
         """A view, or the part of one that matters, completed."""
         now, viewer = self.observation(view.time), viewer or self.viewer()
-        completed, context = (
-            CompletedView(view, view.rgb),
-            ContextProvider(self._context, quality, exclude, self._memory),
-        )
+        completed = CompletedView(view, view.rgb)
+        context = ContextProvider(self._context, quality, exclude, self._memory)
         start = now_s(view.rgb.device)
         if quality.mend:
             completed, viewer = self.inpainter.step(view, context, viewer)
@@ -278,16 +293,6 @@ class Stream:
             for old in [t for t in self._observations if t < time - WINDOW]:
                 del self._observations[old]
             return
-        size = {time: observation.size for time, observation in self._observations.items()}
-        while sum(size.values()) > 1e6 * self.config.memory_mb and len(self._observations) > 1:
-            oldest, _ = self._observations.popitem(last=False)
-            del size[oldest]
-
-
-def _demand_known(view: IncompleteView, frame: MultiViewFrame) -> None:
-    unknown = sorted({*view.source_views, *view.candidate_views} - set(frame.cameras.names))
-    if unknown:
-        known = list(frame.cameras.names)
-        raise ValueError(
-            f"expected a view of cameras among {known}, got {unknown}; correct source_views and candidate_views"
-        )
+        bytes_left = sum(observation.size for observation in self._observations.values())
+        while bytes_left > 1e6 * self.config.memory_mb and len(self._observations) > 1:
+            bytes_left -= self._observations.popitem(last=False)[1].size

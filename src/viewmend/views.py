@@ -168,6 +168,15 @@ class IncompleteView:
         """Names of this many cameras: the chosen ones, then the closest others."""
         return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
 
+    def demand_cameras(self, known: Sequence[str]) -> None:
+        """ValueError where the view names cameras that are not among these."""
+        unknown = sorted({*self.source_views, *self.candidate_views} - set(known))
+        if unknown:
+            raise ValueError(
+                f"expected a view of cameras among {list(known)}, got {unknown}; correct source_views and "
+                "candidate_views"
+            )
+
 
 FAINT = 1 / 16
 """Opacity below which a pixel's own colour, divided by it, would be noise."""

@@ -18,6 +18,9 @@ from viewmend.evaluation import ray_cluster, scene_run
 from viewmend.evaluation.cells import CellStore
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
+from viewmend.rendering.view import RenderConfig
+from viewmend.stream import StreamConfig
+from viewmend.views import CompletedView
 
 METHODS = ("telea", "unfilled")
 
@@ -131,6 +134,26 @@ def test_a_cell_that_fails_is_shown_tried_again_and_harms_no_other(
     assert cells["s1", "unfilled"].error is None
     again = run(small_scenes[:1], tmp_path)
     assert figures(again) == {at: f for at, f in figures(whole[1]).items() if at[0] == "s1"}
+
+
+class Repaints(Telea):
+    error_rule = "all"
+
+    def step(self, view, context, state):
+        return CompletedView(view, (1 - view.error) * view.rgb), state
+
+
+@pytest.mark.parametrize("rule", [None, "unseen"])
+def test_each_method_is_asked_for_what_it_is_made_for(small_scenes, tmp_path, monkeypatch, whole, rule):
+    honest = scene_run.make_method
+    own = lambda name, *how: Repaints() if name == "telea" else honest(name, *how)  # noqa: E731
+    monkeypatch.setattr(scene_run, "make_method", own)
+    settings = RunSettings(stream=StreamConfig(render=RenderConfig(error_rule=rule), memory_mb=None))
+    cells = run(small_scenes[:1], tmp_path, settings=settings)
+    black, unfilled = (cells["s1", name].frames[0] for name in METHODS)
+    assert unfilled.psnr_whole == whole[1]["s1", "unfilled"].frames[0].psnr_whole
+    assert (black.psnr_whole < unfilled.psnr_whole) == (rule is None), "its own rule asks for what is coloured, too"
+    assert (black.hole_px, black.psnr_whole_rendered) == (unfilled.hole_px, unfilled.psnr_whole_rendered)
 
 
 def test_a_scene_that_fails_is_shown_for_every_method(small_scenes, tmp_path):

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from viewmend.inpainting.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
-from viewmend.inpainting.protocol import ContextProvider, State
+from viewmend.inpainting.coarse_fill import SmoothFill
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
 from viewmend.inpainting.ray_sampling import sample_along_rays, subject_size_m
 from viewmend.inpainting.sweep import _lookup_torch, lookup, pyramids
 from viewmend.inpainting.sweep._lookup_numba import look_up_numba
@@ -335,3 +336,41 @@ def test_pyramids_of_a_time_are_made_once_for_all_views(scene, monkeypatch):
     assert torch.equal(stream.mend(view).completed.rgb, first.rgb) and len(halvings) == made
     stream.mend(replace(view, candidate_views=view.candidate_views[::-1]))
     assert made < len(halvings) < 2 * made, "only the camera that nobody needed before"
+
+
+def test_a_stream_asks_for_what_its_inpainter_is_made_for(scene):
+    stream, view, _ = scene
+    asked = {}
+    for name, inpainter, rule in [
+        ("reader", stream.inpainter, None),
+        ("fill", SmoothFill(), None),
+        ("told", SmoothFill(), "all"),
+        ("held", stream.inpainter, "unseen"),
+    ]:
+        own = Stream(inpainter, StreamConfig(render=RenderConfig(error_rule=rule)))
+        own.push(stream.observation().frame, stream.observation().proxy)
+        asked[name] = own.render(view.camera).error
+        assert torch.equal(own.view(view.camera).completed.view.error, asked[name])
+    assert torch.equal(asked["reader"], view.error) and torch.equal(asked["told"], view.error)
+    assert torch.equal(asked["fill"] > 0, view.holes) and torch.equal(asked["held"] > 0, view.holes)
+    assert int(view.holes.sum()) > 0
+
+
+def test_a_quality_may_allow_only_a_part(scene, teller):
+    stream, view, _ = scene
+    hull, holes = int((view.mask > 0).sum()), int(view.holes.sum())
+
+    def mended_px(rule, fraction, wrong_fraction=0.5, **more):
+        render = RenderConfig(error_rule=rule, wrong_fraction=wrong_fraction)
+        own = Stream(teller, StreamConfig(render=render))
+        own.push(stream.observation().frame, stream.observation().proxy)
+        quality = RenderQuality(read_fraction=fraction, **more)
+        return [own.view(view.camera, quality=quality), own.mend(view, quality=quality)]
+
+    for rule, allowed, most in [("all", 0.4, 0.4), ("wrong", 0.4, 0.4), ("wrong", 0.9, 0.5)]:
+        seen, given = (int((one.completed.view.error > 0).sum()) for one in mended_px(rule, allowed))
+        assert holes < seen <= most * hull < 1.1 * seen
+        assert given <= allowed * hull < 1.1 * given, "what other renderers ask for is narrowed, too"
+    assert int((mended_px("unseen", 0.4)[0].completed.view.error > 0).sum()) == holes
+    untouched = mended_px("all", 0.4, mend=False)[0].completed.view
+    assert torch.equal(untouched.error, view.error), "nobody was to look"

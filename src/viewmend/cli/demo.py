@@ -30,8 +30,9 @@ class Options:
     """Width and height of all images."""
     cameras: int = 6
     """Cameras of the ring."""
-    error_rule: str = "unseen"
-    """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject."""
+    error_rule: str | None = None
+    """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject; 'wrong', what a model takes
+    for wrong. By default what the model is made for."""
     model: str | None = None
     """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
     json: bool = False

@@ -38,9 +38,10 @@ class RunOptions:
     """How many cameras of a capture are looked at: all, or a number of them, evenly around; several with commas."""
     closest: int = 3
     """How many of these colour a view: the closest to it."""
-    error_rule: str = "unseen"
+    error_rule: str | None = None
     """What all methods are asked to mend: 'unseen', the pixels that no camera colours; 'all' of the subject, which is
-    for methods that keep by themselves what is right. Scores in the holes are of the same pixels by every rule."""
+    for methods that keep by themselves what is right; 'wrong', what a model takes for wrong. By default each is asked
+    for what it is made for. Scores in the holes are of the same pixels by every rule."""
     frames: int | None = None
     """Frames of each scene, from the first. By default 10 of P and Q, all of a capture."""
     every: int = 1

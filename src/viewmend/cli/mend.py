@@ -41,9 +41,9 @@ class Options:
     """Names of the input cameras, with commas; all by default."""
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
-    error_rule: str = "unseen"
+    error_rule: str | None = None
     """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject, for models that keep by
-    themselves what is right."""
+    themselves what is right; 'wrong', what a model takes for wrong. By default what the model is made for."""
     model: str | None = None
     """What fills the holes: a shipped model's name or a model's folder, or any method that `viewmend evaluate` takes
     ('telea', 'reprojection', 'dstt-o-mul', FILE.py:NAME)."""

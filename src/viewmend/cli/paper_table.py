@@ -1,7 +1,7 @@
 """`viewmend evaluate paper-table`: the tables of the paper on the data at hand, its own figures beside ours."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -43,6 +43,7 @@ def run(options: Options) -> int:
     from viewmend.evaluation.report_markdown import written
     from viewmend.methods import method_names
 
+    options = replace(options, error_rule=options.error_rule or "unseen")
     sets = options.sets or (("P", "Q") if options.performers else ("P",))
     rows = list(TABLES[options.table])
     if options.table == 3:

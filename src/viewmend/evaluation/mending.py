@@ -109,7 +109,7 @@ class Mender:
 
     def _holes_mended(self, completed: CompletedView) -> CompletedView:
         """The same view with nothing but its holes mended, as a stream of its own."""
-        if self._config.render.error_rule == "unseen":
+        if self._stream.error_rule == "unseen":
             return completed
         view = replace(completed.view, error=completed.view.holes.to(completed.rgb))
         mended = self._stream.mend(view, self._viewer_of_holes, self._quality, self._exclude)

@@ -42,9 +42,10 @@ class Grid:
 def setting_lines(report: Report) -> list[str]:
     """How, where and by which code the figures came about."""
     settings = report.settings
+    rule = settings.stream.render.error_rule or "of each"
     lines = [
         f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
-        f"{settings.stream.render.cameras} closest cameras; error rule {settings.stream.render.error_rule}; "
+        f"{settings.stream.render.cameras} closest cameras; error rule {rule}; "
         f"SSIM {settings.ssim}."
     ]
     return lines + [

@@ -174,10 +174,10 @@ class _Stream:
             self._error = _said(error)
 
     def _step(self, moment: _Moment) -> None:
-        view = moment.view
         mended = self._mend(moment)
         if not self._scores and mended.times.inpainting < SLOW_MS:
             mended = self._mend(moment)
+        view = mended.completed.view
         rgb, before = mended.completed.rgb, None
         _check(rgb, view)
         if moment.before is not None and self._last is not None:
@@ -201,7 +201,10 @@ class _Stream:
             self._stream = Stream(self._inpainter, self.settings.stream)
         observation = self._stream.push(moment.observation.frame, moment.observation.proxy)
         observation.depths.update(moment.observation.depths)
-        return self._stream.mend(moment.view, self._viewer)
+        view = moment.view
+        if self._stream.error_rule != (self.settings.stream.render.error_rule or "unseen"):
+            view = self._stream.render(view.camera, view.time)
+        return self._stream.mend(view, self._viewer)
 
     def run(self, box: Box | None) -> MethodRun:
         """What came out; `box` is what its film shows."""

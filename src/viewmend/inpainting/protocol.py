@@ -34,6 +34,9 @@ class RenderQuality:
     context_times: int | None = None
     """How many times of the window are context, the latest first (1: the view's own alone); None takes all. With 0
     no camera image is encoded: a model with a coarse fill shows that alone, others have but the view's own patches."""
+    read_fraction: float | None = None
+    """At most this part of the proxy's pixels is mended, where most is to be gained, beside what no camera colours;
+    None is for all that E asks. Rules that ask for no more than that are not changed by it."""
 
 
 class ContextProvider:
@@ -166,6 +169,11 @@ class ViewInpainter(Protocol):
         `context` is asked for no time later than the view's own. `state` is what this inpainter gave before.
         """
         ...
+
+
+def own_error_rule(inpainter: ViewInpainter) -> str:
+    """The error rule that an inpainter is made for; the paper's `unseen` where it has no attribute `error_rule`."""
+    return getattr(inpainter, "error_rule", "unseen")
 
 
 def crop_margin_px(inpainter: ViewInpainter, quality: RenderQuality) -> int | None:

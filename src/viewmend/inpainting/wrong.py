@@ -1,10 +1,9 @@
 """The error rule `wrong`: what a model that knows all cameras takes for wrong. Ours."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.protocol import ContextProvider, ViewInpainter
@@ -16,23 +15,27 @@ WHOLE_VIEWS = "views"
 """The shipped model that is asked where the inpainter cannot tell."""
 
 
-def wrong_error(
+def narrowed(
     view: IncompleteView, inpainter: ViewInpainter, context: ContextProvider, fraction: float
-) -> Float[Tensor, "height width"]:
-    """E where most is to be gained, of the subject's part of a view; as it was where no camera may be looked at.
+) -> IncompleteView:
+    """The view with E where most is to be gained; as it was where E is nothing but holes, or no camera may be seen.
 
     Args:
-        view: what was rendered, from any inpainter's stream.
+        view: the subject's part of what was rendered, from any inpainter's stream.
         inpainter: is asked if it is a `SweepNet`; else the one that is shipped is.
         context: what the cameras saw.
-        fraction: at most this part of the proxy's pixels, beside the paper's E.
+        fraction: at most this part of the proxy's pixels, beside what no camera colours.
 
     Raises:
         ValueError: the inpainter was trained without an `ErrorNet`.
     """
+    if not bool(((view.error > 0) & ~view.holes).any()):
+        return view
     net = inpainter if isinstance(inpainter, SweepNet) else _shipped(view.rgb.device)
     found = net.error_map(view, context)
-    return view.error if found is None else most_wrong(view, found, fraction)
+    if found is None:
+        return view
+    return replace(view, error=torch.minimum(view.error, most_wrong(view, found, fraction)))
 
 
 @lru_cache(maxsize=2)

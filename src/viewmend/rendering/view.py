@@ -33,14 +33,14 @@ class RenderConfig:
     """How many cameras colour a view: those closest to it in angle (the paper: 3)."""
     blend: BlendConfig = field(default_factory=BlendConfig)
     """How the chosen cameras' colours are weighted."""
-    error_rule: str = "unseen"
+    error_rule: str | None = None
     """What must be mended: 'unseen', the pixels that no chosen camera colours, 'all' of the subject, or what a model
-    takes for 'wrong'."""
+    takes for 'wrong'. None is for what the stream's inpainter is made for."""
     wrong_fraction: float = 0.15
     """Rule 'wrong': at most this part of the proxy's pixels is mended, where most is to be gained; holes are always."""
 
     def __post_init__(self) -> None:
-        error_rule(self.error_rule)
+        error_rule(self.error_rule or "unseen")
         if not 0 < self.wrong_fraction <= 1:
             raise ValueError(f"expected a wrong_fraction above 0 and up to 1, got {self.wrong_fraction}")
 
@@ -80,7 +80,7 @@ def render_view(
     bias_m = config.blend.depth_bias * float(proxy.bounds.size_m.norm())
     blended = blend(target, depth, normals, sources, bias_m, config.blend)
 
-    error = error_rule(config.error_rule)(Evidence(mask, depth, blended))
+    error = error_rule(config.error_rule or "unseen")(Evidence(mask, depth, blended))
     coloured = mask * (blended.weights.sum(0) >= MIN_WEIGHT)
     weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
     seen = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)

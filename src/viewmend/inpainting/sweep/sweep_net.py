@@ -75,6 +75,8 @@ class SweepNet(Network):
     """Reads the pixels of the proxy that must be mended, and tells their alpha, confidence and depth."""
 
     config: SweepConfig  # pyright: ignore
+    error_rule = "all"
+    """What it is made for: it keeps by itself what is right."""
 
     def __init__(self, config: SweepConfig | None = None) -> None:
         super().__init__()
