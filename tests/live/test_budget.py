@@ -5,7 +5,10 @@ from itertools import pairwise
 
 import pytest
 
-from viewmend.live.budget import FULL, LADDER, Budget, QualityLevel
+from viewmend.baselines.classical import Telea
+from viewmend.inpainting.sweep.config import SweepConfig
+from viewmend.inpainting.sweep.sweep_net import SweepNet
+from viewmend.live.budget import CONTEXT_LADDER, FULL, READING_LADDER, Budget, QualityLevel, ladder_for
 from viewmend.live.protocol import FrameTimes
 
 
@@ -20,6 +23,7 @@ class Device:
         """Filling has a part that no picture size shrinks below a third; without context it is the first fill's."""
         size = 0.3 + 0.7 * level.scale**2
         context = 1 - self.context_share * (1 - level.context_times / 7) if level.context_times else 0.25
+        context *= 0.2 + 0.8 * (level.read_fraction or 1.0)
         by = 1 + self.noise * self.chance.uniform(-1, 1)
         encoding = 0.2 * self.relative_cost * by if level.context_times else 0.0
         filling = 0.8 * self.relative_cost * size * context * by
@@ -37,25 +41,26 @@ def run(budget: Budget, device: Device, frames: int) -> tuple[list[int], list[fl
     return indices, taken
 
 
-def best(device: Device, target_ms: float) -> int:
+def best(device: Device, target_ms: float, levels) -> int:
     """The highest level that holds the target, by trying them all."""
-    return max((n for n, level in enumerate(LADDER) if device.frame(level).total <= target_ms), default=0)
+    return max((n for n, level in enumerate(levels) if device.frame(level).total <= target_ms), default=0)
 
 
+@pytest.mark.parametrize("ladder", [CONTEXT_LADDER, READING_LADDER])
 @pytest.mark.parametrize("filling", [5.0, 60.0, 150.0, 400.0])
 @pytest.mark.parametrize("target_ms", [60.0, 100.0, 250.0])
 @pytest.mark.parametrize("context_share", [0.1, 0.8])
-def test_it_holds_the_budget_and_settles(filling, target_ms, context_share):
+def test_it_holds_the_budget_and_settles(filling, target_ms, context_share, ladder):
     device = Device(filling=filling, context_share=context_share)
-    budget = Budget(target_ms)
+    budget = Budget(target_ms, ladder.levels)
     indices, taken = run(budget, device, 400)
     late = taken[100:]
-    reachable = device.frame(LADDER[0]).total <= target_ms
+    reachable = device.frame(ladder.levels[0]).total <= target_ms
     over = sum(ms > target_ms for ms in late) / len(late)
     assert over < 0.05 if reachable else max(indices[100:]) == 0
     changes = sum(a != b for a, b in pairwise(indices[200:]))
     assert changes <= 4, "swings"
-    assert indices[-1] >= best(device, 0.6 * target_ms), "gives up more than it must"
+    assert indices[-1] >= best(device, 0.6 * target_ms, ladder.levels), "gives up more than it must"
 
 
 def test_noise_does_not_make_it_swing():
@@ -87,10 +92,20 @@ def test_one_slow_frame_changes_nothing():
     assert budget.level == FULL
 
 
-def test_the_ladder_grows_in_work_and_its_top_is_all():
-    work = [level.relative_cost for level in LADDER]
-    assert work == sorted(work) and LADDER[-1] == QualityLevel(1.0, 7, None)
-    assert Budget(100.0).predicted_ms(FULL) == 0
+@pytest.mark.parametrize("ladder", [CONTEXT_LADDER, READING_LADDER])
+def test_a_ladder_grows_in_work_and_its_top_is_all(ladder):
+    work = [level.relative_cost for level in ladder.levels]
+    assert work == sorted(set(work)) and ladder.levels[-1] == FULL == QualityLevel(1.0, 7, None)
+    assert work[0] < 0.1 and work[-1] == 1
+    assert max(ladder.moving.relative_cost, ladder.still.relative_cost) < 0.5 and ladder.still.scale == 1
+    assert Budget(100.0, ladder.levels).predicted_ms(FULL) == 0
+
+
+def test_who_can_tell_errors_reads_a_part_instead_of_taking_less_context():
+    assert ladder_for(SweepNet(SweepConfig(error_features=8))) is READING_LADDER
+    assert ladder_for(SweepNet(SweepConfig())) is CONTEXT_LADDER and ladder_for(Telea()) is CONTEXT_LADDER
+    assert all(level.context_times == FULL.context_times for level in READING_LADDER.levels)
+    assert all(0 < level.read_fraction < 1 for level in READING_LADDER.levels[:-1])
 
 
 def test_impossible_budgets_are_refused():

@@ -5,12 +5,12 @@ import torch
 from reference.ball import ring
 
 from viewmend.inpainting.protocol import State
-from viewmend.live.budget import FULL
+from viewmend.live.budget import CONTEXT_LADDER, FULL, READING_LADDER
 from viewmend.live.clock import Span
 from viewmend.live.poses import rig_frame
 from viewmend.live.protocol import ClockChange, Look, unpack
 from viewmend.live.renderer import RenderResult
-from viewmend.live.sessions import MOVING, REFINEMENTS, Playback, ViewerSession
+from viewmend.live.sessions import FULL_S, STILL_S, Playback, ViewerSession
 from viewmend.timing import StageTimes
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
@@ -20,9 +20,9 @@ SPAN = Span(0, 20, 20, 10.0)
 class Desk:
     """A session, and a hand that turns its clock and acknowledges."""
 
-    def __init__(self, budget_ms=None, present=lambda time: True):
+    def __init__(self, budget_ms=None, present=lambda time: True, ladder=CONTEXT_LADDER):
         self.sent, self.errors, self.now = [], [], 1000.0
-        self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms)
+        self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms, ladder)
         self.session._last = self.now
         self.present, self.edge, self.active_viewers = present, 0.0, 1
 
@@ -87,7 +87,7 @@ def test_a_moving_view_is_small_and_a_still_one_full():
     desk.pause()
     desk.look(id=1, moving=True, width=200, height=100)
     request = desk.due()
-    assert desk.size(request) == (100, 50) and request.quality.context_times == MOVING.context_times
+    assert desk.size(request) == (100, 50) and request.quality.context_times == 0
     assert desk.due(1.0) is None, "a moving view is not refined"
     desk.look(id=2, width=200, height=100)
     request = desk.due()
@@ -103,14 +103,27 @@ def test_a_still_view_is_refined_in_two_steps():
     desk.look(id=1, scale=0.5, top_k=100)
     first = desk.due()
     assert desk.size(first)[0] < 160 and first.quality.top_k == 100
-    (soon, sharp), (later, _) = REFINEMENTS
-    assert desk.due(soon / 2) is None
-    better = desk.due(soon)
-    assert desk.size(better) == (160, 160) and better.quality.context_times == sharp.context_times == 0
+    assert desk.due(STILL_S / 2) is None
+    better = desk.due(STILL_S)
+    assert desk.size(better) == (160, 160) and better.quality.context_times == 0
     assert not desk.session._full and desk.due(0.1) is None
-    best = desk.due(later)
+    best = desk.due(FULL_S)
     assert best.quality.context_times == FULL.context_times and desk.session._full
     assert best.quality.top_k == 100 and desk.due(1.0) is None
+
+
+def test_a_model_that_tells_errors_reads_a_part_while_it_is_looked_for():
+    desk = Desk(ladder=READING_LADDER)
+    desk.pause()
+    desk.look(id=1, moving=True, width=200, height=100)
+    request = desk.due()
+    assert desk.size(request) == (100, 50) and request.quality.read_fraction == READING_LADDER.moving.read_fraction
+    desk = Desk(budget_ms=50.0, ladder=READING_LADDER)
+    desk.pause()
+    desk.look(id=1)
+    assert desk.due().quality.read_fraction is not None
+    assert desk.due(STILL_S).quality.read_fraction == READING_LADDER.still.read_fraction
+    assert desk.due(FULL_S).quality.read_fraction is None
 
 
 def test_budgets_are_shared_among_a_crowd():

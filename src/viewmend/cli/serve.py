@@ -49,6 +49,8 @@ class Options:
     """Take a capture's calibration as it is. By default it is aligned as `viewmend mend` does."""
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
+    error_rule: str | None = None
+    """What is mended, as `viewmend mend` takes it; by default what the model is made for."""
     viewers: int = 8
     """How many may watch at once."""
     cameras: int = 8
@@ -86,6 +88,7 @@ def run(options: Options) -> int:
     from viewmend.live.renderer import Renderer
     from viewmend.live.server import LiveServer, ServerConfig
     from viewmend.live.service import RenderService
+    from viewmend.methods import default_method
     from viewmend.rendering.view import RenderConfig
     from viewmend.stream import StreamConfig
 
@@ -96,12 +99,13 @@ def run(options: Options) -> int:
         port=options.port,
         token=token,
         budget_ms=options.budget_ms or None,
-        model=options.model or "small",
+        model=options.model or default_method(),
         limits=Limits(viewers=options.viewers),
     )
     supply = _supply(options)
     inpainter = load_named(options.model, options.device)
-    stream = StreamConfig(render=RenderConfig(cameras=options.context), memory_mb=options.memory_mb / 2)
+    render = RenderConfig(cameras=options.context, error_rule=options.error_rule)
+    stream = StreamConfig(render=render, memory_mb=options.memory_mb / 2)
     renderer = Renderer(supply, inpainter, stream, options.device)
     server = Server(LiveServer(RenderService(renderer, supply), config), config)
     with server.bound() as address:

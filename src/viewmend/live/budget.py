@@ -3,7 +3,8 @@
 The control law, docs/live.md in code:
 
 * The ladder has quality levels from a small picture without context up to all that the model can do. Going down,
-  older context is given up first, then context tokens, then all context, then resolution.
+  older context is given up first, then context tokens, then all context, then resolution. With a model that tells
+  where most is to be gained, it is the part of the subject that is read, then resolution.
 * The time that a level will take is predicted from the medians of the last `MEMORY_FRAMES` frames. Each stage is scaled
   to the level: geometry stays, rendering and encoding grow with the pixels, inpainting grows with pixels, tokens and
   times. The context stage counts at levels with context only.
@@ -20,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
+from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.live.protocol import FrameTimes
 
 MEMORY_FRAMES = 5
@@ -29,6 +31,8 @@ MAX_UP_AFTER_FRAMES = 256
 PROBATION_FRAMES = 12
 COARSE_FILL_COST = 0.15
 """Cost of a fill without the transformer, relative to the full level's."""
+READING_COST = 0.25
+"""Cost of finding out where most is to be gained and of reading nothing, relative to reading all."""
 
 
 @dataclass(frozen=True)
@@ -41,31 +45,67 @@ class QualityLevel:
     """How many times of the window are context, the latest first; 0: no camera image is encoded."""
     top_k: int | None
     """Context tokens that survive pruning; None for all."""
+    read_fraction: float | None = None
+    """The part of the subject that is read; None for all that the error rule asks."""
 
     @property
     def relative_cost(self) -> float:
         """Cost of inpainting, relative to the full level's."""
+        if self.read_fraction is not None:
+            return self.scale**2 * (READING_COST + (1 - READING_COST) * self.read_fraction)
         tokens = min(self.top_k or 2048, 2048) / 2048
         if self.context_times == 0:
             return self.scale**2 * COARSE_FILL_COST
         return self.scale**2 * (0.4 + 0.4 * self.context_times / 7 + 0.2 * tokens)
 
 
-LADDER = (
-    *(QualityLevel(scale, 0, 256) for scale in (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)),
-    QualityLevel(1.0, 1, 256),
-    QualityLevel(1.0, 2, 512),
-    QualityLevel(1.0, 4, 1024),
-    QualityLevel(1.0, 7, None),
+FULL = QualityLevel(1.0, 7, None)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """What views may be made with, for one kind of model."""
+
+    levels: tuple[QualityLevel, ...]
+    """The cheapest first; the last is `FULL`."""
+    moving: QualityLevel
+    """What a moving view is made with where there is no budget."""
+    still: QualityLevel
+    """What a view that has been still for a moment is made with: sharp, but soon there."""
+
+
+SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
+CONTEXT_LADDER = Ladder(
+    (
+        *(QualityLevel(scale, 0, 256) for scale in SCALES),
+        QualityLevel(1.0, 1, 256),
+        QualityLevel(1.0, 2, 512),
+        QualityLevel(1.0, 4, 1024),
+        FULL,
+    ),
+    moving=QualityLevel(0.5, 0, 256),
+    still=QualityLevel(1.0, 0, None),
 )
-"""All levels, the cheapest first."""
-FULL = LADDER[-1]
+READING_LADDER = Ladder(
+    (
+        *(QualityLevel(scale, 7, None, 0.1) for scale in SCALES),
+        *(QualityLevel(1.0, 7, None, fraction) for fraction in (0.15, 0.25, 0.4, 0.6)),
+        FULL,
+    ),
+    moving=QualityLevel(0.5, 7, None, 0.15),
+    still=QualityLevel(1.0, 7, None, 0.15),
+)
+
+
+def ladder_for(inpainter: ViewInpainter) -> Ladder:
+    """The ladder of a model; one that has `tells_errors` reads a part of the subject, others use less context."""
+    return READING_LADDER if getattr(inpainter, "tells_errors", False) else CONTEXT_LADDER
 
 
 class Budget:
     """Chooses one viewer's quality level, frame by frame."""
 
-    def __init__(self, target_ms: float, levels: Sequence[QualityLevel] = LADDER) -> None:
+    def __init__(self, target_ms: float, levels: Sequence[QualityLevel] = CONTEXT_LADDER.levels) -> None:
         """Begin in the middle of the ladder.
 
         Raises:
@@ -124,6 +164,7 @@ class Budget:
             "scale": self.level.scale,
             "top_k": self.level.top_k,
             "context_times": self.level.context_times,
+            "read_fraction": self.level.read_fraction,
             "level": self.index,
             "levels": len(self.levels),
         }

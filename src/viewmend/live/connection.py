@@ -89,7 +89,9 @@ class ViewerConnection:
         self._faults = FaultLimit()
         self._rate = RateLimit(registry.limits.messages_per_s)
         self._rig: dict[str, Any] | None = None
-        self._session = ViewerSession(self._deliver, self._report_error, registry.budget_ms)
+        self._session = ViewerSession(
+            self._deliver, self._report_error, registry.budget_ms, registry.service.renderer.ladder
+        )
 
     async def run(self) -> None:
         """Serve an accepted socket until it ends."""

@@ -6,6 +6,7 @@ from typing import Any
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter
+from viewmend.live.budget import ladder_for
 from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
@@ -54,6 +55,8 @@ class Renderer:
         self._supply = supply
         self._inpainter = inpainter
         self._config = config or StreamConfig()
+        self.ladder = ladder_for(inpainter)
+        """What views may be made with."""
         self._device = device
         self._rig: Rig | None = None
         self._stream: Stream | None = None

@@ -8,18 +8,16 @@ from itertools import count
 from typing import Any, Protocol, runtime_checkable
 
 from viewmend.inpainting.protocol import RenderQuality, State
-from viewmend.live.budget import FULL, Budget, QualityLevel
+from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLevel
 from viewmend.live.clock import Clock, Span
 from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
 from viewmend.live.protocol import ClockChange, FrameTimes, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
 
-REFINEMENTS = ((0.25, QualityLevel(1.0, 0, None)), (0.8, FULL))
-"""Seconds that a view has been still, and the level that it is rendered with again. The sharp picture comes first,
-since whoever moves on waits for it; then all that the model can do."""
-MOVING = QualityLevel(0.5, 0, 256)
-"""What a moving view is made with where there is no budget."""
+STILL_S, FULL_S = 0.25, 0.8
+"""Seconds that a view has been still when it is rendered again. The sharp picture comes first, since whoever moves on
+waits for it; then all that the model can do."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +70,7 @@ class ViewerSession:
         deliver: Callable[[bytes], None],
         report_error: Callable[[str], None],
         budget_ms: float | None,
+        ladder: Ladder = CONTEXT_LADDER,
     ) -> None:
         """Begin a session.
 
@@ -79,6 +78,7 @@ class ViewerSession:
             deliver: called with each frame's message, on the render thread.
             report_error: called with what went wrong, on the render thread.
             budget_ms: milliseconds that a view may take when alone; None without a limit.
+            ladder: what views may be made with.
         """
         self.viewer: State | None = None
         self.clock = Clock()
@@ -87,7 +87,8 @@ class ViewerSession:
         self.recent: deque[SentFrame] = deque(maxlen=120)
         self.in_flight: int | None = None
         self.in_flight_since = 0.0
-        self.budget = None if budget_ms is None else Budget(budget_ms)
+        self.budget = None if budget_ms is None else Budget(budget_ms, ladder.levels)
+        self._ladder = ladder
         self._budget_ms = budget_ms
         self._deliver, self._report_error = deliver, report_error
         self._frame_numbers = count()
@@ -148,7 +149,8 @@ class ViewerSession:
         if self._full:
             return None
         cost = self._level.relative_cost
-        better = [level for after_s, level in REFINEMENTS if still_s >= after_s and level.relative_cost > cost]
+        steps = ((STILL_S, self._ladder.still), (FULL_S, FULL))
+        better = [level for after_s, level in steps if still_s >= after_s and level.relative_cost > cost]
         return better[-1] if better else None
 
     def _level_for(self, look: Look, active_viewers: int) -> QualityLevel:
@@ -156,13 +158,16 @@ class ViewerSession:
             self.budget.target_ms = self._budget_ms / max(1, active_viewers)
             level = self.budget.level
         else:
-            level = MOVING if look.moving else FULL
+            level = self._ladder.moving if look.moving else FULL
         return level if look.adaptive else replace(level, scale=1.0)
 
     def _request(self, look: Look, at: int, rig_frame: RigFrame) -> RenderRequest:
         level = self._level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
-        quality = RenderQuality(mend="mended" in look.modes, top_k=top_k, context_times=level.context_times)
+        mend = "mended" in look.modes
+        quality = RenderQuality(
+            mend=mend, top_k=top_k, context_times=level.context_times, read_fraction=level.read_fraction
+        )
         scale = look.scale * level.scale
         cameras = tuple(view_camera(eye, rig_frame, (look.width, look.height), scale) for eye in look.cameras)
         return RenderRequest(at, cameras, quality)

@@ -143,6 +143,11 @@ class SweepNet(Network):
         seen = context(view.time, names) if names else None
         return None if seen is None else self.errors(view, Rig.of(seen, view.silhouettes, context))
 
+    @property
+    def tells_errors(self) -> bool:
+        """Whether it can say where most is to be gained."""
+        return self.errors is not None
+
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """What is around the subject tells where its outline is."""
         return max(MARGIN_PX, self.coarse.crop_margin_px(quality))
