@@ -356,6 +356,18 @@ def test_a_stream_asks_for_what_its_inpainter_is_made_for(scene):
     assert int(view.holes.sum()) > 0
 
 
+def test_a_part_is_read_with_a_quick_guess(scene, monkeypatch):
+    stream, view, _ = scene
+    net = SweepNet(replace(SMALL, coarse_fill="rays", error_features=8)).eval()
+    own, asked = Stream(net, StreamConfig()), []
+    own.push(stream.observation().frame, stream.observation().proxy)
+    monkeypatch.setattr(net.coarse, "forward", lambda *given: asked.append(given) or [view.rgb])
+    own.view(view.camera, quality=RenderQuality(read_fraction=0.3))
+    assert asked == []
+    own.view(view.camera)
+    assert len(asked) == 1
+
+
 def test_a_quality_may_allow_only_a_part(scene, teller):
     stream, view, _ = scene
     hull, holes = int((view.mask > 0).sum()), int(view.holes.sum())

@@ -10,6 +10,7 @@ import torch
 from viewmend.cli import main
 from viewmend.geometry.cameras import project, unproject
 from viewmend.inpainting.checkpoint import load_network, save_inpainter
+from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
@@ -286,6 +287,28 @@ def test_a_number_always_gives_the_same_views(view_shards):
         torch.equal(a.view.rgb, b.view.rgb) and torch.equal(a.truth, b.truth) for a, b in zip(first, again, strict=True)
     )
     assert any(not torch.equal(a.truth, b.truth) for a, b in zip(first, third, strict=True))
+
+
+def test_some_holes_are_guessed_from_their_surroundings_alone(view_shards):
+    """What a live view's budget may leave of the guess is learned, too; colours are the same for all that."""
+    net = SweepNet(SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8, coarse_fill="rays"))
+
+    def guesses(quick):
+        shards = StoredSamples(StoredShards(view_shards, "0"), PLAN, "0")
+        scenes = WholeViewScenes(shards, "0", net, quick)
+        return [own for number in range(1, 4) for own in scenes.scene(number)]
+
+    slow, quick, some = guesses(0.0), guesses(1.0), guesses(0.5)
+    assert all(torch.equal(a.truth, b.truth) for a, b in zip(slow, quick, strict=True))
+    kinds = set()
+    for a, b, own in zip(slow, quick, some, strict=True):
+        holes = a.view.holes
+        assert torch.equal(a.guess[:, ~holes], b.guess[:, ~holes])
+        if bool(holes.any()):
+            assert torch.equal(b.guess, SmoothFill()([replace(b.view, error=holes.float())], [None])[0])
+            assert not torch.equal(a.guess, b.guess)
+            kinds.add(torch.equal(own.guess, b.guess))
+    assert kinds == {True, False}
 
 
 def test_samples_go_on_where_they_stopped(tmp_path, monkeypatch, capsys):

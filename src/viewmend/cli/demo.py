@@ -33,6 +33,8 @@ class Options:
     error_rule: str | None = None
     """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject; 'wrong', what a model takes
     for wrong. By default what the model is made for."""
+    wrong_fraction: float = 0.15
+    """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     model: str | None = None
     """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
     json: bool = False
@@ -59,7 +61,7 @@ def run(options: Options) -> int:
     from viewmend.rendering.view import RenderConfig
     from viewmend.studio.stage import Studio, StudioConfig
 
-    render = RenderConfig(error_rule=options.error_rule)
+    render = RenderConfig(error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
     inpainter = load_named(options.model, "cpu")
     config = StudioConfig(
         seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=FPS

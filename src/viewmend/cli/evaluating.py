@@ -42,6 +42,8 @@ class RunOptions:
     """What all methods are asked to mend: 'unseen', the pixels that no camera colours; 'all' of the subject, which is
     for methods that keep by themselves what is right; 'wrong', what a model takes for wrong. By default each is asked
     for what it is made for. Scores in the holes are of the same pixels by every rule."""
+    wrong_fraction: float = 0.15
+    """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     frames: int | None = None
     """Frames of each scene, from the first. By default 10 of P and Q, all of a capture."""
     every: int = 1
@@ -184,7 +186,10 @@ def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
         device=options.device,
         precision=options.precision,
         stream=StreamConfig(
-            render=RenderConfig(cameras=options.closest, error_rule=options.error_rule), memory_mb=None
+            render=RenderConfig(
+                cameras=options.closest, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction
+            ),
+            memory_mb=None,
         ),
         ssim=options.ssim,
         networks=networks,

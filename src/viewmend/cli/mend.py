@@ -44,6 +44,8 @@ class Options:
     error_rule: str | None = None
     """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject, for models that keep by
     themselves what is right; 'wrong', what a model takes for wrong. By default what the model is made for."""
+    wrong_fraction: float = 0.15
+    """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     model: str | None = None
     """What fills the holes: a shipped model's name or a model's folder, or any method that `viewmend evaluate` takes
     ('telea', 'reprojection', 'dstt-o-mul', FILE.py:NAME)."""
@@ -89,7 +91,7 @@ def run(options: Options) -> int:
     from viewmend.inpainting.protocol import RenderQuality
     from viewmend.rendering.view import RenderConfig
 
-    render = RenderConfig(cameras=options.context, error_rule=options.error_rule)
+    render = RenderConfig(cameras=options.context, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = _times(options.frames, len(opened.frame_ids))

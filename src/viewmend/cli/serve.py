@@ -51,6 +51,8 @@ class Options:
     """How many cameras colour a view and are the inpainter's context."""
     error_rule: str | None = None
     """What is mended, as `viewmend mend` takes it; by default what the model is made for."""
+    wrong_fraction: float = 0.15
+    """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     viewers: int = 8
     """How many may watch at once."""
     cameras: int = 8
@@ -104,7 +106,7 @@ def run(options: Options) -> int:
     )
     supply = _supply(options)
     inpainter = load_named(options.model, options.device)
-    render = RenderConfig(cameras=options.context, error_rule=options.error_rule)
+    render = RenderConfig(cameras=options.context, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
     stream = StreamConfig(render=render, memory_mb=options.memory_mb / 2)
     renderer = Renderer(supply, inpainter, stream, options.device)
     server = Server(LiveServer(RenderService(renderer, supply), config), config)

@@ -98,7 +98,9 @@ class WholeViewValidation:
     def _made(self) -> list[WholeView]:
         plan = replace(self.recipe.data, held_cameras=1, performers=None, motions=None, data_device="cpu")
         store = StudioStore(StudioScenes(plan, "validation", "validation"))
-        scenes = WholeViewScenes(StoredSamples(store, plan, "validation"), "validation", untrained(self.recipe))
+        scenes = WholeViewScenes(
+            StoredSamples(store, plan, "validation"), "validation", untrained(self.recipe), quick=0.0
+        )
         made = (view for number in count() for view in scenes.scene(number))
         return list(islice(made, self.recipe.validation_views))
 

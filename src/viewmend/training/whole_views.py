@@ -33,8 +33,9 @@ LEAST_PX = 200
 """Views of a smaller subject are passed over."""
 FEWEST_CAMERAS = 4
 """At least so many cameras are shown, where there are more."""
-BLINDED, SPARSE, RECOLOURED = 0.6, 0.3, 0.7
-"""Fractions: windows with fewer cameras, windows of which only a part is read, views with other colours."""
+BLINDED, SPARSE, RECOLOURED, QUICK = 0.6, 0.3, 0.7, 0.3
+"""Fractions: windows with fewer cameras, windows of which only a part is read, views with other colours, views whose
+holes are guessed from their surroundings alone."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,8 @@ class WholeView:
     """True z-depth, metres, 0 where there is no surface."""
 
     @classmethod
-    def of(cls, sample: Sample, net: SweepNet) -> "WholeView":
-        """A sample that knows alpha and depth, and the cameras near it; `net` makes the guess."""
+    def of(cls, sample: Sample, net: SweepNet, quick: bool = False) -> "WholeView":
+        """A sample that knows alpha and depth, and the cameras near it; `net` makes the guess, or a quick one."""
         assert sample.nearby is not None and sample.alpha is not None and sample.depth is not None, "a stored scene's"
         view, truth, alpha, depth = sample.view, sample.truth, sample.alpha, sample.depth
         scale, rig = Scale.of(view), Rig.of(sample.nearby, view.silhouettes)
@@ -63,7 +64,7 @@ class WholeView:
         if crop is not None:
             view = crop.of_view(view)
             truth, alpha, depth = (crop.of_image(image).contiguous() for image in (truth, alpha, depth))
-        return cls(view, rig, scale, net.coarse_guess(view, rig.views), truth, alpha, depth)
+        return cls(view, rig, scale, net.coarse_guess(view, rig.views, quick), truth, alpha, depth)
 
     def to(self, device: torch.device | str) -> "WholeView":
         """The same on `device`."""
@@ -83,17 +84,19 @@ class WholeView:
 class WholeViewScenes:
     """A source's samples as whole views, most with other colours; the same for the same number."""
 
-    def __init__(self, scenes: SceneSource[Sample], seed: str, net: SweepNet) -> None:
-        """`net` makes the guesses."""
+    def __init__(self, scenes: SceneSource[Sample], seed: str, net: SweepNet, quick: float = QUICK) -> None:
+        """`net` makes the guesses, this fraction of them quick ones."""
         self.scenes = scenes
         self.seed = seed
         self.net = net
+        self.quick = quick
 
     def scene(self, number: int) -> list[WholeView]:
         """Views of scene `number` that show anything."""
-        random = Random(f"{self.seed}/colours/{number}")
+        random, guesses = (Random(f"{self.seed}/{kind}/{number}") for kind in ("colours", "guesses"))
         samples = [s for s in self.scenes.scene(number) if int((s.view.mask > 0).sum()) >= LEAST_PX]
-        return [WholeView.of(recoloured(s, random) if random.random() < RECOLOURED else s, self.net) for s in samples]
+        shown = [recoloured(s, random) if random.random() < RECOLOURED else s for s in samples]
+        return [WholeView.of(s, self.net, guesses.random() < self.quick) for s in shown]
 
 
 def untrained(recipe: WholeViewRecipe) -> SweepNet:

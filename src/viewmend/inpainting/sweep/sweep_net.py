@@ -123,9 +123,15 @@ class SweepNet(Network):
         return self._blend(view, rig, scale, torch.nonzero(read), shown, swept)
 
     @torch.no_grad()
-    def coarse_guess(self, view: IncompleteView, seen: ContextViews) -> Float[Tensor, "3 height width"]:
-        """The whole view, with what no source view coloured filled by what the cameras show or by its surroundings."""
-        return self.coarse([replace(view, error=view.holes.to(view.error))], [seen])[0].float()
+    def coarse_guess(
+        self, view: IncompleteView, seen: ContextViews, quick: bool = False
+    ) -> Float[Tensor, "3 height width"]:
+        """The whole view, with what no source view coloured filled by what the cameras show or by its surroundings.
+
+        `quick` looks at surroundings alone.
+        """
+        fill = SmoothFill() if quick else self.coarse
+        return fill([replace(view, error=view.holes.to(view.error))], [seen])[0].float()
 
     @torch.no_grad()
     def error_map(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
@@ -160,7 +166,8 @@ class SweepNet(Network):
         seen = context(view.time, names) if names and bool(read.any()) else None
         if seen is None:
             return CompletedView(view, view.rgb), state
-        found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read), view.error
+        guess = self.coarse_guess(view, seen, quick=context.quality.read_fraction is not None)
+        found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read, guess=guess), view.error
         rgb, alpha, confidence, depth = (
             scattered(values, found.pixels, view.mask.shape)
             for values in (found.rgb, found.alpha[:, None], found.confidence[:, None], found.depth[:, None])
