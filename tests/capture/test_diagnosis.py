@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from viewmend.capture.diagnosis import diagnose
+from viewmend.capture.diagnosis import diagnose, faulty_masks
 from viewmend.capture.plain import open_capture
 from viewmend.capture.plain_writer import write_capture
 from viewmend.capture.prepare import prepare
 from viewmend.cli import main
 from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.training.plan import DataPlan
+from viewmend.training.sources import scene_source
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +79,20 @@ def test_wrong_poses_are_named_and_refused(folder, capsys, tmp_path, said):
     assert said in capsys.readouterr().out
 
 
+def test_what_mend_refuses_is_served_to_nobody(folder, capsys):
+    change_cameras(folder, flipped)
+    assert main(["mend", str(folder), "--out", str(folder / "out"), "--path", "orbit", "--model", "telea"]) == 2
+    said = capsys.readouterr().err
+    assert main(["serve", str(folder), "--port", "0", "--model", "telea"]) == 2
+    assert capsys.readouterr().err == said and "OpenGL axes" in said and "http" not in said
+
+
+def test_training_on_what_mend_refuses_does_not_begin(folder):
+    change_masks(folder, lambda mask: 255 - mask)
+    with pytest.raises(ValueError, match="inverted"):
+        scene_source(DataPlan(captures=(folder,)), "seed")
+
+
 def test_swapped_cameras_are_named_and_refused(folder):
     first, _, second, *_ = names_of(folder)
     file = folder / "cameras.json"
@@ -138,6 +154,16 @@ def test_a_held_out_camera_judges_nobody_and_is_named(folder, caplog):
     assert before.cameras.names == after.cameras.names and "scores against it mean nothing" in caplog.text
     masks = [frame.without([held]).mask for frame in (before, after)]
     assert masks[0] is not None and masks[1] is not None and torch.equal(masks[0], masks[1])
+
+
+def test_masks_are_judged_by_inputs_alone(folder, caplog):
+    held, *others = names_of(folder)
+    change_masks(folder, lambda mask: 0 * mask, held)
+    assert held in prepare(open_capture(folder), others, align=False).read(0).cameras.names and not caplog.messages
+    change_masks(folder, lambda mask: 255 - mask, others[0])
+    change_masks(folder, lambda mask: 255 - mask, others[1])
+    frame, bounds = open_capture(folder).read(0), open_capture(folder).bounds
+    assert [finding.fatal for finding in faulty_masks(frame, others[:3], bounds)] == [True], "two of three"
 
 
 def test_a_subject_of_another_unit_is_named(folder, caplog):

@@ -88,12 +88,12 @@ def test_where_few_frames_have_room_reading_ahead_comes_to_rest(reading):
     assert source.order == [0, 1] and supply.read(0) is not None
 
 
-def test_failures_are_said_and_tried_again():
+def test_failures_are_said_and_tried_again(caplog):
     tries = []
 
     def opens():
         tries.append(1)
-        if len(tries) < 2:
+        if len(tries) < 3:
             raise ValueError("no such rig")
         return BallCapture(CAMERAS, 1)
 
@@ -103,6 +103,7 @@ def test_failures_are_said_and_tried_again():
     assert supply.status.error == "ValueError: no such rig"
     wait_until(lambda: supply.status.state == "ready")
     assert supply.status.error is None and supply.span.fps == 0
+    assert caplog.messages == ["while reading: ValueError: no such rig"], "once, in the terminal"
     supply.stop()
 
 

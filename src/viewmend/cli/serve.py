@@ -171,15 +171,10 @@ def _studio(options: Options) -> "Callable[[], CaptureSource]":
 
 
 def _capture(options: Options) -> "Callable[[], CaptureSource]":
-    """Prepares the capture on the thread that reads it; what is wrong with the folder is said at once."""
+    """Prepares the capture, so that one that cannot be rendered is refused before anybody is told an address."""
     from viewmend.capture.prepare import open_masked, prepare
     from viewmend.cli.alignment import say_alignment
 
-    capture = open_masked(options.source)
-
-    def open_capture() -> "CaptureSource":
-        prepared = prepare(capture, longest_px=options.width, align=options.align)
-        say_alignment(prepared.alignment)
-        return prepared
-
-    return open_capture
+    prepared = prepare(open_masked(options.source), longest_px=options.width, align=options.align)
+    say_alignment(prepared.alignment)
+    return lambda: prepared

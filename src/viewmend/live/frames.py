@@ -1,6 +1,7 @@
 """Frames of a recording, read or generated ahead on a thread of their own, and what all supplies of frames share."""
 
 import contextlib
+import logging
 import os
 import threading
 from abc import ABC, abstractmethod
@@ -21,6 +22,8 @@ RETRY_S = 1.0
 """A source that failed is tried again after this long."""
 AHEAD = 3
 """Frames that are read before they are asked for."""
+
+log = logging.getLogger("viewmend.live")
 
 
 @dataclass(frozen=True)
@@ -164,10 +167,16 @@ class ReadAhead(FrameSupply):
                     source = self._opened()
                 self._step(source)
             except Exception as error:  # whatever a source does wrong, it is said, and tried again
-                self.status = replace(self.status, state="failing", error=f"{type(error).__name__}: {error}"[:400])
-                self.changed()
+                self._failed(f"{type(error).__name__}: {error}"[:400])
                 with self._lock:
                     self._lock.wait_for(lambda: self._stopped, RETRY_S)
+
+    def _failed(self, said: str) -> None:
+        """Tell viewers by the status; the terminal too, once until it works again or something else fails."""
+        if self.status.error != said:
+            log.warning("while reading: %s", said)
+        self.status = replace(self.status, state="failing", error=said)
+        self.changed()
 
     def _opened(self) -> CaptureSource:
         source = self._open()

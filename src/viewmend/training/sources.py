@@ -1,6 +1,6 @@
 """Where a run's scenes come from, by its plan."""
 
-from viewmend.capture.prepare import open_masked
+from viewmend.capture.prepare import open_masked, prepare
 from viewmend.leave_one_out.splits import Split, recordings
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
 from viewmend.training.plan import DataPlan, Recipe, WholeViewRecipe
@@ -54,5 +54,6 @@ def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneS
     studio = StudioScenes(plan, seed, split)
     if not plan.captures:
         return studio
-    captures = [open_masked(folder, held=1) for folder in recordings(split, plan.captures)]
+    opened = [open_masked(folder, held=1) for folder in recordings(split, plan.captures)]
+    captures = [prepare(capture, align=False) for capture in opened]  # which refuses the wrong ones
     return MixedScenes(CaptureScenes(captures, plan, seed), studio, plan.captures_fraction, seed)
