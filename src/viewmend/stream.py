@@ -113,6 +113,13 @@ class Stream:
         """What E is by: as configured, else what the inpainter is made for."""
         return self.config.render.error_rule or own_error_rule(self.inpainter)
 
+    def by_rule(self, error_rule: str) -> "Stream":
+        """The same times and memory, with E by another rule; ValueError where there is no such rule."""
+        config = replace(self.config, render=replace(self.config.render, error_rule=error_rule))
+        other = Stream(self.inpainter, config, self.bounds)
+        other._observations = self._observations
+        return other
+
     @property
     def times(self) -> tuple[int, ...]:
         """The times at hand, in order."""
@@ -133,10 +140,8 @@ class Stream:
         """
         if frame.time not in self._observations:
             frame = replace(frame, depth=None)  # the truth of synthetic captures: nobody looks at it here
-            observed = (
-                observe(frame, self.bounds, self.config.hull) if geometry is None else Observation(frame, geometry)
-            )
-            self._observations[frame.time] = observed
+            given = None if geometry is None else Observation(frame, geometry)
+            self._observations[frame.time] = given or observe(frame, self.bounds, self.config.hull)
         self._observations.move_to_end(frame.time)
         self._forget(frame.time)
         return self._observations[frame.time]
@@ -193,8 +198,7 @@ class Stream:
         crop = None if margin_px is None else subject_crop(view, margin_px)
         if crop is None:
             return self._fill(view, viewer, quality, exclude)
-        part = crop.of_view(view)
-        mended = self._fill(part, viewer, quality, exclude)
+        mended = self._fill(crop.of_view(view), viewer, quality, exclude)
         return replace(mended, completed=crop.pasted(mended.completed, view))
 
     def view(
@@ -252,9 +256,7 @@ class Stream:
         frame, proxy = observation.frame, observation.proxy
         if not isinstance(proxy, GeometryProxy):
             got = type(proxy).__name__
-            raise ValueError(
-                f"expected a GeometryProxy to render, got {got}; render the view yourself and mend it then"
-            )
+            raise ValueError(f"expected a GeometryProxy to render, got {got}; render it yourself and mend it then")
         room = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
         crop = mesh_crop(proxy.mesh.vertices, target, *room)
         camera = target if crop is None else crop.of_camera(target)

@@ -1,9 +1,20 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from viewmend.live.pictures import COLOURS, depth_stride, pack_depth, picture, to_jpeg, unpack_depth
+from viewmend.live.pictures import (
+    COLOURS,
+    depth_stride,
+    mean_confidence,
+    pack_depth,
+    picture,
+    surface_depth,
+    to_jpeg,
+    unpack_depth,
+)
 
 
 def test_every_mode_shows_what_it_says(ball_view):
@@ -19,6 +30,32 @@ def test_every_mode_shows_what_it_says(ball_view):
     left, right = images["coverage"][24, 18].astype(float), images["coverage"][24, 30].astype(float)
     assert np.allclose(left / left.max(), np.array(COLOURS[0]) / max(COLOURS[0]), atol=0.02)
     assert np.allclose(right / right.max(), np.array(COLOURS[1]) / max(COLOURS[1]), atol=0.02)
+
+
+def test_holes_are_the_missing_pixels_by_every_rule(ball_view):
+    whole = replace(ball_view, view=replace(ball_view.view, error=ball_view.view.mask))
+    for mode in ("holes", "coverage"):
+        assert (picture(whole, mode) == picture(ball_view, mode)).all()
+
+
+def test_confidence_is_a_heat_upon_the_background(ball_view):
+    view, alpha = ball_view.view, 0.5 * ball_view.view.mask
+    sure, unsure = (replace(ball_view, alpha=alpha, confidence=told * view.mask) for told in (1.0, 0.25))
+    assert mean_confidence(ball_view) is None
+    assert mean_confidence(sure) == pytest.approx(1, abs=1e-3) and mean_confidence(unsure) == pytest.approx(0.25)
+    yellow, violet = (picture(one, "confidence") for one in (sure, unsure))
+    assert np.abs(yellow[24, 24] - np.array([253, 231, 36]) / 2).max() <= 1 and violet[24, 24, 2] > violet[24, 24, 0]
+    assert yellow[0, 0].tolist() == [0, 0, 0], "no subject, no colour"
+    grey = picture(ball_view, "confidence")
+    assert grey.max() > 40 and (grey == grey[..., :1]).all(), "who does not tell is shown without colour"
+
+
+def test_depth_of_a_soft_outline_is_that_of_the_surface_beside_it(ball_view):
+    assert torch.equal(surface_depth(ball_view), ball_view.view.depth)
+    depth, alpha = torch.zeros(48, 48), torch.zeros(48, 48)
+    depth[10:20, 10:20], alpha[10:20, 10:20], alpha[20, 10:20], alpha[25, 25] = 2.0, 1.0, 0.3, 0.3
+    shown = surface_depth(replace(ball_view, alpha=alpha, depth=depth))
+    assert (shown[20, 10:20] == 2).all() and shown[21].max() == 0 == shown[25, 25]
 
 
 @pytest.mark.parametrize("quality", [85, 95])

@@ -52,8 +52,9 @@ def test_every_message_is_understood():
         ({"type": "look", "width": 99.5}, "a whole number"),
         (
             {"type": "look", "modes": ["mended", "mendet"]},
-            'expected rendered or holes or mended or depth or coverage, got "mendet"',
+            'expected rendered or holes or mended or depth or coverage or confidence, got "mendet"',
         ),
+        ({"type": "look", "error_rule": "some"}, 'expected unseen or all or wrong, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, -1], "T": [0, 0, 0]}}, "expected 'R' as a rotation"),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}, "'T'"),

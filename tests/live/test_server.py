@@ -19,6 +19,7 @@ from viewmend.live.client import Client
 from viewmend.live.frames import ReadAhead
 from viewmend.live.poses import view_camera
 from viewmend.live.protocol import Camera, Limits
+from viewmend.rendering.error_rules import ERROR_RULES
 
 
 def get(url, headers=None, data=None):
@@ -76,6 +77,7 @@ def test_a_picture_shows_the_subject_from_where_it_was_asked(ball):
         ("azimuth=x", "azimuth: expected a number"),
         ("width=99999", "from 16 to 2048"),
         ("mode=naked", "mode: expected rendered or holes"),
+        ("error_rule=some", "error_rule: expected unseen or all"),
         ("time=soon", "time: expected"),
         ("distanse=3", "expected keys among"),
         ("elevation=90", "elevation: expected"),
@@ -106,6 +108,24 @@ def test_a_viewer_sees_what_it_asks_for_and_when(ball):
         assert 0 < shown.latency_ms < 20_000
         state = viewer.wait_for("state")
         assert state["playing"] is False and state["time"] == 0 and state["total"] == 3
+
+
+def test_the_error_rule_is_the_viewers_choice(ball):
+    with Client(ball.ws) as viewer:
+        welcome = viewer.messages["welcome"]
+        assert welcome["error_rules"] == list(ERROR_RULES) and welcome["error_rule"] == "unseen"
+        viewer.send("clock", playing=False, seek=0)
+        shown = {}
+        for rule in (None, "unseen", "all"):
+            look = viewer.look(width=64, height=64, error_rule=rule)
+            shown[rule] = viewer.frame(look, full=True)
+    own, unseen, whole = (frame.images[0, "mended"].astype(int) for frame in shown.values())
+    assert (own == unseen).all()
+    assert np.abs(whole - own).mean() > 5, "all of the ball is filled from about it: black"
+    assert shown["all"].header["confidence"] is None
+    query = f"{ball.url}/frame.jpg?time=0&width=64&height=64&error_rule="
+    unseen, whole = (decoded(get(query + rule)[2]).astype(int) for rule in ("unseen", "all"))
+    assert np.abs(unseen - whole).mean() > 5
 
 
 def test_stereo_is_two_eyes_of_one_time(ball):

@@ -158,6 +158,9 @@ def test_rendering_without_mending_costs_no_filling():
     assert not desk.due().quality.mend
     desk.look(id=2, modes=("rendered", "mended"))
     assert desk.due().quality.mend
+    desk.look(id=3, modes=("confidence",), error_rule="all")
+    request = desk.due()
+    assert request.quality.mend and request.error_rule == "all"
 
 
 @pytest.mark.parametrize("mode", ["mended", "depth"])

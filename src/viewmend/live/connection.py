@@ -26,6 +26,7 @@ from viewmend.live.protocol import (
 )
 from viewmend.live.service import RenderService
 from viewmend.live.sessions import ViewerSession
+from viewmend.rendering.error_rules import ERROR_RULES
 
 HELLO_S = 10.0
 ACK_S = 30.0
@@ -130,6 +131,8 @@ class ViewerConnection:
             "version": VERSION,
             "viewer": next(self._registry.numbers),
             "modes": MODES,
+            "error_rules": tuple(ERROR_RULES),
+            "error_rule": self._service.renderer.error_rule,
             "budget_ms": self._registry.budget_ms,
             "limits": asdict(self._registry.limits),
             **self._registry.about,

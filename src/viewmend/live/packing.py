@@ -4,9 +4,18 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from viewmend.live.pictures import COLOURS, Picture, depth_stride, pack_depth, picture, to_jpeg
+from viewmend.live.pictures import (
+    COLOURS,
+    Picture,
+    depth_stride,
+    mean_confidence,
+    pack_depth,
+    picture,
+    surface_depth,
+    to_jpeg,
+)
 from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import FrameTimes, Look, pack
+from viewmend.live.protocol import MENDED_MODES, FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
 
@@ -53,7 +62,7 @@ def frame_message(
             parts.append(part)
             data.append(encoded)
         if look.depth:
-            depth = completed.view.depth
+            depth = surface_depth(completed) if MENDED_MODES.issuperset(look.modes) else completed.view.depth
             packed = asdict(pack_depth(depth, depth_stride(*depth.shape)))
             data.append(packed.pop("data"))
             parts.append({"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed})
@@ -73,6 +82,7 @@ def frame_message(
         "chosen": list(first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(float(first.holes.sum()) / max(1.0, float((first.mask > 0).sum())), 5),
+        "confidence": mean_confidence(result.completed[0]),
         "top_k": request.quality.top_k,
         "context_times": request.quality.context_times,
         "read_fraction": request.quality.read_fraction,

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.inpainting.sweep.cells import rim_depth
+from viewmend.views import FAINT, CompletedView, IncompleteView
 
 Picture = UInt8[np.ndarray, "height width 3"]
 HOLE = (1.0, 0.15, 0.55)
@@ -24,19 +25,49 @@ COARSEST_STRIDE = 4
 def picture(completed: CompletedView, mode: str) -> Picture:
     """One of the protocol's modes as 8-bit RGB, on black.
 
-    rendered: F. holes: F with E in pink. mended: Fhat. depth: near is bright. coverage: which camera coloured what,
-    missing pixels pink.
+    rendered: F. holes: F with the pixels that no camera colours in pink, by any error rule. mended: Fhat. depth: near
+    is bright. coverage: which camera coloured what, missing pixels pink. confidence: from violet, a guess, to
+    yellow, sure; grey where the inpainter does not tell.
     """
     view = completed.view
     if mode == "mended":
         return _eight_bit(completed.rgb)
+    if mode == "confidence":
+        return _confidence(completed)
     if mode == "depth":
         return _eight_bit(_shade(view.depth).expand(3, -1, -1))
     base = _coverage(view) if mode == "coverage" else view.rgb
     if mode == "rendered":
         return _eight_bit(base)
     pink = torch.tensor(HOLE, device=base.device)[:, None, None]
-    return _eight_bit(torch.lerp(base, pink.expand_as(base), view.error.clamp(0, 1)))
+    return _eight_bit(torch.lerp(base, pink.expand_as(base), view.holes.to(base)))
+
+
+def surface_depth(completed: CompletedView) -> Float[Tensor, "height width"]:
+    """Depth of what the mended picture shows, metres, 0 elsewhere; the proxy's where the inpainter tells none.
+
+    Soft outlines lie on the surface beside them.
+    """
+    if completed.depth is None:
+        return completed.view.depth
+    return torch.where(completed.opacity > FAINT, rim_depth(completed.depth), 0.0)
+
+
+def mean_confidence(completed: CompletedView) -> float | None:
+    """The mean confidence of the subject's pixels; None where the inpainter does not tell."""
+    if completed.confidence is None:
+        return None
+    return round(float((completed.confidence * completed.opacity).sum() / completed.opacity.sum().clamp(min=1)), 4)
+
+
+def _confidence(completed: CompletedView) -> Picture:
+    import cv2
+
+    if completed.confidence is None:
+        return _eight_bit(completed.rgb.mean(0).expand(3, -1, -1))
+    told = (completed.confidence.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    heat = torch.from_numpy(cv2.applyColorMap(told, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy())
+    return _eight_bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
 
 
 def _coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:

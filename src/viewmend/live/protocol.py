@@ -13,10 +13,13 @@ from msgspec.structs import force_setattr
 
 from viewmend.geometry.rigid import is_rotation
 from viewmend.json_input import LARGEST_INTEGER, one_of, read_json, typed
+from viewmend.rendering.error_rules import ERROR_RULES
 from viewmend.timing import StageTimes
 
 VERSION = 1
-MODES = ("rendered", "holes", "mended", "depth", "coverage")
+MODES = ("rendered", "holes", "mended", "depth", "coverage", "confidence")
+MENDED_MODES = frozenset({"mended", "confidence"})
+"""Modes that need the model."""
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
 MAX_PARTS = 512
@@ -39,6 +42,7 @@ FocalLength = Annotated[float, Meta(ge=1, le=1e6)]
 PrincipalPoint = Annotated[float, Meta(ge=-1e5, le=1e5)]
 Side = Annotated[int, Meta(ge=16)]
 Mode = Annotated[str, one_of(*MODES)]
+Rule = Annotated[str, one_of(*ERROR_RULES)]
 TopK = Annotated[int, Meta(ge=1, le=1_000_000)]
 Quality = Annotated[int, Meta(ge=30, le=95)]
 ShortText = Annotated[str, Meta(max_length=40)]
@@ -105,6 +109,8 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     height: Side = 320
     modes: Annotated[tuple[Mode, ...], Meta(min_length=1, max_length=2)] = ("mended",)
     top_k: TopK | None = None
+    error_rule: Rule | None = None
+    """What is mended; None for what the server was started with."""
     scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
     moving: bool = False
     adaptive: bool = True

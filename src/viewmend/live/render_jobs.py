@@ -14,7 +14,7 @@ from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live import protocol
 from viewmend.live.pictures import picture, to_jpeg
 from viewmend.live.poses import view_camera
-from viewmend.live.protocol import Camera, FrameTimes, Limits, ProtocolError, read_message
+from viewmend.live.protocol import MENDED_MODES, Camera, FrameTimes, Limits, ProtocolError, read_message
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.sessions import Playback
 
@@ -29,6 +29,7 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
     height: protocol.Side = 320
     mode: protocol.Mode = "mended"
     top_k: protocol.TopK | None = None
+    error_rule: protocol.Rule | None = None
 
 
 class PictureQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -166,4 +167,5 @@ def _request(asked: ViewOptions, pose: Camera, at: float | int, playback: Playba
     if playback.span.end <= playback.span.first or not playback.has_frame(time):
         return None
     camera = view_camera(pose, playback.rig_frame, (asked.width, asked.height))
-    return RenderRequest(time, (camera,), RenderQuality(mend=asked.mode == "mended", top_k=asked.top_k))
+    quality = RenderQuality(mend=asked.mode in MENDED_MODES, top_k=asked.top_k)
+    return RenderRequest(time, (camera,), quality, asked.error_rule)

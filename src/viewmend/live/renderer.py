@@ -5,7 +5,7 @@ from typing import Any
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter
+from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter, own_error_rule
 from viewmend.live.budget import ladder_for
 from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
@@ -19,11 +19,13 @@ WARM_UP_PX = 64
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """One view to render: of which time, from where (one camera each eye), how well."""
+    """One view to render: of which time, from where (one camera each eye), how well, what of it is mended."""
 
     time: int
     cameras: tuple[Cameras, ...]
     quality: RenderQuality
+    error_rule: str | None = None
+    """None for that of the renderer."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,11 @@ class Renderer:
         self.model_error: str | None = None
         """Why views are shown with their holes, if they are."""
 
+    @property
+    def error_rule(self) -> str:
+        """The rule of views that are asked for without one."""
+        return self._config.render.error_rule or own_error_rule(self._inpainter)
+
     def is_of(self, rig: Rig | None) -> bool:
         """Whether it renders this rig."""
         return rig is not None and rig is self._rig
@@ -109,9 +116,8 @@ class Renderer:
             raise FrameNotReadyError
         self._stream.push(self._read(request.time))
         before = viewer or self._stream.viewer()
-        views = [
-            self._view(self._stream, c.to(self._device), before, request.time, request.quality) for c in request.cameras
-        ]
+        stream = self._stream if request.error_rule is None else self._stream.by_rule(request.error_rule)
+        views = [self._view(stream, c.to(self._device), before, request.time, request.quality) for c in request.cameras]
         completed = tuple(view.completed for view in views)
         return RenderResult(request.time, completed, views[0].viewer, sum((v.times for v in views), StageTimes()))
 

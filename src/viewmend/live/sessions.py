@@ -12,7 +12,7 @@ from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLe
 from viewmend.live.clock import Clock, Span
 from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
-from viewmend.live.protocol import ClockChange, FrameTimes, Look
+from viewmend.live.protocol import MENDED_MODES, ClockChange, FrameTimes, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
 
 STILL_S, FULL_S = 0.25, 0.8
@@ -164,13 +164,13 @@ class ViewerSession:
     def _request(self, look: Look, at: int, rig_frame: RigFrame) -> RenderRequest:
         level = self._level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
-        mend = "mended" in look.modes
+        mend = not MENDED_MODES.isdisjoint(look.modes)
         quality = RenderQuality(
             mend=mend, top_k=top_k, context_times=level.context_times, read_fraction=level.read_fraction
         )
         scale = look.scale * level.scale
         cameras = tuple(view_camera(eye, rig_frame, (look.width, look.height), scale) for eye in look.cameras)
-        return RenderRequest(at, cameras, quality)
+        return RenderRequest(at, cameras, quality, look.error_rule)
 
     def show(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Encode and send a frame, and learn from what it took."""

@@ -79,6 +79,8 @@ def picture(rgb: np.ndarray, z: np.ndarray, points: np.ndarray, mode: str) -> np
         return np.repeat(np.where(seen, np.clip(255 - 50 * z, 30, 255), 0)[..., None], 3, -1).astype(np.uint8)
     if mode == "coverage":
         return np.where(seen[..., None], np.where(points[..., :1] > 0, COLOURS[0], COLOURS[1]), 0).astype(np.uint8)
+    if mode == "confidence":
+        return np.where(seen[..., None], (253, 231, 36), 0).astype(np.uint8)
     fill = {"mended": rgb, "rendered": np.zeros_like(rgb), "holes": np.full_like(rgb, PINK)}[mode]
     return np.where(hole[..., None], fill, rgb).astype(np.uint8)
 

@@ -22,7 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.live.page_files import HEADERS, page_files
 
-MODES = ["rendered", "holes", "mended", "depth", "coverage"]
+MODES = ["rendered", "holes", "mended", "depth", "coverage", "confidence"]
 LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
 
 
@@ -53,6 +53,7 @@ class StandIn:
     source: str = "ready"
     error: str | None = None
     model_error: str | None = None
+    confidence: float | None = 0.9
     hold: bool = False
     """True sends no frames."""
     refuse: int | None = None
@@ -127,6 +128,7 @@ class StandIn:
             self.hellos.append(message)
             codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
             about = {"version": 1, "viewer": 1, "server": "stand-in", "model": "none", "modes": MODES, "codecs": codecs}
+            about |= {"error_rules": ["unseen", "all", "yours"], "error_rule": "all"}
             more = {"export": True, "budget_ms": None, "limits": LIMITS, "token_needed": False}
             await viewer.socket.send_json({"type": "welcome", **about, **more})
             await viewer.socket.send_json(scene.rig())
@@ -194,7 +196,13 @@ class StandIn:
                 data.append(content)
         header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
         header |= {"height": height, "full": part == 1.0, "cameras": cameras, "chosen": scene.CHOSEN, "holes": share}
-        header |= {"top_k": look.get("top_k"), "context_times": 3, "dropped": 0, "colours": scene.COLOURS}
+        header |= {
+            "top_k": look.get("top_k"),
+            "context_times": 3,
+            "dropped": 0,
+            "colours": scene.COLOURS,
+            "confidence": self.confidence,
+        }
         stages = {
             "geometry": 8.0,
             "context": 4.0,

@@ -34,8 +34,11 @@ def test_modes_show_their_pictures(view):
         assert share(seen["Coverage"], tuple(colour)) > 0.01
 
 
+DIGITS = ["rendered", "holes", "mended", None, "depth", "coverage", "confidence"]
+
+
 def test_digits_choose_modes(desktop):
-    for digit, mode in zip("123456", ["rendered", "holes", "mended", None, "depth", "coverage"], strict=True):
+    for digit, mode in zip("1234567", DIGITS, strict=True):
         desktop.page.keyboard.press(digit)
         desktop.settle()
         assert desktop.server.looks[-1]["modes"] == ([mode] if mode else ["rendered", "mended"])
@@ -68,6 +71,30 @@ def test_side_by_side_has_a_divider_that_is_dragged(view):
     split.focus()
     view.page.keyboard.press("ArrowRight")
     view.until(lambda: float(split.get_attribute("aria-valuenow")) == pytest.approx(at + 2, abs=1))
+
+
+def test_the_error_rule_is_one_of_the_servers(view):
+    assert view.server.looks[-1]["error_rule"] == "all", "the one that the server was started with"
+    view.tab("quality")
+    rules = view.page.locator("#error-rule")
+    assert rules.locator("option").all_inner_texts() == ["holes alone", "the whole subject", "yours"]
+    rules.select_option("unseen")
+    view.settle()
+    assert view.server.looks[-1]["error_rule"] == "unseen"
+
+
+def test_a_model_that_tells_no_confidence_is_named(desktop):
+    desktop.page.keyboard.press("7")
+    desktop.settle()
+    assert share(desktop.picture(), (253, 231, 36)) > 0.05 and not desktop.page.locator("#pill").is_visible()
+    desktop.server.confidence = None
+    desktop.page.keyboard.press("r")
+    desktop.page.keyboard.press("3")
+    desktop.settle()
+    assert not desktop.page.locator("#pill").is_visible(), "nobody asked"
+    desktop.page.keyboard.press("7")
+    desktop.settle()
+    assert desktop.page.locator("#pill").inner_text() == "No confidence"
 
 
 def test_quality_and_resolution_sliders(view):

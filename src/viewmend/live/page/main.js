@@ -108,6 +108,7 @@ class Page {
     on(this.link, "welcome", (welcome) => {
       this.limits = welcome.limits;
       this.controls.codecs(welcome.codecs);
+      this.controls.rules(welcome.error_rules, welcome.error_rule);
       this.paths.offer(welcome.export);
       this.wake();
     });
@@ -150,7 +151,7 @@ class Page {
     this.stage.take(shown);
     this.chosen(header.chosen, this.settings.modes.includes("coverage") ? header.colours : undefined);
     this.transport.picture(header.time);
-    this.notices.arrived();
+    this.notices.arrived(this.settings.modes.includes("confidence") && header.confidence === null);
     this.paint();
     const latency = this.statistics.picture(header, shown.bytes);
     Object.assign(this.canvas.dataset, { frame: header.frame, look: header.look, time: header.time, full: header.full });
@@ -186,6 +187,7 @@ class Page {
     return {
       modes: settings.modes,
       top_k: settings.get("topK"),
+      error_rule: settings.get("errorRule") || null,
       adaptive: settings.get("adaptive"),
       depth: settings.get("reproject") || settings.get("rig"),
       codec: settings.get("codec"),

@@ -2,11 +2,12 @@
 
 /**
  * @typedef {object} Choices
- * @property {"rendered" | "holes" | "mended" | "split" | "depth" | "coverage"} mode
+ * @property {"rendered" | "holes" | "mended" | "split" | "depth" | "coverage" | "confidence"} mode
  * @property {string} left mode on the divider's left
  * @property {string} right mode on its right
  * @property {number} divider where it is, 0 to 1 of the free part's width
  * @property {number | null} topK
+ * @property {string} errorRule what is mended; "" for what the server was started with
  * @property {number} side pixels of a square with as many pixels as the picture
  * @property {string} size "" for the page's shape, or "WIDTHxHEIGHT"
  * @property {string} codec
@@ -22,6 +23,7 @@ const DEFAULTS = {
   right: "mended",
   divider: 0.5,
   topK: null,
+  errorRule: "",
   side: 384,
   size: "",
   codec: "jpeg",
@@ -31,7 +33,7 @@ const DEFAULTS = {
   panel: window.innerHeight > 460,
 };
 
-const PICTURES = ["rendered", "holes", "mended", "depth", "coverage"];
+const PICTURES = ["rendered", "holes", "mended", "depth", "coverage", "confidence"];
 /** What a choice may be, where not everything is one. @type {Record<string, (value: string) => boolean>} */
 const SENSIBLE = {
   mode: (value) => value === "split" || PICTURES.includes(value),

@@ -3,6 +3,7 @@
 import { byId, element, radioGroup, setSlider } from "./dom.js";
 
 const TOKENS = [64, 128, 256, 512, 1024, 2048, null];
+const RULES = { unseen: "holes alone", all: "the whole subject", wrong: "what seems wrong" };
 const CODECS = { jpeg: "JPEG", vp9: "VP9 video", h264: "H.264 video" };
 
 /** @typedef {import("../settings.js").Settings} Settings */
@@ -35,12 +36,21 @@ export function buildControls(settings, motion, wake) {
   });
   byId("side").addEventListener("input", () => settings.set("side", Number(byId("side").value)));
   settings.watch(["side"], () => setSlider(byId("side"), settings.get("side")));
+  byId("error-rule").addEventListener("change", () => settings.set("errorRule", byId("error-rule").value));
   byId("codec").addEventListener("change", () => settings.set("codec", byId("codec").value));
   return {
     /** @param {string} mode */
     movement(mode) {
       motion.mode = mode === "fly" ? "fly" : "orbit";
       showMovement(mode);
+    },
+    /** @param {string[]} rules that the server knows @param {string} standard the one it was started with */
+    rules(rules, standard) {
+      const list = byId("error-rule");
+      list.replaceChildren(...rules.map((value) => element("option", { value, textContent: /** @type {any} */ (RULES)[value] ?? value })));
+      if (!rules.includes(settings.get("errorRule"))) settings.set("errorRule", standard);
+      list.value = settings.get("errorRule");
+      list.closest("label").hidden = rules.length < 2;
     },
     /** @param {string[]} codecs that both sides can */
     codecs(codecs) {

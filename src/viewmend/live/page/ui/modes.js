@@ -12,6 +12,7 @@ export const MODES = {
   split: "Side by side",
   depth: "Depth",
   coverage: "Coverage",
+  confidence: "Confidence",
 };
 
 /** @param {Settings} settings */

@@ -13,6 +13,7 @@ export class Notices {
     /** @type {any} */
     this.state = null;
     this.pictured = false;
+    this.untold = false;
     this.waitingSince = 0;
     byId("cover-retry").addEventListener("click", retry);
     setInterval(() => this.show(), 500);
@@ -36,13 +37,13 @@ export class Notices {
     this.waitingSince ||= performance.now();
   }
 
-  /** It is there. */
-  arrived() {
+  /** It is there. @param {boolean} untold whether it ought to show a confidence that the model does not tell */
+  arrived(untold) {
     this.waitingSince = 0;
-    if (!this.pictured) {
-      this.pictured = true;
-      this.show();
-    }
+    if (this.pictured && this.untold === untold) return;
+    this.pictured = true;
+    this.untold = untold;
+    this.show();
   }
 
   /** @param {string} text @param {"plain" | "error"} [kind] */
@@ -90,6 +91,7 @@ export class Notices {
       return { kind: this.pictured ? "warning" : "error", title: "The source fails", text: reason };
     }
     if (this.state.model_error) return { kind: "warning", title: "Shown without mending", text: this.state.model_error };
+    if (this.untold) return { kind: "warning", title: "No confidence", text: "This model does not tell how sure it is; --model views does." };
     if (!this.pictured) return { kind: "wait", title: "Rendering the first view", text: "This takes a moment." };
     const late = this.waitingSince && performance.now() - this.waitingSince > STALLED_MS;
     if (late || this.state.buffering) return { kind: "wait", title: "Waiting for the server", text: "" };

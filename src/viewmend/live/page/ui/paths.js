@@ -125,7 +125,7 @@ export class PathPanel {
     const times = moments.map((seconds) =>
       still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
     );
-    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1] };
+    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null };
   }
 
   async #export() {
