@@ -30,11 +30,11 @@ VIEWERS = (1, 2, 4, 8)
 
 
 @contextlib.contextmanager
-def served(size: tuple[int, int], budget_ms: float | None, device: str):
+def served(size: tuple[int, int], budget_ms: float | None, device: str, model: str):
     """The address of a server whose frames are all made."""
     config = StudioConfig(seed=SEED, cameras=CAMERAS, frames=FRAMES, size_px=size, fps=FPS)
     supply = ReadAhead(lambda: Studio(config), generated=True)
-    renderer = Renderer(supply, load_inpainter("small", device), device=device)
+    renderer = Renderer(supply, load_inpainter(model, device), device=device)
     service, settings = RenderService(renderer, supply), ServerConfig(port=0, budget_ms=budget_ms)
     server = Server(LiveServer(service, settings), settings)
     with server.bound() as url:
@@ -92,6 +92,7 @@ def crowd(url: str, size: tuple[int, int], viewers: int, seconds: float) -> dict
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--model", default="views", help="a shipped model's name, or a folder")
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--budget-ms", type=float, nargs="*", default=[100.0, 0.0], help="0: none")
     parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
@@ -99,20 +100,20 @@ def main() -> None:
     figures: dict[str, object] = {}
     for size in SIZES:
         for budget_ms in options.budget_ms:
-            with served(size, budget_ms or None, options.device) as (url, _):
+            with served(size, budget_ms or None, options.device, options.model) as (url, _):
                 walk(url, size, 3.0, 0.0, [])
                 alone: list[dict[str, object]] = []
                 walk(url, size, options.seconds, 0.0, alone)
                 label = f"{size[0]}x{size[1]}, " + (f"budget {budget_ms:g} ms" if budget_ms else "no budget")
                 figures[label] = alone[0]
                 print(label, json.dumps(figures[label]), flush=True)
-    with served(SIZES[0], None, options.device) as (url, _):
+    with served(SIZES[0], None, options.device, options.model) as (url, _):
         walk(url, SIZES[0], 3.0, 0.0, [])
         for viewers in VIEWERS:
             figures[f"{viewers} viewers"] = crowd(url, SIZES[0], viewers, options.seconds)
             print(viewers, json.dumps(figures[f"{viewers} viewers"]), flush=True)
     if options.write:
-        config = {"seed": SEED, "cameras": CAMERAS, "frames": FRAMES, "fps": FPS, "model": "small"}
+        config = {"seed": SEED, "cameras": CAMERAS, "frames": FRAMES, "fps": FPS, "model": options.model}
         print(write("live", options.device, config, figures))
 
 

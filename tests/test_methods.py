@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from viewmend import cli
+from viewmend import cli, methods
 from viewmend.inpainting.checkpoint import shipped_models
 from viewmend.methods import (
     BASELINES,
@@ -93,3 +93,18 @@ def test_names_that_a_file_does_not_have_are_refused(name, tmp_path):
     (tmp_path / "own.py").write_text(OWN)
     with pytest.raises(ValueError, match=r"check (FILE.py:NAME|the path)"):
         make_method(name.format(tmp_path / "own.py"))
+
+
+@pytest.mark.parametrize(
+    ("shipped", "default"),
+    [
+        (("base", "small", "views"), "views"),
+        (("base", "small"), "small"),
+        (("base",), "base"),
+        (("small",), "small"),
+        ((), "telea"),
+    ],
+)
+def test_the_default_mends_whole_views(monkeypatch, shipped, default):
+    monkeypatch.setattr(methods, "shipped_models", lambda: shipped)
+    assert methods.default_method() == default

@@ -61,7 +61,7 @@ def method_names(selection: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def make_method(name: str, device: str = "cpu", precision: str = "float32") -> ViewInpainter:
+def make_method(name: str, device: str = "cpu", precision: str = "auto") -> ViewInpainter:
     """The inpainter of this name: an entry of `METHODS`, a baseline, FILE.py:NAME, a shipped model, a model's folder.
 
     FILE.py:NAME is what NAME in that file, called with the device, returns.
@@ -104,9 +104,9 @@ def make_method(name: str, device: str = "cpu", precision: str = "float32") -> V
 
 
 def default_method() -> str:
-    """The model that is shipped, `small` among several; where none is, OpenCV's Telea."""
-    shipped = (*shipped_models(), "telea")
-    return "small" if "small" in shipped else shipped[0]
+    """The model that is shipped, of several `views`, which mends whole views; where none is, OpenCV's Telea."""
+    shipped = shipped_models()
+    return next((name for name in ("views", "small", *shipped) if name in shipped), "telea")
 
 
 def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[str, ...], dict[str, str]]:

@@ -158,6 +158,14 @@ class IncompleteView:
     silhouettes: Silhouettes | None = None
     """The masks of these cameras at the view's time: they say more exactly than the proxy whether a pixel shows the
     subject at all. None where the renderer does not say."""
+    fade: Float[Tensor, "height width"] | None = None
+    """How much of a pixel with E > 0 is known to be background, in [0, 1]: it only fades by that, nobody need look. 0
+    where a pixel must be looked at. None where nobody knows."""
+
+    @property
+    def read(self) -> Bool[Tensor, "height width"]:
+        """Pixels that must be looked at: those of E that do not only fade."""
+        return self.error > 0 if self.fade is None else (self.error > 0) & (self.fade == 0)
 
     @property
     def holes(self) -> Bool[Tensor, "height width"]:

@@ -138,9 +138,27 @@ def test_a_perfect_stream_flickers_not_at_all(case, moving):
     assert scores.change == scores.change_truth > 0.1
 
 
+def test_what_changes_where_the_truth_stands_still_is_told(case):
+    completed, truth = case
+    still = torch.zeros(3, HEIGHT, WIDTH)
+    still[:, :, : WIDTH // 2] = 0.5
+    then, now = truth.rgb, truth.rgb + still
+    before = Before(completed.rgb, then, completed.view.holes)
+    other = replace(completed, rgb=completed.rgb + 0.2)
+    assert score_frame(other, replace(truth, rgb=now), before, 1.0).change_still == pytest.approx(0.2, abs=1e-6)
+    moves = replace(completed, rgb=completed.rgb + still)
+    assert score_frame(moves, replace(truth, rgb=now), before, 1.0).change_still == pytest.approx(0, abs=1e-6)
+    assert score_frame(completed, truth, None, 1.0).change_still is None
+
+
 def test_an_error_that_moves_with_the_surface_does_not_flicker_and_one_that_stays_does(case, moving):
     before, now, _ = moving
     assert temporal(case, moving, before + 0.1, now + 0.1).flicker == pytest.approx(0, abs=1e-6)
     assert temporal(case, moving, before, now + 0.1).flicker == pytest.approx(0.1, abs=1e-6)
+    beside = now.clone()
+    beside[:, ~case[0].view.holes] += 0.1  # what is coloured, alone
+    assert temporal(case, moving, before, beside).flicker == pytest.approx(0, abs=1e-6)
+    whole = temporal(case, moving, before, beside).flicker_whole
+    assert 0.08 < whole < 0.1, "over all that shows, holes included"
     stuck = temporal(case, moving, before, before)
     assert stuck.change == 0 and stuck.flicker > 0.1 and stuck.warp_error == pytest.approx(stuck.flicker, abs=1e-6)

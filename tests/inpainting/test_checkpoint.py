@@ -11,7 +11,7 @@ from inpainting.plates import Rig, tiny, view
 from safetensors.torch import load_file, save_file
 
 from viewmend import atomic_writes
-from viewmend.inpainting import checkpoint
+from viewmend.inpainting import checkpoint, network
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.checkpoint import (
     MissingCheckpointError,
@@ -20,6 +20,8 @@ from viewmend.inpainting.checkpoint import (
     save_inpainter,
 )
 from viewmend.inpainting.config import InpainterConfig, paper, small
+from viewmend.inpainting.sweep.config import SweepConfig
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
 from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError
 
@@ -148,7 +150,7 @@ def test_a_model_of_format_1_loads_as_it_was(saved):
 def test_the_precision_is_that_of_every_network(saved):
     net = load_inpainter(saved, precision="bfloat16")
     assert {net.compute_dtype, net.patches.compute_dtype, net.coarse.compute_dtype} == {torch.bfloat16}
-    with pytest.raises(ValueError, match="float32 or bfloat16, got 'float16'"):
+    with pytest.raises(ValueError, match="bfloat16 or auto, got 'float16'"):
         load_inpainter(saved, precision="float16")
 
 
@@ -183,3 +185,26 @@ def test_shipped_models_are_found_by_name(saved, tmp_path, monkeypatch):
 def test_impossible_configs(changes):
     with pytest.raises(ValueError, match="expected"):
         replace(paper(), **changes)
+
+
+@pytest.mark.parametrize(("faster", "dtype"), [(4.0, torch.bfloat16), (1.2, torch.float32), (0.25, torch.float32)])
+def test_bfloat16_is_taken_by_who_was_trained_in_it_where_it_is_clearly_faster(
+    monkeypatch, saved, tmp_path, faster, dtype
+):
+    asked = []
+    monkeypatch.setattr(network, "bfloat16_speedup", lambda device: asked.append(device.type) or faster)
+    assert load_network_dtype(saved, "auto") == torch.float32 and asked == []
+    save_inpainter(SweepNet(SweepConfig(num_views=2, width=8, place_channels=4, features=8)), tmp_path / "whole", "")
+    assert load_network_dtype(tmp_path / "whole", "auto") == dtype and asked == ["cpu"]
+    assert load_network_dtype(tmp_path / "whole", "float32") == torch.float32
+    with pytest.raises(ValueError, match="float32, bfloat16 or auto"):
+        load_inpainter(saved, precision="half")
+
+
+def load_network_dtype(folder, precision):
+    loaded = load_inpainter(folder, precision=precision)
+    return (loaded.inner if isinstance(loaded, TemporalAccumulation) else loaded).compute_dtype
+
+
+def test_the_probe_measures_both():
+    assert 0.02 < network.bfloat16_speedup(torch.device("cpu")) < 50

@@ -13,7 +13,7 @@ from viewmend.inpainting.sweep import _lookup_torch, lookup, pyramids
 from viewmend.inpainting.sweep._lookup_numba import look_up_numba
 from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
-from viewmend.inpainting.sweep.error_net import ErrorMap, most_wrong
+from viewmend.inpainting.sweep.error_net import ErrorMap, faded, most_wrong
 from viewmend.inpainting.sweep.lookup import Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet
 from viewmend.inpainting.sweep.pyramids import Rig, halved, silhouette_pyramids
@@ -200,7 +200,7 @@ def test_it_is_written_and_loads_and_reads_the_same(scene, tmp_path):
     stream, view, rig = scene
     net = stream.inpainter
     save_inpainter(net, tmp_path / "model", "# card")
-    again = load_inpainter(tmp_path / "model")
+    again = load_inpainter(tmp_path / "model", precision="float32")
     assert isinstance(again, SweepNet) and again.config == SMALL
     assert torch.equal(again(view, rig).rgb, net(view, rig).rgb)
     config = tmp_path / "model" / "config.json"
@@ -288,14 +288,43 @@ def test_most_is_gained_first_and_holes_always(scene):
     _, view, _ = scene
     gain = torch.rand(view.mask.shape, generator=torch.Generator().manual_seed(0)) * (rim_depth(view.depth) > 0)
     hull, holes = int((view.mask > 0).sum()), view.holes
-    error = most_wrong(view, ErrorMap(gain, gain), 0.3)
+    error = most_wrong(view, gain, 0.3)
     chosen = error > 0
     assert int(holes.sum()) < 0.3 * hull and int(chosen.sum()) == int(0.3 * hull)
     assert bool(chosen[holes].all()) and float(gain[chosen & ~holes].min()) >= float(gain[~chosen].max())
     assert set(error.unique().tolist()) == {0.0, 1.0}
-    assert torch.equal(most_wrong(view, ErrorMap(gain, gain), 1e-6) > 0, holes), "though that is more"
-    nothing = most_wrong(view, ErrorMap(gain, 1e-5 * gain), 0.3) > 0
+    assert torch.equal(most_wrong(view, gain, 1e-6) > 0, holes), "though that is more"
+    nothing = most_wrong(view, 1e-5 * gain, 0.3) > 0
     assert torch.equal(nothing, holes), "what hardly changes is left"
+
+
+def test_what_is_background_fades_and_is_not_read(scene, teller):
+    """E is 1 where a view is read, and elsewhere how much of the colour goes; nothing else changes."""
+    stream, view, _ = scene
+    random = torch.Generator().manual_seed(0)
+    rest, alpha = (torch.rand(view.mask.shape, generator=random) for _ in range(2))
+    rest, alpha = rest * (rim_depth(view.depth) > 0), torch.where(alpha < 0.3, 1.0, alpha)
+    part = faded(view, ErrorMap(rest, rest, alpha, rest), 0.3)
+    hull = view.mask > 0
+    assert torch.equal(part.read, most_wrong(view, rest, 0.3) > 0) and bool((part.error[part.read] == 1).all())
+    left = hull & ~part.read
+    assert torch.equal(part.error[left], torch.where(alpha < 0.98, 1 - alpha, 0.0)[left])
+    assert not bool(part.error[~hull & ~part.read].any())
+    mended = stream.mend(part).completed
+    assert torch.equal(mended.rgb[:, left & (alpha == 1)], view.rgb[:, left & (alpha == 1)])
+    torch.testing.assert_close(mended.rgb[:, left], ((1 - part.error) * view.rgb)[:, left])
+    torch.testing.assert_close(mended.alpha[left], 1 - part.error[left])
+    alone = stream.mend(replace(view, error=part.read.float())).completed
+    assert torch.equal(mended.rgb[:, part.read], alone.rgb[:, part.read])
+    assert float((mended.rgb - view.rgb)[:, part.read].abs().mean()) > 0.01
+    nothing = replace(view, error=part.fade, fade=part.fade)
+    dark, _ = stream.inpainter.step(nothing, ContextProvider(lambda *_: None), State())
+    torch.testing.assert_close(dark.rgb, (1 - part.fade) * view.rgb)
+    half = faded(replace(view, error=0.5 * view.error), ErrorMap(rest, rest, 0 * alpha, rest), 0.3)
+    assert float(half.error.max()) == 0.5, "never more than was asked"
+    whole, crop = Crop(16, 16, 80, 83), view.camera
+    around = whole.uncropped(whole.of_view(part), crop)
+    assert torch.equal(around.fade[16:, 16:80], part.fade[16:, 16:80]) and not bool(around.fade[:16].any())
 
 
 def test_the_rule_wrong_asks_the_inpainter_or_the_shipped_model(scene, teller):
@@ -306,12 +335,13 @@ def test_the_rule_wrong_asks_the_inpainter_or_the_shipped_model(scene, teller):
     own = Stream(teller, config)
     own.push(frame, stream.observation().proxy)
     narrowed = own.render(view.camera)
-    chosen = narrowed.error > 0
+    chosen = narrowed.read
     hull = int((view.mask > 0).sum())
     assert bool(chosen[view.holes].all()) and not bool(chosen[view.error == 0].any())
     assert int(view.holes.sum()) < int(chosen.sum()) <= int(0.5 * hull)
     mended = own.view(view.camera).completed
-    assert torch.equal(mended.rgb[:, ~chosen], view.rgb[:, ~chosen])
+    same = mended.view.error == 0
+    assert torch.equal(mended.rgb[:, same], view.rgb[:, same])
     with pytest.raises(ValueError, match="a model that predicts errors"):
         silent = Stream(SweepNet(SMALL), config)
         silent.push(frame, stream.observation().proxy)
@@ -380,7 +410,7 @@ def test_a_quality_may_allow_only_a_part(scene, teller):
         return [own.view(view.camera, quality=quality), own.mend(view, quality=quality)]
 
     for rule, allowed, most in [("all", 0.4, 0.4), ("wrong", 0.4, 0.4), ("wrong", 0.9, 0.5)]:
-        seen, given = (int((one.completed.view.error > 0).sum()) for one in mended_px(rule, allowed))
+        seen, given = (int(one.completed.view.read.sum()) for one in mended_px(rule, allowed))
         assert holes < seen <= most * hull < 1.1 * seen
         assert given <= allowed * hull < 1.1 * given, "what other renderers ask for is narrowed, too"
     assert int((mended_px("unseen", 0.4)[0].completed.view.error > 0).sum()) == holes

@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.training import loop
-from viewmend.training.loop import Run, train
+from viewmend.training.loop import Run, averaging, train
 from viewmend.training.plan import DataPlan, LossWeights, WholeViewRecipe
 from viewmend.training.processes import processes
 from viewmend.training.recipes import RECIPES, small, small_rays
@@ -124,8 +124,22 @@ def test_averages_follow_slowly(tiny, tmp_path):
         run = Run(replace(tiny, ema=0.9, learning_rate=0.01), tmp_path, None, own)
         seen = [[weight.detach().clone() for weight in run.model.parameters()] for _ in islice(run.steps(), 2)]
         for average, first, second in zip(run.averaged.parameters(), *seen, strict=True):
-            assert torch.allclose(average, 0.9 * first + 0.1 * second, atol=1e-6)
+            assert torch.allclose(average, 2 / 11 * first + 9 / 11 * second, atol=1e-6), "at first faster"
         assert any(float((a - b).abs().max()) > 1e-3 for a, b in zip(*seen, strict=True))
+
+
+def test_averages_forget_the_beginning_and_then_follow_slowly():
+    average, following = torch.tensor([100.0]), averaging(0.998)
+    for count in range(1, 400):
+        following([average], [torch.tensor([float(count % 2)])], count)
+    assert 0.4 < float(average) < 0.6, "a hundred is forgotten"
+    late = torch.tensor([0.0])
+    following([late], [torch.tensor([1.0])], 10**6)
+    assert float(late) == pytest.approx(0.002, rel=1e-3)
+    for decay in (0.0, 0.05):
+        now = torch.tensor([0.0])
+        averaging(decay)([now], [torch.tensor([1.0])], torch.tensor(1))
+        assert float(now) == pytest.approx(1 - decay)
 
 
 def test_gradients_are_clipped(tiny, tmp_path):

@@ -173,7 +173,7 @@ def test_each_term_alone_can_be_learned(whole, term):
     net = SweepNet(MODEL)
     objective, rate = WholeViewObjective(net, weights), torch.optim.Adam(net.parameters(), 3e-3)
     losses = []
-    for _ in range(12):
+    for _ in range(24):
         torch.manual_seed(5)
         rate.zero_grad()
         loss = objective([whole]).total

@@ -62,7 +62,7 @@ class RunOptions:
     """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Literal["float32", "bfloat16", "auto"] = "float32"
     """Numbers that our networks compute with."""
     shown: int = 12
     """How many scenes of each set the report's page shows in pictures; sheets/ has them all."""

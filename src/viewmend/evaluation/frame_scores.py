@@ -48,6 +48,10 @@ class Scores:
     """Overlap of alpha above one half, or of M where the method tells no alpha, with the true mask."""
     flicker: float | None
     """The error's change from the frame before along the surface's true motion, over holes; 0 for the truth."""
+    flicker_whole: float | None
+    """The same over all of the subject and the proxy: compare with the method `unfilled`, which shows the rendering."""
+    change_still: float | None
+    """The change from the frame before, in place, where the truth hardly changes (`STILL`): for captures."""
     warp_error: float | None
     """The view's own change from the frame before along the true motion, over holes (`warp_error`)."""
     warp_error_truth: float | None
@@ -175,16 +179,22 @@ def _temporal(completed: CompletedView, truth: TrueView, before: Before | None) 
     holes = completed.view.holes
     now_or_then = holes | before.holes
     now, then, true_now, true_then = completed.rgb, before.completed, truth.rgb, before.truth
+    shown = (completed.view.mask > 0) | truth.mask
+    still = shown & ((true_now - true_then).abs().amax(0) < STILL)
+    found["change_still"] = change(now, then, still, ENOUGH_HOLE_PX)
     found["change"] = change(now, then, now_or_then, ENOUGH_HOLE_PX)
     found["change_truth"] = change(true_now, true_then, now_or_then, ENOUGH_HOLE_PX)
     if (moved := truth.backward_flow_px) is not None:
+        found["flicker_whole"] = warp_error(now - true_now, then - true_then, moved, shown)
         found["flicker"] = warp_error(now - true_now, then - true_then, moved, holes, ENOUGH_HOLE_PX)
         found["warp_error"] = warp_error(now, then, moved, holes, ENOUGH_HOLE_PX)
         found["warp_error_truth"] = warp_error(true_now, true_then, moved, holes, ENOUGH_HOLE_PX)
     return found
 
 
-TEMPORAL = ("flicker", "warp_error", "warp_error_truth", "change", "change_truth")
+STILL = 0.02
+"""The truth hardly changes where no channel does by more, in [0, 1]."""
+TEMPORAL = ("flicker", "flicker_whole", "change_still", "warp_error", "warp_error_truth", "change", "change_truth")
 
 
 def similarity(

@@ -160,7 +160,7 @@ class MendSummary:
         self.frames += 1
         self._hull_px += int((view.mask > 0.5).sum())
         self._holes_px += int(view.holes.sum())
-        self._mended_px += int(((view.mask > 0.5) & (view.error > 0)).sum())
+        self._mended_px += int(((view.mask > 0.5) & view.read).sum())
         if step.scores is not None:
             self._scores.append(step.scores)
         for name, iou in step.hull_iou.items():

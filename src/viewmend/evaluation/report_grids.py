@@ -18,6 +18,8 @@ COLUMNS = (
     ("subject, dB", "psnr_subject", 1, 2),
     ("alpha IoU", "alpha_iou", 1, 4),
     ("flicker", "flicker", 255, 2),
+    ("flicker whole", "flicker_whole", 255, 2),
+    ("still", "change_still", 255, 2),
     ("warp", "warp_error", 255, 2),
     ("change", "change", 255, 2),
 )

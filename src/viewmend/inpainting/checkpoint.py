@@ -8,7 +8,7 @@ import torch
 from viewmend.atomic_writes import write_atomically, write_tensors
 from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.config import InpainterConfig
-from viewmend.inpainting.network import set_compute_dtype
+from viewmend.inpainting.network import auto_dtype, set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
@@ -36,14 +36,15 @@ def shipped_models() -> tuple[str, ...]:
 
 
 def load_inpainter(
-    name_or_path: str | Path, device: torch.device | str = "cpu", precision: str = "float32"
+    name_or_path: str | Path, device: torch.device | str = "cpu", precision: str = "auto"
 ) -> Mender | TemporalAccumulation:
     """The inpainter in this folder, or the shipped one of this name, ready for `Stream`.
 
     Args:
         name_or_path: a name of `shipped_models()`, or a folder that `save_inpainter` wrote.
         device: where it computes.
-        precision: what its layers compute in: float32, or bfloat16 by autocast.
+        precision: what its layers compute in: float32, or bfloat16 by autocast; auto is bfloat16 for models that were
+            trained in it, where this machine is clearly faster in it.
 
     Raises:
         MissingCheckpointError: there is no such folder or name, or a file of it is missing.
@@ -56,10 +57,10 @@ def load_inpainter(
         >>> isinstance(load_inpainter("small"), ViewInpainter)
         True
     """
-    if precision not in PRECISIONS:
-        raise ValueError(f"expected --precision float32 or bfloat16, got '{precision}'")
+    if precision not in (*PRECISIONS, "auto"):
+        raise ValueError(f"expected --precision float32, bfloat16 or auto, got '{precision}'")
     network = load_network(name_or_path, device)
-    set_compute_dtype(network, PRECISIONS[precision])
+    set_compute_dtype(network, auto_dtype(network) if precision == "auto" else PRECISIONS[precision])
     weight = 0.0 if isinstance(network, SweepNet) else network.config.temporal_accumulation
     return TemporalAccumulation(network, weight) if weight else network
 

@@ -37,12 +37,12 @@ class Crop:
 
     def of_view(self, view: IncompleteView) -> IncompleteView:
         """This part of a view."""
-        parts = {name: self.of_image(getattr(view, name)).contiguous() for name in _IMAGES}
+        parts = {name: self.of_image(image).contiguous() for name, image in _images(view).items()}
         return replace(view, camera=self.of_camera(view.camera), **parts)
 
     def uncropped(self, part: IncompleteView, camera: Cameras) -> IncompleteView:
         """The whole view of `camera` again: black, and without subject, around this part."""
-        whole = {name: self._padded(getattr(part, name), camera) for name in _IMAGES}
+        whole = {name: self._padded(image, camera) for name, image in _images(part).items()}
         return replace(part, camera=camera, **whole)
 
     def uncropped_completed(self, part: CompletedView, camera: Cameras) -> CompletedView:
@@ -65,8 +65,10 @@ class Crop:
         return F.pad(image, (self.left, width - self.right, self.top, height - self.bottom))
 
 
-_IMAGES = ("rgb", "mask", "error", "depth", "weights")
-"""The fields of a view that are images."""
+def _images(view: IncompleteView) -> dict[str, Tensor]:
+    """The fields of a view that are images, as far as it has them."""
+    fields = ("rgb", "mask", "error", "depth", "weights", "fade")
+    return {name: image for name in fields if (image := getattr(view, name)) is not None}
 
 
 def mesh_crop(

@@ -1,14 +1,14 @@
 """The training loop: batches, steps, averaged weights, logs, checkpoints."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel as Ddp
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 
 from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.checkpoint import save_inpainter
@@ -95,7 +95,7 @@ class Run:
         self.recipe, self.out, self.own = recipe, out, own
         self.model = self._make_model(start).to(own.device)
         self.objective = self._make_objective(start).to(own.device)
-        self.average = AveragedModel(self.model, multi_avg_fn=get_ema_multi_avg_fn(recipe.ema))
+        self.average = AveragedModel(self.model, multi_avg_fn=averaging(recipe.ema))
         self.learned = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = self._make_optimizer()
         self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own) if recipe.loss.adversarial else None
@@ -264,6 +264,18 @@ def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | Pa
         parameter.requires_grad_(recipe.part == "all" or name.startswith("coarse.") == (recipe.part == "rays"))
     set_compute_dtype(model, torch.bfloat16 if recipe.bfloat16 else torch.float32)
     return model
+
+
+def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
+    """Moves averages towards weights by 1 - decay; at first faster, to forget what training began with."""
+
+    @torch.no_grad()
+    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], count: Tensor | int) -> None:
+        kept = min(decay, (1 + int(count)) / (10 + int(count)))
+        for average, weight in zip(averages, weights, strict=True):
+            average.lerp_(weight, 1 - kept)
+
+    return update
 
 
 def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tensor]:

@@ -69,10 +69,12 @@ class WholeViewObjective(nn.Module):
             return off.new_zeros(())
         at = tuple(reading.pixels.T)
         found = self.model.errors(window.view, window.rig, window.scale)
-        rendered = window.view.rgb[:, *at].T
-        wrong = ((rendered - (reading.rgb.detach() - off.detach())).abs().amax(1) > SURE).float()
-        gain = (rendered - reading.rgb.detach()).square().mean(1)
-        return _entropy(found.wrong[at], wrong) + GAIN * _entropy(found.gain[at], gain)
+        rendered, read = window.view.rgb[:, *at].T, reading.rgb.detach()
+        wrong = ((rendered - (read - off.detach())).abs().amax(1) > SURE).float()
+        alpha = found.alpha[at]
+        gain, rest = ((k * rendered - read).square().mean(1) for k in (1.0, alpha.detach()[:, None]))
+        gains = _entropy(found.gain[at], gain) + _entropy(found.rest[at], rest)
+        return _entropy(found.wrong[at], wrong) + _entropy(alpha, reading.alpha.detach()) + GAIN * gains
 
     def _cell_terms(self, window: WholeView, reading: Reading) -> Float[Tensor, ""]:
         """What cells are taught: mean colour, the surface's place, and who sees it."""

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from viewmend.inpainting.checkpoint import save_inpainter
-from viewmend.inpainting.sweep.cells import scattered
-from viewmend.inpainting.sweep.error_net import most_wrong
+from viewmend.inpainting.sweep.cells import rim_depth, scattered
+from viewmend.inpainting.sweep.error_net import faded
 from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.loop import Run, fitting_weights
@@ -88,8 +88,9 @@ class WholeViewValidation:
             subject, holes = own.alpha > 127, (view.mask > 0) & (view.weights.sum(0) == 0)
             ways = [(view.rgb, None), (rgb, None), (rgb, subject), (rgb, holes)]
             if model.errors is not None:
-                error = most_wrong(view, model.errors(view, own.rig, own.scale), WRONG_FRACTION)
-                ways.append((torch.where(error > 0, rgb, view.rgb), None))
+                around = (rim_depth(view.depth) > 0).to(view.error)
+                part = faded(replace(view, error=around), model.errors(view, own.rig, own.scale), WRONG_FRACTION)
+                ways.append((torch.where(part.read, rgb, (1 - part.error) * view.rgb), None))
             scores.append([_psnr(image, truth, where) for image, where in ways])
             shown.append(torch.cat([view.rgb, rgb, truth], 2))
         write_picture(shown[:SHOWN], self.folder / f"validation-{step:06d}.png")

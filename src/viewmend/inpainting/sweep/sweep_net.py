@@ -75,6 +75,7 @@ class SweepNet(Network):
     """Reads the pixels of the proxy that must be mended, and tells their alpha, confidence and depth."""
 
     config: SweepConfig  # pyright: ignore
+    trained_in_bfloat16 = True
     error_rule = "all"
     """What it is made for: it keeps by itself what is right."""
 
@@ -160,12 +161,14 @@ class SweepNet(Network):
 
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        """The view with all of E read, on the proxy and its rim; a view without E comes back at once."""
-        read = (view.error > 0) & (rim_depth(view.depth) > 0)
+        """The view with all of E read, on the proxy and its rim, or faded; a view without E comes back at once."""
+        read = view.read & (rim_depth(view.depth) > 0)
+        fades = torch.zeros_like(read) if view.fade is None else view.fade > 0
         names = view.closest_views(self.config.num_views)
         seen = context(view.time, names) if names and bool(read.any()) else None
         if seen is None:
-            return CompletedView(view, view.rgb), state
+            rgb = view.rgb if view.fade is None else blend(view.rgb, view.error, 0 * view.rgb, fades.to(view.rgb))
+            return CompletedView(view, rgb), state
         guess = self.coarse_guess(view, seen, quick=context.quality.read_fraction is not None)
         found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read, guess=guess), view.error
         rgb, alpha, confidence, depth = (
@@ -174,8 +177,8 @@ class SweepNet(Network):
         )
         return CompletedView(
             view,
-            blend(view.rgb, E, rgb, read.to(E)),
-            torch.where(read, E * alpha[0] + (1 - E) * view.mask, view.mask),
+            blend(view.rgb, E, rgb, (read | fades).to(E)),
+            torch.where(read | fades, E * alpha[0] + (1 - E) * view.mask, view.mask),
             torch.where(read, E * confidence[0] + (1 - E), view.mask),
             torch.where(read, depth[0] * (alpha[0] > 0.5), view.depth),
         ), state
