@@ -19,6 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from inpainting.plates import tiny
 from reference.ball import BallCapture, ring
+from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
 from studio.tiny_performer import write_character, write_motion
 
 from viewmend.capture.camera_path import read_path
@@ -164,6 +165,44 @@ def test_cameras_json(capture):
         fuzz()
     finally:
         file.write_bytes(good)
+
+
+@pytest.mark.parametrize("kind", ["transforms", "colmap text", "colmap binary", "easymocap"])
+def test_calibrations_of_others(kind, tmp_path):
+    cameras = []
+    for name in ("a", "b"):
+        (tmp_path / "images" / name).mkdir(parents=True)
+        cv2.imwrite(str(tmp_path / "images" / name / "0.png"), np.zeros((20, 30, 3), np.uint8))
+        camera = {"name": name, "width": 30, "height": 20, "K": np.diag([40.0, 40.0, 1.0]), "dist": np.zeros(5)}
+        camera |= {"R": np.eye(3), "t": np.zeros(3), "image": f"images/{name}/0.png", "mask": None}
+        cameras.append(camera)
+    if kind == "transforms":
+        write_transforms(tmp_path, cameras)
+    elif kind == "easymocap":
+        write_easymocap(tmp_path, cameras)
+    else:
+        write_colmap(tmp_path, cameras, binary=kind == "colmap binary")
+    places = (tmp_path / "sparse" / "0", tmp_path)
+    files = sorted(path for place in places for path in place.glob("*.*") if path.is_file())
+    assert files and len(open_capture(tmp_path).cameras) == 2
+
+    def fuzz_file(file):
+        good = file.read_bytes()
+        others = changed(json.loads(good)).map(text_of) if kind == "transforms" else spoilt(good)
+        if kind in ("colmap text", "easymocap"):
+            others |= reworded(good.decode())
+
+        @FUZZED
+        @given(others | spoilt(good))
+        def fuzz(data):
+            file.write_bytes(data)
+            held(lambda: open_capture(tmp_path))
+
+        fuzz()
+        file.write_bytes(good)
+
+    for file in files:
+        fuzz_file(file)
 
 
 def test_camera_paths(capture, tmp_path):

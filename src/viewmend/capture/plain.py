@@ -13,7 +13,8 @@ from torch import Tensor
 
 from viewmend.capture.camera_reader import CameraImages, CameraReader
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.plain_format import CALIBRATION, PlainCamera, read_calibration, stays_inside
+from viewmend.capture.formats.recognition import read_any_calibration
+from viewmend.capture.plain_format import CALIBRATION, PlainCamera, stays_inside
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
@@ -21,8 +22,10 @@ from viewmend.geometry.rigid import rigid
 from viewmend.views import MultiViewFrame
 
 
-def open_capture(path: Path | str, cameras: Sequence[str] | None = None) -> "PlainCapture":
-    """Open a plain capture: the folder, or its `cameras.json`; `cameras` are the names to use (default: all).
+def open_capture(path: Path | str, cameras: Sequence[str] | None = None, kind: str | None = None) -> "PlainCapture":
+    """Open a capture: a folder of any format that is read (docs/formats.md), or a plain one's `cameras.json`.
+
+    `cameras` are the names to use (default: all). `kind` names the format where the folder could be of several.
 
     Raises:
         CaptureError: the calibration is wrong, files are missing, or a name is unknown (see `PlainCapture`).
@@ -42,7 +45,7 @@ def open_capture(path: Path | str, cameras: Sequence[str] | None = None) -> "Pla
         torch.Size([4, 3, 64, 64])
     """
     path = Path(path)
-    return PlainCapture(path.parent if path.name == CALIBRATION and path.is_file() else path, cameras)
+    return PlainCapture(path.parent if path.name == CALIBRATION and path.is_file() else path, cameras, kind)
 
 
 class PlainCapture:
@@ -56,10 +59,10 @@ class PlainCapture:
             there for some of the cameras only; a file lies outside the folder; `cameras` names one that is not there.
     """
 
-    def __init__(self, folder: Path, cameras: Sequence[str] | None = None):
+    def __init__(self, folder: Path, cameras: Sequence[str] | None = None, kind: str | None = None):
         self.folder = folder
-        calibration = read_calibration(folder)
-        self._file = folder / CALIBRATION
+        calibration = read_any_calibration(folder, kind)
+        self._file = calibration.file
         self._plain = _select(calibration.cameras, cameras, self._file)
         self._calibration = calibration
         self.has_masks = self._all_or_none("mask")

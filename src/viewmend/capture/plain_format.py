@@ -1,6 +1,7 @@
 """A plain capture's `cameras.json`, format "plain-capture/1": parsed strictly, in this project's conventions."""
 
 import difflib
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -129,6 +130,8 @@ class PlainCalibration:
     fps: float | None
     bounds_m: Float64[np.ndarray, "2 3"] | None
     metres_per_unit: float
+    file: Path
+    """Where it was read."""
 
 
 def read_calibration(folder: Path) -> PlainCalibration:
@@ -145,9 +148,18 @@ def read_calibration(folder: Path) -> PlainCalibration:
         there = "the folder has none" if folder.is_dir() else "there is no such folder"
         raise CaptureError(f"expected a capture folder with {path}, but {there}; check the path")
     try:
-        file = _parsed(path.read_bytes())
+        return calibration_of(_spelt(path.read_bytes()), path)
     except ValueError as error:
         raise CaptureError(f"{path}: {error}") from None
+
+
+def calibration_of(content: dict[str, Any], path: Path) -> PlainCalibration:
+    """The calibration that this content of a `cameras.json` means; `path` is where it was read.
+
+    Raises:
+        ValueError: a key is absent, or a value cannot be right.
+    """
+    file = typed({"format": FORMAT, **read_json(json.dumps(content))}, CalibrationFile)
     shift_px = 0.5 - np.array(file.first_pixel_center)
     up = None if file.up is None else np.array(file.up)
     return PlainCalibration(
@@ -157,10 +169,11 @@ def read_calibration(folder: Path) -> PlainCalibration:
         fps=file.fps,
         bounds_m=None if file.bounds is None else np.array(file.bounds) * file.metres_per_unit,
         metres_per_unit=file.metres_per_unit,
+        file=path,
     )
 
 
-def _parsed(text: bytes) -> CalibrationFile:
+def _spelt(text: bytes) -> dict[str, Any]:
     content = typed(read_json(text), dict[str, Any], "see docs/plain-capture.md")
     version = content.get("format")
     if version != FORMAT:
@@ -170,7 +183,7 @@ def _parsed(text: bytes) -> CalibrationFile:
     for entry in content["cameras"] if isinstance(content.get("cameras"), list) else ():
         if isinstance(entry, dict):
             _check_spelling(entry, CameraEntry.__struct_fields__)
-    return typed(content, CalibrationFile)
+    return content
 
 
 def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:

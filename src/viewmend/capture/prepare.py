@@ -172,7 +172,14 @@ def reduced(frame: MultiViewFrame, longest_px: int | None) -> MultiViewFrame:
     Images and masks are filtered (bilinear, antialiased). A frame that is small enough comes back itself; another one
     loses its depth, which has no mean.
     """
-    cameras = _reduced_cameras(frame.cameras, longest_px)
+    return resized_frame(frame, _reduced_cameras(frame.cameras, longest_px))
+
+
+def resized_frame(frame: MultiViewFrame, cameras: Cameras) -> MultiViewFrame:
+    """The frame with images of the sizes of `cameras`, which are its own cameras resized; without depth.
+
+    Where `cameras` are the very ones of the frame, it comes back itself.
+    """
     if cameras is frame.cameras:
         return frame
     layers = frame.rgb if frame.mask is None else torch.cat([frame.rgb, frame.mask[:, None]], 1)

@@ -45,6 +45,7 @@ COMMANDS = (
     Command("evaluate parity", "viewmend.cli.parity", "Compare our baselines with the published networks."),
     Command("evaluate paper-table", "viewmend.cli.paper_table", "The paper's tables on your data, beside its figures."),
     Command("weights", "viewmend.cli.weights", "List and check weights of others' networks."),
+    Command("convert", "viewmend.cli.convert", "Write a capture of any format as a plain one."),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 

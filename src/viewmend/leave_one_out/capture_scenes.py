@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from viewmend.capture.plain_format import read_calibration
+from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.prepare import open_masked, prepare
 from viewmend.geometry.cameras import Cameras
 from viewmend.leave_one_out.scenes import LeaveOneOutScene, SceneFrame, without_held
@@ -98,7 +98,7 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
 def _fingerprint(folder: Path) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
     folder = folder if folder.is_dir() else folder.parent
-    plain = read_calibration(folder)
+    plain = read_any_calibration(folder)
     named = {c.file(stream, frame) for c in plain.cameras for stream in c.streams for frame in plain.frames}
     stats = [(name, (folder / name).stat()) for name in sorted(named) if (folder / name).is_file()]
     listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]

@@ -1,0 +1,52 @@
+"""`viewmend convert`: a capture of any format that is read, as a plain one."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Write a capture of any format that is read as a plain one: undistorted images, masks, cameras.json."""
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
+    """The capture's folder."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder for the plain capture; it must not be in use."""
+    kind: Literal["plain", "transforms", "colmap", "easymocap"] | None = None
+    """The source's format; by default it is recognised."""
+    frames: str | None = None
+    """Which frames, as FIRST:END by index; either may be left out."""
+    scale: float = 1.0
+    """Scale of the images' sides, above 0 and at most 1; below 1 depth is left out."""
+    cameras: tuple[str, ...] = ()
+    """Names of the cameras to keep; by default all."""
+    images: Literal["jpeg", "png"] = "png"
+    """Image files: exact, or smaller."""
+
+
+def run(options: Options) -> int:
+    """Run the command; the exit code."""
+    from viewmend.capture.part import CapturePart
+    from viewmend.capture.plain import open_capture
+    from viewmend.capture.plain_writer import write_capture
+    from viewmend.cli.console import say, track
+
+    if not 0 < options.scale <= 1:
+        raise ValueError(f"expected --scale above 0 and at most 1, got {options.scale}; choose again")
+    capture = open_capture(options.source, options.cameras or None, options.kind)
+    part = CapturePart(capture, _times(options.frames, len(capture.frame_ids)), options.scale)
+    write_capture(part, options.out, images=options.images, progress=lambda times: track(times, options.out.name))
+    say(f"{options.out}: {len(part.cameras)} cameras, {len(part.frame_ids)} frames")
+    return 0
+
+
+def _times(text: str | None, count: int) -> range:
+    parts = re.fullmatch(r"(\d{0,9}):(\d{0,9})", text or ":")
+    times = range(count)[int(parts[1] or 0) : int(parts[2] or count)] if parts else range(0)
+    if not times:
+        raise ValueError(f"expected --frames as FIRST:END within 0:{count}, got '{text}'; choose again")
+    return times
