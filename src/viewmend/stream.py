@@ -167,7 +167,8 @@ class Stream:
         Raises:
             ValueError: that time is not at hand, its geometry is not a `GeometryProxy`, or no camera is left.
         """
-        part, crop = self._render(target, time, exclude, self._read_fraction(RenderQuality()))
+        part, crop = self._render(target, time, exclude)
+        part = self._narrowed(part, self._read_fraction(RenderQuality()), exclude)
         return part if crop is None else crop.uncropped(part, target)
 
     def mend(
@@ -224,12 +225,11 @@ class Stream:
         quality = quality or RenderQuality()
         margin_px = crop_margin_px(self.inpainter, quality)
         start = now_s(target.K.device)
-        fraction = self._read_fraction(quality) if quality.mend else None
-        part, crop = self._render(target, time, exclude, fraction, margin_px)
+        part, crop = self._render(target, time, exclude, margin_px)
         if crop is not None and margin_px is None and quality.mend:
             part, crop = crop.uncropped(part, target), None
         rendering_ms = ms_since(start, target.K.device)
-        mended = self._fill(part, viewer, quality, exclude)
+        mended = self._fill(part, viewer, quality, exclude, self._read_fraction(quality))
         completed = mended.completed if crop is None else crop.uncropped_completed(mended.completed, target)
         return replace(mended, completed=completed, times=replace(mended.times, rendering=rendering_ms))
 
@@ -244,12 +244,7 @@ class Stream:
         return view if fraction is None else narrowed(view, self.inpainter, context, fraction)
 
     def _render(
-        self,
-        target: Cameras,
-        time: int | None,
-        exclude: Sequence[str],
-        fraction: float | None,
-        margin_px: int | None = None,
+        self, target: Cameras, time: int | None, exclude: Sequence[str], margin_px: int | None = None
     ) -> tuple[IncompleteView, Crop | None]:
         """The part of the view that shows the subject, or that can be filled on its own with a margin; and which."""
         observation = self.observation(time)
@@ -261,18 +256,23 @@ class Stream:
         crop = mesh_crop(proxy.mesh.vertices, target, *room)
         camera = target if crop is None else crop.of_camera(target)
         config, depth = replace(self.config.render, error_rule=self.error_rule), observation.depth
-        view = render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth)
-        return self._narrowed(view, fraction, exclude), crop
+        return render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth), crop
 
     def _fill(
-        self, view: IncompleteView, viewer: State | None, quality: RenderQuality, exclude: Sequence[str]
+        self,
+        view: IncompleteView,
+        viewer: State | None,
+        quality: RenderQuality,
+        exclude: Sequence[str],
+        fraction: float | None = None,
     ) -> StreamView:
-        """A view, or the part of one that matters, completed."""
+        """A view, or the part of one that matters, completed; at most this fraction of it is read."""
         now, viewer = self.observation(view.time), viewer or self.viewer()
         completed = CompletedView(view, view.rgb)
         context = ContextProvider(self._context, quality, exclude, self._memory)
         start = now_s(view.rgb.device)
         if quality.mend:
+            view = self._narrowed(view, fraction, exclude)
             completed, viewer = self.inpainter.step(view, context, viewer)
         inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms if quality.mend else 0.0
         self._observations.move_to_end(view.time)

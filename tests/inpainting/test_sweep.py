@@ -1,5 +1,6 @@
 """The reader of whole views: lookups equal their slow twins, reading touches E alone, and depends on nothing else."""
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -416,3 +417,14 @@ def test_a_quality_may_allow_only_a_part(scene, teller):
     assert int((mended_px("unseen", 0.4)[0].completed.view.error > 0).sum()) == holes
     untouched = mended_px("all", 0.4, mend=False)[0].completed.view
     assert torch.equal(untouched.error, view.error), "nobody was to look"
+
+
+def test_finding_what_is_wrong_is_paid_by_inpainting(scene, teller, monkeypatch):
+    stream, view, _ = scene
+    own = Stream(teller, StreamConfig())
+    own.push(stream.observation().frame, stream.observation().proxy)
+    own.view(view.camera, quality=RenderQuality(read_fraction=0.3))
+    whole = teller.error_map
+    monkeypatch.setattr(teller, "error_map", lambda *given: time.sleep(1.0) or whole(*given))
+    times = own.view(view.camera, quality=RenderQuality(read_fraction=0.3)).times
+    assert times.inpainting > 1000 > times.rendering

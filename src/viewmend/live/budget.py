@@ -31,8 +31,8 @@ MAX_UP_AFTER_FRAMES = 256
 PROBATION_FRAMES = 12
 COARSE_FILL_COST = 0.15
 """Cost of a fill without the transformer, relative to the full level's."""
-READING_COST = 0.25
-"""Cost of finding out where most is to be gained and of reading nothing, relative to reading all."""
+READING_FIXED, READING_COST = 0.05, 0.15
+"""Costs of what no resolution changes, and of finding out where most is to be gained, relative to reading all."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class QualityLevel:
     def relative_cost(self) -> float:
         """Cost of inpainting, relative to the full level's."""
         if self.read_fraction is not None:
-            return self.scale**2 * (READING_COST + (1 - READING_COST) * self.read_fraction)
+            read = (1 - READING_FIXED - READING_COST) * self.read_fraction
+            return READING_FIXED + self.scale**2 * (READING_COST + read)
         tokens = min(self.top_k or 2048, 2048) / 2048
         if self.context_times == 0:
             return self.scale**2 * COARSE_FILL_COST
