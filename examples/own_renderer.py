@@ -20,7 +20,7 @@ from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.rendering.selection import select_closest
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.views import IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.views import CompletedView, IncompleteView, MultiViewFrame, Silhouettes
 
 
 class DepthSensors:
@@ -94,18 +94,26 @@ def run(inpainter: ViewInpainter, frames: int = 4, size: int = 256, cameras: int
     return mended.completed, studio.truth(target, frames - 1)
 
 
+BACKGROUND = torch.tensor([0.85, 0.88, 0.92])
+
+
+def laid_over(completed: CompletedView, background: torch.Tensor) -> torch.Tensor:
+    """The view upon a colour, (3, h, w). Its own colours lie upon black: none of them spills over the outline."""
+    return completed.rgb + (1 - completed.opacity) * background[:, None, None]
+
+
 def main() -> None:
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own_renderer.png")
     completed, truth = run(load_inpainter("small"))
     assert truth.mask is not None
     black = truth.rgb[0] / 255 * (truth.mask[0] / 255)
-    pictures = torch.cat([completed.view.rgb, completed.rgb, black], 2)
+    pictures = torch.cat([completed.view.rgb, completed.rgb, laid_over(completed, BACKGROUND), black], 2)
     write_image(out, (pictures.clamp(0, 1) * 255).byte().movedim(0, -1).contiguous().numpy())
     holes = completed.view.error > 0
     for name, rgb in (("left black", completed.view.rgb), ("mended", completed.rgb)):
         error = (rgb - black)[:, holes].square().mean()
         print(f"{name}: {-10 * math.log10(float(error)):.1f} dB in {int(holes.sum())} missing pixels")
-    print(f"wrote {out}: rendered, mended, truth")
+    print(f"wrote {out}: rendered, mended, upon a background of one's own, truth")
 
 
 if __name__ == "__main__":

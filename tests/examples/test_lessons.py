@@ -1,10 +1,13 @@
 """The lesson and the error rule run as they stand."""
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import torch
 
+from viewmend.baselines.classical import Telea
 from viewmend.rendering.error_rules import ERROR_RULES
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -19,6 +22,16 @@ def test_the_first_lesson_mends_a_view(tmp_path, capsys):
     rendered, mended, truth = (image[:, i * 96 : (i + 1) * 96].astype(float) for i in range(3))
     assert image.shape == (96, 288, 3)
     assert ((mended - truth) ** 2).mean() < ((rendered - truth) ** 2).mean()
+
+
+def test_a_view_is_laid_over_a_background_of_ones_own():
+    renderer = runpy.run_path(str(EXAMPLES / "own_renderer.py"))
+    completed, _ = renderer["run"](Telea(), frames=1, size=64)
+    alpha = torch.linspace(0, 1, 64).expand(64, 64)
+    soft = replace(completed, rgb=0.5 * alpha.expand(3, -1, -1), alpha=alpha)
+    over = renderer["laid_over"](soft, torch.tensor([1.0, 0.5, 0.0]))
+    assert over[:, 0, 0].tolist() == [1, 0.5, 0] and over[:, 0, -1].tolist() == [0.5, 0.5, 0.5]
+    assert torch.allclose(over[1], torch.tensor(0.5)), "grey upon grey shows no outline, dark or light"
 
 
 def test_a_rule_of_ones_own_asks_for_more():
