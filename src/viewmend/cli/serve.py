@@ -38,7 +38,8 @@ class Options:
     token_file: Path | None = None
     """A file whose first line is the token."""
     model: str | None = None
-    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills."""
+    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills. By default 'small',
+    which is the fastest; 'views' mends whole views, as `viewmend mend` does by default."""
     fps: float | None = None
     """Frames a second, instead of the capture's."""
     budget_ms: float = 100.0
@@ -101,11 +102,11 @@ def run(options: Options) -> int:
         port=options.port,
         token=token,
         budget_ms=options.budget_ms or None,
-        model=options.model or default_method(),
+        model=options.model or default_method(live=True),
         limits=Limits(viewers=options.viewers),
     )
     supply = _supply(options)
-    inpainter = load_named(options.model, options.device)
+    inpainter = load_named(options.model, options.device, live=True)
     render = RenderConfig(cameras=options.context, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
     stream = StreamConfig(render=render, memory_mb=options.memory_mb / 2)
     renderer = Renderer(supply, inpainter, stream, options.device)
