@@ -7,51 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
-from scipy.spatial.transform import Rotation
+from reference.random_rigs import COUNTS, RIGS, SEEDS, assert_same, random_rig, write_images
 
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain import open_capture
 from viewmend.cli import main
-
-
-def random_rig(seed, count, distorted=5):
-    """Cameras as plain dicts; K in the convention of this project (first pixel's centre at 0.5)."""
-    rng = np.random.default_rng(seed)
-    rig = []
-    for number in np.sort(rng.choice(90, count, replace=False)):
-        width, height = (int(n) for n in rng.integers(8, 40, 2))
-        fx, fy = rng.uniform(10, 5000, 2)
-        dist = np.zeros(5)
-        dist[:distorted] = rng.uniform(-0.3, 0.3, distorted)
-        camera = {"name": f"cam{number:02d}", "width": width, "height": height, "dist": dist}
-        camera["K"] = np.array([[fx, 0, rng.uniform(1, 30)], [0, fy, rng.uniform(1, 30)], [0, 0, 1]])
-        camera |= {"R": Rotation.random(random_state=seed + int(number)).as_matrix(), "t": rng.uniform(-5, 5, 3)}
-        rig.append(camera | {"image": f"images/{camera['name']}.png", "mask": f"masks/{camera['name']}.png"})
-    return rig
-
-
-def write_images(folder, rig, frame=None):
-    for camera in rig:
-        for stream, value in (("images", 90), ("masks", 255)):
-            path = folder / (f"{stream}/{camera['name']}/{frame}.png" if frame else f"{stream}/{camera['name']}.png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path), np.full((camera["height"], camera["width"], 3), value, np.uint8))
-
-
-def assert_same(calibration, rig):
-    assert [camera.name for camera in calibration.cameras] == [camera["name"] for camera in rig]
-    for read, camera in zip(calibration.cameras, rig, strict=True):
-        assert (read.width, read.height) == (camera["width"], camera["height"])
-        for key, value in (("K", read.K), ("R", read.R), ("t", read.t_m), ("dist", read.dist)):
-            np.testing.assert_allclose(value, camera[key], rtol=1e-9, atol=1e-9, err_msg=key)
-
-
-RIGS = settings(max_examples=25, deadline=None, database=None, derandomize=True)
-SEEDS, COUNTS = st.integers(0, 2**20), st.integers(2, 6)
+from viewmend.leave_one_out.capture_scenes import capture_set
 
 
 @RIGS
@@ -107,6 +72,17 @@ def test_easymocap_frames_are_counted_and_gaps_are_gaps(tmp_path):
     capture = open_capture(tmp_path)
     assert capture.frame_ids == ("9", "10") and capture.gaps == ((rig[0]["name"], "10"),)
     assert capture.has_masks and len(capture.read(1).cameras) == 2
+
+
+def test_cameras_of_others_are_left_out_in_turn(tmp_path):
+    rig = random_rig(1, 4)
+    write_images(tmp_path, rig, "0")
+    write_easymocap(tmp_path, rig)
+    scenes = capture_set(tmp_path)
+    assert [scene.held for scene in scenes] == [camera["name"] for camera in rig]
+    before = scenes[0].fingerprint
+    write_easymocap(tmp_path, [camera | {"t": camera["t"] + 1} for camera in rig])
+    assert capture_set(tmp_path)[0].fingerprint != before  # though only the second file changed
 
 
 def test_blenders_file_has_angle_alpha_and_no_suffix(tmp_path):

@@ -5,6 +5,7 @@ default a minute in all; VIEWMEND_FUZZ=100000 (inputs a parser) is the longer ru
 """
 
 import copy
+import functools
 import json
 import os
 import resource
@@ -20,6 +21,7 @@ from hypothesis import strategies as st
 from inpainting.plates import tiny
 from reference.ball import BallCapture, ring
 from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
+from reference.foreign_rigs import write_qualisys, write_toml
 from studio.tiny_performer import write_character, write_motion
 
 from viewmend.capture.camera_path import read_path
@@ -167,29 +169,34 @@ def test_cameras_json(capture):
         file.write_bytes(good)
 
 
-@pytest.mark.parametrize("kind", ["transforms", "colmap text", "colmap binary", "easymocap"])
+WRITERS = {
+    "transforms": write_transforms,
+    "colmap text": functools.partial(write_colmap, binary=False),
+    "colmap binary": write_colmap,
+    "easymocap": write_easymocap,
+    "pose2sim": lambda folder, cameras: write_toml(folder / "Calib.toml", cameras),
+    "qualisys": lambda folder, cameras: write_qualisys(folder / "a.qca.txt", cameras),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
 def test_calibrations_of_others(kind, tmp_path):
     cameras = []
-    for name in ("a", "b"):
+    for name in ("cam1", "cam2"):
         (tmp_path / "images" / name).mkdir(parents=True)
         cv2.imwrite(str(tmp_path / "images" / name / "0.png"), np.zeros((20, 30, 3), np.uint8))
         camera = {"name": name, "width": 30, "height": 20, "K": np.diag([40.0, 40.0, 1.0]), "dist": np.zeros(5)}
         camera |= {"R": np.eye(3), "t": np.zeros(3), "image": f"images/{name}/0.png", "mask": None}
         cameras.append(camera)
-    if kind == "transforms":
-        write_transforms(tmp_path, cameras)
-    elif kind == "easymocap":
-        write_easymocap(tmp_path, cameras)
-    else:
-        write_colmap(tmp_path, cameras, binary=kind == "colmap binary")
+    WRITERS[kind](tmp_path, cameras)
     places = (tmp_path / "sparse" / "0", tmp_path)
     files = sorted(path for place in places for path in place.glob("*.*") if path.is_file())
     assert files and len(open_capture(tmp_path).cameras) == 2
 
     def fuzz_file(file):
         good = file.read_bytes()
-        others = changed(json.loads(good)).map(text_of) if kind == "transforms" else spoilt(good)
-        if kind in ("colmap text", "easymocap"):
+        others = changed(json.loads(good)).map(text_of) if file.suffix == ".json" else spoilt(good)
+        if kind != "colmap binary":
             others |= reworded(good.decode())
 
         @FUZZED

@@ -62,7 +62,7 @@ class CameraReader:
         height, width = image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
             raise CaptureError(
-                f"{where}: expected {self.camera.width} x {self.camera.height} pixels as cameras.json says, "
+                f"{where}: expected {self.camera.width} x {self.camera.height} pixels as the calibration says, "
                 f"got {width} x {height}; correct width, height and K there, or the file"
             )
 

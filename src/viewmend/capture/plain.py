@@ -151,7 +151,7 @@ class PlainCapture:
         return (
             f"{self.folder / camera.file('mask', frame)}: camera '{camera.name}', frame '{frame}': expected foreground "
             f"(255) in this or another camera's mask, got no value above {highest} in any; segment the images, scale "
-            f"masks of 0 and 1 by 255, or remove the frame from {CALIBRATION}"
+            f"masks of 0 and 1 by 255, or remove the frame from {self._file.name}"
         )
 
     def _all_or_none(self, stream: str) -> bool:
@@ -178,7 +178,7 @@ class PlainCapture:
         present = np.array([[has_all(camera, frame) for frame in self.frame_ids] for camera in self._plain], bool)
         for camera, row in zip(self._plain, present, strict=True):
             if not row.any():
-                raise CaptureError(_never(self.folder, camera, self.frame_ids, has))
+                raise CaptureError(_never(self._file, self.folder, camera, self.frame_ids, has))
         for frame, column in zip(self.frame_ids, present.T, strict=True):
             if not column.any():
                 example = self.folder / self._plain[0].file(self._plain[0].streams[0], frame)
@@ -208,18 +208,18 @@ def _files(folder: Path) -> frozenset[str]:
         return frozenset()
 
 
-def _never(folder: Path, camera: PlainCamera, frames: Sequence[str], has: Callable[[str], bool]) -> str:
+def _never(file: Path, folder: Path, camera: PlainCamera, frames: Sequence[str], has: Callable[[str], bool]) -> str:
     """What to say of a camera that is at no time there."""
     for stream in camera.streams:
         if not any(has(camera.file(stream, frame)) for frame in frames):
-            file, what = camera.file(stream, frames[0]), f"the camera's {stream} at one frame or more"
+            lacking, what = camera.file(stream, frames[0]), f"the camera's {stream} at one frame or more"
             break
     else:
-        file = camera.file(camera.streams[0], frames[0])
+        lacking = camera.file(camera.streams[0], frames[0])
         what = f"{' and '.join(camera.streams)} of the camera at the same frame"
     return (
-        f"{folder / file}: camera '{camera.name}', frame '{frames[0]}': expected {what}, found at none of "
-        f"{len(frames)}; correct the paths in {folder / CALIBRATION}, or leave the camera out"
+        f"{folder / lacking}: camera '{camera.name}', frame '{frames[0]}': expected {what}, found at none of "
+        f"{len(frames)}; correct the paths in {file}, or leave the camera out"
     )
 
 

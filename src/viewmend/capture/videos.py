@@ -1,6 +1,7 @@
 """Frames of a video file, each exactly once its index says."""
 
 import threading
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,46 @@ from viewmend.capture.errors import CaptureError
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
 
+MOST_CLAIMED = 30
+"""How many frames a container may claim beyond those that it has."""
+
 
 def is_video(path: str) -> bool:
     """Whether a file's name is that of a video."""
     return path.lower().endswith(VIDEO_SUFFIXES)
+
+
+@dataclass(frozen=True)
+class VideoFacts:
+    """What a video says of itself."""
+
+    width: int
+    height: int
+    fps: float | None
+    frames: int
+    """How many can be decoded; containers often claim a few more."""
+
+
+def video_facts(path: Path) -> VideoFacts:
+    """Size, rate and length of a video, of which only the end is decoded.
+
+    Raises:
+        CaptureError: none of the decoders opens it, or it has no frames.
+    """
+    import cv2
+
+    decoder = cv2.VideoCapture(str(path))
+    width, height = (int(decoder.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    frames, fps = int(decoder.get(cv2.CAP_PROP_FRAME_COUNT)), float(decoder.get(cv2.CAP_PROP_FPS))
+    for last in range(frames - 1, max(-1, frames - 1 - MOST_CLAIMED), -1):
+        decoder.set(cv2.CAP_PROP_POS_FRAMES, last)
+        if decoder.grab():
+            break
+        frames = last
+    decoder.release()
+    if min(width, height, frames) < 1:
+        raise CaptureError(f"{path}: expected a video, got a file without frames for the decoders; export it again")
+    return VideoFacts(width, height, fps if fps > 0 else None, frames)
 
 
 class VideoFile:

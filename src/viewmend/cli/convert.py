@@ -16,8 +16,8 @@ class Options:
     """The capture's folder."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder for the plain capture; it must not be in use."""
-    kind: Literal["plain", "transforms", "colmap", "easymocap"] | None = None
-    """The source's format; by default it is recognised."""
+    kind: str | None = None
+    """The source's format, as docs/formats.md names it; by default it is recognised."""
     frames: str | None = None
     """Which frames, as FIRST:END by index; either may be left out."""
     scale: float = 1.0

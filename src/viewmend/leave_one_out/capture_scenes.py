@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from viewmend.capture.formats.recognition import read_any_calibration
+from viewmend.capture.plain_format import CALIBRATION
 from viewmend.capture.prepare import open_masked, prepare
 from viewmend.geometry.cameras import Cameras
 from viewmend.leave_one_out.scenes import LeaveOneOutScene, SceneFrame, without_held
@@ -102,5 +103,7 @@ def _fingerprint(folder: Path) -> str:
     named = {c.file(stream, frame) for c in plain.cameras for stream in c.streams for frame in plain.frames}
     stats = [(name, (folder / name).stat()) for name in sorted(named) if (folder / name).is_file()]
     listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
-    calibration = (folder / "cameras.json").read_bytes()
+    calibration = plain.file.read_bytes()
+    if plain.file.name != CALIBRATION:  # there may be other files beside this one
+        calibration = repr([(c.name, *(n.tolist() for n in (c.K, c.R, c.t_m, c.dist))) for c in plain.cameras]).encode()
     return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()

@@ -1,12 +1,12 @@
 """`intri.yml` and `extri.yml` of EasyMocap and EasyVolcap, with `images/<camera>/<frame>` and `masks` likewise."""
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from viewmend.capture.formats.files import bounded_bytes, image_size_px
+from viewmend.capture.formats.files import bounded_bytes, five_coefficients, image_size_px, rotation_of
+from viewmend.capture.formats.footage import MASK_PLACES, in_time, listing
 from viewmend.capture.plain_format import stays_inside
 
 MOST_BYTES = 2**22
@@ -29,23 +29,26 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     names = intrinsics["names"]
     if not all(stays_inside(name) for name in names):
         raise ValueError("expected names of cameras that are fit for folders, got others; rename them")
-    images = {name: _listing(folder / "images" / name) for name in names}
-    masks = next((place for place in ("masks", "mask") if (folder / place).is_dir()), None)
-    frames = sorted({stem for stems, _ in images.values() for stem in stems}, key=lambda stem: (len(stem), stem))
+    listed = {name: listing(folder, f"images/{name}") for name in names}
+    images = {name: found for name, found in listed.items() if found}
+    if len(images) < len(names):
+        lacking = next(name for name in names if name not in images)
+        raise ValueError(f"expected images of camera '{lacking}' in images/{lacking}, got none; add them")
+    masks = next((place for place in MASK_PLACES if (folder / place).is_dir()), None)
+    frames = sorted({frame for found in images.values() for frame in found.frames}, key=in_time)
     entries = []
     for name in names:
-        stems, suffix = images[name]
-        if not stems:
-            raise ValueError(f"expected images of camera '{name}' in images/{name}, got none; add them")
         K = _matrix(intrinsics, f"K_{name}", 9).reshape(3, 3)
         size = intrinsics.get(f"W_{name}"), intrinsics.get(f"H_{name}")
-        width, height = size if all(size) else image_size_px(folder, f"images/{name}/{sorted(stems)[0]}{suffix}")
+        width, height = size if all(size) else image_size_px(folder, images[name].first())
         dist = next((intrinsics[key] for key in (f"dist_{name}", f"D_{name}") if key in intrinsics), np.zeros(5))
-        entry = {"name": name, "width": width, "height": height, "K": K.tolist(), "dist": _five(name, dist)}
-        entry |= {"R": _rotation(extrinsics, name).tolist(), "t": _matrix(extrinsics, f"T_{name}", 3).tolist()}
-        entry["image"] = f"images/{name}/{{frame}}{suffix}"
+        entry = {"name": name, "width": width, "height": height, "K": K.tolist(), "dist": five_coefficients(name, dist)}
+        rotation = extrinsics.get(f"Rot_{name}", extrinsics.get(f"R_{name}"))
+        entry |= {"R": rotation_of(name, rotation), "t": _matrix(extrinsics, f"T_{name}", 3).tolist()}
+        entry["image"] = images[name].pattern
         if masks:
-            entry["mask"] = f"{masks}/{name}/{{frame}}{_listing(folder / masks / name)[1]}"
+            found = listing(folder, f"{masks}/{name}")
+            entry["mask"] = found.pattern if found else f"{masks}/{name}/{{frame}}.png"
         entries.append(entry)
     return {"frames": frames, "cameras": entries}
 
@@ -79,25 +82,3 @@ def _matrix(found: dict[str, Any], key: str, size: int) -> np.ndarray:
     if value.size != size:
         raise ValueError(f"expected {key} of {size} numbers, got {value.size}; add it")
     return value.ravel()
-
-
-def _rotation(found: dict[str, Any], name: str) -> np.ndarray:
-    import cv2
-
-    if f"Rot_{name}" in found:
-        return _matrix(found, f"Rot_{name}", 9).reshape(3, 3)
-    return cv2.Rodrigues(_matrix(found, f"R_{name}", 3))[0]
-
-
-def _five(name: str, dist: np.ndarray) -> list[float]:
-    values = np.asarray(dist).ravel()
-    if values.size < 4 or values[5:].any():
-        raise ValueError(f"expected k1 k2 p1 p2 k3 of camera '{name}', got {values.size} numbers; undistort the images")
-    return [*values[:5].tolist(), 0.0][:5]
-
-
-def _listing(folder: Path) -> tuple[set[str], str]:
-    """Stems of the images in a folder, and their suffix: the one that most have."""
-    files = [path for path in folder.glob("*.*") if not path.name.startswith(".")] if folder.is_dir() else []
-    suffix = Counter(sorted(path.suffix for path in files)).most_common(1)[0][0] if files else ".png"
-    return {path.stem for path in files if path.suffix == suffix}, suffix

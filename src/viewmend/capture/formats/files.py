@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from viewmend.capture.images import told_size
 from viewmend.capture.plain_format import stays_inside
 
@@ -26,6 +28,12 @@ def bounded_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     return data
 
 
+def places_named(folder: Path, part: str) -> list[Path]:
+    """The folder, and those within it whose name has this part; none where there is no folder."""
+    within = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [folder, *(path for path in within if path.is_dir() and part in path.name.lower())] if within else []
+
+
 def image_size_px(folder: Path, name: str) -> tuple[int, int]:
     """Width and height of an image in the folder, from its head.
 
@@ -47,3 +55,39 @@ def camera_names(paths: Sequence[str]) -> list[str]:
     if len(set(stems)) == len(stems):
         return stems
     return [str(PurePosixPath(path).with_suffix("")).replace("/", "_") if path else path for path in paths]
+
+
+def rotation_of(name: str, values: object) -> list[list[float]]:
+    """A rotation from its nine numbers, or from Rodrigues' vector.
+
+    Raises:
+        ValueError: these are neither.
+    """
+    import cv2
+
+    numbers = _numbers(values)
+    if numbers.size not in (3, 9):
+        raise ValueError(f"camera '{name}': expected a rotation of 3 or 9 numbers, got {numbers.size}; add it")
+    matrix = cv2.Rodrigues(numbers)[0] if numbers.size == 3 else numbers.reshape(3, 3)
+    return np.asarray(matrix).tolist()
+
+
+def five_coefficients(name: str, values: object) -> list[float]:
+    """OpenCV's k1 k2 p1 p2 k3, of which the last may be left out; nothing for a lens without distortion.
+
+    Raises:
+        ValueError: there are more that are not 0, or fewer.
+    """
+    numbers = _numbers(values)
+    if 0 < numbers.size < 4 or numbers[5:].any():
+        raise ValueError(
+            f"camera '{name}': expected k1 k2 p1 p2 k3, got {numbers.size} numbers; undistort the images first"
+        )
+    return [*numbers[:5].tolist(), 0.0, 0.0, 0.0, 0.0, 0.0][:5]
+
+
+def _numbers(values: object) -> np.ndarray:
+    try:
+        return np.asarray(values, float).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("expected numbers, got something else; export the calibration again") from None

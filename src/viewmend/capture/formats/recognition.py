@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.formats import colmap, easymocap, transforms
+from viewmend.capture.formats import colmap, easymocap, pose2sim, qualisys, transforms
 from viewmend.capture.plain_format import CALIBRATION, PlainCalibration, calibration_of, read_calibration
 
 
@@ -26,6 +26,8 @@ FORMATS = {
     "transforms": Format(transforms.find, transforms.content),
     "colmap": Format(colmap.find, colmap.content),
     "easymocap": Format(easymocap.find, easymocap.content),
+    "pose2sim": Format(pose2sim.find, pose2sim.content),
+    "qualisys": Format(qualisys.find, qualisys.content),
 }
 KINDS = ("plain", *FORMATS)
 
