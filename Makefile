@@ -30,7 +30,7 @@ format: .venv/installed
 
 .venv/installed: pyproject.toml constraints-cpu.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,docs,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,engines,docs,dev]'
 	touch $@
 
 clean:

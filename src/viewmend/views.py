@@ -227,6 +227,11 @@ class CompletedView:
         return self.view.mask if self.alpha is None else self.alpha
 
     @property
+    def surface_depth(self) -> Float[Tensor, "height width"]:
+        """`depth`, or the proxy's where the inpainter does not tell; metres, 0 where there is no subject."""
+        return self.view.depth if self.depth is None else self.depth
+
+    @property
     def straight_rgb(self) -> Float[Tensor, "3 height width"]:
         """Fhat divided by `opacity`, in [0, 1]: colours without the black that they lie upon.
 

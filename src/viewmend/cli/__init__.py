@@ -46,6 +46,9 @@ COMMANDS = (
     Command("evaluate paper-table", "viewmend.cli.paper_table", "The paper's tables on your data, beside its figures."),
     Command("weights", "viewmend.cli.weights", "List and check weights of others' networks."),
     Command("convert", "viewmend.cli.convert", "Write a capture of any format as a plain one."),
+    Command(
+        "export-scene", "viewmend.cli.export_scene", "Write a capture as a scene for engines: hull, points, depth."
+    ),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 

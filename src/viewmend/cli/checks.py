@@ -1,5 +1,6 @@
 """What several commands make of their options before they begin."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,3 +38,12 @@ def load_named(name: str | None, device: str, live: bool = False) -> "ViewInpain
     if name is None and (name := default_method(live)) == "telea":
         say("no model is shipped with this version: the holes are filled by OpenCV's Telea")
     return make_method(name, device)
+
+
+def chosen_times(text: str | None, count: int) -> range:
+    """The frames that `--frames FIRST:END` chooses of so many, all by default; ValueError for none."""
+    parts = re.fullmatch(r"(\d{0,9}):(\d{0,9})", text or ":")
+    times = range(count)[int(parts[1] or 0) : int(parts[2] or count)] if parts else range(0)
+    if not times:
+        raise ValueError(f"expected --frames as FIRST:END within 0:{count}, got '{text}'; choose again")
+    return times

@@ -1,6 +1,5 @@
 """`viewmend convert`: a capture of any format that is read, as a plain one."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -33,20 +32,13 @@ def run(options: Options) -> int:
     from viewmend.capture.part import CapturePart
     from viewmend.capture.plain import open_capture
     from viewmend.capture.plain_writer import write_capture
+    from viewmend.cli.checks import chosen_times
     from viewmend.cli.console import say, track
 
     if not 0 < options.scale <= 1:
         raise ValueError(f"expected --scale above 0 and at most 1, got {options.scale}; choose again")
     capture = open_capture(options.source, options.cameras or None, options.kind)
-    part = CapturePart(capture, _times(options.frames, len(capture.frame_ids)), options.scale)
+    part = CapturePart(capture, chosen_times(options.frames, len(capture.frame_ids)), options.scale)
     write_capture(part, options.out, images=options.images, progress=lambda times: track(times, options.out.name))
     say(f"{options.out}: {len(part.cameras)} cameras, {len(part.frame_ids)} frames")
     return 0
-
-
-def _times(text: str | None, count: int) -> range:
-    parts = re.fullmatch(r"(\d{0,9}):(\d{0,9})", text or ":")
-    times = range(count)[int(parts[1] or 0) : int(parts[2] or count)] if parts else range(0)
-    if not times:
-        raise ValueError(f"expected --frames as FIRST:END within 0:{count}, got '{text}'; choose again")
-    return times

@@ -12,6 +12,7 @@ from torch import Tensor
 from viewmend.capture.images import MAX_DEPTH_M, read_rgb, read_rgba, write_depth, write_image
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.evaluation.mending import MendStep
+from viewmend.export.cutout import cutout
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.output_folder import OutputFolder
 from viewmend.views import CompletedView, IncompleteView
@@ -116,15 +117,9 @@ class MendOutput:
         return (read_rgb(file, str(file)) for file in self._pictures(name))
 
 
-def cutout(completed: CompletedView) -> UInt8[np.ndarray, "height width 4"]:
-    """The subject alone: colours as they are, not multiplied by the alpha that comes fourth."""
-    return np.dstack([picture(completed.straight_rgb), picture(completed.opacity[None])[..., 0]])
-
-
 def depth_picture_m(completed: CompletedView) -> Float32[np.ndarray, "height width"]:
     """Refined z-depth of the subject, else the proxy's, metres; 0 where there is none, 65.535 from there on."""
-    depth = completed.view.depth if completed.depth is None else completed.depth
-    return depth.clamp(max=MAX_DEPTH_M).float().cpu().numpy()
+    return completed.surface_depth.clamp(max=MAX_DEPTH_M).float().cpu().numpy()
 
 
 def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "_height _width 3"]:

@@ -1,0 +1,1 @@
+"""Scenes and models in the formats of other people's systems."""

@@ -1,0 +1,152 @@
+"""Cameras as a USD scene and as a script for Blender."""
+
+import json
+import re
+from collections.abc import Mapping
+
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.export.engine_world import engine_from_cameras
+from viewmend.geometry.cameras import Cameras
+
+SENSOR_MM = 36.0
+"""Width of every camera's film: engines want one, and only its ratio to the focal length is known."""
+
+
+def usd_scene(groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int) -> str:
+    """Cameras as ASCII USD (.usda), metres, y up; skew is left out.
+
+    Args:
+        groups: cameras by the name of the scope that holds them.
+        rotation: `engine_from_world`'s.
+        fps: frames a second of the scene.
+        frames: how many times there are; they are counted from 0.
+    """
+    lines = ["#usda 1.0", "(", '    defaultPrim = "scene"', "    metersPerUnit = 1", '    upAxis = "Y"']
+    lines += [f"    timeCodesPerSecond = {fps:g}", "    startTimeCode = 0", f"    endTimeCode = {frames - 1}", ")", ""]
+    lines += ['def Xform "scene"', "{"]
+    for group, cameras in groups.items():
+        lines += [f'    def Scope "{group}"', "    {"]
+        names = _prim_names(cameras.names)
+        for view, pose in enumerate(engine_from_cameras(cameras, rotation).double().mT.tolist()):
+            lines += [f"        {line}" for line in _usd_camera(names[view], cameras[view], pose)]
+        lines.append("    }")
+    return "\n".join([*lines, "}", ""])
+
+
+def _usd_camera(prim: str, camera: Cameras, pose: list[list[float]]) -> list[str]:
+    """One camera; lengths of its film are tenths of the scene's unit, as USD has them."""
+    (width, height), K = camera.size_px[0].tolist(), camera.K[0].double()
+    aperture = SENSOR_MM / 100
+    per_x, per_y = aperture / width, aperture / width * float(K[0, 0] / K[1, 1])
+    rows = ", ".join(f"({', '.join(f'{value:.9g}' for value in row)})" for row in pose)
+    values = {
+        "focalLength": float(K[0, 0]) * per_x,
+        "horizontalAperture": aperture,
+        "verticalAperture": height * per_y,
+        "horizontalApertureOffset": (width / 2 - float(K[0, 2])) * per_x,
+        "verticalApertureOffset": (float(K[1, 2]) - height / 2) * per_y,
+    }
+    return [
+        f'def Camera "{prim}" (displayName = {json.dumps(camera.names[0])})',
+        "{",
+        *(f"    float {name} = {value:.9g}" for name, value in values.items()),
+        "    float2 clippingRange = (0.01, 1000)",
+        f"    matrix4d xformOp:transform = ({rows})",
+        '    uniform token[] xformOpOrder = ["xformOp:transform"]',
+        "}",
+    ]
+
+
+def _prim_names(names: tuple[str, ...]) -> list[str]:
+    """Identifiers as USD wants them, each once."""
+    found: list[str] = []
+    for n, name in enumerate(names):
+        plain = re.sub(r"\W", "_", name, flags=re.ASCII)
+        plain = plain if plain and not plain[0].isdigit() else f"camera_{plain}"
+        found.append(f"{plain}_{n}" if plain in found else plain)
+    return found
+
+
+def blender_script(
+    groups: Mapping[str, Cameras],
+    rotation: Float[Tensor, "3 3"],
+    fps: float,
+    frames: int,
+    pictures: Mapping[str, str],
+) -> str:
+    """A script that opens the exported scene in Blender: its cameras, their pictures behind them, the hull over time.
+
+    Args:
+        groups: cameras by the name of their collection.
+        rotation: `engine_from_world`'s; Blender's own world, z up, follows from it.
+        fps: frames a second.
+        frames: how many times there are.
+        pictures: the first picture of a camera, by the camera's name, as a path relative to the script.
+    """
+    found = [
+        {"group": group, "picture": pictures.get(cameras.names[view]), "engine_from_camera": pose}
+        | _blender_lens(cameras[view])
+        for group, cameras in groups.items()
+        for view, pose in enumerate(engine_from_cameras(cameras, rotation).tolist())
+    ]
+    scene = {"fps": fps, "frames": frames, "sensor_mm": SENSOR_MM, "cameras": found}
+    return BLENDER.replace("SCENE", json.dumps(json.dumps(scene)))
+
+
+def _blender_lens(camera: Cameras) -> dict[str, object]:
+    """Name, size and intrinsics; the film's shift is in widths."""
+    (width, height), K = camera.size_px[0].tolist(), camera.K[0]
+    return {
+        "name": camera.names[0],
+        "size_px": [width, height],
+        "lens": SENSOR_MM * float(K[0, 0]) / width,
+        "shift_x": 0.5 - float(K[0, 2]) / width,
+        "shift_y": (float(K[1, 2]) - height / 2) / width,
+    }
+
+
+BLENDER = '''"""Opens this folder in Blender: blender --python open_in_blender.py"""
+
+import json
+from pathlib import Path
+
+import bpy
+from mathutils import Matrix
+
+HERE = Path(__file__).resolve().parent
+scene = json.loads(SCENE)
+z_up = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))  # from y up
+
+bpy.context.scene.render.fps = max(1, round(scene["fps"]))
+bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, scene["frames"] - 1
+collections = {}
+for given in scene["cameras"]:
+    if given["group"] not in collections:
+        collections[given["group"]] = bpy.data.collections.new(given["group"])
+        bpy.context.scene.collection.children.link(collections[given["group"]])
+    data = bpy.data.cameras.new(given["name"])
+    data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", scene["sensor_mm"], given["lens"]
+    data.shift_x, data.shift_y = given["shift_x"], given["shift_y"]
+    camera = bpy.data.objects.new(given["name"], data)
+    camera.matrix_world = z_up @ Matrix(given["engine_from_camera"])
+    collections[given["group"]].objects.link(camera)
+    if given["picture"]:
+        image = bpy.data.images.load(str(HERE / given["picture"]))
+        image.source = "SEQUENCE"
+        behind = data.background_images.new()
+        behind.image, data.show_background_images = image, True
+        behind.image_user.frame_start, behind.image_user.frame_offset = 0, -1
+        behind.image_user.frame_duration = scene["frames"]
+        bpy.context.scene.camera = camera
+        bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = given["size_px"]
+
+for frame, file in enumerate(sorted((HERE / "hull").glob("*.glb"))):
+    bpy.ops.import_scene.gltf(filepath=str(file))  # turns y up into z up itself
+    for hull in bpy.context.selected_objects:
+        for hidden, at in ((True, frame - 1), (False, frame), (True, frame + 1)):
+            hull.hide_viewport = hull.hide_render = hidden
+            hull.keyframe_insert("hide_viewport", frame=at)
+            hull.keyframe_insert("hide_render", frame=at)
+'''

@@ -1,0 +1,147 @@
+"""`viewmend export-scene` from end to end on a small capture of a ball."""
+
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+import trimesh
+from pxr import Usd
+from reference import tells_all
+from reference.ball import RADIUS_M, BallCapture, camera_at, photograph, ring
+
+from viewmend.capture.plain_writer import write_capture
+from viewmend.cli import main
+from viewmend.export.scene import points_of
+from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.methods import make_method
+from viewmend.stream import Stream
+
+
+def rig():
+    """Twelve cameras at many heights: their hull is nearly the ball."""
+    heights = (0.0, 3.0, -1.5, 1.0, -4.0, 0.5, 2.0, -1.0, 4.0, -0.5, 1.5, -2.5)
+    return concatenate_cameras([camera_at(30 * n, f"c{n}", 64, height) for n, height in enumerate(heights)])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "ball"
+    write_capture(BallCapture(rig()), path, images="png")
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("scene") / "out"
+    assert main(["export-scene", str(folder), str(out), "--views", "4", "--model", "telea"]) == 0
+    return out
+
+
+def load(path):
+    return trimesh.load(path, process=False)
+
+
+def test_all_files_are_there(scene):
+    files = {
+        str(path.relative_to(scene)) for path in scene.rglob("*") if path.is_file() and ".viewmend" not in str(path)
+    }
+    times = ("000000", "000001")
+    assert files == {
+        *("cameras.usda", "open_in_blender.py"),
+        *(f"hull/{time}.{kind}" for time in times for kind in ("glb", "ply")),
+        *(f"points/{time}.ply" for time in times),
+        *(f"{kind}/orbit{view:03d}/{time}.{suffix}" for view in range(4) for time in times
+          for kind, suffix in (("rgba", "png"), ("depth", "exr"))),
+    }  # fmt: skip
+
+
+def test_the_hull_is_the_ball(scene):
+    hull = trimesh.load(scene / "hull/000000.glb", force="mesh")
+    assert hull.is_watertight and hull.volume > 0
+    assert np.abs(np.linalg.norm(hull.vertices, axis=1) - RADIUS_M).mean() < 0.04
+    first, second = (load(scene / f"hull/00000{n}.ply") for n in range(2))
+    side = np.abs(first.vertices[:, 1]) < 0.2
+    colours = first.visual.vertex_colors[side, :3] / 255
+    assert np.abs(colours - (0.5 + 0.4 * first.vertices[side] / RADIUS_M)).mean() < 0.03
+    assert second.visual.vertex_colors[:, :3].mean() == pytest.approx(
+        0.9 * first.visual.vertex_colors[:, :3].mean(), rel=0.02
+    )
+
+
+def test_points_lie_on_the_ball_in_its_colours(scene):
+    cloud = load(scene / "points/000000.ply")
+    assert len(cloud.vertices) > 3000
+    assert np.abs(np.linalg.norm(cloud.vertices, axis=1) - RADIUS_M).mean() < 0.04
+    side = np.abs(cloud.vertices[:, 1]) < 0.2
+    assert np.abs(cloud.colors[side, :3] / 255 - (0.5 + 0.4 * cloud.vertices[side] / RADIUS_M)).mean() < 0.04
+
+
+@pytest.mark.parametrize("depth_m", [2.7, 50.0])
+def test_points_outside_a_mask_are_left_out(depth_m):
+    """A model may take a pixel for far behind the subject."""
+    frame = photograph(rig())
+    stream = Stream(make_method("telea"))
+    stream.push(frame)
+    completed = stream.view(camera_at(15, "view", 64)).completed
+    depth = completed.view.depth.clone()
+    depth[32, 30:34] = depth_m
+    spoilt = points_of(replace(completed, depth=depth), frame, 0.5)
+    assert len(points_of(completed, frame, 0.5)) - len(spoilt) == 4
+    assert float(spoilt[:, :3].norm(dim=-1).max()) < 0.6
+
+
+def test_pictures_and_depth_fit_each_other(scene):
+    rgba = cv2.imread(str(scene / "rgba/orbit001/000001.png"), cv2.IMREAD_UNCHANGED)
+    with OpenEXR.File(str(scene / "depth/orbit001/000001.exr")) as file:
+        depth = file.channels()["Z"].pixels
+    assert rgba.shape == (64, 64, 4) and depth.dtype == np.float32
+    assert ((rgba[..., 3] > 127) == (depth > 0)).all() and (depth > 0).mean() > 0.1
+    assert depth[depth > 0].min() == pytest.approx(float(rig().centers.norm(dim=-1).mean()) - RADIUS_M, abs=0.05)
+    assert len(np.unique(depth)) > 200  # not rounded
+
+
+def test_usd_opens(scene):
+    stage = Usd.Stage.Open(str(scene / "cameras.usda"))
+    assert len(stage.GetPrimAtPath("/scene/rig").GetChildren()) == 12
+    assert len(stage.GetPrimAtPath("/scene/views").GetChildren()) == 4
+    assert stage.GetEndTimeCode() == 1
+
+
+def test_views_of_a_rig_on_one_side_swing_only_there(tmp_path):
+    write_capture(BallCapture(ring(8, 48), 1), tmp_path / "ball", images="png")
+    some = BallCapture(ring(8, 48)[:3], 1)
+    write_capture(some, tmp_path / "side", images="png")
+    assert (
+        main(["export-scene", str(tmp_path / "side"), str(tmp_path / "out"), "--views", "4", "--model", "telea"]) == 0
+    )
+    stage = Usd.Stage.Open(str(tmp_path / "out/cameras.usda"))
+    places = torch.tensor(
+        [list(p.GetAttribute("xformOp:transform").Get()[3]) for p in stage.GetPrimAtPath("/scene/views").GetChildren()]
+    )
+    assert float(torch.pdist(places[:, :3]).min()) > 0.3
+
+
+def test_unsure_pixels_are_no_points(folder, tmp_path, capsys):
+    model = f"{tells_all.__file__}:TellsAll"
+    counts = []
+    for least in ("0", "1"):
+        given = ["--views", "1", "--frames", "0:1", "--model", model, "--least-confidence", least]
+        assert main(["export-scene", str(folder), str(tmp_path / least), *given]) == 0
+        counts.append((tmp_path / least / "points/000000.ply").stat().st_size)
+    assert counts[0] > counts[1] + 1000
+
+
+@pytest.mark.parametrize("wrong", [["--views", "0"], ["--least-confidence", "2"], ["--frames", "5:"]])
+def test_what_cannot_be_is_said(folder, tmp_path, capsys, wrong):
+    assert main(["export-scene", str(folder), str(tmp_path / "out"), *wrong]) == 2
+    assert "expected --" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_without_openexr_it_says_what_to_install(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    assert main(["export-scene", str(folder), str(tmp_path / "out")]) == 2
+    assert "extra 'engines'" in capsys.readouterr().err
