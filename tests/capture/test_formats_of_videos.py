@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.foreign_rigs import write_qualisys, write_toml
+from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import COUNTS, RIGS, SEEDS, assert_same, opencv, random_rig, write_images, write_videos
 
 from viewmend.capture.errors import CaptureError
@@ -40,6 +40,16 @@ def test_qualisys_there_and_back(seed, count):
     with tempfile.TemporaryDirectory() as name:
         folder, rig = Path(name), random_rig(seed, count)
         write_qualisys(folder / "calibration/Calib.qca.txt", opencv(rig))
+        write_images(folder, rig, "000003")
+        assert_same(read_any_calibration(folder), rig)
+
+
+@RIGS
+@given(SEEDS, COUNTS, st.sampled_from(["files", "folders"]))
+def test_opencvs_own_files_there_and_back(seed, count, style):
+    with tempfile.TemporaryDirectory() as name:
+        folder, rig = Path(name), random_rig(seed, count)
+        write_opencv(folder, opencv(rig), style)
         write_images(folder, rig, "000003")
         assert_same(read_any_calibration(folder), rig)
 
@@ -81,6 +91,7 @@ def test_names_of_cameras_and_footage_are_compared():
         "videos/GX01.mp4",
         "videos/GX02.mp4",
     ]
+    assert paired(["cam01_x2", "cam02_x2"], ["cam2.mp4", "cam1.mp4"]) == ["cam1.mp4", "cam2.mp4"]
     assert paired(["cam_01", "cam_02"], ["left.mp4", "right.mp4"]) is None
     assert paired(["a1", "b1"], ["x1.mp4", "y1.mp4"]) is None  # nothing tells them apart
 
@@ -118,6 +129,16 @@ def test_pose2sims_own_files(shared):
     torch.testing.assert_close(read.cameras.K, plain.cameras.K, rtol=0, atol=1e-4)
     torch.testing.assert_close(read.cameras.camera_from_world, plain.cameras.camera_from_world, rtol=0, atol=1e-6)
     assert torch.equal(read.read(3).rgb, plain.read(3).rgb)
+
+
+def test_utrecht_as_it_came(shared):
+    """OpenCV's files beside each camera's video give what `cameras.json` says, but for the unit."""
+    plain = open_capture(shared / "captures/utrecht")
+    read = open_capture(shared / "captures/utrecht/original")
+    assert read.cameras.names == plain.cameras.names and read.frame_ids[-1] == "000425" and read.fps == 50
+    torch.testing.assert_close(read.cameras.K, plain.cameras.K)
+    torch.testing.assert_close(read.cameras.centers / 1000, plain.cameras.centers)
+    assert torch.equal(read.read(2).rgb, plain.read(2).rgb)  # undistorted alike, and not the empty room
 
 
 def test_a_container_may_claim_too_much(shared):

@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from inpainting.plates import tiny
 from reference.ball import BallCapture, ring
 from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
-from reference.foreign_rigs import write_qualisys, write_toml
+from reference.foreign_images import write_agisoft, write_middlebury
+from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from studio.tiny_performer import write_character, write_motion
 
 from viewmend.capture.camera_path import read_path
@@ -175,6 +176,9 @@ WRITERS = {
     "colmap binary": write_colmap,
     "easymocap": write_easymocap,
     "pose2sim": lambda folder, cameras: write_toml(folder / "Calib.toml", cameras),
+    "agisoft": lambda folder, cameras: write_agisoft(folder / "a.xml", cameras),
+    "middlebury": lambda folder, cameras: write_middlebury(folder / "a_par.txt", cameras),
+    "opencv": write_opencv,
     "qualisys": lambda folder, cameras: write_qualisys(folder / "a.qca.txt", cameras),
 }
 
@@ -184,12 +188,13 @@ def test_calibrations_of_others(kind, tmp_path):
     cameras = []
     for name in ("cam1", "cam2"):
         (tmp_path / "images" / name).mkdir(parents=True)
-        cv2.imwrite(str(tmp_path / "images" / name / "0.png"), np.zeros((20, 30, 3), np.uint8))
+        for image in (f"images/{name}.png", f"images/{name}/0.png"):
+            cv2.imwrite(str(tmp_path / image), np.zeros((20, 30, 3), np.uint8))
         camera = {"name": name, "width": 30, "height": 20, "K": np.diag([40.0, 40.0, 1.0]), "dist": np.zeros(5)}
-        camera |= {"R": np.eye(3), "t": np.zeros(3), "image": f"images/{name}/0.png", "mask": None}
+        camera |= {"R": np.eye(3), "t": np.zeros(3), "image": f"images/{name}.png", "mask": None}
         cameras.append(camera)
     WRITERS[kind](tmp_path, cameras)
-    places = (tmp_path / "sparse" / "0", tmp_path)
+    places = (tmp_path / "sparse" / "0", tmp_path / "cam1", tmp_path)
     files = sorted(path for place in places for path in place.glob("*.*") if path.is_file())
     assert files and len(open_capture(tmp_path).cameras) == 2
 

@@ -49,3 +49,23 @@ def write_qualisys(file, cameras):
     text = "\n".join(entries).replace("np.float64(", "").replace(')"', '"')
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(f"<?xml version='1.0'?>\n<calibration><cameras>{text}</cameras></calibration>\n")
+
+
+def write_opencv(folder, cameras, style="folders"):
+    """Files as OpenCV writes them: `CAMERA/config.xml` with short keys, or `calib/CAMERA.yml` with long ones."""
+    import cv2
+
+    long = style == "files"
+    for camera in cameras:
+        file = folder / (f"calib/{camera['name']}.yml" if long else f"{camera['name']}/config.xml")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        rotation = camera["R"] if long else Rotation.from_matrix(camera["R"]).as_rotvec()[:, None]
+        storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_matrix" if long else "CameraMatrix", camera["K"])
+        storage.write("distortion_coefficients" if long else "DistortionCoeffs", camera["dist"][:, None])
+        storage.write("rotation_matrix" if long else "Rotation", rotation)
+        storage.write("translation_vector" if long else "Translation", camera["t"][:, None])
+        if long:
+            storage.write("image_width", camera["width"])
+            storage.write("image_height", camera["height"])
+        storage.release()

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viewmend.capture.formats.files import bounded_bytes, camera_names
+from viewmend.capture.formats.files import bounded_bytes, camera_names, mask_beside
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
@@ -59,7 +59,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     for view, name in zip(views, camera_names([view.name for view in views]), strict=True):
         if view.camera not in lenses:
             raise ValueError(f"expected the camera of image '{name[:40]}', got none of id {view.camera}; export again")
-        mask = _mask(folder, view.name)
+        mask = mask_beside(folder, view.name)
         entries.append({"name": name, **lenses[view.camera], **_pose(view), "image": beside + view.name, "mask": mask})
     return {"first_pixel_center": [0.5, 0.5], "frames": ["0"], "cameras": entries}
 
@@ -136,12 +136,3 @@ def _pose(view: Image) -> dict[str, Any]:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return {"R": np.array(R).tolist(), "t": view.t}
-
-
-def _mask(folder: Path, image: str) -> str | None:
-    """The mask's path, as COLMAP names it (`masks/a.jpg.png`) or with the suffix replaced."""
-    if not (folder / "masks").is_dir():
-        return None
-    own = f"masks/{image}.png"
-    replaced = f"masks/{image.rpartition('.')[0]}.png"
-    return replaced if "\0" not in image and (folder / replaced).is_file() else own

@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from viewmend.capture.formats.files import bounded_bytes, five_coefficients, image_size_px, rotation_of
+from viewmend.capture.formats.files import five_coefficients, image_size_px, rotation_of
 from viewmend.capture.formats.footage import MASK_PLACES, in_time, listing
+from viewmend.capture.formats.opencv_storage import read_storage
 from viewmend.capture.plain_format import stays_inside
-
-MOST_BYTES = 2**22
-"""The largest of these files that is read; sixty cameras have 50 kB."""
 
 
 def find(folder: Path) -> Path | None:
@@ -25,8 +23,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     Raises:
         ValueError: a file is no OpenCV YAML, lacks a camera's matrix, or there are no images.
     """
-    intrinsics, extrinsics = _matrices(file), _matrices(file.with_name("extri.yml"))
-    names = intrinsics["names"]
+    intrinsics, extrinsics = read_storage(file), read_storage(file.with_name("extri.yml"))
+    names = intrinsics.get("names") or sorted(key[2:] for key in intrinsics if key.startswith("K_"))
     if not all(stays_inside(name) for name in names):
         raise ValueError("expected names of cameras that are fit for folders, got others; rename them")
     listed = {name: listing(folder, f"images/{name}") for name in names}
@@ -51,30 +49,6 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
             entry["mask"] = found.pattern if found else f"{masks}/{name}/{{frame}}.png"
         entries.append(entry)
     return {"frames": frames, "cameras": entries}
-
-
-def _matrices(file: Path) -> dict[str, Any]:
-    """Matrices, whole numbers and the list `names` of an OpenCV YAML file."""
-    import cv2
-
-    text = bounded_bytes(file, MOST_BYTES).decode()
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        root, found = storage.root(), {}
-        for key in root.keys():  # noqa: SIM118 (it is no dict)
-            node = root.getNode(key)
-            if key == "names":
-                found[key] = [node.at(index).string() for index in range(node.size())] if node.isSeq() else []
-            elif node.isMap():
-                found[key] = np.asarray(node.mat(), float).ravel()
-            elif node.isInt() or node.isReal():
-                found[key] = int(node.real())
-    except (cv2.error, SystemError, TypeError, OverflowError) as error:
-        got = str(error).strip().splitlines()[-1][-80:]
-        raise ValueError(f"expected OpenCV YAML in {file.name}, got: {got}; export it again") from None
-    if not found.get("names"):
-        found["names"] = sorted(key[2:] for key in found if key.startswith("K_"))
-    return found
 
 
 def _matrix(found: dict[str, Any], key: str, size: int) -> np.ndarray:

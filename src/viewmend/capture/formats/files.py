@@ -57,6 +57,15 @@ def camera_names(paths: Sequence[str]) -> list[str]:
     return [str(PurePosixPath(path).with_suffix("")).replace("/", "_") if path else path for path in paths]
 
 
+def mask_beside(folder: Path, image: str) -> str | None:
+    """The path of an image's mask in `masks`: `a.jpg.png` as COLMAP has it, or `a.png`; None without that folder."""
+    if not (folder / "masks").is_dir():
+        return None
+    own = f"masks/{image}.png"
+    replaced = f"masks/{image.rpartition('.')[0]}.png"
+    return replaced if "\0" not in image and (folder / replaced).is_file() else own
+
+
 def rotation_of(name: str, values: object) -> list[list[float]]:
     """A rotation from its nine numbers, or from Rodrigues' vector.
 

@@ -13,6 +13,8 @@ from viewmend.capture.videos import is_video, video_facts
 PLACES = ("videos", "videos-raw", "recordings", "images", "")
 """Where footage is looked for, beside folders of one recording within `recordings`."""
 MASK_PLACES = ("masks", "mask")
+NO_TAKES = re.compile("background|plate|empty|board|calib|intrinsic")
+"""Videos that are so named show no subject."""
 CROPPED_PX = 16
 """Encoders round sizes down to whole blocks; a calibration of a slightly larger image stays right."""
 
@@ -26,15 +28,15 @@ class Footage:
     entries: dict[str, dict[str, Any]]
     """The keys of a `cameras.json` that say a camera's size, images and masks, by its name."""
 
-    def of(self, name: str, told_px: Sequence[float]) -> dict[str, Any]:
-        """The keys of a camera that was calibrated at this width and height.
+    def of(self, name: str, told_px: Sequence[float] | None = None) -> dict[str, Any]:
+        """The keys of a camera, which was calibrated at this width and height where the calibration says so.
 
         Raises:
             ValueError: its images are of another size.
         """
         entry = self.entries[name]
         size = entry["width"], entry["height"]
-        if any(not 0 <= told - got <= CROPPED_PX for told, got in zip(told_px, size, strict=True)):
+        if told_px and any(not 0 <= told - got <= CROPPED_PX for told, got in zip(told_px, size, strict=True)):
             told = " x ".join(f"{side:g}" for side in told_px)
             got = f"{size[0]} x {size[1]}"
             raise ValueError(f"camera '{name}': expected images of {told} pixels, got {got}; export them in that size")
@@ -122,6 +124,7 @@ def _with_recordings(folder: Path, places: Sequence[str]) -> list[str]:
 
 def _footage(folder: Path, chosen: dict[str, str]) -> Footage:
     entries, frames, rates = {}, set(), []
+    chosen = {name: _only_video(folder, path) or path for name, path in chosen.items()}
     videos = {name: video_facts(folder / path) for name, path in chosen.items() if is_video(path)}
     for name, path in chosen.items():
         if name in videos:
@@ -154,6 +157,12 @@ def _masks(folder: Path, names: Sequence[str]) -> dict[str, str]:
         name: found if isinstance(found, str) else found.pattern if found else f"{path}/{{frame}}.png"
         for (name, found), path in zip(listed.items(), chosen, strict=True)
     }
+
+
+def _only_video(folder: Path, path: str) -> str | None:
+    """The video in a camera's folder, if there is one besides those of an empty room or a board."""
+    found = [video for video in _videos(folder, path) if not NO_TAKES.search(Path(video).name.lower())]
+    return found[0] if len(found) == 1 else None
 
 
 def _videos(folder: Path, place: str) -> list[str]:

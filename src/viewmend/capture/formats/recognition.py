@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.formats import colmap, easymocap, pose2sim, qualisys, transforms
+from viewmend.capture.formats import agisoft, colmap, easymocap, middlebury, opencv, pose2sim, qualisys, transforms
 from viewmend.capture.plain_format import CALIBRATION, PlainCalibration, calibration_of, read_calibration
 
 
@@ -23,11 +23,8 @@ class Format:
 
 
 FORMATS = {
-    "transforms": Format(transforms.find, transforms.content),
-    "colmap": Format(colmap.find, colmap.content),
-    "easymocap": Format(easymocap.find, easymocap.content),
-    "pose2sim": Format(pose2sim.find, pose2sim.content),
-    "qualisys": Format(qualisys.find, qualisys.content),
+    module.__name__.rpartition(".")[2]: Format(module.find, module.content)
+    for module in (transforms, colmap, easymocap, pose2sim, qualisys, agisoft, middlebury, opencv)
 }
 KINDS = ("plain", *FORMATS)
 
