@@ -50,8 +50,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
 def _image(folder: Path, label: str) -> str:
     """The path of the image of this label, which often lacks the suffix."""
     for place in ("", "images/"):
-        within = sorted((folder / place).iterdir()) if (folder / place).is_dir() else []
-        for path in within:
+        within = (folder / place).iterdir() if (folder / place).is_dir() else ()
+        for path in sorted(path for path in within if path.is_file()):
             if path.name == label or (path.stem == label and path.suffix.lower() not in (".xml", ".txt")):
                 return place + path.name
     return f"images/{label}"
