@@ -54,6 +54,10 @@ class CameraReader:
             self._check_size(depth, where)
         return self._undistort(CameraImages(rgb, mask, depth)) if camera.dist.any() else CameraImages(rgb, mask, depth)
 
+    def straightened(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Another image of the camera (a clean plate), undistorted as its own are."""
+        return self._undistort(CameraImages(rgb, None, None)).rgb if self.camera.dist.any() else rgb
+
     def _locate(self, stream: Stream, frame: str) -> tuple[Path, str]:
         path = self._folder / self.camera.file(stream, frame)
         return path, f"{path}: camera '{self.camera.name}', frame '{frame}'"

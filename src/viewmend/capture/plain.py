@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.capture.camera_reader import CameraImages, CameraReader
@@ -132,6 +132,17 @@ class PlainCapture:
         if frame.mask is not None and int(frame.mask.max()) <= FOREGROUND:
             raise CaptureError(self._no_foreground(self._plain[views[0]], frame_id, int(frame.mask.max())))
         return frame
+
+    def straightened(
+        self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Another image that this camera took, a clean plate perhaps, undistorted as its frames are.
+
+        Raises:
+            ValueError: there is no such camera, or the image is not of its size.
+        """
+        self.cameras.select([camera])
+        return self._readers[self.cameras.names.index(camera)].straightened(rgb)
 
     def _stack(self, images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
         width, height = cameras.max_size_px

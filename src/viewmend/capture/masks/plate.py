@@ -1,0 +1,83 @@
+"""Masks by a clean plate: an image of the same camera without the subject."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from viewmend.capture.masks.maker import Mask, Rgb, demand_size, soft_mask
+
+SURE, POSSIBLE = 28.0, 14.0
+"""Distances in CIELAB (L from 0 to 255) that are foreground for sure, and where they hang together with sure ones."""
+DEEPEST_SHADOW = 0.6
+"""How much of the plate's brightness the deepest shadow leaves."""
+SHADOW_COST = 0.1
+"""How much of a shadow's darkening counts as difference."""
+MOST_GAIN = 1.6
+"""A camera whose exposure wandered by more than this factor is not brought back to its plate."""
+
+
+class PlateMasks:
+    """Makes masks of what differs from the plate, shadows apart; the same for the same image, at any time.
+
+    Exposure that wandered since the plate is brought back first. A shadow is the plate times one number a pixel.
+    """
+
+    def __init__(self, plate: Rgb):
+        self._plate = _smooth(plate)
+        self._lab = _lab(self._plate)
+        self._square = np.maximum((self._plate**2).sum(-1), 1e-4)
+
+    def mask(self, rgb: Rgb) -> Mask:
+        """Foreground of an image, 0 to 255.
+
+        Raises:
+            ValueError: the image is not of the plate's size.
+        """
+        demand_size(rgb, self._plate, "the plate")
+        image = _smooth(rgb)
+        image = np.minimum(image * exposure_gain(image, self._plate), 1)
+        lit = ((image * self._plate).sum(-1) / self._square).clip(DEEPEST_SHADOW, 1).astype(np.float32)
+        shaded, lab = _lab(self._plate * lit[..., None]), _lab(image)
+        darkening = self._lab[..., 0] - shaded[..., 0]
+        as_shadow = np.linalg.norm(lab - shaded, axis=-1) + SHADOW_COST * darkening
+        distance = np.minimum(as_shadow, np.linalg.norm(lab - self._lab, axis=-1))
+        return soft_mask(distance, SURE, POSSIBLE)
+
+
+def median_plate(images: Iterable[Rgb]) -> Rgb:
+    """The median of some images, pixel by pixel: the plate, where less than half of them show the subject.
+
+    Raises:
+        ValueError: there is no image.
+    """
+    stack = list(images)
+    if not stack:
+        raise ValueError("expected at least one image to make a plate of, got none; choose other frames")
+    return np.median(np.stack(stack), axis=0).astype(np.uint8)
+
+
+def exposure_gain(
+    image: Float32[np.ndarray, "height width 3"], plate: Float32[np.ndarray, "height width 3"]
+) -> Float32[np.ndarray, "3"]:
+    """What each channel of an image is multiplied by to be as bright as its plate: medians, the subject is the less."""
+    image, plate = image[::4, ::4], plate[::4, ::4]
+    usable = ((image > 0.05) & (image < 0.95) & (plate > 0.05) & (plate < 0.95)).all(-1)
+    if usable.mean() < 0.05:
+        return np.ones(3, np.float32)
+    gain = np.median(plate[usable] / image[usable], axis=0).astype(np.float32)
+    return gain if gain.min() > 1 / MOST_GAIN and gain.max() < MOST_GAIN else np.ones(3, np.float32)
+
+
+def _smooth(rgb: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+    """In [0, 1], without the noise of single pixels."""
+    import cv2
+
+    return np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), np.float32) / 255
+
+
+def _lab(rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+    """CIELAB with L from 0 to 255, like OpenCV's of 8 bits."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.float32) * np.array([2.55, 1, 1], np.float32)
