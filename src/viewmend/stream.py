@@ -113,10 +113,9 @@ class Stream:
         """What E is by: as configured, else what the inpainter is made for."""
         return self.config.render.error_rule or own_error_rule(self.inpainter)
 
-    def by_rule(self, error_rule: str) -> "Stream":
-        """The same times and memory, with E by another rule; ValueError where there is no such rule."""
-        config = replace(self.config, render=replace(self.config.render, error_rule=error_rule))
-        other = Stream(self.inpainter, config, self.bounds)
+    def rendered_by(self, render: RenderConfig) -> "Stream":
+        """The same times and memory, with views rendered in another way."""
+        other = Stream(self.inpainter, replace(self.config, render=render), self.bounds)
         other._observations = self._observations
         return other
 

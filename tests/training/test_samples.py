@@ -8,11 +8,14 @@ from random import Random
 import pytest
 import torch
 
+from viewmend.baselines.classical import Unfilled
 from viewmend.capture.prepare import prepare, reduced
+from viewmend.evaluation.frame_scores import true_view
 from viewmend.geometry.hull import HullConfig
-from viewmend.leave_one_out.scenes import LeaveOneOutFrames
-from viewmend.leave_one_out.studio_scenes import P_SEEDS, Q_SEEDS
+from viewmend.leave_one_out.scenes import LeaveOneOut
+from viewmend.leave_one_out.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
 from viewmend.rendering.view import RenderConfig
+from viewmend.stream import Stream
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
 from viewmend.training.replay import SampleReplay, samples_in_order
@@ -24,7 +27,7 @@ from viewmend.training.sample_files import (
     sample_to_bytes,
     write_shards,
 )
-from viewmend.training.samples import LeaveOneOut, Sample, widened
+from viewmend.training.samples import HeldOutCamera, Sample, widened
 from viewmend.training.scenes import StudioScenes, random_stage
 from viewmend.training.sources import scene_source
 
@@ -44,16 +47,28 @@ def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
     vandalised = replace(frame, rgb=frame.rgb.clone(), mask=frame.mask.clone())
     vandalised.rgb[2] = 255
     vandalised.mask[2] = 255
-    truth = studio.truth(studio.true_cameras.select([held]), 1)
-    samples = [
-        LeaveOneOut(rig.inputs(held, {}), None, HullConfig(resolution=48)).sample(1, (1,), truth, RenderConfig(), 0)
-        for rig in (LeaveOneOutFrames({1: f}, None, lambda held: studio.cameras) for f in (frame, vandalised))
-    ]
-    first, second = samples
+    first, second = (
+        HeldOutCamera(LeaveOneOut({1: f}), held, HullConfig(resolution=48)).sample(1, (1,), RenderConfig(), 0)
+        for f in (frame, vandalised)
+    )
     assert first is not None and second is not None
     assert torch.equal(first.view.rgb, second.view.rgb) and torch.equal(first.view.error, second.view.error)
     assert held not in first.view.source_views
     assert all(held not in views.frame.cameras.names for views in first.context)
+
+
+def test_training_is_shown_what_evaluation_is():
+    config = StudioConfig(seed=3, cameras=5, frames=2, size_px=96, background="stage")
+    scene = StudioScene(name="s", set="A", rig="", style="", config=config, held="cam02")
+    rig = LeaveOneOut({time: scene.studio().read(time) for time in range(2)})
+    camera, stream = HeldOutCamera(rig, scene.held, HullConfig()), Stream(Unfilled())
+    for frame in scene.frames("cpu"):
+        observation, time = stream.push(frame.inputs), frame.inputs.time
+        sample = camera.sample(time, (time,), RenderConfig(), 1, (0, 4))
+        assert sample is not None and sample.truth.any()
+        view, near = stream.render(frame.truth.cameras), observation.context(sample.view.candidate_views)
+        truth = (255 * true_view(frame.truth, None).rgb).round().to(torch.uint8)
+        assert same(sample, Sample(view, sample.context, near, truth)) and len(near.depth) == 4
 
 
 def test_truth_is_black_where_the_mask_is_and_context_is_past(plan):

@@ -14,7 +14,7 @@ from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
-from viewmend.leave_one_out.scenes import LeaveOneOutFrames
+from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.stage import Studio, StudioConfig
@@ -50,7 +50,7 @@ def stored(studio):
     def truth(held, time):
         return studio.truth(studio.true_cameras.select([held]), time)
 
-    rig = LeaveOneOutFrames({0: studio.read(0)}, None, lambda held: studio.cameras, truth)
+    rig = LeaveOneOut({0: studio.read(0)}, true_view=truth)
     return store(rig, 0, replace(PLAN, held_cameras=6), Random(0))
 
 

@@ -12,7 +12,7 @@ from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain_format import CALIBRATION
 from viewmend.capture.prepare import open_masked, prepare
 from viewmend.geometry.cameras import Cameras
-from viewmend.leave_one_out.scenes import LeaveOneOutScene, SceneFrame, without_held
+from viewmend.leave_one_out.scenes import LeaveOneOut, LeaveOneOutFrame, LeaveOneOutScene
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,15 +32,14 @@ class CaptureScene(LeaveOneOutScene):
         """The capture's fingerprint, which cameras, how many frames."""
         return repr((self.fingerprint, self.held, self.inputs, self.count))
 
-    def frames(self, device: str) -> Iterator[SceneFrame]:
+    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """Frames in which the camera that was left out, and at least two of the inputs, have images."""
         capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1), self.inputs)
         bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):
             frame = capture.read(time).to(device)
-            inputs = without_held(frame, self.held, self.inputs)
-            if self.held in frame.cameras.names and len(inputs.cameras) >= 2:
-                yield SceneFrame(inputs, frame.select([self.held]), bounds)
+            if self.held in frame.cameras.names and len(frame.cameras) >= 3:
+                yield LeaveOneOut({time: frame}, bounds).frame(self.held, time)
 
 
 def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) -> tuple[CaptureScene, ...]:

@@ -1,7 +1,7 @@
-"""A rig's frames without one of its cameras, and what that camera saw."""
+"""The leave-one-out data set: what a rig without one of its cameras saw, and what that camera saw."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from jaxtyping import Float
@@ -13,8 +13,8 @@ from viewmend.views import MultiViewFrame
 
 
 @dataclass(frozen=True)
-class SceneFrame:
-    """One time of a scene."""
+class LeaveOneOutFrame:
+    """One time of a rig, one of whose cameras is left out."""
 
     inputs: MultiViewFrame
     """What the rig saw, without the camera that was left out, and without true depth."""
@@ -24,6 +24,39 @@ class SceneFrame:
     """The volume that may hold the subject, None to find it."""
     backward_flow_px: Float[Tensor, "height width 2"] | None = None
     """Where in the previous true image each pixel's surface point was (`backward_flow`); None where nobody knows."""
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Some times of a rig, each of whose cameras can be left out."""
+
+    frames: Mapping[int, MultiViewFrame]
+    """What all cameras saw, by time."""
+    bounds: Bounds | None = None
+    """The volume that may hold the subject, None to find it."""
+    cameras: Callable[[str], Cameras] | None = None
+    """cameras(held): the rig's calibration as it is known without that camera's image; None where it is the frames'."""
+    true_view: Callable[[str, int], MultiViewFrame] | None = None
+    """true_view(held, time): what that camera should have seen; None where its own image is the truth."""
+
+    def frame(self, held: str, time: int) -> LeaveOneOutFrame:
+        """One time without a camera, and its truth."""
+        return LeaveOneOutFrame(self.inputs(held, time), self.truth(held, time), self.bounds)
+
+    def inputs(self, held: str, time: int, dropped: Collection[str] = ()) -> MultiViewFrame:
+        """What the others saw, without true depth; `dropped` are names of cameras that have no frame at that time."""
+        frame = replace(self.frames[time], depth=None).without((held, *dropped))
+        return replace(frame, cameras=self.calibration(held, time).select(frame.cameras.names))
+
+    def truth(self, held: str, time: int) -> MultiViewFrame:
+        """What the camera that is left out should see (one view), with its mask."""
+        seen = self.frames[time].select([held]) if self.true_view is None else self.true_view(held, time)
+        return replace(seen, cameras=self.calibration(held, time).select([held]))
+
+    def calibration(self, held: str, time: int) -> Cameras:
+        """All cameras of that time, as they are known without the image of one."""
+        there = self.frames[time].cameras
+        return there if self.cameras is None else self.cameras(held).select(there.names)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,50 +80,5 @@ class LeaveOneOutScene(ABC):
         """All that its frames depend on, in words that are the same on every machine."""
 
     @abstractmethod
-    def frames(self, device: str) -> Iterator[SceneFrame]:
+    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """The scene's frames in order of time, on a device."""
-
-
-def without_held(
-    frame: MultiViewFrame, held: str, inputs: Collection[str] | None = None, dropped: Collection[str] = ()
-) -> MultiViewFrame:
-    """What may be looked at when a camera is left out: the inputs that are there, without true depth.
-
-    Args:
-        frame: what all cameras saw.
-        held: the camera that is left out.
-        inputs: names of those that may be looked at; None for all others.
-        dropped: names of those that have no frame at this time.
-    """
-    names = frame.cameras.names
-    seen = [n for n in names if n != held and n not in dropped and (inputs is None or n in inputs)]
-    return replace(frame, depth=None).select(seen)
-
-
-@dataclass(frozen=True)
-class LeaveOneOutFrames:
-    """Some times of a rig, each of whose cameras can be left out."""
-
-    frames: Mapping[int, MultiViewFrame]
-    """What all cameras saw, by time."""
-    bounds: Bounds | None
-    """The volume that may hold the subject, None to find it."""
-    cameras: Callable[[str], Cameras]
-    """cameras(held): the rig's calibration as it is known without that camera's image."""
-    true_view: Callable[[str, int], MultiViewFrame] | None = None
-    """true_view(held, time): what that camera should have seen; None where its own image is the truth."""
-
-    def inputs(self, held: str, dropped: Mapping[int, Sequence[str]]) -> dict[int, MultiViewFrame]:
-        """What the others saw, by time; `dropped` are names of cameras without a frame at a time."""
-        return {
-            time: self._calibrated(without_held(frame, held, dropped=dropped.get(time, ())), held)
-            for time, frame in self.frames.items()
-        }
-
-    def truth(self, held: str, time: int) -> MultiViewFrame:
-        """What the camera that is left out should see (one view), with its mask."""
-        seen = self.frames[time].select([held]) if self.true_view is None else self.true_view(held, time)
-        return self._calibrated(seen, held)
-
-    def _calibrated(self, frame: MultiViewFrame, held: str) -> MultiViewFrame:
-        return replace(frame, cameras=self.cameras(held).select(frame.cameras.names))

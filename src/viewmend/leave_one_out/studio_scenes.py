@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
-from viewmend.leave_one_out.scenes import LeaveOneOutScene, SceneFrame, without_held
+from viewmend.leave_one_out.scenes import LeaveOneOut, LeaveOneOutFrame, LeaveOneOutScene
 from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, TEST_FOLDER
 from viewmend.leave_one_out.true_motion import backward_flow
 from viewmend.studio.procedural import PerformerStyle, procedural_scene
@@ -52,19 +52,18 @@ class StudioScene(LeaveOneOutScene):
             config, None if tempo is None else procedural_scene(config.seed, style=PerformerStyle(tempo=tempo))
         )
 
-    def frames(self, device: str) -> Iterator[SceneFrame]:
+    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """Renders them, one at a time."""
         studio = self.studio(device)
         before: MultiViewFrame | None = None
         for time in range(self.config.frames):
-            frame = studio.read(time)
-            truth = frame.select([self.held])
-            source = None
+            frame = LeaveOneOut({time: studio.read(time)}).frame(self.held, time)
             if before is not None and before.depth is not None:
                 now, then = (studio.scene(t).mesh for t in (time, time - 1))
-                source = backward_flow(now, then, before.depth[0], truth.cameras)
-            yield SceneFrame(without_held(frame, self.held), truth, None, source)
-            before = truth
+                flow_px = backward_flow(now, then, before.depth[0], frame.truth.cameras)
+                frame = replace(frame, backward_flow_px=flow_px)
+            yield frame
+            before = frame.truth
 
 
 def procedural_set(

@@ -116,7 +116,9 @@ class Renderer:
             raise FrameNotReadyError
         self._stream.push(self._read(request.time))
         before = viewer or self._stream.viewer()
-        stream = self._stream if request.error_rule is None else self._stream.by_rule(request.error_rule)
+        stream = self._stream
+        if request.error_rule is not None:
+            stream = stream.rendered_by(replace(stream.config.render, error_rule=request.error_rule))
         views = [self._view(stream, c.to(self._device), before, request.time, request.quality) for c in request.cameras]
         completed = tuple(view.completed for view in views)
         return RenderResult(request.time, completed, views[0].viewer, sum((v.times for v in views), StageTimes()))

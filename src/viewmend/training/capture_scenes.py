@@ -7,7 +7,7 @@ from random import Random
 from viewmend.capture.prepare import PreparedCapture, prepare, reduced
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.cameras import Cameras
-from viewmend.leave_one_out.scenes import LeaveOneOutFrames
+from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.training.plan import DataPlan
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import SceneSource, rig_samples
@@ -41,7 +41,7 @@ class CaptureScenes:
                 self._prepared[which, held] = prepare(capture, [n for n in capture.cameras.names if n != held])
             return replace(self._prepared[which, held], longest_px=size_px).cameras.to(self.plan.data_device)
 
-        return rig_samples(LeaveOneOutFrames(frames, capture.bounds, cameras), self.plan, random)
+        return rig_samples(LeaveOneOut(frames, capture.bounds, cameras), self.plan, random)
 
 
 class MixedScenes:

@@ -1,6 +1,6 @@
-"""Training pairs through the production pipeline: leave a camera out, hull, render, holes (section 8)."""
+"""Training pairs of the leave-one-out data set, by the stream that everybody drives (section 8)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
@@ -9,11 +9,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.bounds import Bounds
+from viewmend.baselines.classical import Unfilled
 from viewmend.geometry.hull import HullConfig
-from viewmend.geometry.proxy import GeometryProxy, reconstruct
-from viewmend.rendering.view import RenderConfig, render_view
-from viewmend.views import ContextViews, IncompleteView, MultiViewFrame
+from viewmend.leave_one_out.scenes import LeaveOneOut
+from viewmend.observation import Observation
+from viewmend.rendering.view import RenderConfig
+from viewmend.stream import Stream, StreamConfig
+from viewmend.views import ContextViews, IncompleteView
 
 
 @dataclass(frozen=True)
@@ -55,28 +57,26 @@ def to_device(value: Any, device: torch.device | str) -> Any:
     return value
 
 
-class LeaveOneOut:
-    """What a rig without one of its cameras saw (`LeaveOneOutFrames.inputs`); proxies are computed once a time."""
+class HeldOutCamera:
+    """One camera of a rig left out, and the stream of what the others see; hulls are carved once a time."""
 
-    def __init__(self, inputs: Mapping[int, MultiViewFrame], bounds: Bounds | None, hull: HullConfig):
-        self.frames = inputs
-        self.bounds = bounds
-        self.hull = hull
-        self._proxies: dict[int, GeometryProxy] = {}
+    def __init__(
+        self, rig: LeaveOneOut, held: str, hull: HullConfig, dropped: Mapping[int, Collection[str]] | None = None
+    ) -> None:
+        """`dropped` are names of cameras without a frame at a time."""
+        self.rig = rig
+        self.held = held
+        self.dropped = dropped or {}
+        self.stream = Stream(Unfilled(), StreamConfig(hull=hull, memory_mb=None), rig.bounds)
 
-    def proxy(self, time: int) -> GeometryProxy:
-        """G[time], from the masks of the cameras that are left."""
-        if time not in self._proxies:
-            frame = self.frames[time]
-            assert frame.mask is not None, "what trains has masks"
-            self._proxies[time] = reconstruct(frame.mask, frame.cameras, self.bounds, self.hull)
-        return self._proxies[time]
+    def observation(self, time: int) -> Observation:
+        """What the others saw at a time, and the hull that they carve."""
+        return self.stream.push(self.rig.inputs(self.held, time, self.dropped.get(time, ())))
 
     def sample(
         self,
         time: int,
         times: Sequence[int],
-        truth: MultiViewFrame,
         render: RenderConfig,
         min_hole_px: int,
         cameras: tuple[int, int] = (0, 0),
@@ -84,26 +84,21 @@ class LeaveOneOut:
     ) -> Sample | None:
         """The pair at `time` with context from these `times`, its own first; None if fewer pixels are missing.
 
-        truth: the held camera at `time`, one view.
         cameras: how many are context at least, and how many `nearby`.
         widened_px: by how much its holes are larger than what the source views do not see.
         """
-        view = render_view(self.frames[time], self.proxy(time), truth.cameras, render)
+        now = self.observation(time)
+        target = self.rig.calibration(self.held, time).select([self.held])
+        view = self.stream.rendered_by(render).render(target, time)
         if float(view.error.sum()) < min_hole_px:
             return None
         view = widened(view, widened_px)
         wanted = view.closest_views(max(len(view.source_views), cameras[0]))
-        context = []
-        for tau in times:
-            names = [n for n in wanted if n in self.frames[tau].cameras.names]
-            frame = self.frames[tau].select(names)
-            context.append(ContextViews(frame, self.proxy(tau).depth(frame.cameras)))
+        context = [self.observation(tau).context(wanted) for tau in times]
+        nearby, truth = now.context(view.closest_views(cameras[1])), self.rig.truth(self.held, time)
         assert truth.mask is not None, "what trains has masks"
-        around = view.closest_views(cameras[1])
-        near = self.frames[time].select(around)
-        nearby = ContextViews(near, self.proxy(time).depth(near.cameras)) if around else None
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
-        return Sample(view, tuple(context), nearby, black.round().to(torch.uint8))
+        return Sample(view, tuple(c for c in context if c is not None), nearby, black.round().to(torch.uint8))
 
 
 def widened(view: IncompleteView, reach_px: int) -> IncompleteView:

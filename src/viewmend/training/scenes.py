@@ -6,13 +6,13 @@ from random import Random
 from typing import Protocol, TypeVar, runtime_checkable
 
 from viewmend.geometry.hull import HullConfig
-from viewmend.leave_one_out.scenes import LeaveOneOutFrames
+from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, Split, recordings
 from viewmend.rendering.view import RenderConfig
 from viewmend.studio.imperfections import Imperfections
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.training.plan import DataPlan
-from viewmend.training.samples import LeaveOneOut, Sample
+from viewmend.training.samples import HeldOutCamera, Sample
 from viewmend.views import MultiViewFrame
 
 ROUGHEST = 2.5
@@ -55,7 +55,7 @@ class StudioScenes:
         rig, random = self.rig(number)
         return rig_samples(rig, self.plan, random)
 
-    def rig(self, number: int) -> tuple[LeaveOneOutFrames, Random]:
+    def rig(self, number: int) -> tuple[LeaveOneOut, Random]:
         """What the stage of scene `number` saw, and what draws anything else about the scene."""
         random = Random(f"{self.seed}/{number}")
         studio = Studio(random_stage(self.plan, random, self.split))
@@ -64,7 +64,7 @@ class StudioScenes:
             return studio.truth(studio.true_cameras.select([held]), time)
 
         frames = {time: studio.read(time) for time in self.plan.times}
-        return LeaveOneOutFrames(frames, None, lambda held: studio.cameras, truth), random
+        return LeaveOneOut(frames, true_view=truth), random
 
 
 def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> StudioConfig:
@@ -115,7 +115,7 @@ def _rougher(it: Imperfections, random: Random) -> Imperfections:
     )
 
 
-def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[Sample]:
+def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random) -> list[Sample]:
     """Some cameras of a rig are left out in turn, each at some of the times.
 
     Args:
@@ -134,8 +134,7 @@ def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[
     names = [n for n in rig.frames[times[-1]].cameras.names if n not in dropped.get(times[-1], ())]
     samples = []
     for held in random.sample(names, min(plan.held_cameras, len(names))):
-        hull = HullConfig(resolution=plan.hull_resolution)
-        others = LeaveOneOut(rig.inputs(held, dropped), rig.bounds, hull)
+        others = HeldOutCamera(rig, held, HullConfig(resolution=plan.hull_resolution), dropped)
         for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
             reach = random.choice(plan.past)
             render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
@@ -145,7 +144,7 @@ def rig_samples(rig: LeaveOneOutFrames, plan: DataPlan, random: Random) -> list[
                 past = [t for t in reversed(times) if t < time][:reach]
                 context = (time, *past) if plan.context else ()
                 least_px = plan.min_hole_px if time == end else 0
-                new = others.sample(time, context, rig.truth(held, time), render, least_px, cameras, wider_px)
+                new = others.sample(time, context, render, least_px, cameras, wider_px)
                 sample = new and replace(new, previous=sample)
             if sample is not None:
                 samples.append(sample)

@@ -19,12 +19,12 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.mesh import Mesh, vertex_normals
-from viewmend.geometry.proxy import GeometryProxy, reconstruct
-from viewmend.leave_one_out.scenes import LeaveOneOutFrames
+from viewmend.geometry.proxy import GeometryProxy
+from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.plan import DataPlan
-from viewmend.training.samples import Sample
+from viewmend.training.samples import HeldOutCamera, Sample
 from viewmend.training.scenes import SceneSource, StudioScenes
 from viewmend.views import MultiViewFrame
 
@@ -85,7 +85,7 @@ class StoredScene:
         return Sample(rendered, (), context, black, alpha=alpha, depth=truth.depth[0])
 
 
-def store(rig: LeaveOneOutFrames, time: int, plan: DataPlan, random: Random) -> StoredScene:
+def store(rig: LeaveOneOut, time: int, plan: DataPlan, random: Random) -> StoredScene:
     """One time of a rig without some of its cameras in turn.
 
     Args:
@@ -103,17 +103,16 @@ def store(rig: LeaveOneOutFrames, time: int, plan: DataPlan, random: Random) -> 
     return StoredScene(images, depths, step_m, tuple(_held_view(rig, name, time, hull) for name in held))
 
 
-def _held_view(rig: LeaveOneOutFrames, name: str, time: int, hull: HullConfig) -> StoredView:
-    inputs, truth = rig.inputs(name, {})[time], rig.truth(name, time)
-    assert inputs.mask is not None and truth.depth is not None, "what trains has masks and true depth"
-    proxy = reconstruct(inputs.mask, inputs.cameras, rig.bounds, hull)
+def _held_view(rig: LeaveOneOut, name: str, time: int, hull: HullConfig) -> StoredView:
+    proxy, truth = HeldOutCamera(rig, name, hull).observation(time).proxy, rig.truth(name, time)
+    assert isinstance(proxy, GeometryProxy) and truth.depth is not None, "hulls are carved, and true depth is known"
     step_m = float(truth.depth.amax().clamp_min(1e-3)) / STEPS
     low, size = proxy.bounds.low, proxy.bounds.size_m
     steps = (STEPS * (proxy.mesh.vertices - low) / size).round().clamp(0, STEPS).cpu().numpy().astype(np.uint16)
     faces = np.diff(proxy.mesh.faces.cpu().numpy().astype(np.int32).ravel(), prepend=0)
     return StoredView(
         name,
-        rig.cameras(name).select(rig.frames[time].cameras.names),
+        rig.calibration(name, time),
         _coded(*_own(truth, 0)),
         _coded_depth(truth.depth[0], step_m),
         step_m,
