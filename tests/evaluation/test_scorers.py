@@ -43,12 +43,15 @@ def test_those_without_weights_are_left_out_with_their_reason(networks):
 
 
 def test_streams_are_cut_into_videos(i3d, rng):
-    frames = torch.rand(CLIP_FRAMES + 2, 3, 40, 44, generator=rng)
+    frames = torch.rand(CLIP_FRAMES + 8, 3, 40, 44, generator=rng)
     holes = torch.rand(40, 44, generator=rng) > 0.5
-    videos = VideoFeatures(i3d)
-    for frame in frames:
+    videos, shorter = VideoFeatures(i3d), VideoFeatures(i3d)
+    for number, frame in enumerate(frames):
         videos.add(frame, holes)
+        if number < CLIP_FRAMES + 1:
+            shorter.add(frame, holes)
     found = videos.features()
+    assert {len(v) for v in (shorter.features() or {}).values()} == {1}, "one frame is no video beside sixteen"
     assert found is not None and {kind: len(v) for kind, v in found.items()} == dict.fromkeys(KINDS, 2)
     expected = video_features(i3d, list(frames[CLIP_FRAMES:] * holes), "train")
     torch.testing.assert_close(torch.from_numpy(found["masked_train"][1]), expected)

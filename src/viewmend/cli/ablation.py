@@ -17,9 +17,9 @@ TOP_K = (64, 128, 256, 512, 1024)
 class Options:
     """The ablation: what each part of the method is worth.
 
-    Samples are made once; every variant is trained on them from every seed by the same number of steps, and evaluated
-    on the first scenes of P, a stage behind their people. OUT gets samples/, models/, cells/, ablation.md, .json and
-    .svg. The same command goes on with what was stopped.
+    Samples are made once; every variant of the paper's model, at small widths, is trained on them from every seed by
+    the same number of steps, and evaluated on the first scenes of P, upon white. OUT gets samples/, models/, cells/,
+    ablation.md, .json and .svg. The same command goes on with what was stopped.
     """
 
     out: Path
@@ -161,11 +161,13 @@ def _evaluate(options: Options, trained: "list[Trained]") -> "list[Cell]":
     from viewmend.cli.console import say, track
     from viewmend.evaluation.cells import CellStore
     from viewmend.evaluation.runner import run_evaluation
+    from viewmend.evaluation.scene_run import RunSettings
     from viewmend.leave_one_out.studio_scenes import procedural_set
 
-    scenes = procedural_set(options.frames, options.size, "stage")[: options.scenes]
+    scenes = procedural_set(options.frames, options.size)[: options.scenes]
     methods = ("telea", *(str(one.folder) for one in trained))
-    steps = run_evaluation(scenes, methods, CellStore(options.out / "cells"), jobs=options.jobs)
+    settings = RunSettings(background="white")
+    steps = run_evaluation(scenes, methods, CellStore(options.out / "cells"), settings, options.jobs)
     cells = list(track((cell for found in steps for cell in found), "evaluating", len(scenes) * len(methods)))
     for cell in cells:
         if cell.error is not None:

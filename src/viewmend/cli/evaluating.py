@@ -54,6 +54,9 @@ class RunOptions:
     """Width and height of the views of P and Q."""
     background: Literal["black", "stage"] = "black"
     """What stands behind the people of P: a stage for models that are not given masks."""
+    score_background: Literal["black", "white"] = "black"
+    """What views and truth lie upon when they are scored. The paper's figures are upon white; figures of whole images
+    upon one and the other do not compare."""
     ssim: Literal["gaussian", "uniform7"] = "gaussian"
     """Windows of SSIM: Gaussian of 11 x 11 pixels, or uniform of 7 x 7."""
     jobs: int = 1
@@ -192,6 +195,7 @@ def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
             memory_mb=None,
         ),
         ssim=options.ssim,
+        background=options.score_background,
         networks=networks,
     )
 

@@ -75,7 +75,8 @@ def markdown(ablation: Ablation) -> str:
     styles = list(ablation.variants[0].loss_by_style)
     header = ["variant", "holes, dB", "loss against full", *(f"loss, {style}" for style in styles), "whole, dB", "ms"]
     lines = [
-        f"{ablation.scenes} scenes of P-stage. Telea: {_figure(ablation.telea)} dB in the holes. Seeds after the mean.",
+        f"{ablation.scenes} scenes of P, upon white. Telea: {_figure(ablation.telea)} dB in the holes. Seeds after the "
+        "mean.",
         "",
     ]
     lines += _table(header, [_cells(line, styles) for line in ablation.variants])

@@ -170,6 +170,7 @@ class CellStore:
 def cell_keys(scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
+    rules += [] if settings.background == "black" else [settings.background]
     scene_digest = _digest([*rules, *settings.networks])
     return tuple(
         CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)

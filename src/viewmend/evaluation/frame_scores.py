@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from viewmend.evaluation.scorers import SSIM_ONLY, ScoreMap, Scorers
+from viewmend.evaluation.scorers import SSIM_ONLY, Background, ScoreMap, Scorers
 from viewmend.evaluation.temporal import change, warp_error
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, mask_iou, psnr, ssim_map
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
-from viewmend.views import CompletedView, MultiViewFrame
+from viewmend.views import CompletedView, IncompleteView, MultiViewFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class TrueView:
     """What the completed view should look like."""
 
     rgb: Float[Tensor, "3 height width"]
-    """Colours in [0, 1], black where there is no subject."""
+    """Colours in [0, 1], upon the background of the `Scorers`."""
     mask: Bool[Tensor, "height width"]
     backward_flow_px: Float[Tensor, "height width 2"] | None
     """See `leave_one_out.true_motion.backward_flow`."""
@@ -104,11 +104,23 @@ class Before:
     holes: Bool[Tensor, "height width"]
 
 
-def true_view(frame: MultiViewFrame, backward_flow_px: Float[Tensor, "height width 2"] | None) -> TrueView:
+def true_view(
+    frame: MultiViewFrame,
+    backward_flow_px: Float[Tensor, "height width 2"] | None,
+    background: Background = "black",
+) -> TrueView:
     """The truth of a frame of one view with a mask."""
     assert frame.mask is not None, "a held camera comes with its mask"
     mask = frame.mask[0]
-    return TrueView(frame.rgb[0].float() / 255 * (mask.float() / 255), mask > FOREGROUND, backward_flow_px)
+    black = frame.rgb[0].float() / 255 * (mask.float() / 255)
+    return TrueView(laid_upon(background, black, mask.float() / 255), mask > FOREGROUND, backward_flow_px)
+
+
+def laid_upon(
+    background: Background, rgb: Float[Tensor, "3 height width"], alpha: Float[Tensor, "height width"]
+) -> Float[Tensor, "3 height width"]:
+    """An image upon black, of what covers so much of each pixel, upon this background."""
+    return rgb if background == "black" else (rgb + (1 - alpha)).clamp(0, 1)
 
 
 def score_frame(
@@ -119,7 +131,9 @@ def score_frame(
     scorers: Scorers = SSIM_ONLY,
 ) -> FrameScores:
     """All scores of one completed view. Its holes are the same for every method and every error rule."""
-    view, rgb = completed.view, completed.rgb
+    view, background = completed.view, scorers.background
+    rgb = laid_upon(background, completed.rgb, completed.opacity)
+    rendered = laid_upon(background, view.rgb, view.mask)
     holes = view.holes
     pixels = _Pixels(rgb, truth.rgb, holes, holes & truth.mask)
     height, width = holes.shape
@@ -134,13 +148,13 @@ def score_frame(
         psnr_holes_fg=psnr(rgb, truth.rgb, pixels.holes_fg),
         psnr_masked=psnr(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None,
         psnr_whole=psnr(rgb, truth.rgb),
-        psnr_whole_rendered=psnr(view.rgb, truth.rgb),
+        psnr_whole_rendered=psnr(rendered, truth.rgb),
         psnr_subject=psnr(rgb, truth.rgb, truth.mask),
         alpha_iou=mask_iou(completed.opacity > 0.5, truth.mask),
         **_by_map("ssim", partial(similarity, window=scorers.ssim), pixels),
         **_by_map("lpips_alex", scorers.lpips_alex, pixels),
         **_by_map("lpips_vgg", scorers.lpips_vgg, pixels),
-        **_temporal(completed, truth, before),
+        **_temporal(rgb, view, truth, before),
         step_ms=step_ms,
     )
 
@@ -172,14 +186,16 @@ def _mean(values: Tensor | None) -> float | None:
     return None if there is None or not there.numel() else float(there.double().mean())
 
 
-def _temporal(completed: CompletedView, truth: TrueView, before: Before | None) -> dict[str, float | None]:
+def _temporal(
+    now: Float[Tensor, "3 height width"], view: IncompleteView, truth: TrueView, before: Before | None
+) -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(TEMPORAL)
     if before is None:
         return found
-    holes = completed.view.holes
+    holes = view.holes
     now_or_then = holes | before.holes
-    now, then, true_now, true_then = completed.rgb, before.completed, truth.rgb, before.truth
-    shown = (completed.view.mask > 0) | truth.mask
+    then, true_now, true_then = before.completed, truth.rgb, before.truth
+    shown = (view.mask > 0) | truth.mask
     still = shown & ((true_now - true_then).abs().amax(0) < STILL)
     found["change_still"] = change(now, then, still, ENOUGH_HOLE_PX)
     found["change"] = change(now, then, now_or_then, ENOUGH_HOLE_PX)

@@ -14,7 +14,9 @@ RULES = (
     "One camera is left out, with its mask; its view is carved and rendered from the others, and completed as a "
     "stream: one frame at a time, from past frames only. All methods complete the same rendered views.",
     "Holes are the proxy's pixels that no camera in use colours, not dilated: E by the rule 'unseen', and the same for "
-    "scores whatever the methods were asked to mend. The truth is the left-out camera's image on black.",
+    "scores whatever the methods were asked to mend. The truth is the left-out camera's image on black, or on white "
+    "where the setting says so: then classical fills and published networks are shown the view on white, too, and a "
+    "model of ours what it was trained on, its result laid on white by its alpha, or M.",
     'Each score has four readings: "whole", over all pixels; "holes", over the holes alone (a); "in mask", over '
     'those of them inside the true mask; "masked", of both images blackened outside the holes, over all pixels (b). '
     'SSIM and LPIPS in "holes" and "in mask" are means of their maps there, of unmasked images.',

@@ -48,7 +48,7 @@ def setting_lines(report: Report) -> list[str]:
     lines = [
         f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
         f"{settings.stream.render.cameras} closest cameras; error rule {rule}; "
-        f"SSIM {settings.ssim}."
+        f"SSIM {settings.ssim}; scored upon {settings.background}."
     ]
     return lines + [
         f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "

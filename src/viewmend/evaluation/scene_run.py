@@ -12,9 +12,10 @@ from viewmend.baselines.classical import Unfilled
 from viewmend.baselines.rgvi import SeesTruth
 from viewmend.contact_sheet import picture
 from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
-from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
-from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
-from viewmend.inpainting.protocol import State, ViewInpainter
+from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, laid_upon, score_frame, true_view
+from viewmend.evaluation.scorers import Background, Features, Scorers, VideoFeatures, load_scorers
+from viewmend.inpainting.protocol import State, ViewInpainter, own_background
+from viewmend.inpainting.upon_white import UponWhite
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import make_method
 from viewmend.metrics.image_quality import SsimWindow
@@ -37,6 +38,8 @@ class RunSettings:
     """Hull and renderer, the same for every method."""
     ssim: SsimWindow = "gaussian"
     """Over which windows SSIM is taken."""
+    background: Background = "black"
+    """What views and truth are laid upon; what fills by what it is shown is shown views upon it."""
     networks: tuple[str, ...] = ()
     """The networks of `scorers.NETWORKS` to compare with."""
 
@@ -90,8 +93,8 @@ def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: Ru
     A function of its arguments alone, which can all be pickled: processes and clusters call it. What goes wrong becomes
     the `error` of the method that it went wrong with, or of all if it is the scene's.
     """
-    scorers = load_scorers(settings.ssim, settings.networks, settings.device)
-    shown = _Shown(VideoFeatures(scorers.i3d))
+    scorers = load_scorers(settings.ssim, settings.networks, settings.device, settings.background)
+    shown = _Shown(VideoFeatures(scorers.i3d), settings.background)
     streams = [_Stream(name, settings, scorers) for name in methods]
     try:
         with torch.no_grad():
@@ -114,7 +117,8 @@ def _moments(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Moment
         observation = stream.push(frame.inputs)
         view = stream.render(frame.truth.cameras)
         holes = int(view.holes.sum())
-        last = _Moment(observation, view, true_view(frame.truth, frame.backward_flow_px), last, holes > most)
+        truth = true_view(frame.truth, frame.backward_flow_px, settings.background)
+        last = _Moment(observation, view, truth, last, holes > most)
         yield last
         most, last = max(most, holes), replace(last, before=None)
 
@@ -122,8 +126,9 @@ def _moments(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Moment
 class _Shown:
     """What is kept of a scene to be shown beside every method's."""
 
-    def __init__(self, videos: VideoFeatures) -> None:
+    def __init__(self, videos: VideoFeatures, background: Background) -> None:
         self.videos = videos
+        self._background: Background = background
         self.pictures: tuple[Picture, Picture, Picture] | None = None
         self.box: Box | None = None
         self._rendered: list[Picture] = []
@@ -132,13 +137,14 @@ class _Shown:
     def add(self, moment: _Moment) -> None:
         """One more time."""
         view, truth = moment.view, moment.truth
+        rendered = laid_upon(self._background, view.rgb, view.mask)
         self.videos.add(truth.rgb, view.holes)
         if moment.largest:
-            self.pictures = picture(view.rgb), picture(view.error[None]), picture(truth.rgb)
+            self.pictures = picture(rendered), picture(view.error[None]), picture(truth.rgb)
         if len(self._truth) < FILM_FRAMES:
             box = subject_box((view.mask > 0) | truth.mask)
             self.box = box if self.box is None else self.box if box is None else self.box.around(box)
-            self._rendered.append(picture(view.rgb))
+            self._rendered.append(picture(rendered))
             self._truth.append(picture(truth.rgb))
 
     def film(self) -> Picture | None:
@@ -177,9 +183,9 @@ class _Stream:
         mended = self._mend(moment)
         if not self._scores and mended.times.inpainting < SLOW_MS:
             mended = self._mend(moment)
-        view = mended.completed.view
-        rgb, before = mended.completed.rgb, None
-        _check(rgb, view)
+        view, before = mended.completed.view, None
+        _check(mended.completed.rgb, view)
+        rgb = laid_upon(self.settings.background, mended.completed.rgb, mended.completed.opacity)
         if moment.before is not None and self._last is not None:
             before = Before(self._last, moment.before.truth.rgb, moment.before.view.holes)
         ms = mended.times.context + mended.times.inpainting
@@ -188,8 +194,9 @@ class _Stream:
         if len(self._frames) < FILM_FRAMES:
             self._frames.append(picture(rgb))
         self._viewer, self._last = mended.viewer, rgb
-        if isinstance(self._inpainter, SeesTruth):
-            self._viewer = self._inpainter.shown(mended.viewer, moment.truth.rgb)
+        own = self._inpainter.inner if isinstance(self._inpainter, UponWhite) else self._inpainter
+        if isinstance(own, SeesTruth):
+            self._viewer = own.shown(mended.viewer, moment.truth.rgb)
         if moment.largest:
             self._picture = picture(rgb)
 
@@ -197,6 +204,8 @@ class _Stream:
         """The view, by a stream of the method's own, so that it pays for what it asks for beyond the rendering."""
         if self._inpainter is None:
             self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
+            if self.settings.background == "white" and own_background(self._inpainter) is None:
+                self._inpainter = UponWhite(self._inpainter)
         if self._stream is None or not self._scores:
             self._stream = Stream(self._inpainter, self.settings.stream)
         observation = self._stream.push(moment.observation.frame, moment.observation.proxy)

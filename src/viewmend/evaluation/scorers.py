@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -16,8 +17,10 @@ from viewmend.metrics.weights import MissingWeightsError
 
 ScoreMap = Callable[[Tensor, Tensor], Tensor | None]
 """score(image, truth): a value for each pixel, NaN where there is none; None for images it cannot score."""
+Background = Literal["black", "white"]
 CLIP_FRAMES = 16
-"""A stream is cut into videos of so many frames for VFID; what is left over, if anything, is one more."""
+"""A stream is cut into videos of so many frames for VFID. What is left over is one more if it is half as long, or
+alone."""
 KINDS = tuple(f"{kind}_{mode}" for mode in MODES for kind in ("whole", "masked"))
 """VFID's readings: whole images or such that are black outside E, by I3D in either mode."""
 
@@ -27,6 +30,8 @@ class Scorers:
     """How images and videos are compared besides PSNR; None without the weights."""
 
     ssim: SsimWindow = "gaussian"
+    background: Background = "black"
+    """What views and truth are laid upon."""
     lpips_alex: ScoreMap | None = None
     lpips_vgg: ScoreMap | None = None
     i3d: I3d | None = None
@@ -37,13 +42,15 @@ Features = dict[str, Float[np.ndarray, "clip 1024"]]
 """I3D's vectors of a stream's videos, for each of `KINDS`."""
 
 
-def load_scorers(ssim: SsimWindow, networks: Sequence[str], device: str) -> Scorers:
-    """Scorers with these of `NETWORKS`.
+def load_scorers(ssim: SsimWindow, networks: Sequence[str], device: str, background: Background = "black") -> Scorers:
+    """Scorers with these of `NETWORKS`, upon this background.
 
     Raises:
         WeightsError: one's weights are missing or wrong.
     """
-    return Scorers(ssim, **{field: load(device) for name, (field, load) in NETWORKS.items() if name in networks})
+    return Scorers(
+        ssim, background, **{field: load(device) for name, (field, load) in NETWORKS.items() if name in networks}
+    )
 
 
 NETWORKS = {
@@ -87,9 +94,10 @@ class VideoFeatures:
 
     def features(self) -> Features | None:
         """Features of all frames so far; None without the network, or without frames."""
-        if self._frames:
+        cut = self._found[KINDS[0]]
+        if self._frames and (not cut or 2 * len(self._frames) >= CLIP_FRAMES):
             self._cut()
-        if not self._found[KINDS[0]]:
+        if not cut:
             return None
         return {kind: torch.stack(found).cpu().numpy() for kind, found in self._found.items()}
 

@@ -23,6 +23,11 @@ class Chain(Network):
         self.patches = PatchTransformer(config)
         self.coarse = RayBlendNet(config.num_ray_views) if config.coarse_fill == "rays" else SmoothFill()
 
+    @property
+    def background(self) -> str:
+        """What it paints upon."""
+        return self.patches.background
+
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
         """The coarse fill's where it is alone; else the patch transformer's, which is wider."""
         return (self.coarse if quality.context_times == 0 else self.patches).crop_margin_px(quality)

@@ -53,6 +53,11 @@ class CoarseFill(Network):
 class SmoothFill(CoarseFill):
     """`fill` on its own: from the surroundings, no camera is looked at."""
 
+    @property
+    def background(self) -> None:
+        """It paints upon whatever it is shown."""
+        return
+
     def forward(
         self, views: Sequence[IncompleteView], ray_views: Sequence[ContextViews | None]
     ) -> list[Float[Tensor, "3 _h _w"]]:

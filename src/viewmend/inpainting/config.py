@@ -1,20 +1,31 @@
 """The sizes and switches of the inpainter."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal
 
 from viewmend.json_input import typed
 
 ENCODER_GROUPS = (1, 1, 1, 1, 1, 2, 4, 8, 1)
 """Groups of the encoder's nine convolutions."""
+SMALL_WIDTHS = (16, 16, 32, 64, 96, 128, 96, 64, 32)
+"""A quarter of the paper's."""
+PAPER_TOP_K = 512
+"""About an eighth of what a whole window of three cameras shows at 512 pixels; 0.00 dB below all in the ablation."""
 LARGEST = 65_536
 """The largest size; what a file claims is not allocated blindly."""
 MAX_BLOCKS = 256
+CHOICES = {
+    "coarse_fill": ("none", "smooth", "rays"),
+    "background": ("black", "white", "recorded"),
+    "patch_depth": ("pixel", "centre"),
+    "past_geometry": ("own", "current"),
+    "rope_unit": ("image", "patch"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
 class InpainterConfig:
-    """One architecture; `paper()` and `small()` are two of them. Defaults are the paper's sizes."""
+    """One architecture; `paper()` and `small()` are two of them. Defaults are the paper's sizes, with what is ours."""
 
     widths: tuple[int, ...] = (64, 64, 128, 256, 384, 512, 384, 256, 128)
     """Output channels of the encoder's nine convolutions; the last is C, the channels of a patch."""
@@ -33,8 +44,12 @@ class InpainterConfig:
     """Show the encoder the proxy's depth, relative to the image's median depth (so it fits any rig)."""
     use_validity: bool = True
     """Show the encoder where a view is right (1 - E), so that a hole is no black cloth. Ours."""
-    black_background: bool = True
-    """Blacken the background of camera images, as it is in a rendered view. Ours."""
+    background: Literal["black", "white", "recorded"] = "black"
+    """What lies behind the subject: black, as in a rendered view (ours); white, upon which holes are black and the
+    model paints (the paper's); or in camera images what they recorded, and black in the view (ours)."""
+    min_foreground: float = 0.1
+    """A camera's mask up to this, in [0, 1], is background: 0 (the paper's), or more, since recorded masks are never
+    quite zero."""
     rope: bool = True
     """Rotary embedding of (u, v, s) in the attention's scores."""
     rope_unit: Literal["image", "patch"] = "image"
@@ -53,12 +68,20 @@ class InpainterConfig:
     """Cameras at the view's own time that `RayBlendNet` looks at: the source views, then the closest others."""
     temporal_accumulation: float = 0.0
     """Weight of a stream's last fill, carried by the proxy, where the new one hardly differs; 0 to below 1. Ours."""
+    copier_start: bool = True
+    """Start attention at what lands nearest, and tokens as copies of it, instead of at random. Ours."""
+    token_norms: bool = True
+    """Normalise tokens where patches become tokens, and before they are decoded. Ours."""
+    clamp_fill: bool = True
+    """Clamp Ftilde to [0, 1] before it is blended, and not Fhat afterwards alone. Ours."""
     top_k: int | None = None
-    """Context tokens that survive pruning; None keeps all. A step may ask for another number."""
+    """Context tokens that survive pruning, in training, too; None keeps all. A step may ask for another number."""
     context_cameras: int | None = None
     """How many cameras are context, whatever number coloured the view; None: those that did."""
     past_geometry: Literal["own", "current"] = "own"
     """Geometry that carries a past patch into the view: that of its own time, or of now (the paper's)."""
+    patch_depth: Literal["pixel", "centre"] = "pixel"
+    """Depth of a patch: of the pixel below and right of its centre, or the mean about the centre (the paper's)."""
     n_c: int = 3
     """Frames just before the current one."""
     n_w: int = 3
@@ -85,8 +108,12 @@ class InpainterConfig:
             raise ValueError(f"expected {len(ENCODER_GROUPS)} encoder widths, multiples of 8, got {self.widths}")
         if not 0 <= self.temporal_accumulation < 1:
             raise ValueError(f"expected temporal_accumulation from 0 to below 1, got {self.temporal_accumulation}")
-        if self.coarse_fill not in ("none", "smooth", "rays"):
-            raise ValueError(f"expected coarse_fill none, smooth or rays, got '{self.coarse_fill}'")
+        if not 0 <= self.min_foreground < 1:
+            raise ValueError(f"expected min_foreground from 0 to below 1, got {self.min_foreground}")
+        for name, known in CHOICES.items():
+            if getattr(self, name) not in known:
+                listed = f"{', '.join(known[:-1])} or {known[-1]}"
+                raise ValueError(f"expected {name} {listed}, got '{getattr(self, name)}'")
         for name in ("top_k", "context_cameras"):
             if (value := getattr(self, name)) is not None and value < 1:
                 raise ValueError(f"expected {name} of at least 1 or none, got {value}")
@@ -119,7 +146,8 @@ class InpainterConfig:
     def from_dict(cls, values: dict[str, Any]) -> "InpainterConfig":
         """Inverse of `to_dict`; what a config does not name yet has its default, which is as it was before.
 
-        Names of earlier versions (`prefill`, `rays`, `steady`, `colour_path`) are read as what they are called now.
+        Names of earlier versions (`prefill`, `rays`, `steady`, `colour_path`, `black_background`) are read as what they
+        are called now.
 
         Raises:
             ValueError: a key is unknown, or a value is impossible.
@@ -146,6 +174,8 @@ def _renamed(values: dict[str, Any]) -> dict[str, Any]:
     for old, new in (("colour_path", "colour_skip"), ("steady", "temporal_accumulation")):
         if old in values:
             values[new] = values.pop(old)
+    if "black_background" in values:
+        values["background"] = "black" if values.pop("black_background") else "recorded"
     rays = values.pop("rays", 0)
     if values.pop("prefill", False):
         values |= {"coarse_fill": "rays", "num_ray_views": rays} if rays else {"coarse_fill": "smooth"}
@@ -155,15 +185,31 @@ def _renamed(values: dict[str, Any]) -> dict[str, Any]:
 def paper() -> InpainterConfig:
     """The paper's model: encoder of FuseFormer's widths, D = 512, 8 heads, 2 groups of 4 blocks, nothing of ours.
 
-    Its k of pruning is not stated: `top_k` is left to who asks.
+    The paper does not state k of its pruning: here it is `PAPER_TOP_K`.
     """
-    return InpainterConfig(use_validity=False, black_background=False, past_geometry="current")
+    return InpainterConfig(
+        use_validity=False,
+        background="white",
+        min_foreground=0.0,
+        copier_start=False,
+        token_norms=False,
+        clamp_fill=False,
+        top_k=PAPER_TOP_K,
+        context_cameras=3,
+        past_geometry="current",
+        patch_depth="centre",
+    )
+
+
+def paper_small() -> InpainterConfig:
+    """The paper's model, nothing of ours, at the widths of `small`: for two CPU cores."""
+    return replace(paper(), widths=SMALL_WIDTHS, dim=128, heads=4)
 
 
 def small() -> InpainterConfig:
     """About a quarter of the paper's widths: for two CPU cores."""
     return InpainterConfig(
-        widths=(16, 16, 32, 64, 96, 128, 96, 64, 32),
+        widths=SMALL_WIDTHS,
         dim=128,
         heads=4,
         rope_unit="patch",

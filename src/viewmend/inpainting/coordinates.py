@@ -10,9 +10,12 @@ from viewmend.inpainting.patches import PATCH_PX, STEP_PX, centers_px, grid_shap
 
 
 def patch_depths(
-    depth: Float[Tensor, "view height width"], foreground: Bool[Tensor, "view height width"]
+    depth: Float[Tensor, "view height width"], foreground: Bool[Tensor, "view height width"], around: bool = False
 ) -> Float[Tensor, "view rows cols"]:
     """z-depth of every patch's centre, metres.
+
+    A centre is where four pixels meet: its depth is that of the pixel below and right of it, or, with `around`, the
+    mean of those of the four that have one.
 
     A patch whose centre has none takes the median depth of its foreground pixels that have one; 0 where there are
     none of these either.
@@ -23,7 +26,8 @@ def patch_depths(
     beyond = (0, full_width - width, 0, full_height - height)
     depth = F.pad(depth.clamp_min(0), beyond)
     half = PATCH_PX // 2
-    centre = depth[:, half::STEP_PX, half::STEP_PX][:, :rows, :cols]
+    four = [depth[:, v::STEP_PX, u::STEP_PX][:, :rows, :cols] for v in (half - 1, half) for u in (half - 1, half)]
+    centre = _mean_of_those(torch.stack(four)) if around else four[-1]
 
     usable = torch.where(F.pad(foreground, beyond), depth, 0.0)
     somewhere = F.max_pool2d(usable[:, None], PATCH_PX, STEP_PX)[:, 0] > 0
@@ -31,6 +35,11 @@ def patch_depths(
     pixels = split(usable[:, None], places, PATCH_PX, STEP_PX).flatten(1)
     median = torch.where(pixels > 0, pixels, torch.nan).nanmedian(1).values
     return centre.index_put(tuple(places.unbind(1)), median)
+
+
+def _mean_of_those(depths: Float[Tensor, "four view rows cols"]) -> Float[Tensor, "view rows cols"]:
+    """The mean of the depths that are there; 0 without any."""
+    return depths.sum(0) / (depths > 0).sum(0).clamp_min(1)
 
 
 def lift(

@@ -18,7 +18,7 @@ class Decoder(nn.Module):
     def __init__(self, config: InpainterConfig) -> None:
         super().__init__()
         C = config.widths[-1]
-        self.norm = nn.LayerNorm(config.dim)
+        self.norm = nn.LayerNorm(config.dim) if config.token_norms else nn.Identity()
         self.features = C
         self.linear = nn.Linear(config.dim, (C + 3 * config.colour_skip) * PATCH_CELLS**2)
         self.layers = nn.Sequential(
@@ -76,7 +76,11 @@ def blend(
     error: Float[Tensor, "height width"],
     inpainted: Float[Tensor, "3 height width"],
     coverage: Float[Tensor, "height width"],
+    clamp: bool = True,
 ) -> Float[Tensor, "3 height width"]:
-    """Fhat = E Ftilde + (1 - E) F; bit for bit F where E is 0 or where no patch was decoded."""
-    mended = error * inpainted.clamp(0, 1) + (1 - error) * known
+    """Fhat = E Ftilde + (1 - E) F; bit for bit F where E is 0 or where no patch was decoded.
+
+    With `clamp`, Ftilde is clamped to [0, 1] first: what a loss is then given is what is shown.
+    """
+    mended = error * (inpainted.clamp(0, 1) if clamp else inpainted) + (1 - error) * known
     return torch.where((error > 0) & (coverage > 0), mended, known)

@@ -21,9 +21,6 @@ from viewmend.inpainting.patches import (
 )
 from viewmend.views import ContextViews, IncompleteView
 
-MIN_FOREGROUND = 0.1
-"""A camera's mask below this is background: recorded masks are never quite zero."""
-
 
 @dataclass(frozen=True)
 class Images:
@@ -45,18 +42,25 @@ def context_images(views: ContextViews, config: InpainterConfig) -> Images:
     frame = views.frame
     rgb = frame.rgb.float() / 255
     mask = (views.depth > 0).float() if frame.mask is None else frame.mask.float() / 255
-    if config.black_background:
-        rgb = rgb * mask[:, None]
+    if config.background != "recorded":
+        rgb = rgb * mask[:, None] + (config.background == "white") * (1 - mask[:, None])
     inside = torch.ones_like(mask)
     for image, (width, height) in zip(inside, frame.cameras.size_px.tolist(), strict=True):
         image[height:], image[:, width:] = 0, 0
-    return _images(rgb, mask, views.depth, inside, mask > MIN_FOREGROUND, config)
+    return _images(rgb, mask, views.depth, inside, mask > config.min_foreground, config)
 
 
 def target_images(view: IncompleteView, rgb: Float[Tensor, "3 height width"], config: InpainterConfig) -> Images:
-    """The novel view with these colours, a stack of one."""
+    """The novel view with these colours, a stack of one; what is missing is foreground, too.
+
+    Upon white, what is missing is black, unless a coarse fill shows something there.
+    """
     mask = view.mask[None]
-    return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], mask > 0, config)
+    if config.background == "white":
+        rgb = rgb + (1 - mask)
+        rgb = rgb * (1 - view.error) if config.coarse_fill == "none" else rgb
+    foreground = (mask > 0) | (view.error[None] > 0)
+    return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], foreground, config)
 
 
 def _images(
@@ -73,14 +77,14 @@ def _images(
 
 
 class Tokeniser(nn.Module):
-    """Encoder, patches, and one linear layer, 7 x 7 x C -> D, with a norm."""
+    """Encoder, patches, and one linear layer, 7 x 7 x C -> D, with a norm where the config has one."""
 
     def __init__(self, config: InpainterConfig) -> None:
         super().__init__()
         self.encoder = Encoder(config)
         self.linear = nn.Linear(config.patch_channels * PATCH_CELLS**2, config.dim)
         self.colour_skip = config.colour_skip
-        self.norm = nn.LayerNorm(config.dim)
+        self.norm = nn.LayerNorm(config.dim) if config.token_norms else nn.Identity()
 
     def forward(self, stacks: Sequence[Images]) -> Float[Tensor, "patch dim"]:
         """Tokens of all kept patches of all stacks, in order.

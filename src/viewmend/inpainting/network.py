@@ -21,6 +21,11 @@ class Network(nn.Module):
     trained_in_bfloat16 = False
     """Whether bfloat16 is as good as float32 for it."""
 
+    @property
+    def background(self) -> str | None:
+        """What it was trained to paint upon: black or white; None for whatever it is shown."""
+        return "black"
+
     def initial_state(self) -> State:
         """The state before the first view of a stream."""
         return State()

@@ -29,6 +29,7 @@ from viewmend.inpainting.patches import (
 )
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
 from viewmend.inpainting.transformer import Transformer
+from viewmend.inpainting.upon_white import covered
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 
@@ -43,7 +44,14 @@ class Prediction:
     coarse: Float[Tensor, "3 height width"]
     """The colours that the encoder was shown: the view's, its holes filled where there is a coarse fill."""
     completed: Float[Tensor, "3 height width"]
-    """Fhat = E Ftilde + (1 - E) F, Ftilde clamped; F bit for bit where E is 0."""
+    """Fhat = E Ftilde + (1 - E) F, Ftilde clamped where the config says so; F, upon black, bit for bit where E is 0."""
+    alpha: Float[Tensor, "height width"] | None
+    """What is not background of a view upon white: M, and all of E that was painted. None upon black, where it is M."""
+
+    @property
+    def upon_own(self) -> Float[Tensor, "3 height width"]:
+        """Fhat upon the background that the model paints on."""
+        return self.completed if self.alpha is None else self.completed + (1 - self.alpha)
 
 
 class PatchTransformer(Network):
@@ -55,8 +63,13 @@ class PatchTransformer(Network):
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
         self.decoder = Decoder(config)
-        if config.colour_skip:
+        if config.colour_skip and config.copier_start:
             identity_init(self.tokeniser.linear, self.decoder.linear, config)
+
+    @property
+    def background(self) -> str:
+        """What it paints upon."""
+        return "white" if self.config.background == "white" else "black"
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
         """How far around the subject a view matters to its result; None where the whole view's size does."""
@@ -72,7 +85,7 @@ class PatchTransformer(Network):
             keys_values = self.transformer.project_context(tokens)
         counts = [len(stack.places) for stack in stacks]
         parts = zip(many, stacks, tokens.split(counts), keys_values.split(counts, 2), strict=True)
-        return [_context_frames(*part) for part in parts]
+        return [_context_frames(*part, self.config.patch_depth == "centre") for part in parts]
 
     def forward(
         self,
@@ -112,7 +125,7 @@ class PatchTransformer(Network):
         if asking:
             decoded = self._decode([targets[i] for i in asking], [frames[i] for i in asking], top_k)
             patches = dict(zip(asking, decoded, strict=True))
-        return [_prediction(target, patches.get(i)) for i, target in enumerate(targets)]
+        return [_prediction(target, patches.get(i), self.config) for i, target in enumerate(targets)]
 
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view (section 9); a view without holes comes back at once."""
@@ -127,7 +140,8 @@ class PatchTransformer(Network):
             return CompletedView(view, view.rgb)
         times = window_times(view.time, self.config)[: context.quality.context_times]
         frames = context.encoded(times, self.context_names(view), self.encode_contexts)
-        return CompletedView(view, self.refine([view], [coarse], [frames], context.quality.top_k)[0].completed)
+        made = self.refine([view], [coarse], [frames], context.quality.top_k)[0]
+        return CompletedView(view, made.completed.clamp(0, 1), made.alpha)
 
     def context_names(self, view: IncompleteView) -> tuple[str, ...]:
         """The cameras that are context."""
@@ -182,11 +196,11 @@ class PatchTransformer(Network):
 
 
 def _context_frames(
-    views: ContextViews, images: Images, tokens: Tensor, keys_values: Tensor
+    views: ContextViews, images: Images, tokens: Tensor, keys_values: Tensor, around: bool
 ) -> tuple[ContextFrame, ...]:
     """The encoded patches of one time, lifted and split by camera."""
     cameras, places = views.frame.cameras, images.places
-    depths = patch_depths(views.depth, images.foreground)
+    depths = patch_depths(views.depth, images.foreground, around)
     points, valid = lift(places, depths, cameras)
     uv_px = centers_px(places)
     frames, first = [], 0
@@ -210,17 +224,21 @@ def _context_frames(
     return tuple(frames)
 
 
-def _prediction(target: Target, patches: Float[Tensor, "patch output 28 28"] | None) -> Prediction:
+def _prediction(
+    target: Target, patches: Float[Tensor, "patch output 28 28"] | None, config: InpainterConfig
+) -> Prediction:
     """Patches back in their places, blended, and the view completed; without patches it stays as it is."""
     view = target.view
+    alpha = covered(view) if config.background == "white" else None
     if patches is None:
-        return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), target.shown[:3], view.rgb)
+        return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), target.shown[:3], view.rgb, alpha)
     height, width = view.mask.shape
     merged, coverage = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
     inpainted = merged[0, :3]
     if len(merged[0]) > 3:
         inpainted = torch.lerp(target.shown[:3] * coverage, inpainted, merged[0, 3])
-    return Prediction(inpainted, coverage[0], target.shown[:3], blend(view.rgb, view.error, inpainted, coverage[0]))
+    completed = blend(view.rgb, view.error, inpainted, coverage[0], config.clamp_fill)
+    return Prediction(inpainted, coverage[0], target.shown[:3], completed, alpha)
 
 
 def _pixels(target: Target) -> Float[Tensor, "patch channel 28 28"]:

@@ -176,6 +176,11 @@ def own_error_rule(inpainter: ViewInpainter) -> str:
     return getattr(inpainter, "error_rule", "unseen")
 
 
+def own_background(inpainter: ViewInpainter) -> str | None:
+    """What an inpainter was trained to paint upon, black or white; None for whatever it is shown (classical fills)."""
+    return getattr(inpainter, "background", None)
+
+
 def crop_margin_px(inpainter: ViewInpainter, quality: RenderQuality) -> int | None:
     """How far around the subject a view matters to what fills it, pixels; None where the whole view does.
 

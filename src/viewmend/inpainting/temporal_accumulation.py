@@ -12,7 +12,14 @@ from torch import Tensor, nn
 
 from viewmend.geometry.cameras import Cameras, project, unproject
 from viewmend.geometry.sampling import in_view, sample_bilinear
-from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, crop_margin_px
+from viewmend.inpainting.protocol import (
+    ContextProvider,
+    RenderQuality,
+    State,
+    ViewInpainter,
+    crop_margin_px,
+    own_background,
+)
 from viewmend.views import CompletedView, IncompleteView
 
 STALE = 3
@@ -57,6 +64,11 @@ class TemporalAccumulation(nn.Module):
         super().__init__()
         self.inner, self.weight = inner, weight
         self.config = getattr(inner, "config", None)
+
+    @property
+    def background(self) -> str | None:
+        """The inner inpainter's."""
+        return own_background(self.inner)
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
         """The inner inpainter's."""

@@ -63,10 +63,11 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.total_blocks))
         self.register_buffer("score_frequencies", rope.score_frequencies(head_dim), persistent=False)
         self.register_buffer("value_frequencies", rope.value_frequencies(head_dim), persistent=False)
-        self._initialise()
+        if config.copier_start:
+            self._start_as_copier()
 
-    def _initialise(self) -> None:
-        """Start as a copier: look at what lands nearest, add half of it.
+    def _start_as_copier(self) -> None:
+        """Start as one that looks at what lands nearest, add half of it.
 
         With RoPE, constant biases of queries and keys make the score contain the sum of cos(frequency x distance).
         """

@@ -19,8 +19,8 @@ TEST_FOLDER = "test"
 def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
     """Folders or files of characters, motions or captures, as this split may use them.
 
-    Validation is given those of training: only its procedural people are new to a model, so that its scores do not show
-    whether a model has learned the recorded ones by heart. Who mends that gives validation folders of its own here.
+    Validation is given none: whatever a model may have learned by heart, its scores are of procedural people that are
+    new to it. What a model gains on recordings is measured on such that were put aside: `viewmend evaluate`.
 
     Raises:
         ValueError: training or validation would look at what is kept for tests.
@@ -31,4 +31,4 @@ def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
             f"{kept[0]}: expected people, motions and captures that are not kept for tests, got a folder named "
             f"'{TEST_FOLDER}'; give the one for training"
         )
-    return tuple(places)
+    return () if split == "validation" else tuple(places)

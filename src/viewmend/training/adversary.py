@@ -9,6 +9,7 @@ from viewmend.training.discriminator import Discriminator, DiscriminatorConfig
 from viewmend.training.plan import LossWeights
 from viewmend.training.processes import Processes
 from viewmend.training.samples import Sample
+from viewmend.training.true_images import true_image
 
 BETAS = (0.0, 0.99)
 """Adam's betas, as in the baselines' training."""
@@ -17,7 +18,9 @@ BETAS = (0.0, 0.99)
 class Adversary:
     """D with its optimizer."""
 
-    def __init__(self, loss: LossWeights, learning_rate: float, own: Processes) -> None:
+    def __init__(self, loss: LossWeights, learning_rate: float, own: Processes, background: str = "black") -> None:
+        """`background` is what the inpainter paints upon, where D is shown the truth, too."""
+        self.background = background
         self.kind: Objective = loss.adversarial_kind
         self.of_clips = loss.discriminator == "clip"
         layers = 6 if self.of_clips else 4
@@ -56,7 +59,9 @@ class Adversary:
     ) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         """F*, Fhat and E as the discriminator takes them: of single views, or of clips."""
         made = iter(completed)
-        rows = [[(s.truth.float() / 255, next(made).float(), s.view.error) for s in last.clip] for last in batch]
+        rows = [
+            [(true_image(s, self.background), next(made).float(), s.view.error) for s in last.clip] for last in batch
+        ]
         if not self.of_clips:
             singles = [image for row in rows for image in row]
             return [t for t, _, _ in singles], [m for _, m, _ in singles], [e for _, _, e in singles]

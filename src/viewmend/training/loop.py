@@ -98,7 +98,10 @@ class Run:
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(recipe.ema))
         self.learned = [p for p in self.model.parameters() if p.requires_grad]
         self.optimizer = self._make_optimizer()
-        self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own) if recipe.loss.adversarial else None
+        self.adversary = None
+        if recipe.loss.adversarial:
+            background = getattr(self.model, "background", None) or "black"
+            self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own, background)
         self.state = RunState(0, 0.0, ())
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}

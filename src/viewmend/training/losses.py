@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -26,9 +27,11 @@ def weighted_l1(
     predicted: Float[Tensor, "3 height width"],
     truth: Float[Tensor, "3 height width"],
     weight: Float[Tensor, "height width"],
+    channels: Literal["mean", "sum"] = "mean",
 ) -> Float[Tensor, ""]:
-    """|weight * (predicted - truth)|_1 / |weight|_1, the mean of the channels; 0 where the weight is."""
-    total = (weight * (predicted - truth).abs().mean(0)).sum()
+    """|weight * (predicted - truth)|_1 / |weight|_1, the mean or sum of the channels; 0 where the weight is."""
+    away = (predicted - truth).abs()
+    total = (weight * (away.sum(0) if channels == "sum" else away.mean(0))).sum()
     return total / weight.sum().clamp_min(torch.finfo(torch.float32).tiny)
 
 
@@ -37,15 +40,23 @@ def image_loss(
     coverage: list[Float[Tensor, "_h _w"]],
     error: list[Float[Tensor, "_h _w"]],
     truth: list[Float[Tensor, "3 _h _w"]],
+    channels: Literal["mean", "sum"] = "mean",
 ) -> ImageLoss:
     """The losses of each image, and their means over a batch of images of any sizes.
 
-    L_out counts the pixels that decoded patches cover (section 8). An empty weight gives 0 with a zero gradient.
+    An empty weight gives 0 with a zero gradient.
+
+    Args:
+        predicted: Ftilde.
+        coverage: the pixels that L_out counts: those that decoded patches cover, or all.
+        error: E.
+        truth: F*, upon the background that Ftilde is upon.
+        channels: whether L_in and L_out take their mean or, as the paper, their sum.
     """
     losses = []
     for image, covered, E, target in zip(predicted, coverage, error, truth, strict=True):
-        inside = weighted_l1(image.float(), target, E)
-        outside = weighted_l1(image.float(), target, (1 - E) * (covered > 0))
+        inside = weighted_l1(image.float(), target, E, channels)
+        outside = weighted_l1(image.float(), target, (1 - E) * (covered > 0), channels)
         squares = (E * (image.float() - target).square().mean(0)).sum() / E.sum().clamp_min(1e-6)
         losses.append(ImageLoss(inside, outside, (squares + LEAST_SQUARE).log10()))
     return mean_loss(losses)

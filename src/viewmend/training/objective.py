@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -10,6 +11,7 @@ from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.training.losses import ImageLoss, image_loss
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
+from viewmend.training.true_images import true_image
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,8 @@ class StepOutput:
     total: Float[Tensor, ""]
     """The weighted sum, without L_adv."""
     completed: tuple[Float[Tensor, "3 _h _w"], ...]
-    """Fhat of each view, samples one after the other, each as a clip; empty where only rays are trained."""
+    """Fhat of each view, upon the model's background; samples one after the other, each as a clip. Empty where only
+    rays are trained."""
 
 
 class Objective(nn.Module):
@@ -38,11 +41,12 @@ class Objective(nn.Module):
         predictions = self.model(
             [s.view for s in views], [list(s.context) for s in views], ray_views=[s.nearby for s in views]
         )
-        image = image_loss(
-            [p.inpainted for p in predictions],
-            [p.coverage for p in predictions],
-            [s.view.error for s in views],
-            [s.truth.float() / 255 for s in views],
-        )
+        made, counted = [p.inpainted for p in predictions], [p.coverage for p in predictions]
+        if weights.outside == "image":
+            pairs = zip(predictions, made, strict=True)
+            made = [torch.where(p.coverage > 0, image, p.upon_own.detach()) for p, image in pairs]
+            counted = [torch.ones_like(coverage) for coverage in counted]
+        truth = [true_image(s, self.model.background) for s in views]
+        image = image_loss(made, counted, [s.view.error for s in views], truth, weights.channels)
         total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
-        return StepOutput(image, total, tuple(p.completed for p in predictions))
+        return StepOutput(image, total, tuple(p.upon_own for p in predictions))

@@ -36,6 +36,8 @@ class DataPlan:
     """How often each of `context_cameras` is taken, relative to the others."""
     past: tuple[int, ...] = (0, 0, 0, 1, 99)
     """How many of the earlier times are context; each target takes one of these."""
+    least_past: int = 0
+    """So many earlier times a target has at least; 6 of `times` make a whole window of the paper's."""
     context: bool = True
     """Whether samples have context; rays alone need none, and are smaller without."""
     least_context: int = 0
@@ -81,6 +83,10 @@ class LossWeights:
 
     image: float = 1.0
     """lambda_img, of L_in + L_out."""
+    channels: Literal["mean", "sum"] = "mean"
+    """L_in and L_out of the channels' mean (ours), or of their sum, as the paper's norms read."""
+    outside: Literal["covered", "image"] = "covered"
+    """L_out over what decoded patches cover (ours), or over the whole image, where Ftilde is F else (the paper's)."""
     log_error: float = 0.0
     """Weight of log10 of the squared error in the holes, a tenth of -PSNR. Ours."""
     adversarial: float = 0.0

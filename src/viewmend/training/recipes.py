@@ -6,6 +6,7 @@ from dataclasses import replace
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.config import base as base_model
 from viewmend.inpainting.config import paper as paper_model
+from viewmend.inpainting.config import paper_small as paper_small_model
 from viewmend.inpainting.config import small as small_model
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.training.plan import DataPlan, LossWeights, Recipe, WholeViewRecipe
@@ -67,13 +68,23 @@ def views(data: DataPlan) -> WholeViewRecipe:
     )
 
 
+WINDOW_TIMES = (0, 10, 20, 27, 28, 29, 30)
+"""The paper's window of time 30: t, t - 1, t - 2, t - 3, t - 10, t - 20 and t - 30."""
+
+
+def as_the_paper(data: DataPlan) -> DataPlan:
+    """Samples with exactly three cameras and the whole window."""
+    data = replace(data, times=WINDOW_TIMES, past=(len(WINDOW_TIMES) - 1,), least_past=len(WINDOW_TIMES) - 1)
+    return replace(data, context_cameras=(3,), context_weights=(1,), targets_per_camera=1)
+
+
 def paper(data: DataPlan) -> Recipe:
     """The paper's size and objective, nothing of ours; for a data-centre GPU."""
     return Recipe(
         name="paper",
         model=paper_model(),
-        data=for_model(paper_model(), data, sizes_px=(320, 512)),
-        loss=LossWeights(adversarial=0.01),
+        data=for_model(paper_model(), as_the_paper(data), sizes_px=(320, 512)),
+        loss=LossWeights(adversarial=0.01, channels="sum", outside="image"),
         steps=200_000,
         batch=8,
         new_per_batch=4,
@@ -81,6 +92,23 @@ def paper(data: DataPlan) -> Recipe:
         warmup=1000,
         ema=0.999,
         workers=12,
+    )
+
+
+def paper_small(data: DataPlan) -> Recipe:
+    """The paper's model and objective at small widths, for two CPU cores."""
+    return replace(
+        paper(data),
+        name="paper_small",
+        model=paper_small_model(),
+        data=for_model(paper_small_model(), as_the_paper(data)),
+        steps=20_000,
+        batch=4,
+        new_per_batch=1,
+        learning_rate=4e-4,
+        warmup=200,
+        ema=0.998,
+        workers=1,
     )
 
 
@@ -128,5 +156,6 @@ RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {
     "views": views,
     "base": base,
     "paper": paper,
+    "paper_small": paper_small,
     "finetune": finetune,
 }

@@ -98,7 +98,8 @@ class HeldOutCamera:
         nearby, truth = now.context(view.closest_views(cameras[1])), self.rig.truth(self.held, time)
         assert truth.mask is not None, "what trains has masks"
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
-        return Sample(view, tuple(c for c in context if c is not None), nearby, black.round().to(torch.uint8))
+        seen = tuple(c for c in context if c is not None)
+        return Sample(view, seen, nearby, black.round().to(torch.uint8), alpha=truth.mask[0])
 
 
 def widened(view: IncompleteView, reach_px: int) -> IncompleteView:

@@ -45,8 +45,8 @@ class StudioScenes:
         """
         if split == "test":
             raise ValueError("expected scenes for training or validation, got those for tests; take procedural_set")
-        recordings(split, [place for place in (plan.performers, plan.motions) if place is not None])
-        self.plan = plan
+        people = [place for place in (plan.performers, plan.motions) if place is not None]
+        self.plan = plan if recordings(split, people) else replace(plan, performers=None, motions=None)
         self.seed = seed
         self.split: Split = split
 
@@ -126,6 +126,12 @@ def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random) -> list[Sample
     dropped = _dropouts(rig.frames, plan.dropped_fraction, random)
     times = sorted(rig.frames)
     ends = [t for t in times if all(t - back in rig.frames for back in range(plan.clip_length))]
+    ends = [t for t in ends if times.index(t) >= plan.least_past]
+    if not ends and plan.least_past:
+        raise ValueError(
+            f"expected more than {plan.least_past} times for a past of as many, got {times}; lower --least-past, or "
+            f"use captures of {max(plan.times) + 1} frames or more"
+        )
     if not ends:
         raise ValueError(
             f"expected {plan.clip_length} consecutive times for clips, got {times}; leave --clip-length away, or use "

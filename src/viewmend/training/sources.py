@@ -43,7 +43,7 @@ def stored_source(recipe: Recipe, seed: str, split: Split = "training") -> Scene
 def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneSource[Sample]:
     """Shards where they are given; else captures and the studio, as the plan shares them out.
 
-    Scenes for validation are made, whatever shards there are.
+    Scenes for validation are the studio's with procedural people, whatever else there is.
 
     Raises:
         CaptureError, ShardError: what the plan names cannot be used.
@@ -52,8 +52,8 @@ def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneS
     if plan.shards is not None and split == "training":
         return ShardScenes(plan.shards, seed, (Sample,), plan.clip_length)
     studio = StudioScenes(plan, seed, split)
-    if not plan.captures:
+    if not (folders := recordings(split, plan.captures)):
         return studio
-    opened = [open_masked(folder, held=1) for folder in recordings(split, plan.captures)]
+    opened = [open_masked(folder, held=1) for folder in folders]
     captures = [prepare(capture, align=False) for capture in opened]  # which refuses the wrong ones
     return MixedScenes(CaptureScenes(captures, plan, seed), studio, plan.captures_fraction, seed)

@@ -11,10 +11,12 @@ from torch.nn import functional as F
 
 from viewmend.baselines.classical import Telea
 from viewmend.inpainting.protocol import ContextProvider, State
+from viewmend.inpainting.upon_white import UponWhite
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
 from viewmend.training.sources import scene_source
+from viewmend.training.true_images import true_image
 
 SHOWN = 8
 """Views in the picture."""
@@ -64,10 +66,10 @@ class Validation:
     @torch.no_grad()
     def judge(self, model: nn.Module, step: int) -> ValidationScores:
         """Mend every view, score it, and leave a picture of the first few."""
+        background = getattr(model, "background", None) or "black"
         if not self._samples:
             self._samples = self._views()
-            unseen = ContextProvider(lambda *_: None)
-            self._telea = [_score(Telea().step(s.view, unseen, State())[0].rgb, s) for s in self._samples]
+            self._telea = [_telea(sample, background) for sample in self._samples]
         training = model.training
         model.eval()
         device = next(model.parameters()).device
@@ -75,10 +77,11 @@ class Validation:
         for sample in self._samples:
             on_device = sample.to(device)
             made = model([on_device.view], [list(on_device.context)], ray_views=[on_device.nearby])[0]
-            completed = made.completed.float().cpu()
-            ours.append(_score(completed, sample))
-            fills.append(_score(torch.where(sample.view.error > 0, made.coarse.float().cpu(), completed), sample))
-            shown.append(torch.cat([sample.view.rgb, completed, sample.truth / 255], 2))
+            completed, truth = made.upon_own.float().clamp(0, 1).cpu(), true_image(sample, background)
+            ours.append(_score(completed, truth, sample))
+            filled = torch.where(sample.view.error > 0, made.coarse.float().cpu(), completed)
+            fills.append(_score(filled, truth, sample))
+            shown.append(torch.cat([sample.view.rgb, completed, truth], 2))
         model.train(training)
         write_picture(shown[:SHOWN], self.folder / f"validation-{step:06d}.png")
         return ValidationScores(step, *(sum(x) / len(x) for x in (ours, self._telea, fills)))
@@ -91,8 +94,15 @@ class Validation:
         return list(islice(samples, self.recipe.validation_views))
 
 
-def _score(rgb: Float[Tensor, "3 height width"], sample: Sample) -> float:
-    score = psnr(rgb, sample.truth.float() / 255, sample.view.error > 0)
+def _telea(sample: Sample, background: str) -> float:
+    """What Telea scores upon the model's background."""
+    fill = UponWhite(Telea()) if background == "white" else Telea()
+    rgb = fill.step(sample.view, ContextProvider(lambda *_: None), State())[0].rgb
+    return _score(rgb, true_image(sample, background), sample)
+
+
+def _score(rgb: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"], sample: Sample) -> float:
+    score = psnr(rgb, truth, sample.view.error > 0)
     assert score is not None, "samples have holes"
     return score
 
