@@ -1,5 +1,7 @@
 """Rigs of random cameras, for round trips through the formats of others."""
 
+import itertools
+
 import cv2
 import numpy as np
 from hypothesis import settings
@@ -7,6 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 RIGS = settings(max_examples=25, deadline=None, database=None, derandomize=True)
+TAKES = settings(RIGS, max_examples=10)
+"""Rigs whose images are read, too."""
 SEEDS, COUNTS = st.integers(0, 2**20), st.integers(2, 6)
 
 
@@ -52,8 +56,44 @@ def write_images(folder, rig, frame=None):
 
 
 def assert_same(calibration, rig):
+    """The calibration, or the capture's, is that of the rig."""
+    calibration = getattr(calibration, "_calibration", calibration)
     assert [camera.name for camera in calibration.cameras] == [camera["name"] for camera in rig]
     for read, camera in zip(calibration.cameras, rig, strict=True):
         assert (read.width, read.height) == (camera["width"], camera["height"])
         for key, value in (("K", read.K), ("R", read.R), ("t", read.t_m), ("dist", read.dist)):
             np.testing.assert_allclose(value, camera[key], rtol=1e-9, atol=1e-9, err_msg=key)
+
+
+def named(rig, pattern):
+    """The rig with other names, of the cameras' own numbers."""
+    return [camera | {"name": pattern.format(int(camera["name"][3:]))} for camera in rig]
+
+
+def random_take(seed, rig, pattern):
+    """Ids of some frames, not all one after the other, and gaps; every camera and every frame has an image."""
+    rng = np.random.default_rng(seed + 1)
+    count = int(rng.integers(1, 5))
+    frames = [pattern.format(n) for n in sorted(int(n) for n in rng.choice(40, count, replace=False))]
+    keep = set(zip((c["name"] for c in rig), itertools.cycle(frames), strict=False))
+    keep |= set(zip(itertools.cycle(c["name"] for c in rig), frames, strict=False))
+    every = [(camera["name"], frame) for camera in rig for frame in frames]
+    return frames, {pair for pair in every if pair not in keep and rng.random() < 0.3}
+
+
+def assert_take(capture, rig, frames, gaps, ids=None):
+    """Frames, gaps, pixels and masks are those that `write_take` wrote."""
+    ids = list(ids or frames)
+    assert list(capture.frame_ids) == ids
+    assert set(capture.gaps) == {(camera, ids[frames.index(frame)]) for camera, frame in gaps}
+    for time, frame in enumerate(frames):
+        read = capture.read(time)
+        there = [(n, c) for n, c in enumerate(rig) if (c["name"], frame) not in gaps]
+        assert read.cameras.names == tuple(camera["name"] for _, camera in there)
+        for view, (number, camera) in enumerate(there):
+            width, height = camera["width"], camera["height"]
+            assert abs(read.rgb[view, :, :height, :width].float() - 60 - 20 * number).max() <= 3
+            mask = read.mask[view, :height, :width]
+            assert int(mask.max()) == 255
+            if not camera["dist"].any():
+                assert int((mask < 128).sum()) == 4

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import as_mask, read_depth, read_mask, read_rgb
 from viewmend.capture.plain_format import PlainCamera, Stream
+from viewmend.capture.run_lengths import RUN_LENGTHS, read_runs
 from viewmend.capture.videos import VideoFile, is_video
 
 
@@ -32,6 +33,7 @@ class CameraReader:
         self._undistortion: tuple[np.ndarray, np.ndarray] | None = None
         streams = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
         self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in streams)
+        self._curves = None if camera.colour is None else _curves(camera.colour)
 
     def read(self, frame: str, index: int) -> CameraImages:
         """The images at frame id `frame`, which is at `index` of the capture's frames.
@@ -43,10 +45,11 @@ class CameraReader:
         path, where = self._locate("video" if camera.video else "image", frame)
         rgb = self._video.read(index, where) if self._video else read_rgb(path, where)
         self._check_size(rgb, where)
+        rgb = self._coloured(rgb)
         mask, depth = None, None
         if camera.mask:
             path, where = self._locate("mask", frame)
-            mask = as_mask(self._mask_video.read(index, where)) if self._mask_video else read_mask(path, where)
+            mask = self._read_mask(path, where, index)
             self._check_size(mask, where)
         if camera.depth:
             path, where = self._locate("depth", frame)
@@ -55,8 +58,23 @@ class CameraReader:
         return self._undistort(CameraImages(rgb, mask, depth)) if camera.dist.any() else CameraImages(rgb, mask, depth)
 
     def straightened(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Another image of the camera (a clean plate), undistorted as its own are."""
+        """Another image of the camera (a clean plate), its colours and distortion corrected as its own are."""
+        rgb = self._coloured(rgb)
         return self._undistort(CameraImages(rgb, None, None)).rgb if self.camera.dist.any() else rgb
+
+    def _coloured(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        import cv2
+
+        return rgb if self._curves is None else cv2.LUT(rgb, self._curves)
+
+    def _read_mask(self, path: Path, where: str, index: int) -> UInt8[np.ndarray, "height width"]:
+        if self._mask_video:
+            mask = as_mask(self._mask_video.read(index, where))
+        elif path.suffix == RUN_LENGTHS:
+            mask = read_runs(path, where, (self.camera.height, self.camera.width))
+        else:
+            mask = read_mask(path, where)
+        return 255 * (mask > 0).astype(np.uint8) if self.camera.mask_labels else mask
 
     def _locate(self, stream: Stream, frame: str) -> tuple[Path, str]:
         path = self._folder / self.camera.file(stream, frame)
@@ -101,3 +119,9 @@ class CameraReader:
                 first, second = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, fixed)  # pyright: ignore
                 self._undistortion = first, second
             return self._undistortion
+
+
+def _curves(colour: Float64[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "1 256 3"]:
+    """What each value of red, green and blue becomes by its quadratic."""
+    values = np.vander(np.arange(256.0), 3) @ colour.T
+    return np.rint(values.clip(0, 255)).astype(np.uint8)[None]

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from viewmend.atomic_writes import write_atomically
+from viewmend.capture.containers import read_bytes
 from viewmend.capture.errors import CaptureError
 
 DEPTH_UNITS_PER_M = 1000
@@ -111,7 +112,7 @@ def _decode(path: Path, where: str, flags: int) -> np.ndarray:
     import cv2
 
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
     if (told := told_size(data)) is not None and told[0] * told[1] > MAX_PIXELS:

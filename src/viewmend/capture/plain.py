@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.capture.camera_reader import CameraImages, CameraReader
+from viewmend.capture.containers import names_in
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain_format import CALIBRATION, PlainCamera, stays_inside
@@ -175,7 +176,7 @@ class PlainCapture:
         return not lacking
 
     def _find_files(self) -> Bool[np.ndarray, "view time"]:
-        listing = functools.cache(lambda parent: _files(self.folder / parent))  # the disk is asked once a folder
+        listing = functools.cache(lambda parent: names_in(self.folder / parent))  # the disk is asked once a folder
 
         def has(path: str) -> bool:
             if not stays_inside(path):
@@ -208,15 +209,6 @@ def _select(cameras: tuple[PlainCamera, ...], names: Sequence[str] | None, file:
     if unknown or not names or len(set(names)) < len(names):
         raise CaptureError(f"{file}: expected different cameras among {list(by_name)}, got {list(names)}; choose again")
     return tuple(by_name[name] for name in names)
-
-
-def _files(folder: Path) -> frozenset[str]:
-    """Names of the files in a folder; none where there is no such folder."""
-    try:
-        with os.scandir(folder) as entries:
-            return frozenset(entry.name for entry in entries if entry.is_file())
-    except OSError:
-        return frozenset()
 
 
 def _never(file: Path, folder: Path, camera: PlainCamera, frames: Sequence[str], has: Callable[[str], bool]) -> str:

@@ -43,6 +43,8 @@ class CameraEntry(Struct, frozen=True, kw_only=True):
     video: Text | None = None
     mask: Text | None = None
     depth: Text | None = None
+    colour: Matrix | None = None
+    mask_labels: bool = False
 
     def __post_init__(self) -> None:
         if not bool(is_intrinsics(torch.tensor(self.K, dtype=torch.float64))):
@@ -106,6 +108,10 @@ class PlainCamera:
     video: str | None
     mask: str | None
     depth: str | None
+    colour: Float64[np.ndarray, "3 3"] | None = None
+    """a, b, c of red, green and blue: values x of 0 to 255 become a x^2 + b x + c."""
+    mask_labels: bool = False
+    """Whether a mask's values are labels, of which 0 alone is background."""
 
     @property
     def streams(self) -> tuple[Stream, ...]:
@@ -209,6 +215,8 @@ def _camera(entry: CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float
         R=u @ vt,
         t_m=np.array(entry.t) * scale,
         dist=np.array(entry.dist),
+        colour=None if entry.colour is None else np.array(entry.colour),
+        mask_labels=entry.mask_labels,
     )
 
 

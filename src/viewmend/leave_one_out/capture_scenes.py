@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from viewmend.capture.containers import container_of
 from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain_format import CALIBRATION
 from viewmend.capture.prepare import open_masked, prepare
@@ -100,7 +101,8 @@ def _fingerprint(folder: Path) -> str:
     folder = folder if folder.is_dir() else folder.parent
     plain = read_any_calibration(folder)
     named = {c.file(stream, frame) for c in plain.cameras for stream in c.streams for frame in plain.frames}
-    stats = [(name, (folder / name).stat()) for name in sorted(named) if (folder / name).is_file()]
+    files = sorted({container_of(folder / name) for name in named})
+    stats = [(str(file.relative_to(folder)), file.stat()) for file in files if file.is_file()]
     listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
     calibration = plain.file.read_bytes()
     if plain.file.name != CALIBRATION:  # there may be other files beside this one

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
+from viewmend.capture.containers import read_bytes
 from viewmend.capture.images import told_size
 from viewmend.capture.plain_format import stays_inside
 
@@ -41,9 +43,11 @@ def image_size_px(folder: Path, name: str) -> tuple[int, int]:
         ValueError: the path leaves the folder, or there is no such image.
     """
     told = None
-    if stays_inside(name) and (folder / name).is_file():
-        with (folder / name).open("rb") as file:
-            told = told_size(file.read(HEAD_BYTES))
+    if stays_inside(name):
+        try:
+            told = told_size(read_bytes(folder / name, HEAD_BYTES))
+        except OSError:
+            told = None
     if told is None:
         raise ValueError(f"expected an image {name[:200]!r} in the folder that tells the size, got none; add the file")
     return told
@@ -100,3 +104,9 @@ def _numbers(values: object) -> np.ndarray:
         return np.asarray(values, float).ravel()
     except (TypeError, ValueError, OverflowError):
         raise ValueError("expected numbers, got something else; export the calibration again") from None
+
+
+def inverted(world_from_camera: np.ndarray) -> dict[str, list[Any]]:
+    """R and t of a `cameras.json`, which map world to camera, from a matrix of 3 x 4 or 4 x 4 that maps back."""
+    R = world_from_camera[:3, :3].T
+    return {"R": R.tolist(), "t": (-R @ world_from_camera[:3, 3]).tolist()}

@@ -12,7 +12,10 @@ from viewmend.capture.videos import is_video, video_facts
 
 PLACES = ("videos", "videos-raw", "recordings", "images", "")
 """Where footage is looked for, beside folders of one recording within `recordings`."""
-MASK_PLACES = ("masks", "mask")
+MASK_PLACES = ("masks", "mask", "mask_cihp", "schp", "fmask", "rvm", "bgmtv2")
+"""Where masks are looked for; the later names are those of segmenting networks, and MVHumanNet's."""
+LABELS = ("mask_cihp", "schp")
+"""Places whose masks label parts of people: 0 alone is background."""
 NO_TAKES = re.compile("background|plate|empty|board|calib|intrinsic")
 """Videos that are so named show no subject."""
 CROPPED_PX = 16
@@ -28,7 +31,7 @@ class Footage:
     entries: dict[str, dict[str, Any]]
     """The keys of a `cameras.json` that say a camera's size, images and masks, by its name."""
 
-    def of(self, name: str, told_px: Sequence[float] | None = None) -> dict[str, Any]:
+    def of(self, name: str, told_px: Sequence[int | float] | None = None) -> dict[str, Any]:
         """The keys of a camera, which was calibrated at this width and height where the calibration says so.
 
         Raises:
@@ -65,12 +68,42 @@ def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLA
     for place in _with_recordings(folder, places):
         for found in (_videos(folder, place), _folders(folder, place)):
             if chosen := paired(names, found):
-                return _footage(folder, dict(zip(names, chosen, strict=True)))
+                return footage_of(folder, dict(zip(names, chosen, strict=True)))
     looked = ", ".join(place or "the folder" for place in places)
     raise ValueError(
         f"expected a video or a folder of images named after each camera ({', '.join(names)[:80]}) in {looked}, "
         "got none; rename them"
     )
+
+
+def footage_of(folder: Path, chosen: dict[str, str]) -> Footage:
+    """The footage of cameras whose video or folder of images is known, by their names; masks are looked for.
+
+    Raises:
+        ValueError: there are fewer than two, a camera has none, or there are masks of some only.
+    """
+    if len(chosen) < 2:
+        raise ValueError(f"expected images or videos of two cameras or more, got {len(chosen)}; add them")
+    entries, frames, rates = {}, set(), []
+    chosen = {name: _only_video(folder, path) or path for name, path in chosen.items()}
+    videos = {name: video_facts(folder / path) for name, path in chosen.items() if is_video(path)}
+    for name, path in chosen.items():
+        if name in videos:
+            facts = videos[name]
+            entries[name] = {"width": facts.width, "height": facts.height, "video": path}
+            rates.append(facts.fps)
+            continue
+        images = listing(folder, path)
+        if images is None:
+            raise ValueError(f"expected images of camera '{name}' in {path}, got none; add them")
+        width, height = image_size_px(folder, images.first())
+        entries[name] = {"width": width, "height": height, "image": images.pattern}
+        frames |= images.frames
+    if videos:
+        frames = {f"{time:06d}" for time in range(min(facts.frames for facts in videos.values()))}
+    for name, mask in masks_of(folder, tuple(chosen)).items():
+        entries[name] |= mask
+    return Footage(tuple(sorted(frames, key=in_time)), rates[0] if rates else None, entries)
 
 
 def listing(folder: Path, place: str) -> Listing | None:
@@ -122,30 +155,12 @@ def _with_recordings(folder: Path, places: Sequence[str]) -> list[str]:
     return [p for place in places for p in (place, *(f"{place}/{n}" for n in within[place] if len(within[place]) == 1))]
 
 
-def _footage(folder: Path, chosen: dict[str, str]) -> Footage:
-    entries, frames, rates = {}, set(), []
-    chosen = {name: _only_video(folder, path) or path for name, path in chosen.items()}
-    videos = {name: video_facts(folder / path) for name, path in chosen.items() if is_video(path)}
-    for name, path in chosen.items():
-        if name in videos:
-            facts = videos[name]
-            entries[name] = {"width": facts.width, "height": facts.height, "video": path}
-            rates.append(facts.fps)
-            continue
-        images = listing(folder, path)
-        if images is None:
-            raise ValueError(f"expected images of camera '{name}' in {path}, got none; add them")
-        width, height = image_size_px(folder, images.first())
-        entries[name] = {"width": width, "height": height, "image": images.pattern}
-        frames |= images.frames
-    if videos:
-        frames = {f"{time:06d}" for time in range(min(facts.frames for facts in videos.values()))}
-    for name, mask in _masks(folder, tuple(chosen)).items():
-        entries[name]["mask"] = mask
-    return Footage(tuple(sorted(frames, key=in_time)), rates[0] if rates else None, entries)
+def masks_of(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The keys of a `cameras.json` that say where each camera's masks are; nothing where there are none.
 
-
-def _masks(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    Raises:
+        ValueError: there are masks, but not of each camera.
+    """
     place = next((place for place in MASK_PLACES if (folder / place).is_dir()), None)
     if place is None:
         return {}
@@ -153,9 +168,12 @@ def _masks(folder: Path, names: Sequence[str]) -> dict[str, str]:
     if chosen is None:
         raise ValueError(f"expected masks of each camera in {place}, got others; rename them after the cameras")
     listed = {name: path if is_video(path) else listing(folder, path) for name, path in zip(names, chosen, strict=True)}
-    return {
+    patterns = {
         name: found if isinstance(found, str) else found.pattern if found else f"{path}/{{frame}}.png"
         for (name, found), path in zip(listed.items(), chosen, strict=True)
+    }
+    return {
+        name: {"mask": mask} | ({"mask_labels": True} if place in LABELS else {}) for name, mask in patterns.items()
     }
 
 

@@ -26,7 +26,8 @@ def read_storage(file: Path) -> dict[str, Any]:
         for key in root.keys():  # noqa: SIM118 (it is no dict)
             node = root.getNode(key)
             if key == "names":
-                found[key] = [node.at(index).string() for index in range(node.size())] if node.isSeq() else []
+                items = [node.at(index) for index in range(node.size())] if node.isSeq() else []
+                found[key] = [item.string() or str(int(item.real())) for item in items]
             elif node.isMap():
                 found[key] = np.asarray(node.mat(), float).ravel()
             elif node.isInt() or node.isReal():

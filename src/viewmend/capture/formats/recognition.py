@@ -8,7 +8,21 @@ from typing import Any
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.formats import agisoft, colmap, easymocap, middlebury, opencv, pose2sim, qualisys, transforms
+from viewmend.capture.formats import (
+    actorshq,
+    agisoft,
+    colmap,
+    easymocap,
+    genebody,
+    middlebury,
+    mvhumannet,
+    opencv,
+    panoptic,
+    pose2sim,
+    qualisys,
+    transforms,
+    zju_mocap,
+)
 from viewmend.capture.plain_format import CALIBRATION, PlainCalibration, calibration_of, read_calibration
 
 
@@ -22,9 +36,11 @@ class Format:
     """What a `cameras.json` would hold, of the capture folder and that file."""
 
 
+_STUDIOS = (easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
+_TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
 FORMATS = {
     module.__name__.rpartition(".")[2]: Format(module.find, module.content)
-    for module in (transforms, colmap, easymocap, pose2sim, qualisys, agisoft, middlebury, opencv)
+    for module in (transforms, colmap, *_STUDIOS, *_TOOLS)
 }
 KINDS = ("plain", *FORMATS)
 
