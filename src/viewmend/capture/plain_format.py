@@ -109,7 +109,7 @@ class PlainCamera:
     mask: str | None
     depth: str | None
     colour: Float64[np.ndarray, "3 3"] | None = None
-    """a, b, c of red, green and blue: values x of 0 to 255 become a x^2 + b x + c."""
+    """Coefficients a, b, c of red, green and blue: values x of 0 to 255 become a x^2 + b x + c."""
     mask_labels: bool = False
     """Whether a mask's values are labels, of which 0 alone is background."""
 
