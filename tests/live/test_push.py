@@ -68,6 +68,17 @@ def test_a_rig_that_goes_is_missed_and_another_one_may_come():
             assert get(f"{server.url}/health")[0] == 200
 
 
+def test_a_rig_changes_its_cameras_while_it_pushes():
+    with running(PushedFrames(), ready=False) as server, Client(server.ws) as viewer, publisher(server) as rig:
+        rig.push(photograph(CAMERAS))
+        viewer.frame(viewer.look(width=32, height=32))
+        others = CAMERAS[[0, 2, 3, 5]]
+        rig.change(others)
+        rig.push(photograph(others))
+        wait_until(lambda: len(viewer.wait_for("rig")["cameras"]) == 4)
+        assert server.service.supply.span.first == 1 and server.service.supply.rig.number == 2
+
+
 def test_recordings_take_no_pushes(ball):
     with pytest.raises(ConnectionError, match="viewmend serve live"):
         publisher(ball)

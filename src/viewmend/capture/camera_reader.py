@@ -1,10 +1,12 @@
 """One camera of a plain capture: its files, read and undistorted."""
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from viewmend.capture.errors import CaptureError
@@ -12,6 +14,8 @@ from viewmend.capture.images import as_mask, read_depth, read_mask, read_rgb
 from viewmend.capture.plain_format import PlainCamera, Stream
 from viewmend.capture.run_lengths import RUN_LENGTHS, read_runs
 from viewmend.capture.videos import VideoFile, is_video
+from viewmend.geometry.cameras import Cameras
+from viewmend.views import MultiViewFrame
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,7 @@ class CameraReader:
     def __init__(self, folder: Path, camera: PlainCamera):
         self.camera = camera
         self._folder = folder
-        self._lock = threading.Lock()
-        self._undistortion: tuple[np.ndarray, np.ndarray] | None = None
+        self._undistortion = Undistortion(camera)
         streams = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
         self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in streams)
         self._curves = None if camera.colour is None else _curves(camera.colour)
@@ -55,12 +58,11 @@ class CameraReader:
             path, where = self._locate("depth", frame)
             depth = read_depth(path, where)
             self._check_size(depth, where)
-        return self._undistort(CameraImages(rgb, mask, depth)) if camera.dist.any() else CameraImages(rgb, mask, depth)
+        return self._undistortion.straight(CameraImages(rgb, mask, depth))
 
     def straightened(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Another image of the camera (a clean plate), its colours and distortion corrected as its own are."""
-        rgb = self._coloured(rgb)
-        return self._undistort(CameraImages(rgb, None, None)).rgb if self.camera.dist.any() else rgb
+        return self._undistortion.straight(CameraImages(self._coloured(rgb), None, None)).rgb
 
     def _coloured(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         import cv2
@@ -88,8 +90,17 @@ class CameraReader:
                 f"got {width} x {height}; correct width, height and K there, or the file"
             )
 
-    def _undistort(self, images: CameraImages) -> CameraImages:
-        """Images of the pinhole camera of the same K and size.
+
+class Undistortion:
+    """Straightens what one camera took. Holds its map, which is made at first use; may be used from any thread."""
+
+    def __init__(self, camera: PlainCamera):
+        self._camera = camera
+        self._lock = threading.Lock()
+        self._maps: tuple[np.ndarray, np.ndarray] | None = None
+
+    def straight(self, images: CameraImages) -> CameraImages:
+        """Images of the pinhole camera of the same K and size; themselves where the lens has no distortion.
 
         Where such a pixel lies outside the image that was taken (the corners, when a lens with pincushion distortion
         is straightened), the nearest pixel of its border stands in: the mask of a subject that the image cuts off then
@@ -97,6 +108,8 @@ class CameraReader:
         """
         import cv2
 
+        if not self._camera.dist.any():
+            return images
         first, second = self._map()
         border = cv2.BORDER_REPLICATE
         rgb = cv2.remap(images.rgb, first, second, cv2.INTER_LINEAR, borderMode=border)
@@ -111,17 +124,37 @@ class CameraReader:
         import cv2
 
         with self._lock:
-            if self._undistortion is None:
-                camera = self.camera
+            if self._maps is None:
+                camera = self._camera
                 K = camera.K.copy()
                 K[:2, 2] -= 0.5  # OpenCV puts the first pixel's centre at 0
                 size, fixed = (camera.width, camera.height), cv2.CV_16SC2  # 1/32 pixel, thrice as fast as floats
                 first, second = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, fixed)  # pyright: ignore
-                self._undistortion = first, second
-            return self._undistortion
+                self._maps = first, second
+            return self._maps
 
 
 def _curves(colour: Float64[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "1 256 3"]:
     """What each value of red, green and blue becomes by its quadratic."""
     values = np.vander(np.arange(256.0), 3) @ colour.T
     return np.rint(values.clip(0, 255)).astype(np.uint8)[None]
+
+
+def stack_images(images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
+    """What these cameras took at one time, padded right and below to the largest.
+
+    All of them have masks or none; depth alike.
+    """
+    width, height = cameras.max_size_px
+    masks, depths = (all(getattr(image, key) is not None for image in images) for key in ("mask", "depth"))
+    rgb = torch.zeros(len(images), 3, height, width, dtype=torch.uint8)
+    mask = torch.zeros(len(images), height, width, dtype=torch.uint8) if masks else None
+    depth = torch.zeros(len(images), height, width) if depths else None
+    for view, image in enumerate(images):
+        h, w = image.rgb.shape[:2]
+        rgb[view, :, :h, :w] = torch.from_numpy(image.rgb).permute(2, 0, 1)
+        if mask is not None:
+            mask[view, :h, :w] = torch.from_numpy(image.mask)
+        if depth is not None:
+            depth[view, :h, :w] = torch.from_numpy(image.depth)
+    return MultiViewFrame(cameras, rgb, mask, time, depth)

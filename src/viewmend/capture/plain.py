@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from viewmend.capture.camera_reader import CameraImages, CameraReader
+from viewmend.capture.camera_reader import CameraReader, stack_images
 from viewmend.capture.containers import names_in
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.formats.recognition import read_any_calibration
@@ -71,7 +71,7 @@ class PlainCapture:
         self.present = self._find_files()
         """Whether each camera is there at each time."""
         self._readers = tuple(CameraReader(folder, camera) for camera in self._plain)
-        self._cameras = _pinholes(self._plain)
+        self._cameras = pinholes(self._plain)
 
     @property
     def name(self) -> str:
@@ -129,7 +129,7 @@ class PlainCapture:
         frame_id = self.frame_ids[time]
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
             images = list(pool.map(lambda view: self._readers[view].read(frame_id, time), views))
-        frame = self._stack(images, self._cameras[views], time)
+        frame = stack_images(images, self._cameras[views], time)
         if frame.mask is not None and int(frame.mask.max()) <= FOREGROUND:
             raise CaptureError(self._no_foreground(self._plain[views[0]], frame_id, int(frame.mask.max())))
         return frame
@@ -144,20 +144,6 @@ class PlainCapture:
         """
         self.cameras.select([camera])
         return self._readers[self.cameras.names.index(camera)].straightened(rgb)
-
-    def _stack(self, images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
-        width, height = cameras.max_size_px
-        rgb = torch.zeros(len(images), 3, height, width, dtype=torch.uint8)
-        mask = torch.zeros(len(images), height, width, dtype=torch.uint8) if self.has_masks else None
-        depth = torch.zeros(len(images), height, width) if self.has_depth else None
-        for view, image in enumerate(images):
-            h, w = image.rgb.shape[:2]
-            rgb[view, :, :h, :w] = torch.from_numpy(image.rgb).permute(2, 0, 1)
-            if mask is not None:
-                mask[view, :h, :w] = torch.from_numpy(image.mask)
-            if depth is not None:
-                depth[view, :h, :w] = torch.from_numpy(image.depth)
-        return MultiViewFrame(cameras, rgb, mask, time, depth)
 
     def _no_foreground(self, camera: PlainCamera, frame: str, highest: int) -> str:
         return (
@@ -226,7 +212,8 @@ def _never(file: Path, folder: Path, camera: PlainCamera, frames: Sequence[str],
     )
 
 
-def _pinholes(cameras: Sequence[PlainCamera]) -> Cameras:
+def pinholes(cameras: Sequence[PlainCamera]) -> Cameras:
+    """The cameras after undistortion, in metres."""
     R = torch.tensor(np.stack([camera.R for camera in cameras]))
     t = torch.tensor(np.stack([camera.t_m for camera in cameras]))
     return Cameras(

@@ -22,12 +22,14 @@ class Options:
 
     The page is at the address that is printed; nothing else is needed, and it asks nothing of anywhere else. Only this
     machine can open it, unless --host and --token say otherwise. The page itself shows the keys (press ?);
-    docs/live.md has the rest: the clock, the budget, single pictures over HTTP, how to push a live rig.
+    docs/live.md has the rest: the clock, the budget, single pictures over HTTP, how to push a live rig;
+    docs/guide/live-rig.md the rig's file.
     """
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|studio|live")] = "studio"
-    """A capture folder (with cameras.json and masks), 'studio' for a synthetic scene made on the spot, or 'live' for a
-    rig that pushes its frames."""
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = "studio"
+    """A capture folder (with cameras.json and masks); a rig's TOML file, which names its cameras (webcams, network
+    streams, videos as if they were live); 'studio' for a synthetic scene made on the spot; or 'live' for a rig that
+    pushes its frames."""
     port: int = 8008
     """Port; 0 takes a free one."""
     host: str = "127.0.0.1"
@@ -152,6 +154,10 @@ def _supply(options: Options) -> "FrameSupply":
     memory_mb = options.memory_mb / 2
     if options.source == "live":
         return PushedFrames(options.fps, memory_mb)
+    if options.source.endswith(".toml"):
+        from viewmend.live.rig_frames import RigFrames
+
+        return RigFrames(Path(options.source), options.fps, memory_mb, options.width, options.align)
     made = options.source == "studio"
     return ReadAhead(_studio(options) if made else _capture(options), options.fps, generated=made, memory_mb=memory_mb)
 

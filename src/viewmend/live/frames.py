@@ -58,6 +58,12 @@ class FrameSupply(ABC):
         """What is known of the cameras; None before the source is open."""
         self.span = span
         """The times that can be asked for."""
+        self.spread_ms: float | None = None
+        """How far apart the newest frame's pictures were taken, where this machine reads the cameras itself."""
+
+    def camera_counts(self) -> dict[str, dict[str, int]]:
+        """What was counted of each camera, where this machine reads them itself; "up" is 1 while it is there."""
+        return {}
 
     @abstractmethod
     def read(self, time: int) -> MultiViewFrame | None:

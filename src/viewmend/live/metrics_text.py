@@ -1,5 +1,7 @@
 """/metrics: counters and gauges as Prometheus reads them."""
 
+from collections.abc import Mapping
+
 from viewmend.live.connection import SessionRegistry
 from viewmend.live.memory import resident_bytes
 
@@ -25,12 +27,34 @@ def metrics_text(registry: SessionRegistry) -> str:
             {f'{{stage="{stage}"}}': ms / 1000 for stage, ms in vars(service.times).items() if stage != "wait"},
         ),
     ]
+    cameras = service.supply.camera_counts()
+    if cameras:
+        up = {_of(camera=name): counts["up"] for name, counts in cameras.items()}
+        pictures = {
+            _of(camera=name, event=event): count
+            for name, counts in cameras.items()
+            for event, count in counts.items()
+            if event != "up"
+        }
+        lines += _metric("viewmend_camera_up", "gauge", "1 while the camera's pictures come.", up)
+        lines += _metric(
+            "viewmend_camera_pictures_total", "counter", "What became of each camera's pictures.", pictures
+        )
+    if (spread_ms := service.supply.spread_ms) is not None:
+        help_text = "How far apart the newest frame's pictures were taken."
+        lines += _metric("viewmend_cameras_apart_seconds", "gauge", help_text, {"": spread_ms / 1000})
     resident = resident_bytes()
     if resident is not None:
         lines += _metric("process_resident_memory_bytes", "gauge", "Resident memory size in bytes.", {"": resident})
     return "\n".join(lines) + "\n"
 
 
-def _metric(name: str, kind: str, text: str, values: dict[str, float | int]) -> list[str]:
+def _of(**labels: str) -> str:
+    """Labels as Prometheus writes them."""
+    escaped = ((key, value.replace("\\", "\\\\").replace('"', '\\"')) for key, value in labels.items())
+    return "{" + ",".join(f'{key}="{value!s}"' for key, value in escaped).replace("\n", "\\n") + "}"
+
+
+def _metric(name: str, kind: str, text: str, values: Mapping[str, float | int]) -> list[str]:
     rows = [f"{name}{labels} {value!r}" for labels, value in values.items()]
     return [f"# HELP {name} {text}", f"# TYPE {name} {kind}", *rows]

@@ -49,16 +49,15 @@ class Publisher:
             bounds: the volume that may hold the subject; None to find it from the masks.
         """
         self._socket = ServerSocket(f"{url}/push", token)
-        rig = {
+        self._rig = {
             "type": "rig",
             "version": VERSION,
             "name": name,
             "fps": fps,
             "up": None if up is None else up.tolist(),
             "bounds": None if bounds is None else bounds_json(bounds),
-            "cameras": cameras_json(cameras),
         }
-        self._ask(json.dumps(rig))
+        self.change(cameras)
 
     def __enter__(self) -> "Publisher":
         return self
@@ -69,6 +68,10 @@ class Publisher:
     def close(self) -> None:
         """Close the connection."""
         self._socket.close()
+
+    def change(self, cameras: Cameras) -> None:
+        """Be a rig of these cameras from now on: some came, went or were moved."""
+        self._ask(json.dumps(self._rig | {"cameras": cameras_json(cameras)}))
 
     def push(self, frame: MultiViewFrame, quality: int = 92) -> int:
         """Send what the cameras see now; the number that it gets. Waits until the server has it.

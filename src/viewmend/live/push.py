@@ -52,7 +52,7 @@ async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
         if message["type"] == "websocket.disconnect":
             return
         try:
-            if cameras is None:
+            if cameras is None or message.get("text"):  # a rig may change while it pushes
                 cameras = await asyncio.to_thread(_begin, message.get("text") or "", supply)
                 admit(socket, _frame_bytes(cameras))
                 await socket.send_text(json.dumps({"type": "taken", "frame": None}))
@@ -98,7 +98,7 @@ class Box(Struct, frozen=True):
 
 
 class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
-    """The first message of a rig."""
+    """The first message of a rig, and whenever its cameras change."""
 
     version: int
     name: Annotated[str, Meta(max_length=200)] = "live rig"

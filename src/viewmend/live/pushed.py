@@ -1,4 +1,4 @@
-"""A live rig: frames are pushed as they happen."""
+"""A live rig: frames as they happen, pushed by the rig."""
 
 import threading
 from dataclasses import replace
@@ -12,12 +12,11 @@ from viewmend.live.frames import FrameCache, FrameSupply, Rig, SourceStatus
 from viewmend.views import MultiViewFrame
 
 
-class PushedFrames(FrameSupply):
-    """A live rig: frames as they are pushed, numbered as they come; the oldest are forgotten."""
+class LiveFrames(FrameSupply):
+    """Frames as they happen, numbered as they come; the oldest are forgotten."""
 
     def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
         super().__init__(Span(live=True, fps=fps or 15.0))
-        self.status = SourceStatus(error="waiting for a rig to push frames")
         self._fps = fps
         self._cache = FrameCache(memory_mb, by_last_use=False)
         self._lock = threading.Lock()
@@ -28,7 +27,7 @@ class PushedFrames(FrameSupply):
             return self._cache.get(time)
 
     def begin(self, name: str, fps: float, bounds: Bounds | None, up: Float[Tensor, "3"] | None) -> None:
-        """A rig has connected. What another one pushed before cannot be asked for any more."""
+        """A rig is there. What another one pushed before cannot be asked for any more."""
         with self._lock:
             self.span = replace(self.span, first=self.span.end, fps=self._fps or fps)
             self.status = SourceStatus()
@@ -44,6 +43,14 @@ class PushedFrames(FrameSupply):
             self.status = replace(self.status, state="ready", error=None)
         self.changed()
         return time
+
+
+class PushedFrames(LiveFrames):
+    """A live rig that pushes its frames."""
+
+    def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
+        super().__init__(fps, memory_mb)
+        self.status = SourceStatus(error="waiting for a rig to push frames")
 
     def lost(self) -> None:
         """The rig has gone."""

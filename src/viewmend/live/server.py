@@ -204,8 +204,8 @@ class LiveServer:
         if not await self._welcome(socket):
             return
         if not isinstance(supply, PushedFrames) or self._pushing:
-            recording = "this server shows a recording; start viewmend serve live"
-            reason = "another rig is pushing" if self._pushing else recording
+            shows = "reads its own cameras" if supply.span.live else "shows a recording"
+            reason = "another rig is pushing" if self._pushing else f"this server {shows}; start viewmend serve live"
             await socket.send_denial_response(_refusal(409, reason))
             return
         self._pushing = True

@@ -26,7 +26,7 @@ class PlateMasks:
     def __init__(self, plate: Rgb):
         self._plate = _smooth(plate)
         self._lab = _lab(self._plate)
-        self._square = np.maximum((self._plate**2).sum(-1), 1e-4)
+        self._square = np.maximum(_dot(self._plate, self._plate), 1e-4)
 
     def mask(self, rgb: Rgb) -> Mask:
         """Foreground of an image, 0 to 255.
@@ -37,11 +37,11 @@ class PlateMasks:
         demand_size(rgb, self._plate, "the plate")
         image = _smooth(rgb)
         image = np.minimum(image * exposure_gain(image, self._plate), 1)
-        lit = ((image * self._plate).sum(-1) / self._square).clip(DEEPEST_SHADOW, 1).astype(np.float32)
+        lit = (_dot(image, self._plate) / self._square).clip(DEEPEST_SHADOW, 1).astype(np.float32)
         shaded, lab = _lab(self._plate * lit[..., None]), _lab(image)
         darkening = self._lab[..., 0] - shaded[..., 0]
-        as_shadow = np.linalg.norm(lab - shaded, axis=-1) + SHADOW_COST * darkening
-        distance = np.minimum(as_shadow, np.linalg.norm(lab - self._lab, axis=-1))
+        as_shadow = _length(lab - shaded) + SHADOW_COST * darkening
+        distance = np.minimum(as_shadow, _length(lab - self._lab))
         return soft_mask(distance, SURE, POSSIBLE)
 
 
@@ -67,6 +67,17 @@ def exposure_gain(
         return np.ones(3, np.float32)
     gain = np.median(plate[usable] / image[usable], axis=0).astype(np.float32)
     return gain if gain.min() > 1 / MOST_GAIN and gain.max() < MOST_GAIN else np.ones(3, np.float32)
+
+
+def _dot(
+    one: Float32[np.ndarray, "height width 3"], other: Float32[np.ndarray, "height width 3"]
+) -> Float32[np.ndarray, "height width"]:
+    """Products of each pixel's channels, added up: several times as fast as `sum` along so short an axis."""
+    return np.einsum("hwc,hwc->hw", one, other)
+
+
+def _length(difference: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width"]:
+    return np.sqrt(_dot(difference, difference))
 
 
 def _smooth(rgb: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:

@@ -32,13 +32,22 @@ def plates_from_files(capture: PlainCapture, place: str) -> dict[str, Rgb]:
         if not path.is_file():
             raise CaptureError(f"{path}: expected the clean plate of camera '{name}', got no file; check --plate")
         where = f"{path}: plate of camera '{name}'"
-        plate = median_plate(_video_frames(path, where)) if is_video(path.name) else read_rgb(path, where)
+        plate = read_plate(path, where)
         width, height = capture.cameras.select([name]).max_size_px
         if plate.shape[:2] != (height, width):
             got = f"{plate.shape[1]} x {plate.shape[0]}"
             raise CaptureError(f"{where}: expected {width} x {height} pixels as the images have, got {got}; resize it")
         plates[name] = capture.straightened(name, plate)
     return plates
+
+
+def read_plate(path: Path, where: str) -> Rgb:
+    """The plate that an image is, or the median of a video; `where` begins the messages.
+
+    Raises:
+        CaptureError: the file cannot be read.
+    """
+    return median_plate(_video_frames(path, where)) if is_video(path.name) else read_rgb(path, where)
 
 
 def plates_from_frames(source: CaptureSource, times: range) -> dict[str, Rgb]:
