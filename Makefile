@@ -3,6 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Without a GPU: the version whose CPU build the package index is known to have.
 CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
+# The page is tested in Chromium where it is installed (Debian: apt-get install chromium).
+comma := ,
+BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || command -v google-chrome),$(comma)browser)
 
 .PHONY: demo test test-all gate format docs clean
 
@@ -30,7 +33,7 @@ format: .venv/installed
 
 .venv/installed: pyproject.toml constraints-cpu.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,engines,docs,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,engines,docs,dev$(BROWSER)]'
 	touch $@
 
 clean:

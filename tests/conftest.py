@@ -1,5 +1,6 @@
 """Fixtures and skips that all tests share."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,28 @@ import torch
 torch.set_num_threads(1)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+BROWSER = "tests/live/browser/"
+PAGE: Counter[str] = Counter()
+"""How the tests of the page ended, and why they were skipped."""
+
+
+def pytest_runtest_logreport(report):
+    if not report.nodeid.startswith(BROWSER) or (report.when != "call" and report.passed):
+        return
+    PAGE[report.outcome] += 1
+    if report.skipped:
+        PAGE[str(report.longrepr[2]).removeprefix("Skipped: ")] += 1
+
+
+def pytest_unconfigure(config):
+    """The last line says whether a browser has seen the page."""
+    if not PAGE or config.option.collectonly:
+        return
+    ran = PAGE["passed"] + PAGE["failed"]
+    why = "; ".join(reason for reason in PAGE if reason not in ("passed", "failed", "skipped"))
+    print(f"The page: {ran} tests in Chromium." if ran else f"The page: NOT TESTED IN A BROWSER ({why}).")
 
 
 def pytest_collection_modifyitems(items):

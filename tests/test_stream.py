@@ -292,3 +292,17 @@ def test_cameras_of_different_sizes_travel_in_one_stack():
 def test_a_capture_without_masks_is_refused():
     with pytest.raises(ValueError, match="expected a capture with masks"):
         Stream(Asker(), CONFIG).push(replace(photograph(SPARSE), mask=None))
+
+
+def test_the_time_looked_at_longest_ago_is_forgotten_first():
+    stream = Stream(Telea(), replace(CONFIG, memory_mb=None))
+    walk(stream, [0], A)
+    seen = Stream(Telea(), replace(CONFIG, memory_mb=3.5e-6 * stream.observation().size))
+    walk(seen, range(3), A)
+    assert seen.times == (0, 1, 2)
+    seen.view(A, time=0)
+    walk(seen, [3], A)
+    assert seen.times == (0, 2, 3)
+    seen.push(photograph(SPARSE, 2))  # at hand already: somebody wants it
+    walk(seen, [4], A)
+    assert seen.times == (2, 3, 4)

@@ -124,3 +124,19 @@ def test_a_failed_cell_fails_the_command(failed, tmp_path, monkeypatch):
     monkeypatch.setattr(evaluating, "write_report", lambda *_: None)
     monkeypatch.setattr(report_markdown, "summary", lambda _: "")
     assert cli.main(["evaluate", "P", "--out", str(tmp_path)]) == int(failed)
+
+
+def test_a_cell_that_really_fails_fails_the_command(tmp_path, capsys):
+    (tmp_path / "broken.py").write_text(
+        "from viewmend.inpainting.coarse_fill import SmoothFill\n\n"
+        "class Broken(SmoothFill):\n"
+        "    def __init__(self, device):\n        super().__init__()\n\n"
+        "    def step(self, view, context, state):\n        raise RuntimeError('no idea')\n"
+    )
+    methods = f"unfilled,{tmp_path}/broken.py:Broken"
+    command = ["evaluate", "P", "--out", str(tmp_path / "out"), *QUICK[:-1], methods, "--json"]
+    assert cli.main(command) == 1
+    said = capsys.readouterr()
+    assert "Broken: failed: RuntimeError: no idea" in said.err
+    failed = {row["method"]: row["failed"] for row in json.loads(said.out)["tables"][0]["rows"]}
+    assert failed == {"unfilled": 0, f"{tmp_path}/broken.py:Broken": 1}

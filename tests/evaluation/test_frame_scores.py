@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from viewmend.evaluation.frame_scores import Before, Scorers, TrueView, score_frame, similarity
+from viewmend.evaluation.frame_scores import Before, Scorers, TrueView, score_frame, similarity, true_view
 from viewmend.geometry.cameras import Cameras
 from viewmend.metrics.image_quality import ssim_map
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.views import CompletedView, IncompleteView, MultiViewFrame
 
 HEIGHT, WIDTH = 40, 50
 
@@ -162,3 +162,24 @@ def test_an_error_that_moves_with_the_surface_does_not_flicker_and_one_that_stay
     assert 0.08 < whole < 0.1, "over all that shows, holes included"
     stuck = temporal(case, moving, before, before)
     assert stuck.change == 0 and stuck.flicker > 0.1 and stuck.warp_error == pytest.approx(stuck.flicker, abs=1e-6)
+
+
+def test_the_change_is_over_the_holes_of_both_times(case):
+    completed, truth = case
+    then = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    then[25:35, 20:30] = True  # as many pixels as this time's holes, elsewhere
+    shown = completed.rgb.clone()
+    shown[:, then] += 0.3
+    scores = score_frame(completed, truth, Before(shown, truth.rgb, then), 1.0)
+    assert scores.change == pytest.approx(0.15, abs=1e-6) and scores.change_truth == 0
+
+
+def test_the_truth_is_black_where_its_mask_is(case):
+    mask = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.uint8)
+    mask[0, :, 10:], mask[0, :, 30:] = 51, 255
+    rgb = torch.full((1, 3, HEIGHT, WIDTH), 200, dtype=torch.uint8)
+    truth = true_view(MultiViewFrame(case[0].view.camera, rgb, mask, 0), None)
+    for columns, share in ((slice(10), 0.0), (slice(10, 30), 0.2), (slice(30, None), 1.0)):
+        expected = torch.tensor(200 / 255 * share)
+        assert torch.allclose(truth.rgb[:, :, columns], expected, atol=1e-6)
+        assert bool((truth.mask[:, columns] == (share > 0.5)).all())

@@ -4,19 +4,15 @@ Every parser is given its own kind of file with something changed: bytes, values
 default a minute in all; VIEWMEND_FUZZ=100000 (inputs a parser) is the longer run.
 """
 
-import copy
 import functools
 import json
-import os
-import resource
 import struct
-import time
-from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from fuzz.inputs import FUZZED, changed, held, reworded, spoilt, text_of
+from hypothesis import given
 from hypothesis import strategies as st
 from inpainting.plates import tiny
 from reference.ball import BallCapture, ring
@@ -36,98 +32,7 @@ from viewmend.output_folder import OutputFolder
 from viewmend.studio.bvh import read_bvh
 from viewmend.studio.gltf import load_character
 
-INPUTS = int(os.environ.get("VIEWMEND_FUZZ", "60"))
-MOST_S, MOST_MB = 5.0, 600
-FUZZED = settings(
-    max_examples=INPUTS,
-    deadline=None,
-    database=None,
-    derandomize=INPUTS < 1000,
-    suppress_health_check=list(HealthCheck),
-)
-NUMBERS = (-1, 0, 1, 2, 0.5, 7, 2**31, 2**40, 10**400, 1e308, -1e308, 1e-300, float("nan"), float("inf"))
-TEXTS = ("", "x", "\0", "../../etc/passwd", "/etc/passwd", "/dev/zero", "\ud800", "a" * 5000)
-NASTY = st.sampled_from([None, True, *NUMBERS, *TEXTS, [], {}, [[]], {"a": {}}, [0] * 100, ["x"] * 3])
-WORDS = ("", "nan", "1e308", "-1", "999999999", "{", "}", "ROOT", "CHANNELS", "w", "\0")
 URIS = ("/etc/passwd", "../secret.bin", "%2e%2e/secret.bin", "/dev/zero", "link.bin", "folder")
-
-
-@st.composite
-def changed(draw, value):
-    """JSON with one to three of its values replaced, removed, doubled or put where another was."""
-    value = copy.deepcopy(value)
-    for _ in range(draw(st.integers(1, 3))):
-        at, key = value, None
-        while isinstance(at, dict | list) and at and (key is None or draw(st.integers(0, 3))):
-            parent, key = at, draw(st.sampled_from(sorted(at) if isinstance(at, dict) else range(len(at))))
-            at = parent[key]
-        if key is None:
-            return draw(NASTY)
-        kind = draw(st.sampled_from(["nasty", "nasty", "remove", "double", "deep"]))
-        if kind == "remove":
-            del parent[key]
-        elif kind == "double" and isinstance(parent, list):
-            parent.extend([at] * draw(st.sampled_from([1, 3000])))
-        else:
-            parent[key] = draw(NASTY) if kind != "deep" else nested(draw(st.sampled_from([3, 900, 5000])))
-    return value
-
-
-def nested(depth):
-    value: list = []
-    for _ in range(depth):
-        value = [value]
-    return value
-
-
-def text_of(value) -> bytes:
-    """JSON as bytes; of what is too deep for Python's own writer, brackets."""
-    try:
-        return json.dumps(value).encode(errors="replace")
-    except RecursionError:
-        return b"[" * 100_000
-
-
-@st.composite
-def spoilt(draw, data: bytes):
-    """Bytes with a few of them changed, a piece cut out, doubled, or nothing after it."""
-    data = bytearray(data)
-    for _ in range(draw(st.integers(1, 4))):
-        at = draw(st.integers(0, max(0, len(data) - 1)))
-        kind = draw(st.sampled_from(["flip", "flip", "cut", "end", "double", "number"]))
-        if kind == "flip" and data:
-            data[at] = draw(st.integers(0, 255))
-        elif kind == "cut":
-            del data[at : at + draw(st.integers(1, 40))]
-        elif kind == "end":
-            del data[at:]
-        elif kind == "double":
-            data[at:at] = data[at : at + 60]
-        else:
-            data[at : at + 4] = struct.pack("<I", draw(st.sampled_from([0, 1, 2**31, 2**32 - 1])))
-    return bytes(data)
-
-
-@st.composite
-def reworded(draw, text: str):
-    """Text with a few words replaced."""
-    words = text.split(" ")
-    for _ in range(draw(st.integers(1, 3))):
-        at = draw(st.integers(0, len(words) - 1))
-        words[at] = draw(st.sampled_from(WORDS))
-    return " ".join(words).encode()
-
-
-def held(read: Callable[[], object], refusals: tuple[type[Exception], ...] = (ValueError,)) -> None:
-    """Read or refuse, in one line, within the bounds."""
-    began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    try:
-        read()
-    except refusals as error:
-        assert len(str(error)) < 2000, str(error)[:3000]
-        assert "Error:" not in str(error)[:20]
-    assert time.monotonic() - began < MOST_S * 4, "too slow"  # on a machine that does other things as well
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_MB * 1000, "too much memory"
 
 
 @pytest.fixture(scope="module")

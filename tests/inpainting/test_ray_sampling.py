@@ -10,7 +10,7 @@ from reference.rays_twin import far_twin, follow_twin
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.decoder import blend
-from viewmend.inpainting.ray_blend_net import PIXELS_STEP
+from viewmend.inpainting.ray_blend_net import PIXELS_STEP, RADIUS_PX, look_around
 from viewmend.inpainting.ray_sampling import (
     CELLS,
     CELLS_AROUND,
@@ -193,3 +193,20 @@ def test_the_reader_alone_completes_a_view():
     assert torch.equal(completed.rgb, expected)
     whole, rig = view(5, hole=None), Rig()
     assert net.step(whole, rig, net.initial_state())[0].rgb is whole.rgb and not rig.asked
+
+
+def test_a_point_that_no_camera_sees_is_no_candidate():
+    """However much the network wants it: such a point has no colour, and would be black."""
+    reader, incomplete = tiny().coarse, view(5)
+    missing = torch.nonzero(incomplete.error > 0)
+    told = look_around(incomplete, context(5), missing)
+    blind = told._replace(features=torch.zeros_like(told.features))
+    last = [layer for layer in reader.choose.modules() if isinstance(layer, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.zero_()
+        last.bias[:-2], last.bias[-2] = 100, 50  # points, then what the surroundings suggest, then black
+        guess = told.window[:, -3:, RADIUS_PX, RADIUS_PX]
+        assert float(guess.mean()) > 0.1
+        assert torch.allclose(reader.mix(blind), guess, atol=1e-3)
+        assert not torch.allclose(reader.mix(told), guess, atol=1e-2)

@@ -112,3 +112,15 @@ def test_impossible_budgets_are_refused():
     for target_ms in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="expected a positive budget"):
             Budget(target_ms)
+
+
+def test_it_goes_up_only_where_the_next_level_has_room():
+    levels = (QualityLevel(0.5, 7, None), FULL)
+    budget = Budget(100.0, levels)
+    budget.record(FULL, FrameTimes(inpainting=400.0))
+    for _ in range(30):
+        assert budget.index == 0
+        budget.record(levels[0], FrameTimes(inpainting=80.0))  # this level has room, the whole would take 320 ms
+    for _ in range(30):
+        budget.record(budget.level, FrameTimes(inpainting=80.0 * budget.level.scale**2))
+    assert budget.level == FULL

@@ -47,7 +47,7 @@ def test_holes_are_where_the_weights_end():
     assert rows[view.mask[48] > 0][0] == 0 and rows[view.mask[48] > 0][-1] == 1
 
 
-@pytest.mark.parametrize(("weight", "missing"), [(0.0, 1.0), (0.9e-5, 1.0), (1.1e-5, 0.0), (1.0, 0.0)])
+@pytest.mark.parametrize(("weight", "missing"), [(0.0, 1.0), (0.9e-5, 1.0), (1e-5, 0.0), (1.1e-5, 0.0), (1.0, 0.0)])
 def test_a_pixel_is_seen_from_a_hundred_thousandth_on(weight, missing):
     blend = Blend(torch.zeros(3, 1, 1), torch.full((2, 1, 1), weight / 2), torch.zeros(1, 1))
     assert error_rule("unseen")(Evidence(mask=torch.ones(1, 1), depth=torch.ones(1, 1), blend=blend)).item() == missing
@@ -81,6 +81,9 @@ def test_excluded_cameras_leave_no_trace():
     alone = render_view(frame.without(["c1"]), BALL, target, config)
     assert set(without.source_views) == set(alone.source_views)
     torch.testing.assert_close(without.rgb, alone.rgb)
+    assert without.candidate_views == alone.candidate_views
+    assert without.silhouettes.cameras.names == alone.silhouettes.cameras.names == ("c0", "c2", "c3", "c4", "c5")
+    assert torch.equal(without.silhouettes.mask, alone.silhouettes.mask)
     with pytest.raises(ValueError, match="all of them excluded"):
         render_view(frame, BALL, target, config, exclude=frame.cameras.names)
 

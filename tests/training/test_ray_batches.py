@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from viewmend.inpainting.chain import build
+from viewmend.inpainting.ray_sampling import RayFeatures
 from viewmend.training.loop import train
 from viewmend.training.losses import image_loss
-from viewmend.training.ray_batches import RayBatch, RayBatchScenes, RaysObjective, augmented
+from viewmend.training.ray_batches import MOST_BLIND, RayBatch, RayBatchScenes, RaysObjective, augmented
 from viewmend.training.sample_files import ShardError, ShardScenes, sample_from_bytes, sample_to_bytes, write_shards
 from viewmend.training.samples import Sample
 from viewmend.training.scenes import StudioScenes
@@ -75,3 +76,19 @@ def test_variations_are_what_other_cameras_in_another_light_might_have_seen(tiny
     torch.manual_seed(1)
     again = [augmented(lookups) for _ in range(2)]
     assert sample_to_bytes(again[0]) != sample_to_bytes(again[1])
+
+
+def test_some_cameras_see_nothing_but_never_those_that_coloured_the_view(tiny):
+    plan = replace(tiny.data, shards=None, clip_length=1, cameras=(8, 8), ray_views=6, context_cameras=(2,))
+    lookups = RayBatchScenes(StudioScenes(replace(plan, context_weights=(1,)), "0"), "0", 20).scene(0)[0]
+    seeing = lambda batch: (batch.features != 0).flatten(0, 1).any(0).any(-1)  # noqa: E731
+    chosen = (RayFeatures.unstack(lookups.features).is_source > 0).flatten(0, 1).any(0)[:, 0]
+    assert int(chosen.sum()) == 2 and bool(seeing(lookups).all())
+    lost = []
+    for seed in range(60):
+        torch.manual_seed(seed)
+        left = seeing(augmented(lookups))
+        assert bool(left[chosen].all())
+        lost.append(int((~left).sum()))
+    assert 0.1 < sum(count > 0 for count in lost) / len(lost) < 0.45, "of three tenths of the samples"
+    assert 1 < max(lost) <= MOST_BLIND

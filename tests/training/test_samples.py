@@ -139,10 +139,10 @@ def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
         assert (scene, number) == (other_scene, other_number) and same(sample, other)
     helped.close()
     feed = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0)
-    batches = [feed.batch(step, 2) for step in range(3)]
-    assert [len(batch) for batch in batches] == [1, 2, 2]
+    batches = [feed.batch(step, 2) for step in range(4)]
+    assert [len(batch) for batch in batches] == [1, 2, 2, 2] and feed.position.sample == 1, "in the middle of a scene"
     again = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0, start=feed.position)
-    for one, other in zip(feed.batch(3, 2), again.batch(3, 2), strict=True):
+    for one, other in zip(feed.batch(4, 2), again.batch(4, 2), strict=True):
         assert same(one, other)
     assert feed.position == again.position
 
@@ -251,3 +251,11 @@ def test_a_mix_takes_its_share_from_each(plan):
     assert 0.68 < len(real.asked) / 800 < 0.82
     assert real.asked[: len(real.asked) // 2] == real.asked[len(real.asked) // 2 :], "a number is always of one source"
     assert {*real.asked, *studio.asked} == {*range(400)} and not {*real.asked} & {*studio.asked}
+
+
+def test_hulls_are_as_fine_as_the_plan_says(plan):
+    coarse, fine = (StudioScenes(replace(plan, hull_resolution=n), "0").scene(0) for n in (12, 48))
+    assert len(coarse) == len(fine) > 0
+    covers = [[int((sample.view.mask > 0).sum()) for sample in samples] for samples in (coarse, fine)]
+    assert sum(covers[0]) < 0.5 * sum(covers[1]), "large voxels lose what is thin"
+    assert all(same(a, b) for a, b in zip(fine, StudioScenes(plan, "0").scene(0), strict=True))

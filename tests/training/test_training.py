@@ -15,9 +15,11 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from viewmend.baselines.classical import Telea
 from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_network
-from viewmend.training import loop
+from viewmend.inpainting.protocol import ContextProvider, State
+from viewmend.training import loop, ray_batches
 from viewmend.training.loop import Run, averaging, train
 from viewmend.training.plan import DataPlan, LossWeights, WholeViewRecipe
 from viewmend.training.processes import processes
@@ -25,6 +27,7 @@ from viewmend.training.recipes import RECIPES, small, small_rays
 from viewmend.training.run_files import FILE, RunError
 from viewmend.training.sample_files import sample_from_bytes
 from viewmend.training.schedule import learning_rate_factor
+from viewmend.training.validation import Validation
 
 
 def log_of(out):
@@ -220,7 +223,17 @@ def test_validation_scores_the_averaged_weights_and_leaves_a_picture(tiny, tmp_p
     train(replace(tiny, validate_every=3), tmp_path)
     judged = [entry for entry in log_of(tmp_path) if "validation" in entry]
     assert [entry["step"] for entry in judged] == [3, 4]
-    assert all(5 < entry["validation"][n] < 60 for entry in judged for n in ("holes", "telea", "coarse_fill"))
+    views, model, found = Validation(tiny, tmp_path)._views(), load_network(tmp_path).eval(), []
+    for sample in views:
+        with torch.no_grad():
+            made = model([sample.view], [list(sample.context)], ray_views=[sample.nearby])[0]
+        telea, _ = Telea().step(sample.view, ContextProvider(lambda *_: None), State())
+        missing = sample.view.error > 0
+        off = [(rgb - sample.truth / 255)[:, missing] for rgb in (made.completed, telea.rgb, made.coarse)]
+        found.append([-10 * float(each.square().mean().log10()) for each in off])
+    last = judged[-1]["validation"]
+    expected = torch.tensor(found).mean(0).tolist()
+    assert [last["holes"], last["telea"], last["coarse_fill"]] == pytest.approx(expected, abs=2e-3)
     assert judged[0]["validation"]["telea"] == judged[1]["validation"]["telea"], "the views are fixed"
     assert sorted(p.name for p in tmp_path.glob("*.png")) == ["validation-000003.png", "validation-000004.png"]
 
@@ -307,3 +320,21 @@ def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
 def test_a_recipe_that_cannot_be_is_refused(change, message, tiny):
     with pytest.raises(ValueError, match=message):
         replace(tiny, **change)
+
+
+def test_what_a_step_draws_follows_from_its_number_alone(tiny, tmp_path):
+    """Whoever draws between the steps changes nothing; the steps themselves draw differently."""
+    recipe = replace(tiny, part="rays", augment=True, steps=3, checkpoint_every=100)
+    drawn, augment = [], ray_batches.augmented
+
+    def noting(lookups):
+        drawn.append(float(torch.rand(())))
+        return augment(lookups)
+
+    for name in ("undisturbed", "disturbed"):
+        between = None if name == "undisturbed" else lambda _: torch.rand(7)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(ray_batches, "augmented", noting)
+            train(recipe, tmp_path / name, report=between)
+    assert same_weights(tmp_path / "undisturbed", tmp_path / "disturbed")
+    assert drawn[: len(drawn) // 2] == drawn[len(drawn) // 2 :] and len(set(drawn)) == len(drawn) // 2 > 3

@@ -339,3 +339,12 @@ def test_samples_go_on_where_they_stopped(tmp_path, monkeypatch, capsys):
     assert "4 samples are there already" in capsys.readouterr().err
     assert main(["samples", "views", "--out", str(out), "--count", "6", *small, "--seed", "1"]) == 2
     assert "expected scenes of the same plan and seed" in capsys.readouterr().err
+
+
+def test_stored_hulls_are_as_fine_as_the_plan_says(studio):
+    rig = LeaveOneOut({0: studio.read(0)})
+    sizes = [
+        sum(len(view.faces) for view in store(rig, 0, replace(PLAN, hull_resolution=n), Random(0)).held)
+        for n in (16, 48)
+    ]
+    assert 4 * sizes[0] < sizes[1]

@@ -11,6 +11,8 @@ from viewmend.cli import recipe_options
 from viewmend.training.plan import FLAT, Recipe, WholeViewRecipe
 
 SAMPLES_A_SHARD, SCENES_A_SHARD = 48, 16
+PLAN = "plan.txt"
+"""What the scenes of a folder are made by."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +39,17 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
 
 def run(options: Options) -> int:
     """Make them, and say how fast that went."""
+    from viewmend.output_folder import OutputFolder
+
+    if options.count < 1:
+        raise ValueError(f"expected a count of at least 1, got {options.count}")
+    with OutputFolder(options.out) as folder:
+        code = _make(options)
+        folder.made("shard-*.tar", PLAN)
+    return code
+
+
+def _make(options: Options) -> int:
     import time
 
     from viewmend.cli.console import say, track
@@ -44,11 +57,9 @@ def run(options: Options) -> int:
     from viewmend.training.sample_files import write_shards
     from viewmend.training.sources import stored_source, training_source
 
-    if options.count < 1:
-        raise ValueError(f"expected a count of at least 1, got {options.count}")
     recipe = options.recipe
     whole = isinstance(recipe, WholeViewRecipe)
-    there = len(list(options.out.glob("shard-*.tar")))
+    there = _count_there(options.out)
     if there and not whole:
         raise ValueError(f"{options.out}: expected no samples yet, found shards; choose another --out, or remove them")
     if whole:
@@ -70,16 +81,35 @@ def run(options: Options) -> int:
     return 0
 
 
+def _count_there(out: Path) -> int:
+    """How many shards there are.
+
+    Raises:
+        ValueError: one is missing between others, so that the next would take another's name.
+    """
+    from viewmend.training.sample_files import shards_of
+
+    names = [path.name for path in shards_of(out) if path.name.startswith("shard-")]
+    for number, name in enumerate(names):
+        if name != f"shard-{number:05d}.tar":
+            raise ValueError(
+                f"{out}: expected shard-{number:05d}.tar before {name}, found none; rename those behind it, or choose "
+                "another --out"
+            )
+    return len(names)
+
+
 def _demand_same(out: Path, recipe: Recipe) -> None:
     """Write down what the folder's scenes are made by, or compare with what was.
 
     Raises:
         ValueError: they are made by another plan or seed.
     """
-    plan, file = f"seed {recipe.seed}, {recipe.data}\n", out / "plan.txt"
+    from viewmend.atomic_writes import write_atomically
+
+    plan, file = f"seed {recipe.seed}, {recipe.data}\n", out / PLAN
     if not file.exists():
-        out.mkdir(parents=True, exist_ok=True)
-        file.write_text(plan)
+        write_atomically(file, lambda path: path.write_text(plan))
     elif file.read_text() != plan:
         raise ValueError(
             f"{out}: expected scenes of the same plan and seed, got {file.read_text().strip()}; give the options that "

@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import math
 import re
+import struct
 import zlib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -18,13 +20,15 @@ from viewmend.evaluation.film import FILM_FRAMES, Picture, frames_of
 from viewmend.evaluation.frame_scores import FrameScores
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
-from viewmend.evaluation.scorers import KINDS, Features
+from viewmend.evaluation.scorers import FEATURES, KINDS, Features
+from viewmend.json_input import typed
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import identity, make_method
 
 PROTOCOL = 2
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
-DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error)
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
+DAMAGED += (RuntimeError, MemoryError, SyntaxError, OverflowError)  # NotImplementedError is a RuntimeError
 """What an .npz file that is not whole raises."""
 
 
@@ -95,7 +99,7 @@ class CellStore:
                 return None
             features, truth = (self._read_features(f"{stem}.npz") for stem in (key.stem, key.scene_stem))
             return replace(_cell(values), features=features, true_features=truth)
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError):
             return None
 
     def save(self, cell: Cell, run: MethodRun) -> None:
@@ -152,7 +156,9 @@ class CellStore:
     def _read_features(self, name: str) -> Features | None:
         try:
             with (self.folder / name).open("rb") as file, np.load(file) as arrays:
-                return {kind: arrays[kind] for kind in KINDS}
+                found = {kind: arrays[kind] for kind in KINDS}
+            fit = all(a.ndim == 2 and a.shape[1] == FEATURES and a.dtype.kind == "f" for a in found.values())
+            return found if fit else None
         except DAMAGED:  # without them there is no VFID, all else stands
             return None
 
@@ -229,7 +235,13 @@ def _cell(values: dict[str, Any]) -> Cell:
     values = dict(values)
     if set(values) != set(REMEMBERED):
         raise ValueError(f"expected a cell with {sorted(REMEMBERED)}, got {sorted(values)}")
-    values["key"] = CellKey(**values["key"])
-    values["frames"] = tuple(FrameScores(**frame) for frame in values["frames"])
-    values["provenance"] = Provenance(**values["provenance"])
+    values["key"] = typed(values["key"], CellKey)
+    values["frames"] = tuple(typed(values["frames"], list[FrameScores]))
+    values["provenance"] = typed(values["provenance"], Provenance)
+    for name in ("set", "rig", "style", "identity"):
+        typed(values[name], str)
+    typed(values["error"], str | None)
+    for frame in values["frames"]:
+        if frame.image_px < 1 or not all(math.isfinite(n) for n in asdict(frame).values() if n is not None):
+            raise ValueError("expected finite scores of pixels, got others")
     return Cell(**values)

@@ -38,6 +38,8 @@ class Scorers:
 
 
 SSIM_ONLY = Scorers()
+FEATURES = 1024
+"""Numbers in one of I3D's vectors."""
 Features = dict[str, Float[np.ndarray, "clip 1024"]]
 """I3D's vectors of a stream's videos, for each of `KINDS`."""
 

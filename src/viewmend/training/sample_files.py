@@ -5,16 +5,18 @@ import json
 import tarfile
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from random import Random
-from typing import Any, Generic, TypeVar
+from types import NoneType, UnionType
+from typing import Any, Generic, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from viewmend.atomic_writes import write_atomically
+from viewmend.atomic_writes import HALF, write_atomically
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.sweep.lookup import Scale
@@ -56,9 +58,10 @@ def sample_from_bytes(data: bytes) -> Stored:
     try:
         tensors = load(data)
         sample = _put_together(json.loads(bytes(tensors.pop(STRUCTURE).tolist())), tensors)
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (SafetensorError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        said = " ".join(str(error).split())[:200]
         raise ShardError(
-            f"expected a sample, got {len(data)} bytes that do not read ({error}); make it again"
+            f"expected a sample, got {len(data)} bytes that do not read ({said}); make it again"
         ) from error
     if not isinstance(sample, Stored):
         raise ShardError(f"expected a sample, got a {type(sample).__name__}; make it again")
@@ -77,6 +80,11 @@ def write_shards(samples: Iterable[Stored], folder: Path, per_shard: int = 48, f
         yield _write_shard(shard, folder / f"shard-{number:05d}.tar")
 
 
+def shards_of(folder: Path) -> list[Path]:
+    """The shards of a folder, by name; what is still being written, or was left so, is none."""
+    return sorted(path for path in folder.glob("*.tar") if not path.name.startswith(HALF))
+
+
 def read_shard(path: Path, member: int | None = None) -> list[Stored]:
     """All samples of a shard; or this one alone, none where there are fewer.
 
@@ -84,8 +92,11 @@ def read_shard(path: Path, member: int | None = None) -> list[Stored]:
         ShardError: the file is damaged.
     """
     try:
-        with tarfile.open(path) as tar:
+        with tarfile.open(path, "r:") as tar:  # uncompressed, so that it says no more than it holds
             members = tar.getmembers()
+            odd = [each.name for each in members if not each.isreg() or each.sparse or each.size > path.stat().st_size]
+            if odd:
+                raise ShardError(f"{odd[0]!r} is no plain file within it")
             wanted = members if member is None else members[member : member + 1]
             files = [tar.extractfile(each) for each in wanted]
             return [sample_from_bytes(file.read()) for file in files if file is not None]
@@ -105,7 +116,7 @@ class ShardScenes(Generic[Kind]):
         Raises:
             ShardError: the folder has none.
         """
-        self.paths = sorted(folder.glob("*.tar"))
+        self.paths = shards_of(folder)
         self.seed = seed
         self.kinds, self.clip = kinds, clip
         if not self.paths:
@@ -148,7 +159,7 @@ class StoredShards:
         Raises:
             ShardError: the folder has none, or the first is damaged.
         """
-        self.paths = sorted(folder.glob("*.tar"))
+        self.paths = shards_of(folder)
         self.seed = seed
         if not self.paths:
             raise ShardError(f"{folder}: expected tar files, found none; make some with `viewmend samples views --out`")
@@ -205,5 +216,27 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
     if isinstance(value, dict) and "tensor" in value:
         return tensors[value["tensor"]]
     if isinstance(value, dict):
-        return KINDS[value["kind"]](**{n: _put_together(part, tensors) for n, part in value["fields"].items()})
+        kind = KINDS[value["kind"]]
+        made = kind(**{n: _put_together(part, tensors) for n, part in value["fields"].items()})
+        if wrong := [name for name, hint in _hints(kind).items() if not _fits(getattr(made, name), hint)]:
+            raise TypeError(f"{wrong[0]} of {value['kind']} is of another kind")
+        return made
     return value
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return {name: hint for name, hint in get_type_hints(kind).items() if name in {f.name for f in fields(kind)}}
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a field's value is what its annotation says."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if origin is tuple:
+        each = [parts[0]] * len(value) if parts[1:] == (...,) and isinstance(value, tuple) else parts
+        return isinstance(value, tuple) and len(value) == len(each) and all(map(_fits, value, each))
+    if hint in (int, float):
+        return isinstance(value, int | hint) and not isinstance(value, bool)
+    return isinstance(value, NoneType if hint is None else hint)

@@ -15,6 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.baselines.classical import Unfilled
+from viewmend.capture.images import MAX_PIXELS, told_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
@@ -30,6 +31,9 @@ from viewmend.views import MultiViewFrame
 
 STEPS = 65535
 """Vertices and depths are kept in so many steps of what they span."""
+MAX_BYTES = 2**28
+"""The most that a stored list of vertices or faces may say."""
+AGAIN = "make the shard again"
 FASTEST = 1
 """Level of compression: more costs time, and saves a tenth."""
 
@@ -64,7 +68,11 @@ class StoredScene:
     held: tuple[StoredView, ...]
 
     def sample(self, number: int, render: RenderConfig, nearby: int) -> Sample:
-        """What `number` of the held views is, rendered; with the views of so many cameras near it."""
+        """What `number` of the held views is, rendered; with the views of so many cameras near it.
+
+        Raises:
+            ValueError: what was stored is damaged.
+        """
         view = self.held[number]
         rig = view.cameras
         rgba = [_decoded(png) for png in self.images]
@@ -123,10 +131,12 @@ def _held_view(rig: LeaveOneOut, name: str, time: int, hull: HullConfig) -> Stor
 
 
 def _proxy(view: StoredView) -> GeometryProxy:
-    steps = np.frombuffer(zlib.decompress(view.vertices.numpy().tobytes()), np.uint16).reshape(-1, 3)
-    faces = np.frombuffer(zlib.decompress(view.faces.numpy().tobytes()), np.int32).cumsum(dtype=np.int32)
+    steps = np.frombuffer(_inflated(view.vertices), np.uint16).reshape(-1, 3)
+    faces = np.frombuffer(_inflated(view.faces), np.int32).cumsum(dtype=np.int32).reshape(-1, 3)
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(steps):
+        raise ValueError(f"expected faces of {len(steps)} stored vertices, got others; {AGAIN}")
     vertices = view.bounds.low + torch.from_numpy(steps.astype(np.float32)) / STEPS * view.bounds.size_m
-    mesh = Mesh(vertices, torch.from_numpy(faces.reshape(-1, 3)))
+    mesh = Mesh(vertices, torch.from_numpy(faces))
     return GeometryProxy(mesh, vertex_normals(mesh), view.bounds)
 
 
@@ -145,6 +155,8 @@ def _frame(
     images = torch.zeros(len(rgba), 4, height, width, dtype=torch.uint8)
     depth = torch.zeros(len(rgba), height, width) if depths else None
     for view, image in enumerate(rgba):
+        if [image.shape[2], image.shape[1]] != cameras.size_px[view].tolist():
+            raise ValueError(f"expected a stored image of the camera's size, got {tuple(image.shape[1:])}; {AGAIN}")
         images[view, :, : image.shape[1], : image.shape[2]] = image
         if depth is not None:
             rows, columns = image.shape[1:]
@@ -162,9 +174,25 @@ def _coded(rgb: UInt8[Tensor, "3 height width"], mask: UInt8[Tensor, "height wid
 
 
 def _decoded(png: UInt8[Tensor, "_byte"]) -> UInt8[Tensor, "4 height width"]:
+    return torch.from_numpy(_opened(png, np.uint8, 3)).movedim(-1, 0)
+
+
+def _opened(png: UInt8[Tensor, "_byte"], kind: type, dimensions: int) -> np.ndarray:
+    """A stored PNG of this kind; ValueError for anything else."""
     import cv2
 
-    return torch.from_numpy(cv2.imdecode(png.numpy(), cv2.IMREAD_UNCHANGED)).movedim(-1, 0)
+    told = told_size(png.numpy().tobytes())
+    image = None if told is None or told[0] * told[1] > MAX_PIXELS else cv2.imdecode(png.numpy(), cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != kind or image.ndim != dimensions or image.shape[2:] not in ((), (4,)):
+        raise ValueError(f"expected a stored PNG of {kind.__name__}, got {len(png)} bytes of something else; {AGAIN}")
+    return image
+
+
+def _inflated(data: UInt8[Tensor, "_byte"]) -> bytes:
+    try:
+        return zlib.decompressobj().decompress(data.numpy().tobytes(), MAX_BYTES)
+    except zlib.error as error:
+        raise ValueError(f"expected a stored mesh, got {error}; {AGAIN}") from None
 
 
 def _coded_depth(depth: Float[Tensor, "height width"], step_m: float) -> UInt8[Tensor, "_byte"]:
@@ -172,10 +200,7 @@ def _coded_depth(depth: Float[Tensor, "height width"], step_m: float) -> UInt8[T
 
 
 def _depth(png: UInt8[Tensor, "_byte"], step_m: float) -> Float[Tensor, "height width"]:
-    import cv2
-
-    steps = cv2.imdecode(png.numpy(), cv2.IMREAD_UNCHANGED)
-    return torch.from_numpy(np.asarray(steps, np.float32)) * step_m
+    return torch.from_numpy(_opened(png, np.uint16, 2).astype(np.float32)) * step_m
 
 
 def _png(image: np.ndarray) -> UInt8[Tensor, "_byte"]:

@@ -1,0 +1,317 @@
+"""Shards, runs and cells of strangers are read or refused like any other file: in one line, soon, in little memory."""
+
+import io
+import json
+import struct
+import tarfile
+import zlib
+from dataclasses import asdict, dataclass, replace
+from random import Random
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from evaluation.conftest import ORIGIN
+from fuzz.inputs import FUZZED, File, changed, held, nested, spoilt, text_of
+from hypothesis import given
+from jaxtyping import UInt8
+from safetensors import safe_open
+from safetensors.torch import save, save_file
+from torch import Tensor
+
+from viewmend.evaluation import scorers
+from viewmend.evaluation.averages import average_cell
+from viewmend.evaluation.cells import Cell, CellKey, CellStore
+from viewmend.evaluation.frame_scores import FrameScores
+from viewmend.evaluation.scene_run import MethodRun
+from viewmend.inpainting.config import small
+from viewmend.leave_one_out.scenes import LeaveOneOut
+from viewmend.rendering.view import RenderConfig
+from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.training.logs import Log
+from viewmend.training.plan import DataPlan, Recipe
+from viewmend.training.run_files import FILE, RunError, RunState, load_run, save_run
+from viewmend.training.sample_files import (
+    KINDS,
+    STRUCTURE,
+    ShardError,
+    ShardScenes,
+    StoredShards,
+    _taken_apart,
+    read_shard,
+    sample_from_bytes,
+    sample_to_bytes,
+    write_shards,
+)
+from viewmend.training.samples import Sample
+from viewmend.training.stored_scenes import StoredScene, store
+
+
+@pytest.fixture(scope="module")
+def stored() -> StoredScene:
+    studio = Studio(StudioConfig(seed=3, cameras=4, frames=1, size_px=48))
+    rig = LeaveOneOut({0: studio.read(0)})
+    return store(rig, 0, DataPlan(held_cameras=1, hull_resolution=24), Random(0))
+
+
+@pytest.fixture(scope="module")
+def sample(stored) -> Sample:
+    return stored.sample(0, RenderConfig(), 2)
+
+
+def parts_of(data: bytes) -> tuple[dict, bytes]:
+    """A safetensors file's head, and its tensors."""
+    size = struct.unpack_from("<Q", data)[0]
+    return json.loads(data[8 : 8 + size]), data[8 + size :]
+
+
+def joined(head: object, tensors: bytes) -> bytes:
+    text = text_of(head)
+    return File(struct.pack("<Q", len(text)) + text + tensors)
+
+
+def with_structure(data: bytes, structure: object) -> bytes:
+    """The sample with another JSON."""
+    head, tensors = parts_of(data)
+    text = text_of(structure)
+    begin, end = head[STRUCTURE]["data_offsets"]
+    rest = {name: entry for name, entry in head.items() if name != STRUCTURE}
+    moved = {
+        name: entry | {"data_offsets": [at - (end - begin if at >= end else 0) for at in entry["data_offsets"]]}
+        for name, entry in rest.items()
+    }
+    tensors = tensors[:begin] + tensors[end:]
+    moved[STRUCTURE] = {"dtype": "U8", "shape": [len(text)], "data_offsets": [len(tensors), len(tensors) + len(text)]}
+    return joined(moved, tensors + text)
+
+
+def structure_of(data: bytes) -> dict:
+    head, tensors = parts_of(data)
+    begin, end = head[STRUCTURE]["data_offsets"]
+    return json.loads(tensors[begin:end])
+
+
+@pytest.mark.parametrize("kind", ["sample", "stored"])
+def test_samples_in_files(kind, request):
+    good = sample_to_bytes(request.getfixturevalue(kind))
+    head, tensors = parts_of(good)
+    structure = structure_of(good)
+    assert sample_to_bytes(sample_from_bytes(with_structure(good, structure))) == good
+
+    def read(data):
+        found = sample_from_bytes(data)
+        if isinstance(found, StoredScene):
+            found.sample(0, RenderConfig(), 2)
+
+    @FUZZED
+    @given(
+        changed(structure).map(lambda other: with_structure(good, other))
+        | changed(head).map(lambda other: joined(other, tensors))
+        | spoilt(good).map(File)
+    )
+    def fuzz(data):
+        held(lambda: read(data))
+
+    fuzz()
+
+
+def test_what_is_of_another_size_or_kind_is_no_sample(sample):
+    good = sample_to_bytes(sample)
+    for field, value in (("view", None), ("truth", {"tensor": "0"}), ("nearby", []), ("alpha", 3)):
+        structure = structure_of(good)
+        structure["fields"][field] = value
+        with pytest.raises(ShardError, match=r"expected a sample, got [0-9]+ bytes that do not read"):
+            sample_from_bytes(with_structure(good, structure))
+    with pytest.raises(ShardError, match="do not read"):
+        sample_from_bytes(with_structure(good, nested(100_000)))
+
+
+@dataclass(frozen=True)
+class Loose:
+    """Nothing but the reader looks at the types of this class, as in production."""
+
+    rgb: UInt8[Tensor, "3 height width"]
+    alpha: UInt8[Tensor, "height width"] | None = None
+    number: int = 0
+    share: float = 0.5
+    names: tuple[str, ...] = ()
+    pair: tuple[int, float] = (1, 0.5)
+
+
+def written(value: Loose) -> bytes:
+    """As `sample_to_bytes` writes samples."""
+    tensors: dict[str, Tensor] = {}
+    text = text_of(_taken_apart(value, tensors))
+    return save(tensors | {STRUCTURE: torch.frombuffer(bytearray(text), dtype=torch.uint8)})
+
+
+def test_every_field_is_compared_with_what_its_class_says(monkeypatch):
+    monkeypatch.setitem(KINDS, "Loose", Loose)
+    image = torch.zeros(3, 4, 5, dtype=torch.uint8)
+    for fits in ({}, {"alpha": image[0]}, {"names": ("a", "b")}, {"share": 1}):
+        with pytest.raises(ShardError, match="expected a sample, got a Loose"):
+            sample_from_bytes(written(Loose(image, **fits)))
+    for name, value in (
+        ("rgb", image.float()),
+        ("rgb", image[:2]),
+        ("alpha", image[0, 0]),
+        ("alpha", 1),
+        ("number", 0.5),
+        ("number", True),
+        ("share", "x"),
+        ("names", (1,)),
+        ("names", "ab"),
+        ("pair", (1, 0.5, 2)),
+        ("pair", (0.5, 1)),
+    ):
+        with pytest.raises(ShardError, match=f"do not read \\({name} of Loose"):
+            sample_from_bytes(written(replace(Loose(image, image[0]), **{name: value})))
+
+
+def test_stored_scenes_say_no_more_than_they_hold(stored):
+    render, view = RenderConfig(), stored.held[0]
+    tensor = lambda data: torch.frombuffer(bytearray(data), dtype=torch.uint8)  # noqa: E731
+    huge = cv2.imencode(".png", np.zeros((8, 8, 4), np.uint8))[1].tobytes()
+    huge = huge[:16] + struct.pack(">II", 60_000, 60_000) + huge[24:]
+    far = np.diff(np.array([0, 1, 10**6], np.int32), prepend=0).astype(np.int32).tobytes()
+    for changes, message in (
+        ({"truth": tensor(huge)}, "expected a stored PNG"),
+        ({"truth": stored.held[0].depth}, "expected a stored PNG"),
+        ({"faces": tensor(zlib.compress(far))}, "expected faces of"),
+        ({"vertices": tensor(b"no")}, "expected a stored mesh"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replace(stored, held=(replace(view, **changes),)).sample(0, render, 2)
+    small = tensor(cv2.imencode(".png", np.zeros((8, 8, 4), np.uint8))[1].tobytes())
+    with pytest.raises(ValueError, match="of the camera's size"):
+        replace(stored, images=(small, *stored.images[1:])).sample(0, render, 2)
+
+
+def test_tars(sample, tmp_path):
+    [path] = write_shards([sample], tmp_path)
+    good = path.read_bytes()
+
+    @FUZZED
+    @given((spoilt(good[:1024]).map(lambda head: head + good[1024:]) | spoilt(good)).map(File))
+    def fuzz(data):
+        path.write_bytes(data)
+        held(lambda: read_shard(path))
+
+    fuzz()
+
+
+@pytest.mark.parametrize("how", ["link", "folder", "compressed", "more than there is"])
+def test_a_tar_holds_plain_files_alone(how, sample, tmp_path):
+    data, path = sample_to_bytes(sample), tmp_path / "shard-00000.tar"
+    with tarfile.open(path, "w:gz" if how == "compressed" else "w") as tar:
+        member = tarfile.TarInfo("a.safetensors")
+        member.size = 10**12 if how == "more than there is" else len(data)
+        member.type = {"link": tarfile.SYMTYPE, "folder": tarfile.DIRTYPE}.get(how, tarfile.REGTYPE)
+        member.linkname = "/etc/passwd"
+        if how == "more than there is":
+            tar.fileobj.write(member.tobuf() + data)
+        else:
+            tar.addfile(member, io.BytesIO(data))
+    with pytest.raises(ShardError, match=r"shard-00000\.tar: expected a tar of samples"):
+        read_shard(path)
+
+
+def test_what_is_being_written_is_no_shard(sample, stored, tmp_path):
+    list(write_shards([sample], tmp_path / "samples"))
+    list(write_shards([stored], tmp_path / "scenes"))
+    for folder in ("samples", "scenes"):
+        (tmp_path / folder / ".half-77-shard-00001.tar").write_bytes(b"half")
+    scenes, whole = ShardScenes(tmp_path / "samples", "0", (Sample,)), StoredShards(tmp_path / "scenes", "0")
+    assert [path.name for path in (*scenes.paths, *whole.paths)] == ["shard-00000.tar"] * 2
+    assert len(scenes.scene(1)) == len(whole.scene(1)) == 1
+
+
+def test_runs(tmp_path):
+    recipe = Recipe(name="a", model=small(), steps=1)
+    module = torch.nn.Linear(2, 3)
+    optimizer = torch.optim.AdamW(module.parameters())
+    module(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    parts = ({"model": module}, {"optimizer": optimizer})
+    save_run(tmp_path, recipe, RunState(1, 2.0, ()), *parts)
+    path = tmp_path / FILE
+    good = path.read_bytes()
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+
+    def told(state):
+        save_file(tensors, path, metadata | {"state": text_of(state).decode()})
+        return File(path.read_bytes())
+
+    head, rest = parts_of(good)
+    state = json.loads(metadata["state"]) | {"positions": [{"scene": 0, "sample": 1, "buffered": 2}]}
+
+    @FUZZED
+    @given(changed(state).map(told) | changed(head).map(lambda other: joined(other, rest)) | spoilt(good).map(File))
+    def fuzz(data):
+        path.write_bytes(data)
+        held(lambda: load_run(path, recipe, *parts), (RunError,))
+
+    fuzz()
+
+
+def test_logs(tmp_path):
+    file = tmp_path / "log.jsonl"
+    good = b"".join(text_of({"step": step, "costs": {"total": 1.0}}) + b"\n" for step in range(4))
+
+    def read():
+        with Log(tmp_path, 2, True):
+            pass
+
+    @FUZZED
+    @given(changed([json.loads(line) for line in good.splitlines()]).map(lines_of) | spoilt(good))
+    def fuzz(data):
+        file.write_bytes(data)
+        held(read)
+
+    fuzz()
+
+
+def lines_of(values: object) -> bytes:
+    return b"".join(text_of(value) + b"\n" for value in values) if isinstance(values, list) else text_of(values)
+
+
+def cell() -> Cell:
+    names = FrameScores.__dataclass_fields__
+    frame = FrameScores(**{n: 1 if n in ("time", "width_px", "height_px") or n.endswith("_px") else 0.5 for n in names})
+    return Cell(CellKey("s", "m", "d", "e"), "P", "ring", "calm", "x", (frame,), None, ORIGIN)
+
+
+def test_cells(tmp_path):
+    store = CellStore(tmp_path)
+    features = {kind: np.zeros((1, 1024), np.float32) for kind in scorers.KINDS}
+    store.save(cell(), MethodRun("m", cell().frames, None, features=features))
+    key = cell().key
+    file, arrays = (tmp_path / f"{key.stem}.{suffix}" for suffix in ("json", "npz"))
+    good, packed = file.read_bytes(), arrays.read_bytes()
+    assert store.load(key) == cell() and store.load(key).features is not None
+
+    @FUZZED
+    @given(changed(json.loads(good)).map(text_of) | spoilt(good))
+    def fuzz(data):
+        file.write_bytes(data)
+        held(lambda: demand_usual(store.load(key)), ())
+
+    @FUZZED
+    @given(spoilt(packed))
+    def fuzz_features(data):
+        arrays.write_bytes(data)
+        held(lambda: store.load(key), ())
+
+    fuzz()
+    file.write_bytes(good)
+    fuzz_features()
+
+
+def demand_usual(found: Cell | None) -> None:
+    """A cell that is there can be averaged."""
+    if found is not None:
+        average_cell(found)
+        json.dumps(asdict(found.key))
