@@ -17,9 +17,10 @@ class Options(RunOptions):
     itself. docs/evaluation.md says what is measured.
     """
 
-    sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="P|Q|CAPTURE...")]
-    """P: 30 procedural scenes. Q: photo-textured people (needs --performers). Anything else is a capture's folder:
-    each of its cameras is left out in turn."""
+    sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="P|Q|P-long|Q-long|P-turn|CAPTURE...")]
+    """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same for 41 frames,
+    the last ten scored, with a whole past. P-turn: people who turn. Anything else is a capture's folder: each of its
+    cameras is left out in turn."""
     methods: str = "all"
     """Names with commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model's name, a
     model's folder, a baseline like dstt-o-def, FILE.py:NAME; all for everything that is shipped, baselines for those

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
 """What is written besides cells, models and samples."""
+LONG_SETS = ("P-long", "Q-long", "P-turn")
 POSITIVE = ("frames", "every", "scenes", "size", "jobs", "closest", "shown")
 
 
@@ -45,13 +46,14 @@ class RunOptions:
     wrong_fraction: float = 0.15
     """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     frames: int | None = None
-    """Frames of each scene, from the first. By default 10 of P and Q, all of a capture."""
+    """Frames of each scene, from the first. By default 10 of P and Q, all of a capture. Long sets have 41, of which the
+    last 10 are scored."""
     every: int = 1
     """Only every n-th scene of each set is taken: a quick look at all kinds of scenes."""
     scenes: int | None = None
     """Only so many scenes of each set are taken, after `every`."""
     size: int = 512
-    """Width and height of the views of P and Q."""
+    """Width and height of the views of P, Q and the long sets."""
     background: Literal["black", "stage"] = "black"
     """What stands behind the people of P: a stage for models that are not given masks."""
     score_background: Literal["black", "white"] = "black"
@@ -162,18 +164,40 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
 
 
 def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
-    """The scenes of P, of Q, or of a capture."""
+    """The scenes of P, of Q, of the same with a whole past, of P-turn, or of a capture.
+
+    Raises:
+        ValueError: the options do not fit the set.
+    """
     from viewmend.leave_one_out.capture_scenes import capture_set
-    from viewmend.leave_one_out.studio_scenes import FRAMES, performer_set, procedural_set
+    from viewmend.leave_one_out.studio_scenes import (
+        FRAMES,
+        LONG_FRAMES,
+        lengthened,
+        performer_set,
+        procedural_set,
+        turning_set,
+    )
 
     frames = options.frames or FRAMES
     part = slice(None, options.scenes and options.every * options.scenes, options.every)
+    if name in LONG_SETS and options.frames not in (None, LONG_FRAMES):
+        raise ValueError(
+            f"expected no --frames with {name}, whose {LONG_FRAMES} frames make a whole window, got {options.frames}; "
+            "leave it away, or take P or Q"
+        )
     if name == "P":
         return list(procedural_set(frames, options.size, options.background)[part])
-    if name == "Q":
+    if name == "P-turn":
+        return list(turning_set(options.size)[part])
+    if name == "P-long":
+        return list(lengthened(procedural_set(LONG_FRAMES, options.size, options.background))[part])
+    if name in ("Q", "Q-long"):
         if options.performers is None:
-            raise ValueError("expected --performers DIR for set Q, got none; P needs nothing")
-        return list(performer_set(options.performers, options.motions, frames, options.size)[part])
+            raise ValueError(f"expected --performers DIR for set {name}, got none; P needs nothing")
+        frames = LONG_FRAMES if name == "Q-long" else frames
+        people = performer_set(options.performers, options.motions, frames, options.size)
+        return list((lengthened(people) if name == "Q-long" else people)[part])
     inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
     if not inputs:
         raise ValueError("expected --inputs all or a number of cameras, got none; leave it away for all")

@@ -23,6 +23,8 @@ class MeanScores(Scores):
     """Hole pixels as a share of those that the proxy covers."""
     holes_of_image: float | None
     """Hole pixels as a share of all."""
+    past_of_surface: float | None = None
+    """Hole pixels that only the past shows, as a share of those inside the true mask."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ def average_cell(cell: Cell) -> CellScores:
     frames = cell.frames
     wide = [f for f in frames if f.hole_px >= ENOUGH_HOLE_PX]
     inside = [f for f in frames if f.hole_fg_px >= ENOUGH_HOLE_PX]
-    of = {"holes": wide, "masked": wide, "fg": inside}  # by the last word of a score's name
+    past = [f for f in frames if f.past_px >= ENOUGH_HOLE_PX]
+    of = {"holes": wide, "masked": wide, "fg": inside, "past": past}  # by the last word of a score's name
     means = {
         f.name: _mean(getattr(frame, f.name) for frame in of.get(f.name.split("_")[-1], frames)) for f in fields(Scores)
     }
@@ -107,6 +110,7 @@ def average_cell(cell: Cell) -> CellScores:
         **means,
         holes_of_hull=_mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in frames),
         holes_of_image=_mean(f.hole_px / f.image_px for f in frames),
+        past_of_surface=_mean(f.past_px / f.hole_fg_px for f in inside),
     )
     return CellScores(cell, scores, len(frames), len(frames) - len(wide), sum(f.hole_px == 0 for f in frames))
 

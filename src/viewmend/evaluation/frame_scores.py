@@ -60,6 +60,8 @@ class Scores:
     """The change from the frame before, in place, over the holes of now or then (`change`)."""
     change_truth: float | None
     """The truth's."""
+    psnr_past: float | None = None
+    """PSNR over the holes whose surface no chosen camera sees now, and one saw at an earlier time of the window."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,6 +79,8 @@ class FrameScores(Scores):
     """Holes inside the true mask."""
     step_ms: float
     """What the inpainter's step took."""
+    past_px: int = 0
+    """Holes that only the past shows (`psnr_past`)."""
 
     @property
     def image_px(self) -> int:
@@ -93,6 +97,8 @@ class TrueView:
     mask: Bool[Tensor, "height width"]
     backward_flow_px: Float[Tensor, "height width 2"] | None
     """See `leave_one_out.true_motion.backward_flow`."""
+    by_past_alone: Bool[Tensor, "height width"] | None = None
+    """See `leave_one_out.true_visibility.SurfaceSeen`, of the cameras that colour the view; None where nobody knows."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +142,7 @@ def score_frame(
     rendered = laid_upon(background, view.rgb, view.mask)
     holes = view.holes
     pixels = _Pixels(rgb, truth.rgb, holes, holes & truth.mask)
+    past = torch.zeros_like(holes) if truth.by_past_alone is None else truth.by_past_alone & holes
     height, width = holes.shape
     return FrameScores(
         time=view.time,
@@ -150,6 +157,8 @@ def score_frame(
         psnr_whole=psnr(rgb, truth.rgb),
         psnr_whole_rendered=psnr(rendered, truth.rgb),
         psnr_subject=psnr(rgb, truth.rgb, truth.mask),
+        psnr_past=psnr(rgb, truth.rgb, past),
+        past_px=int(past.sum()),
         alpha_iou=mask_iou(completed.opacity > 0.5, truth.mask),
         **_by_map("ssim", partial(similarity, window=scorers.ssim), pixels),
         **_by_map("lpips_alex", scorers.lpips_alex, pixels),

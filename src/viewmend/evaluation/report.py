@@ -22,6 +22,9 @@ RULES = (
     'SSIM and LPIPS in "holes" and "in mask" are means of their maps there, of unmasked images.',
     '"Rendered" is the PSNR over all pixels before anything is mended, "subject" that inside the true mask; "alpha '
     "IoU\" is the overlap of alpha above one half (without alpha: of the proxy's mask) with the true mask.",
+    '"Only past" is the PSNR over the holes whose true surface none of the cameras that colour the view sees now, and '
+    "one of them saw 1, 2, 3, 10, 20 or 30 frames ago, by true depth; known for P-long, Q-long and P-turn alone, whose "
+    "last frames are scored, with a whole past.",
     "SSIM: Gaussian window of 11 x 11 pixels, sigma 1.5, unless the setting says another; mean of the channels; only "
     "windows that lie in the image.",
     "LPIPS 0.1 of AlexNet and VGG16. VFID: I3D's Mixed_5c, a mean vector for each video of up to 16 frames in [0, 1], "

@@ -10,6 +10,7 @@ from viewmend.methods import PRIVILEGED, REFERENCE
 COLUMNS = (
     ("holes, dB", "psnr_holes", 1, 2),
     ("in mask", "psnr_holes_fg", 1, 2),
+    ("only past", "psnr_past", 1, 2),
     ("masked", "psnr_masked", 1, 2),
     ("SSIM masked", "ssim_masked", 1, 5),
     ("whole, dB", "psnr_whole", 1, 2),
@@ -60,14 +61,15 @@ def setting_lines(report: Report) -> list[str]:
 def holes_line(table: Table) -> str:
     """How much there is to fill, and what is left out."""
     sizes = " and ".join(f"{width} x {height}" for width, height in table.sizes_px)
-    of_hull, of_image = (
+    of_hull, of_image, of_surface = (
         next((v for row in table.rows if (v := getattr(row.scores, name)) is not None), None)
-        for name in ("holes_of_hull", "holes_of_image")
+        for name in ("holes_of_hull", "holes_of_image", "past_of_surface")
     )
+    past = f"; only the past shows {number(of_surface, 100, 2)} % of the missing surface" if of_surface else ""
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
-        f"{number(of_image, 100, 3)} % of the image; {table.thin_frames} frames with too few hole pixels left out, "
-        f"{table.empty_frames} of them with none."
+        f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames with too few hole pixels left "
+        f"out, {table.empty_frames} of them with none."
     )
 
 

@@ -13,8 +13,9 @@ from viewmend.baselines.rgvi import SeesTruth
 from viewmend.contact_sheet import picture
 from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
 from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, laid_upon, score_frame, true_view
+from viewmend.evaluation.own_stream import all_of, push_again
 from viewmend.evaluation.scorers import Background, Features, Scorers, VideoFeatures, load_scorers
-from viewmend.inpainting.protocol import State, ViewInpainter, own_background
+from viewmend.inpainting.protocol import State, ViewInpainter, encode_past, own_background
 from viewmend.inpainting.upon_white import UponWhite
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import make_method
@@ -79,6 +80,9 @@ class SceneRun:
 class _Moment:
     """One time of a scene, as all methods are shown it."""
 
+    scored: bool
+    """Or only there for who carries something from one view to the next."""
+
     observation: Observation
     view: IncompleteView
     truth: TrueView
@@ -98,8 +102,10 @@ def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: Ru
     streams = [_Stream(name, settings, scorers) for name in methods]
     try:
         with torch.no_grad():
-            for moment in _moments(scene, settings):
-                shown.add(moment)
+            every = any(stream.carries for stream in streams)
+            for moment in _moments(scene, settings, every):
+                if isinstance(moment, _Moment) and moment.scored:
+                    shown.add(moment)
                 for stream in streams:
                     stream.show(moment)
         if shown.pictures is None:
@@ -110,17 +116,24 @@ def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: Ru
     return SceneRun(scene.name, runs, shown.pictures, shown.film(), shown.videos.features())
 
 
-def _moments(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Moment]:
+def _moments(scene: LeaveOneOutScene, settings: RunSettings, every: bool) -> Iterator[_Moment | Observation]:
+    """The times of a scene; the observation alone of those that are not scored, unless `every` is wanted."""
     most, last, stream = -1, None, Stream(Unfilled(), settings.stream)
     for frame in scene.frames(settings.device):
         stream.bounds = frame.bounds
         observation = stream.push(frame.inputs)
+        scored = frame.inputs.time >= scene.scored_from
+        if not scored and not every:
+            yield observation
+            continue
         view = stream.render(frame.truth.cameras)
         holes = int(view.holes.sum())
         truth = true_view(frame.truth, frame.backward_flow_px, settings.background)
-        last = _Moment(observation, view, truth, last, holes > most)
+        if frame.seen is not None:
+            truth = replace(truth, by_past_alone=frame.seen.by_past_alone(view.source_views))
+        last = _Moment(scored, observation, view, truth, last, scored and holes > most)
         yield last
-        most, last = max(most, holes), replace(last, before=None)
+        most, last = max(most, holes) if scored else most, replace(last, before=None)
 
 
 class _Shown:
@@ -164,20 +177,48 @@ class _Stream:
         self._inpainter: ViewInpainter | None = None
         self._stream: Stream | None = None
         self._viewer: State | None = None
+        self._past: list[Observation] = []
         self._last: Float[Tensor, "3 height width"] | None = None
         self._scores: list[FrameScores] = []
         self._picture: Picture | None = None
         self._videos = VideoFeatures(scorers.i3d)
         self._frames: list[Picture] = []
 
-    def show(self, moment: _Moment) -> None:
-        """Complete and score the next view; nothing once something went wrong."""
+    @property
+    def carries(self) -> bool:
+        """Whether the method carries anything of its own from view to view, and must see every time."""
+        try:
+            return type(self._made().initial_state()) is not State
+        except Exception as error:
+            self._error = _said(error)
+            return False
+
+    def show(self, moment: _Moment | Observation) -> None:
+        """Complete and score the next view, or look at a time; nothing once something went wrong."""
         if self._error is not None:
             return
         try:
-            self._step(moment)
+            if isinstance(moment, Observation):
+                self._past.append(moment)
+            elif moment.scored:
+                self._step(moment)
+            else:
+                self._carry(moment)
         except Exception as error:
             self._error = _said(error)
+
+    def _carry(self, moment: _Moment) -> None:
+        """What a view that is not scored leaves to the next."""
+        self._past.append(moment.observation)
+        if not self.carries:
+            return
+        stream = self._stream = self._stream or Stream(self._made(), self.settings.stream)
+        push_again(stream, moment.observation)
+        self._go_on(stream.mend(self._asked(stream, moment.view), self._viewer), moment)
+
+    def _go_on(self, mended: StreamView, moment: _Moment) -> None:
+        own = self._inpainter.inner if isinstance(self._inpainter, UponWhite) else self._inpainter
+        self._viewer = own.shown(mended.viewer, moment.truth.rgb) if isinstance(own, SeesTruth) else mended.viewer
 
     def _step(self, moment: _Moment) -> None:
         mended = self._mend(moment)
@@ -193,27 +234,38 @@ class _Stream:
         self._videos.add(rgb, view.holes)
         if len(self._frames) < FILM_FRAMES:
             self._frames.append(picture(rgb))
-        self._viewer, self._last = mended.viewer, rgb
-        own = self._inpainter.inner if isinstance(self._inpainter, UponWhite) else self._inpainter
-        if isinstance(own, SeesTruth):
-            self._viewer = own.shown(mended.viewer, moment.truth.rgb)
+        self._last = rgb
+        self._go_on(mended, moment)
         if moment.largest:
             self._picture = picture(rgb)
 
     def _mend(self, moment: _Moment) -> StreamView:
-        """The view, by a stream of the method's own, so that it pays for what it asks for beyond the rendering."""
+        """The view, by a stream of the method's own, so that it pays for what it asks for beyond the rendering.
+
+        What it encodes of the past it would have encoded then: that is done before, and not in its milliseconds.
+        """
+        if self._stream is None or not self._scores:
+            self._stream = Stream(self._made(), self.settings.stream)
+            for observation in self._past:
+                push_again(self._stream, observation)
+        stream = self._stream
+        push_again(stream, moment.observation)
+        view = self._asked(stream, moment.view)
+        encode_past(stream.inpainter, view, all_of(stream))
+        return stream.mend(view, self._viewer)
+
+    def _made(self) -> ViewInpainter:
         if self._inpainter is None:
             self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
             if self.settings.background == "white" and own_background(self._inpainter) is None:
                 self._inpainter = UponWhite(self._inpainter)
-        if self._stream is None or not self._scores:
-            self._stream = Stream(self._inpainter, self.settings.stream)
-        observation = self._stream.push(moment.observation.frame, moment.observation.proxy)
-        observation.depths.update(moment.observation.depths)
-        view = moment.view
-        if self._stream.error_rule != (self.settings.stream.render.error_rule or "unseen"):
-            view = self._stream.render(view.camera, view.time)
-        return self._stream.mend(view, self._viewer)
+        return self._inpainter
+
+    def _asked(self, stream: Stream, view: IncompleteView) -> IncompleteView:
+        """The view by the stream's error rule."""
+        if stream.error_rule == (self.settings.stream.render.error_rule or "unseen"):
+            return view
+        return stream.render(view.camera, view.time)
 
     def run(self, box: Box | None) -> MethodRun:
         """What came out; `box` is what its film shows."""

@@ -50,6 +50,10 @@ class Chain(Network):
         coarse = self.coarse(views, ray_views or [None] * len(views))
         return self.patches.refine(views, coarse, contexts, top_k)
 
+    def encode_past(self, view: IncompleteView, context: ContextProvider) -> None:
+        """The patch transformer's."""
+        self.patches.encode_past(view, context)
+
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view; the coarse fill alone where the quality allows no context times."""

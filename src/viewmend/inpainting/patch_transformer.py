@@ -143,6 +143,13 @@ class PatchTransformer(Network):
         made = self.refine([view], [coarse], [frames], context.quality.top_k)[0]
         return CompletedView(view, made.completed.clamp(0, 1), made.alpha)
 
+    @torch.no_grad()
+    def encode_past(self, view: IncompleteView, context: ContextProvider) -> None:
+        """Encodes the cameras of a view at the earlier times of its window."""
+        if bool((view.error > 0).any()):
+            times = window_times(view.time, self.config)[1:]
+            context.encoded(times, self.context_names(view), self.encode_contexts)
+
     def context_names(self, view: IncompleteView) -> tuple[str, ...]:
         """The cameras that are context."""
         count = self.config.context_cameras

@@ -181,6 +181,16 @@ def own_background(inpainter: ViewInpainter) -> str | None:
     return getattr(inpainter, "background", None)
 
 
+def encode_past(inpainter: ViewInpainter, view: IncompleteView, context: ContextProvider) -> None:
+    """Encodes what a view needs of earlier times, as if these had been looked at when they were now.
+
+    An inpainter tells how by a method of this name; one without has nothing to encode.
+    """
+    own = getattr(inpainter, "encode_past", None)
+    if own is not None:
+        own(view, context)
+
+
 def crop_margin_px(inpainter: ViewInpainter, quality: RenderQuality) -> int | None:
     """How far around the subject a view matters to what fills it, pixels; None where the whole view does.
 

@@ -18,6 +18,7 @@ from viewmend.inpainting.protocol import (
     State,
     ViewInpainter,
     crop_margin_px,
+    encode_past,
     own_background,
 )
 from viewmend.views import CompletedView, IncompleteView
@@ -73,6 +74,10 @@ class TemporalAccumulation(nn.Module):
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
         """The inner inpainter's."""
         return crop_margin_px(self.inner, quality)
+
+    def encode_past(self, view: IncompleteView, context: ContextProvider) -> None:
+        """The inner inpainter's."""
+        encode_past(self.inner, view, context)
 
     def initial_state(self) -> AccumulationState:
         """The state before the first view of a stream."""

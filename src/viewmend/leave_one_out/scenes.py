@@ -9,6 +9,7 @@ from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.leave_one_out.true_visibility import SurfaceSeen
 from viewmend.views import MultiViewFrame
 
 
@@ -24,6 +25,9 @@ class LeaveOneOutFrame:
     """The volume that may hold the subject, None to find it."""
     backward_flow_px: Float[Tensor, "height width 2"] | None = None
     """Where in the previous true image each pixel's surface point was (`backward_flow`); None where nobody knows."""
+    seen: SurfaceSeen | None = None
+    """Which of the inputs' cameras saw, now and at the window's times, what each pixel truly shows; None where nobody
+    knows."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,8 @@ class LeaveOneOutScene(ABC):
     """What happens, for tables by kind."""
     held: str
     """The camera that is left out."""
+    scored_from: int = 0
+    """The first time that is scored; those before are looked at alone."""
 
     @property
     @abstractmethod

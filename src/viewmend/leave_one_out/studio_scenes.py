@@ -1,4 +1,4 @@
-"""Scenes of the studio: the fixed sets P and Q."""
+"""Scenes of the studio: the fixed sets P and Q, the same long enough for a whole window, and people who turn."""
 
 import hashlib
 import itertools
@@ -10,9 +10,12 @@ from typing import Literal
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
+from viewmend.inpainting.config import paper
+from viewmend.inpainting.context import window_times
 from viewmend.leave_one_out.scenes import LeaveOneOut, LeaveOneOutFrame, LeaveOneOutScene
 from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, TEST_FOLDER
 from viewmend.leave_one_out.true_motion import backward_flow
+from viewmend.leave_one_out.true_visibility import TrueSurface, surface_seen
 from viewmend.studio.procedural import PerformerStyle, procedural_scene
 from viewmend.studio.stage import Studio, StudioConfig
 from viewmend.views import MultiViewFrame
@@ -24,6 +27,12 @@ TEMPOS = ("calm", "dance", "fast")
 Q_SEEDS = PROCEDURAL_SEEDS["test"][10000:]
 """Seeds of lights, rig and the part of the motion that is shown."""
 FRAMES, SIZE_PX = 10, 512
+LONG_FRAMES = 41
+"""Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's window is whole."""
+TURN_SEEDS = PROCEDURAL_SEEDS["test"][100:124]
+TURN_RINGS = (5, 4)
+"""Sparse rings: what faces the camera that is left out, its neighbours see from aside."""
+TURNS: tuple[tuple["Tempo", str], ...] = (("calm", "turn"), ("dance", "spin"))
 
 Background = Literal["black", "stage"]
 Tempo = Literal["calm", "dance", "fast"]
@@ -36,6 +45,8 @@ class StudioScene(LeaveOneOutScene):
     config: StudioConfig
     tempo: Tempo | None = None
     """How fast procedural people move; None leaves it to the seed."""
+    motion: str | None = None
+    """How procedural people move, one person alone on an empty stage; None leaves all that to the seed."""
     files_sha256: tuple[str, ...] = ()
     """Hashes of the character's and the motion's files; () for procedural people."""
 
@@ -43,22 +54,34 @@ class StudioScene(LeaveOneOutScene):
     def definition(self) -> str:
         """The studio's config without paths and device, and what else matters."""
         config = replace(self.config, performers=None, motions=None, device="cpu")
-        return repr((config, self.held, self.tempo, self.files_sha256))
+        longer = (self.scored_from, self.motion) if self.scored_from or self.motion else ()
+        return repr((config, self.held, self.tempo, self.files_sha256, *longer))
 
     def studio(self, device: str = "cpu") -> Studio:
         """The studio with its people: frames of all cameras, the one that is left out among them."""
-        tempo, config = self.tempo, replace(self.config, device=device)
-        return Studio(
-            config, None if tempo is None else procedural_scene(config.seed, style=PerformerStyle(tempo=tempo))
-        )
+        config = replace(self.config, device=device)
+        if self.tempo is None:
+            return Studio(config)
+        alone = {} if self.motion is None else {"motion": self.motion, "people": 1, "furniture": False}
+        return Studio(config, procedural_scene(config.seed, style=PerformerStyle(tempo=self.tempo, **alone)))
 
     def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
-        """Renders them, one at a time."""
+        """Renders them, one at a time. Of those before the first that is scored, only what a context needs is made."""
         studio = self.studio(device)
         before: MultiViewFrame | None = None
+        surfaces: dict[int, TrueSurface] = {}
         for time in range(self.config.frames):
-            frame = LeaveOneOut({time: studio.read(time)}).frame(self.held, time)
-            if before is not None and before.depth is not None:
+            drawn = studio.read(time)
+            frame = LeaveOneOut({time: drawn}).frame(self.held, time)
+            scored = time >= self.scored_from
+            if self.scored_from:
+                mesh = studio.scene(time).mesh
+                surfaces[time] = TrueSurface.of(drawn.without((self.held,)), mesh)
+                surfaces.pop(time - paper().window - 1, None)
+                if scored:
+                    seen = surface_seen(surfaces, window_times(time, paper()), mesh, frame.truth.cameras)
+                    frame = replace(frame, seen=seen)
+            if scored and before is not None and before.depth is not None:
                 now, then = (studio.scene(t).mesh for t in (time, time - 1))
                 flow_px = backward_flow(now, then, before.depth[0], frame.truth.cameras)
                 frame = replace(frame, backward_flow_px=flow_px)
@@ -89,6 +112,44 @@ def procedural_set(
             )
         )
     return tuple(scenes)
+
+
+def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
+    """P-turn: 24 people who turn or spin on an empty stage, seen by sparse rings; both rigs and motions take turns.
+
+    Some of what is missing no chosen camera sees now, and one saw some frames ago.
+    """
+    scenes = []
+    for n, seed in enumerate(TURN_SEEDS):
+        cameras, (tempo, motion) = TURN_RINGS[n % 2], TURNS[n // 2 % 2]
+        scenes.append(
+            StudioScene(
+                name=f"P-turn-{seed}",
+                set="P-turn",
+                rig=f"ring of {cameras}",
+                style=motion,
+                config=StudioConfig(seed=seed, cameras=cameras, frames=LONG_FRAMES, size_px=size_px),
+                held=held_camera(seed, cameras),
+                tempo=tempo,
+                motion=motion,
+                scored_from=LONG_FRAMES - FRAMES,
+            )
+        )
+    return tuple(scenes)
+
+
+def lengthened(scenes: Sequence[StudioScene]) -> tuple[StudioScene, ...]:
+    """P-long of P, Q-long of Q: the same scenes of `LONG_FRAMES` frames, whose last `FRAMES` are scored."""
+    return tuple(
+        replace(
+            scene,
+            name=scene.name.replace(scene.set, f"{scene.set}-long", 1),
+            set=f"{scene.set}-long",
+            config=replace(scene.config, frames=LONG_FRAMES),
+            scored_from=LONG_FRAMES - FRAMES,
+        )
+        for scene in scenes
+    )
 
 
 def performer_set(
