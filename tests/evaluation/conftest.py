@@ -46,7 +46,15 @@ def make_frame():
     """Makes frames of 20 x 10 pixels with these scores, all others None."""
 
     def make(**scores: float | None) -> FrameScores:
-        plain = {"time": 0, "width_px": 20, "height_px": 10, "hull_px": 100, "hole_px": 60, "hole_fg_px": 60}
+        plain = {
+            "time": 0,
+            "width_px": 20,
+            "height_px": 10,
+            "hull_px": 100,
+            "hole_px": 60,
+            "hole_fg_px": 60,
+            "past_px": 0,
+        }
         values = dict.fromkeys(f.name for f in fields(FrameScores)) | plain | {"psnr_whole": 30.0, "step_ms": 1.0}
         return FrameScores(**(values | scores))  # pyright: ignore[reportArgumentType]
 

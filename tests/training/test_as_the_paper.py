@@ -170,3 +170,13 @@ def test_three_cameras_are_looked_at_whatever_number_coloured_the_view():
     many = replace(view(5), source_views=("a", "b"), candidate_views=("a", "b", "c", "d"))
     assert PatchTransformer(paper_small()).context_names(many) == ("a", "b", "c")
     assert PatchTransformer(replace(small(), coarse_fill="none")).context_names(many) == ("a", "b")
+
+
+def test_beyond_a_smaller_image_of_a_stack_there_is_no_white():
+    views = context(5)
+    cameras = views.frame.cameras
+    size_px = cameras.size_px.clone()
+    size_px[0, 0] -= 10
+    frame = replace(views.frame, cameras=replace(cameras, size_px=size_px), mask=torch.zeros_like(views.frame.mask))
+    shown = context_images(replace(views, frame=frame), paper()).channels
+    assert not shown[0, :3, :, -10:].any() and (shown[0, :3, :, :-10] == 1).all() and (shown[1, :3] == 1).all()

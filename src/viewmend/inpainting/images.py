@@ -42,11 +42,12 @@ def context_images(views: ContextViews, config: InpainterConfig) -> Images:
     frame = views.frame
     rgb = frame.rgb.float() / 255
     mask = (views.depth > 0).float() if frame.mask is None else frame.mask.float() / 255
-    if config.background != "recorded":
-        rgb = rgb * mask[:, None] + (config.background == "white") * (1 - mask[:, None])
     inside = torch.ones_like(mask)
     for image, (width, height) in zip(inside, frame.cameras.size_px.tolist(), strict=True):
         image[height:], image[:, width:] = 0, 0
+    if config.background != "recorded":
+        white = (inside * (1 - mask))[:, None]  # beyond an image there is nothing, not even a background
+        rgb = rgb * mask[:, None] + (config.background == "white") * white
     return _images(rgb, mask, views.depth, inside, mask > config.min_foreground, config)
 
 
