@@ -32,7 +32,8 @@ class Remembered(LeaveOneOutScene):
 def turning() -> Remembered:
     """A turning person and three cameras beside the one that is left out, five frames, of which the last two count."""
     scene = turning_set(64)[3]
-    scene = replace(scene, config=replace(scene.config, frames=5, samples_per_side=1, fps=6), scored_from=3)
+    config = replace(scene.config, cameras=4, frames=5, samples_per_side=1, fps=6)
+    scene = replace(scene, config=config, held="cam00", scored_from=3)
     kind = {name: getattr(scene, name) for name in ("name", "set", "rig", "style", "held", "scored_from")}
     return Remembered(made=list(scene.frames("cpu")), **kind)
 

@@ -30,8 +30,8 @@ FRAMES, SIZE_PX = 10, 512
 LONG_FRAMES = 41
 """Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's window is whole."""
 TURN_SEEDS = PROCEDURAL_SEEDS["test"][100:124]
-TURN_RINGS = (5, 4)
-"""Sparse rings: what faces the camera that is left out, its neighbours see from aside."""
+TURN_RINGS = (8, 7)
+"""Rings in which holes are a few percent of the subject, and of these what only the past shows is a good part."""
 TURNS: tuple[tuple["Tempo", str], ...] = (("calm", "turn"), ("dance", "spin"))
 
 Background = Literal["black", "stage"]
@@ -115,7 +115,7 @@ def procedural_set(
 
 
 def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
-    """P-turn: 24 people who turn or spin on an empty stage, seen by sparse rings; both rigs and motions take turns.
+    """P-turn: 24 people who turn or spin on an empty stage, seen by two rings; both rigs and motions take turns.
 
     Some of what is missing no chosen camera sees now, and one saw some frames ago.
     """
