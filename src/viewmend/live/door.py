@@ -8,12 +8,16 @@ import asyncio
 import time
 from typing import Any
 
+import h11
 from starlette.requests import HTTPConnection
 from uvicorn.config import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
 from websockets.frames import Frame
+from websockets.http11 import Request
+
+from viewmend.live.turns import TURN_BYTES, Turns
 
 STRANGERS = 128
 """Connections of strangers at a time."""
@@ -30,6 +34,14 @@ PONGS_UNREAD_BYTES = 65_536
 
 
 REFUSED = b"HTTP/1.1 400 Bad Request\r\nConnection: close\r\n\r\n"
+
+
+class Lodge(ServerState):
+    """What all connections share."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.turns = Turns()
 
 
 class Visitor:
@@ -100,6 +112,10 @@ class HttpDoor(H11Protocol, Visitor):
         _loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         Visitor.__init__(self)
+        assert isinstance(server_state, Lodge), "`Server` has one"
+        self._turns, self._turns_had = server_state.turns, 0
+        self._unheard = b""
+        self._asks = self._has_turn = False
         H11Protocol.__init__(self, config, server_state, app_state | {"visitor": self}, _loop)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -111,6 +127,73 @@ class HttpDoor(H11Protocol, Visitor):
         """What was sent is nearly read."""
         self.drained()
         super().resume_writing()
+
+    def data_received(self, data: bytes) -> None:
+        """Bytes have come. A stranger's wait for its turn."""
+        if self.admitted and not self._unheard:
+            self._hear(data)
+            return
+        self._unheard += data
+        self.transport.pause_reading()
+        self._ask_turn()
+
+    def handle_events(self) -> None:
+        """Go on with what has come: a request that waited for the answer to the one before, say."""
+        if self.admitted or self._has_turn:
+            super().handle_events()
+        else:
+            self._ask_turn()
+
+    def _ask_turn(self) -> None:
+        if not self._asks:
+            self._asks = True
+            self._turns.ask(self._take_turn, self._turns_had == 0)
+
+    def _take_turn(self) -> None:
+        self._asks, self._has_turn = False, True
+        self._turns_had += 1
+        piece, self._unheard = self._unheard[:TURN_BYTES], self._unheard[TURN_BYTES:]
+        try:
+            if not self.gone:
+                self._hear(piece)
+        finally:
+            self._has_turn = False
+        if self.gone or self.transport.get_protocol() is not self:  # it has become a socket
+            return
+        if self._unheard:
+            self._ask_turn()
+        elif not self.flow.read_paused:
+            self.transport.resume_reading()
+
+    def _hear(self, data: bytes) -> None:
+        """Take in bytes. The rest of a request that is answered already is not looked at."""
+        if self._is_answered_early:
+            return
+        if data:
+            self._unset_keepalive_if_required()
+            self.conn.receive_data(data)
+        self.handle_events()
+
+    def on_response_complete(self) -> None:
+        """An answer is out. No request can follow one that goes on after its answer: the other side is told so."""
+        super().on_response_complete()
+        if self._is_answered_early and not self.gone:
+            self.transport.write_eof()
+
+    def send_400_response(self, msg: str) -> None:
+        """What came is no HTTP. The request that it was the rest of, if any, gets no other answer."""
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
+            super().send_400_response(msg)
+        else:
+            self.transport.close()
+
+    @property
+    def _is_answered_early(self) -> bool:
+        answered = self.conn.our_state in (h11.DONE, h11.MUST_CLOSE)
+        return answered and self.conn.their_state in (h11.SEND_BODY, h11.ERROR)
 
 
 class SocketDoor(WebSocketsSansIOProtocol, Visitor):
@@ -140,6 +223,18 @@ class SocketDoor(WebSocketsSansIOProtocol, Visitor):
             answer = b"".join(self.conn.data_to_send())
             self.transport.write(answer or REFUSED)
             self.transport.close()
+
+    def handle_connect(self, event: Request) -> None:
+        """Somebody asks for a socket. What a stranger sends before the answer is not read."""
+        super().handle_connect(event)
+        if not self.close_sent:
+            self.read_paused = True
+            self.transport.pause_reading()
+
+    async def send(self, message: Any) -> None:
+        """Send what the application says; a refusal completes the handshake, too."""
+        await super().send(message)
+        self.handshake_complete = self.handshake_complete or self.close_sent
 
     def handle_cont(self, event: Frame) -> None:
         """One more piece of a message. Empty ones would cost memory for ever."""

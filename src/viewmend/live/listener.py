@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 
 import uvicorn
 
-from viewmend.live.door import HttpDoor, SocketDoor, Visitor
+from viewmend.live.door import HttpDoor, Lodge, SocketDoor, Visitor
 from viewmend.live.server import LiveServer, ServerConfig
 
 CONNECTIONS = 512
@@ -37,11 +37,12 @@ class Server(uvicorn.Server):
                 ws_per_message_deflate=False,
                 limit_concurrency=CONNECTIONS,
                 timeout_graceful_shutdown=5,
-                log_level="warning",
+                log_level="error",  # strangers can cause warnings as they like
                 access_log=False,
                 server_header=False,
             )
         )
+        self.server_state = Lodge()
         self._since: WeakKeyDictionary[object, tuple[int, float]] = WeakKeyDictionary()
         """The id of the last request that was answered, if any, and since when the connection asks for nothing more."""
 
