@@ -1,34 +1,30 @@
 """A server under a thousand connections of strangers: what a viewer with the token still gets, and what memory does.
 
-Run: `python benchmarks/attack.py [seconds]`. A server in a process of its own; a viewer; five kinds of strangers, 200
-of each, opened anew as soon as the server ends them. Prints JSON: the viewer's frames a second before and during, and
-the server's memory before, at its highest, and 30 seconds after.
+Run: `python benchmarks/attack.py [--each] [--write]`. A server in a process of its own; a viewer; kinds of strangers in
+waves of five, 200 of each, opened anew as soon as the server ends them; with `--each` one kind after the other, 1000
+of it. Prints JSON: the viewer's frames a second meanwhile, their share of those before and after, its longest wait, and
+what the server's memory grew by at its highest and 30 seconds after. The strangers' own programs take the same
+processor: on few cores the share says how much of it they leave, too.
 """
 
-import contextlib
+import argparse
 import json
 import os
 import re
-import socket
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from measure import write
+from strangers import KINDS, begin
 
 from viewmend.live.client import Client
 
 TOKEN = "a token of the benchmark"
 EACH = 200
-UPGRADE = "GET {} HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n{}\r\n"
-KEYS = "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n"
-KINDS = {
-    "silent": b"",
-    "half a request": b"GET / HTTP/1.1\r\nHost: loc",
-    "no token, 60 MB": UPGRADE.format("/ws", KEYS).encode() + b"\x82\xff" + (60_000_000).to_bytes(8, "big"),
-    "an upgrade that cannot be": UPGRADE.format("/ws?" + "a" * 9000, KEYS).encode(),
-    "answers unread": b"GET /page/main.js HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200,
-}
 
 
 def megabytes(process: int) -> float:
@@ -37,82 +33,87 @@ def megabytes(process: int) -> float:
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def strangers(port: int, sent: bytes, ended: threading.Event, opened: list[int]) -> None:
-    """Keep so many connections of one kind; what the server ends is opened again."""
-    held: list[socket.socket] = []
-    while not ended.is_set():
-        for raw in list(held):
-            with contextlib.suppress(BlockingIOError):
-                try:
-                    gone = sent != KINDS["answers unread"] and not raw.recv(65536)
-                except ConnectionError:
-                    gone = True
-                if gone:
-                    raw.close()
-                    held.remove(raw)
-        for _ in range(min(20, EACH - len(held))):
-            with contextlib.suppress(OSError):
-                raw = socket.create_connection(("127.0.0.1", port), timeout=2)
-                raw.setblocking(False)
-                with contextlib.suppress(OSError):
-                    raw.send(sent)
-                held.append(raw)
-                opened[0] += 1
-        ended.wait(0.1)
-    for raw in held:
-        raw.close()
+@dataclass
+class Outcome:
+    """What a viewer with the token had beside strangers, and what they cost."""
+
+    kinds: list[str]
+    connections: int = 0
+    frames_per_s: float = 0.0
+    slowest_s: float = 0.0
+    share: float = 0.0
+    """Of the mean of its frames before and after."""
+    highest_mb: float = 0.0
+    after_30_s_mb: float = 0.0
 
 
-def frames_a_second(viewer: Client, seconds: float) -> float:
-    """Of a viewer who asks for the next view as soon as the last has come."""
-    count, end = 0, time.monotonic() + seconds
+def look_on(viewer: Client, seconds: float) -> tuple[float, float]:
+    """Frames a second, and the longest wait, of a viewer who asks for the next view once the last has come."""
+    count, end, slowest = 0, time.monotonic() + seconds, 0.0
     while time.monotonic() < end:
+        asked = time.monotonic()
         viewer.frame(viewer.look(camera={"azimuth": 3.0 * count}, width=160, height=160, modes=["rendered"]))
-        count += 1
-    return count / seconds
+        count, slowest = count + 1, max(slowest, time.monotonic() - asked)
+    return count / seconds, slowest
+
+
+def attack(viewer: Client, port: int, server: int, kinds: list[str], seconds: float) -> Outcome:
+    """Let strangers of these kinds come, 1000 in all."""
+    outcome = Outcome(kinds)
+    ended = threading.Event()
+    each = 5 * EACH // len(kinds)
+    before, memory = look_on(viewer, seconds)[0], megabytes(server)
+
+    def watch() -> None:
+        while not ended.wait(0.2):
+            outcome.highest_mb = max(outcome.highest_mb, megabytes(server) - memory)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    crowd = begin(port, each, seconds + 8, kinds)
+    time.sleep(4)
+    outcome.frames_per_s, outcome.slowest_s = look_on(viewer, seconds)
+    outcome.connections = int(crowd.communicate()[0])
+    ended.set()
+    watcher.join()
+    outcome.share = outcome.frames_per_s / ((before + look_on(viewer, seconds)[0]) / 2)
+    time.sleep(30)
+    outcome.after_30_s_mb = megabytes(server) - memory
+    return outcome
 
 
 def main() -> None:
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each look")
+    parser.add_argument("--each", action="store_true", help="one kind after the other, instead of five at a time")
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    given = parser.parse_args()
+    names = list(KINDS)
+    waves = [[name] for name in names] if given.each else [names[n : n + 5] for n in range(0, len(names), 5)]
     options = ["--port", "0", "--size", "160", "--cameras", "6", "--frames", "4", "--model", "nearest"]
     command = [sys.executable, "-m", "viewmend", "serve", *options]
-    environment = os.environ | {"VIEWMEND_TOKEN": TOKEN}
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as server:
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env=os.environ | {"VIEWMEND_TOKEN": TOKEN}
+    ) as server:
         assert server.stderr is not None
         address = re.search(r"http(://127\.0\.0\.1:(\d+))", server.stderr.readline())
         assert address is not None
-        threading.Thread(target=server.stderr.read, daemon=True).start()
-        ended, opened, highest = threading.Event(), [0], [0.0]
+        said: list[str] = []
+        threading.Thread(target=lambda: said.extend(server.stderr or []), daemon=True).start()
+        outcomes = []
         with Client(f"ws{address[1]}", TOKEN, timeout_s=120) as viewer:
-            frames_a_second(viewer, 5)
-            before = frames_a_second(viewer, seconds)
-            memory = megabytes(server.pid)
-            port = int(address[2])
-            crowd = [threading.Thread(target=strangers, args=(port, sent, ended, opened)) for sent in KINDS.values()]
-
-            def watch() -> None:
-                while not ended.wait(0.5):
-                    highest[0] = max(highest[0], megabytes(server.pid))
-
-            for thread in [*crowd, watcher := threading.Thread(target=watch)]:
-                thread.start()
-            time.sleep(5)
-            during = frames_a_second(viewer, seconds)
-            ended.set()
-            for thread in [*crowd, watcher]:
-                thread.join()
-            time.sleep(30)
-            after = megabytes(server.pid)
+            look_on(viewer, 10)
+            for kinds in waves:
+                outcomes.append(attack(viewer, int(address[2]), server.pid, kinds, given.seconds))
+                print(json.dumps(asdict(outcomes[-1])), flush=True)
         server.terminate()
-        code = server.wait(30)
-    report = {
-        "connections": opened[0],
-        "frames_per_s": {"before": round(before, 2), "during": round(during, 2)},
-        "share": round(during / before, 3),
-        "memory_mb": {"before": round(memory), "highest": round(highest[0]), "after_30_s": round(after)},
-        "exit_code": code,
-    }
-    print(json.dumps(report, indent=1))
+        began = time.monotonic()
+        code = server.wait(60)
+    report = {"waves": [asdict(one) for one in outcomes], "exit_code": code, "lines_said": len(said)}
+    report["seconds_to_end"] = round(time.monotonic() - began, 1)
+    if given.write:
+        print(write("attack", "cpu", {"strangers": 5 * EACH, "seconds": given.seconds, "model": "nearest"}, report))
+    print(json.dumps({key: report[key] for key in report if key != "waves"}))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 A server in a process of its own, `viewmend serve live`; a rig that pushes the studio's frames and is killed now and
 then; viewers that come and go, each of whom checks that every frame is its own (the camera it asked for, an answer to
-its own look); and one who sends malformed messages. Every ten seconds the server's resident memory is read. Ends with 1
+its own look); one who sends malformed messages; strangers without the token, of each kind of attack.py; and one who
+asks for paths as videos and gives up half of them. Every ten seconds the server's resident memory is read. Ends with 1
 when the server died, a viewer saw a frame that was not its own, or memory grew by more than 5 %: the median of the last
 two fifths against that of the second and third (in the first the stores fill). Time in which the whole run was
 stopped (SIGSTOP) does not count.
@@ -20,18 +21,22 @@ import subprocess
 import sys
 import threading
 import time
+import urllib.error
 import urllib.request
 from collections import Counter
 from pathlib import Path
 
 from measure import write
+from strangers import KINDS, begin
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from viewmend.live.client import Client
+from viewmend.live.protocol import token_query
 from viewmend.live.publisher import Publisher
 from viewmend.studio.stage import Studio, StudioConfig
 
+TOKEN = "a token of the benchmark"
 SIZE, CAMERAS, FRAMES = 160, 6, 24
 ALLOWED_GROWTH = 0.05
 SAMPLE_S = 10.0
@@ -42,6 +47,8 @@ class Soak:
 
     def __init__(self, url: str, minutes: float) -> None:
         self.url = url
+        self.studio = Studio(StudioConfig(seed=10008, cameras=CAMERAS, frames=FRAMES, size_px=SIZE))
+        self.studio_frames = [self.studio.read(t) for t in range(FRAMES)]
         self.ends = time.monotonic() + 60 * minutes
         self.counts: Counter[str] = Counter()
         self.faults: list[str] = []
@@ -52,12 +59,11 @@ class Soak:
 
     def push(self) -> None:
         """A rig: a few seconds to half a minute at a time, then it is gone without a word."""
-        studio = Studio(StudioConfig(seed=10008, cameras=CAMERAS, frames=FRAMES, size_px=SIZE))
-        frames = [studio.read(t) for t in range(FRAMES)]
+        studio, frames = self.studio, self.studio_frames
         chance = random.Random(1)
         while not self.over:
             with contextlib.suppress(ConnectionError, OSError, TimeoutError):
-                rig = Publisher(studio.cameras, self.url, up=studio.up, bounds=studio.bounds)
+                rig = Publisher(studio.cameras, self.url, token=TOKEN, up=studio.up, bounds=studio.bounds)
                 until = time.monotonic() + chance.uniform(3, 30)
                 number = 0
                 while time.monotonic() < until and not self.over:
@@ -74,7 +80,7 @@ class Soak:
         chance = random.Random(100 + seat)
         while not self.over:
             with contextlib.suppress(ConnectionError, OSError, TimeoutError):
-                viewer = Client(self.url, timeout_s=8.0).__enter__()
+                viewer = Client(self.url, TOKEN, timeout_s=20.0).__enter__()
                 until = time.monotonic() + chance.uniform(2, 40)
                 while time.monotonic() < until and not self.over:
                     self._look(viewer, seat, chance)
@@ -94,7 +100,7 @@ class Soak:
         camera = {"azimuth": chance.uniform(0, 360), "target": [0.0, 0.9 + height_m, 0.0], "distance": 3.0}
         asked = time.monotonic()
         look = viewer.look(camera=camera, width=96 + 16 * seat, height=96, adaptive=False, depth=True)
-        while time.monotonic() - asked < 6:
+        while time.monotonic() - asked < 15:
             frame = viewer.frame()
             self.counts["frames"] += 1
             R, T = frame.header["cameras"][0]["R"], frame.header["cameras"][0]["T"]
@@ -111,7 +117,7 @@ class Soak:
         while not self.over:
             with (
                 contextlib.suppress(ConnectionClosed, OSError, TimeoutError),
-                connect(f"{self.url}/ws", compression=None) as socket,
+                connect(f"{self.url}/ws{token_query(TOKEN)}", compression=None) as socket,
             ):
                 socket.send(json.dumps({"type": "hello", "version": 1, "codecs": []}))
                 for _ in range(40):
@@ -119,6 +125,30 @@ class Soak:
                     socket.send(chance.choice([chance.randbytes(40), cut, '{"type": "look", "width": -1}']))
                     self.counts["malformed"] += 1
             time.sleep(0.5)
+
+    def film(self) -> None:
+        """One who asks for paths, and leaves half of them."""
+        chance = random.Random(8)
+        url = self.url.replace("ws", "http", 1)
+        while not self.over:
+            poses = [{"azimuth": chance.uniform(0, 360)} for _ in range(12)]
+            body = json.dumps({"poses": poses, "width": 128, "height": 128}).encode()
+            asked = urllib.request.Request(f"{url}/path.mp4{token_query(TOKEN)}", body)
+            leaves = chance.random() < 0.5
+            try:
+                with urllib.request.urlopen(asked, timeout=chance.uniform(0.2, 1.5) if leaves else 60) as answer:
+                    self.counts["films"] += answer.read()[4:8] == b"ftyp"
+            except (TimeoutError, OSError):
+                self.counts["films_given_up"] += 1
+            time.sleep(chance.uniform(1, 4))
+
+    def strangers(self) -> None:
+        """Forty strangers of one kind after another, twenty seconds each."""
+        port = int(self.url.rsplit(":", 1)[1])
+        while not self.over:
+            for kind in KINDS:
+                seconds = min(20.0, max(0.1, self.ends - time.monotonic()))
+                self.counts["strangers"] += int(begin(port, 40, seconds, [kind]).communicate()[0])
 
 
 def memory_mb(process: int) -> float:
@@ -137,14 +167,22 @@ def main() -> int:
     options = parser.parse_args()
     command = [sys.executable, "-m", "viewmend.cli", "serve", "live", "--port", "0"]
     command += ["--memory-mb", str(options.memory_mb), "--viewers", str(options.viewers + 4)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ) as server:
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env=os.environ | {"VIEWMEND_TOKEN": TOKEN}
+    ) as server:
         assert server.stderr is not None
         address = re.search(r"http://[\d.:]+", server.stderr.readline())
         assert address is not None, "the server does not start"
         said: list[str] = []
         threading.Thread(target=lambda: said.extend(server.stderr or []), daemon=True).start()
         soak = Soak(address[0].replace("http", "ws"), options.minutes)
-        works = [soak.push, soak.vex, *(lambda n=n: soak.watch(n) for n in range(options.viewers))]
+        works = [
+            soak.push,
+            soak.vex,
+            soak.film,
+            soak.strangers,
+            *(lambda n=n: soak.watch(n) for n in range(options.viewers)),
+        ]
         threads = [threading.Thread(target=work, daemon=True) for work in works]
         for thread in threads:
             thread.start()
@@ -161,7 +199,7 @@ def main() -> int:
         alive = server.poll() is None
         for thread in threads:
             thread.join(20)
-        with urllib.request.urlopen(f"{address[0]}/metrics", timeout=10) as answer:
+        with urllib.request.urlopen(f"{address[0]}/metrics{token_query(TOKEN)}", timeout=10) as answer:
             alive = alive and answer.status == 200
         server.send_signal(signal.SIGINT)
         server.wait(30)

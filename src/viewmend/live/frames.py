@@ -153,7 +153,7 @@ class ReadAhead(FrameSupply):
             self._stopped = True
             self._lock.notify_all()
         if self._thread.is_alive():
-            self._thread.join(timeout=10)
+            self._thread.join(timeout=3)
 
     def read(self, time: int) -> MultiViewFrame | None:
         """The frame; None while it is on its way."""

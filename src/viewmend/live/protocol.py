@@ -25,6 +25,8 @@ MAGIC = b"VMF1"
 MAX_PARTS = 512
 HEADER_BYTES = 1_000_000
 """The largest JSON of a rig, or at the beginning of a binary message."""
+MAX_NESTED = 10_000
+"""Lists and objects in one JSON: a megabyte of empty ones takes seconds, in which nothing else runs."""
 
 Kind = TypeVar("Kind")
 Integer = Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
@@ -180,6 +182,10 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
     Raises:
         ProtocolError: it does not fit.
     """
+    if isinstance(message, str | bytes):
+        opening = ("[", "{") if isinstance(message, str) else (b"[", b"{")
+        if (nested := sum(map(message.count, opening))) > MAX_NESTED:  # pyright: ignore[reportArgumentType]
+            raise ProtocolError(f"expected at most {MAX_NESTED} lists and objects in a message, got {nested}")
     try:
         value = read_json(message) if isinstance(message, str | bytes) else message
         return typed(value, kind, "see docs/live-protocol.md", strict)

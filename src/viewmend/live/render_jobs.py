@@ -72,13 +72,13 @@ def parse_query(query: dict[str, str], limits: Limits) -> PictureQuery:
     return asked
 
 
-def parse_path(body: bytes, limits: Limits) -> PathBody:
+def parse_path(body: bytes | bytearray, limits: Limits) -> PathBody:
     """What the body of a request for a video asks for.
 
     Raises:
         ProtocolError: it does not fit, or the pictures are too large.
     """
-    asked: PathBody = read_message(body, PathBody)
+    asked: PathBody = read_message(bytes(body), PathBody)
     limits.check_size(asked.width, asked.height)
     return asked
 
@@ -141,7 +141,7 @@ class PathJob(RenderJob[bytes]):
         self._path, self._times = path, path.times
         self._count = 0
         self._mp4 = BytesIO()
-        self._video = VideoWriter(self._mp4, path.fps)
+        self._video = VideoWriter(self._mp4, path.fps, threads=1)  # the render thread's own: none is left behind
 
     def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The next pose, once its frame has been read."""

@@ -161,7 +161,8 @@ class LiveServer:
             body = await _body(request)
             if body is None:
                 return _refusal(413, f"expected at most {BODY_BYTES} bytes")
-            job = PathJob(parse_path(body, self._config.limits))
+            # On a thread: a megabyte of JSON takes its time.
+            job = PathJob(await asyncio.to_thread(parse_path, body, self._config.limits))
             video = await self._wait(request, job, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
@@ -220,13 +221,13 @@ class LiveServer:
             supply.lost()
 
 
-async def _body(request: Request) -> bytes | None:
+async def _body(request: Request) -> bytearray | None:
     """The request's body; None where it is too large.
 
     Raises:
         ProtocolError: it takes too long.
     """
-    body = b""
+    body = bytearray()
     try:
         async with asyncio.timeout(BODY_S):
             async for chunk in request.stream():

@@ -55,7 +55,7 @@ class RenderService:
             self.lock.notify_all()
         self.supply.stop()
         if self._thread.is_alive():
-            self._thread.join(timeout=30)
+            self._thread.join(timeout=5)
 
     def wake(self) -> None:
         """Something has changed."""
