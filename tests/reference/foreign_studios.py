@@ -173,3 +173,65 @@ def write_easyvolcap(folder, rig, frames, gaps=(), bounds=None, quoted=True):
         for name in ("intri.yml", "extri.yml"):
             text = (folder / name).read_text()
             (folder / name).write_text(text.replace('- "', "- ").replace('"\n', "\n"))
+
+
+def write_dna(folder, rig, frames, gaps=(), apart=False, colours=None, name="0012_11"):
+    """A pair of .smc files; cameras below 48 are of 5 megapixels. `apart` puts them into two folders, as published."""
+    import h5py
+
+    places = [folder / "part1_main", folder / "part1_annotations"] if apart else [folder, folder]
+    for place in places:
+        place.mkdir(parents=True, exist_ok=True)
+    with h5py.File(places[0] / f"{name}.smc", "w") as main, h5py.File(places[1] / f"{name}_annots.smc", "w") as annots:
+        main.attrs["actor_id"] = name[:4]
+        for number, camera in enumerate(rig):
+            cam = int(camera["name"])
+            size = camera["height"], camera["width"]
+            parameters = annots.create_group(f"Camera_Parameter/{cam:02d}")
+            parameters["K"], parameters["D"] = camera["K"], camera["dist"]
+            parameters["RT"] = world_from_camera(camera)
+            if colours is not None:
+                parameters["Color_Calibration"] = colours[number]
+            full = np.full((*size, 3), 255, np.uint8)
+            full[-2:, -2:] = 0
+            pixels = np.full((*size, 3), 60 + 20 * (number % 9), np.uint8)
+            for frame in frames:
+                if (camera["name"], frame) in gaps:
+                    continue
+                group = "Camera_5mp" if cam < 48 else "Camera_12mp"
+                main[f"{group}/{cam}/color/{frame}"] = cv2.imencode(".jpg", pixels)[1].ravel()
+                annots[f"Mask/{cam}/mask/{frame}"] = cv2.imencode(".png", full)[1].ravel()
+    return places[0] / f"{name}.smc"
+
+
+def write_riftcast(folder, rig, frames, gaps=(), meta=None):
+    """calibration.json, images, and masks as run lengths, by the plainest of loops; `meta` as meta.json."""
+    write_take(
+        folder,
+        rig,
+        frames,
+        gaps,
+        lambda c, f: f"frame_{f}/rgb/rgb_{c['name']}.png",
+        lambda c, f: f"frame_{f}/mask/mask_{c['name']}.png",
+    )
+    for png in folder.glob("frame_*/mask/*.png"):
+        runs, before = [], None
+        values = (cv2.imread(str(png), cv2.IMREAD_GRAYSCALE) > 0).ravel().tolist()
+        for at, value in enumerate(values):
+            if value != before:
+                runs.append(at)
+            before = value
+        np.array([int(values[0]), *runs[1:], len(values)], "<i4").tofile(png.with_suffix(".bin"))
+        png.unlink()
+    for png in folder.glob("frame_*/rgb/*.png"):
+        cv2.imwrite(str(png.with_suffix(".jpeg")), cv2.imread(str(png)))
+        png.unlink()
+    cameras = []
+    for camera in rig:
+        view = np.vstack([np.c_[camera["R"], camera["t"]], [0, 0, 0, 1]])
+        lens = {"camera_matrix": camera["K"].ravel().tolist(), "resolution": [camera["width"], camera["height"]]}
+        entry = {"camera_id": int(camera["name"]), "camera_model_name": "a camera", "intrinsics": lens}
+        cameras.append(entry | {"extrinsics": {"view_matrix": view.ravel().tolist()}})
+    (folder / "calibration.json").write_text(json.dumps({"cameras": cameras}))
+    if meta is not None:
+        (folder / "meta.json").write_text(meta)

@@ -60,9 +60,10 @@ class PlainCapture:
             there for some of the cameras only; a file lies outside the folder; `cameras` names one that is not there.
     """
 
-    def __init__(self, folder: Path, cameras: Sequence[str] | None = None, kind: str | None = None):
-        self.folder = folder
-        calibration = read_any_calibration(folder, kind)
+    def __init__(self, path: Path, cameras: Sequence[str] | None = None, kind: str | None = None):
+        calibration = read_any_calibration(path, kind)
+        self.folder = folder = calibration.folder
+        self._name = path.stem if path.is_file() else folder.resolve().name
         self._file = calibration.file
         self._plain = _select(calibration.cameras, cameras, self._file)
         self._calibration = calibration
@@ -75,8 +76,8 @@ class PlainCapture:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
-        return self.folder.resolve().name
+        """The name of the folder, or of the file that was opened."""
+        return self._name
 
     @property
     def cameras(self) -> Cameras:

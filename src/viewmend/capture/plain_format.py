@@ -138,6 +138,8 @@ class PlainCalibration:
     metres_per_unit: float
     file: Path
     """Where it was read."""
+    folder: Path
+    """What the files' paths are relative to."""
 
 
 def read_calibration(folder: Path) -> PlainCalibration:
@@ -176,6 +178,7 @@ def calibration_of(content: dict[str, Any], path: Path) -> PlainCalibration:
         bounds_m=None if file.bounds is None else np.array(file.bounds) * file.metres_per_unit,
         metres_per_unit=file.metres_per_unit,
         file=path,
+        folder=path.parent,
     )
 
 

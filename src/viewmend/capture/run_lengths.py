@@ -39,3 +39,10 @@ def read_runs(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.ndarray
         )
     values = (np.arange(len(runs)) + numbers[0]) % 2 * 255
     return np.repeat(values.astype(np.uint8), runs).reshape(height, width)
+
+
+def run_lengths(mask: UInt8[np.ndarray, "height width"], threshold: int = 127) -> bytes:
+    """The mask as run lengths; foreground is what lies above the threshold."""
+    flat = mask.ravel() > threshold
+    ends = np.append(np.flatnonzero(flat[1:] != flat[:-1]) + 1, flat.size)
+    return np.concatenate([[int(flat[0])], ends]).astype("<i4").tobytes()

@@ -98,8 +98,8 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
 
 def _fingerprint(folder: Path) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
-    folder = folder if folder.is_dir() else folder.parent
-    plain = read_any_calibration(folder)
+    plain = read_any_calibration(folder.parent if folder.name == CALIBRATION and folder.is_file() else folder)
+    folder = plain.folder
     named = {c.file(stream, frame) for c in plain.cameras for stream in c.streams for frame in plain.frames}
     files = sorted({container_of(folder / name) for name in named})
     stats = [(str(file.relative_to(folder)), file.stat()) for file in files if file.is_file()]

@@ -1,7 +1,7 @@
 """Which format a folder has, and its calibration by the reader of that format."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from viewmend.capture.formats import (
     actorshq,
     agisoft,
     colmap,
+    dna_rendering,
     easymocap,
     genebody,
     middlebury,
@@ -20,6 +21,7 @@ from viewmend.capture.formats import (
     panoptic,
     pose2sim,
     qualisys,
+    riftcast,
     transforms,
     zju_mocap,
 )
@@ -34,34 +36,37 @@ class Format:
     """The file by which a folder is recognised, None where it has none."""
     content: Callable[[Path, Path], dict[str, Any]]
     """What a `cameras.json` would hold, of the capture folder and that file."""
+    root: Callable[[Path, Path], Path] = lambda path, _: path
+    """What its paths are relative to, of the same two: the capture folder, unless a file was opened."""
 
 
-_STUDIOS = (easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
+_STUDIOS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
 _TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
 FORMATS = {
-    module.__name__.rpartition(".")[2]: Format(module.find, module.content)
+    module.__name__.rpartition(".")[2]: Format(module.find, module.content, getattr(module, "root", Format.root))
     for module in (transforms, colmap, *_STUDIOS, *_TOOLS)
 }
 KINDS = ("plain", *FORMATS)
 
 
-def read_any_calibration(folder: Path, kind: str | None = None) -> PlainCalibration:
-    """The calibration of a folder of `kind`, by default of the first of `KINDS` whose file it has.
+def read_any_calibration(path: Path, kind: str | None = None) -> PlainCalibration:
+    """The calibration of a folder, or of a file that stands for one, of `kind`; by default the first of `KINDS`.
 
     Raises:
         CaptureError: the kind is unknown, the folder is not of it, or its calibration cannot be used.
     """
     if kind not in (None, *KINDS):
         raise CaptureError(f"expected a kind among {', '.join(KINDS)}, got '{kind}'; choose one of them")
-    if kind == "plain" or (kind is None and (folder / CALIBRATION).is_file()):
-        return read_calibration(folder)
+    if kind == "plain" or (kind is None and (path / CALIBRATION).is_file()):
+        return read_calibration(path)
     for name in FORMATS if kind is None else (kind,):
-        if (file := FORMATS[name].find(folder)) is not None:
+        if (file := FORMATS[name].find(path)) is not None:
             try:
                 with np.errstate(all="ignore"):  # what overflows is refused as a number that is not finite
-                    return calibration_of(FORMATS[name].content(folder, file), file)
+                    told = calibration_of(FORMATS[name].content(path, file), file)
+                    return replace(told, folder=FORMATS[name].root(path, file))
             except (ValueError, OSError) as error:
                 raise CaptureError(f"{file}: {error}") from None
     if kind is None:
-        return read_calibration(folder)  # says what a capture folder has
-    raise CaptureError(f"{folder}: expected a folder of the kind '{kind}', got none of its files; see docs/formats.md")
+        return read_calibration(path)  # says what a capture folder has
+    raise CaptureError(f"{path}: expected a folder of the kind '{kind}', got none of its files; see docs/formats.md")
