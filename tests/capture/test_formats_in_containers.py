@@ -31,7 +31,7 @@ def test_dna_rendering_there_and_back(seed, count, apart, opened_as_file):
 
 
 def test_dnas_colours_are_calibrated_by_channel(tmp_path):
-    """A value x becomes a x^2 + b x + c of the 0 to 255 that are stored, in the order blue, green, red; then cut off."""
+    """A value x becomes a x^2 + b x + c of 0 to 255, in the order blue, green, red; then it is cut off."""
     rig = named([camera | {"dist": np.zeros(5)} for camera in random_rig(3, 2)], "{:02d}")
     blue, green, red = [0.001, 0.5, 3.0], [0.0, 1.0, 0.0], [0.0, 9.0, 0.0]
     write_dna(tmp_path, rig, ["0"], colours=[np.array([blue, green, red])] * 2)

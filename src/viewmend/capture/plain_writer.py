@@ -4,8 +4,9 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 from typing import Literal
@@ -41,6 +42,18 @@ def write_capture(
             with gaps.
         ImportError: `video` without PyAV.
     """
+    with whole_folder(out) as unfinished:
+        writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png", video)
+        writer.write(range(len(source.frame_ids)) if progress is None else progress(range(len(source.frame_ids))))
+
+
+@contextmanager
+def whole_folder(out: Path | str) -> Iterator[Path]:
+    """A folder beside `out`, to be made and filled, which takes its place at the end: `out` is complete or absent.
+
+    Raises:
+        CaptureError: `out` exists and is not an empty folder.
+    """
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise CaptureError(
@@ -52,8 +65,7 @@ def write_capture(
         if not _is_running(left.name.rpartition("-")[2]):
             shutil.rmtree(left, ignore_errors=True)
     try:
-        writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png", video)
-        writer.write(range(len(source.frame_ids)) if progress is None else progress(range(len(source.frame_ids))))
+        yield unfinished
         if out.exists():
             out.rmdir()
         unfinished.rename(out)

@@ -148,13 +148,15 @@ def _refuse_or_warn(where: str, found: Sequence[Finding], said: set[str]) -> Non
             logging.getLogger("viewmend").warning("%s: %s", where, finding.text)
 
 
-def open_masked(path: Path | str, cameras: Sequence[str] | None = None, held: int = 0) -> PlainCapture:
+def open_masked(
+    path: Path | str, cameras: Sequence[str] | None = None, held: int = 0, kind: str | None = None
+) -> PlainCapture:
     """Open a capture that has masks, and at least two input cameras besides `held` cameras that are left out.
 
     Raises:
         CaptureError: it cannot be opened (see `open_capture`), has no masks, or too few cameras.
     """
-    capture = open_capture(path, cameras)
+    capture = open_capture(path, cameras, kind)
     if not capture.has_masks:
         raise CaptureError(
             f"{path}: expected a 'mask' for every camera, got none: the visual hull is carved from them, and the truth "

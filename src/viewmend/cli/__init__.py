@@ -46,6 +46,9 @@ COMMANDS = (
     Command("evaluate paper-table", "viewmend.cli.paper_table", "The paper's tables on your data, beside its figures."),
     Command("weights", "viewmend.cli.weights", "List and check weights of others' networks."),
     Command("masks", "viewmend.cli.masks", "Make masks for a capture that has none."),
+    Command(
+        "splits", "viewmend.cli.splits", "Split captures for training and tests by the paper's protocol, as a file."
+    ),
     Command("convert", "viewmend.cli.convert", "Write a capture of any format as a plain one."),
     Command(
         "export-scene", "viewmend.cli.export_scene", "Write a capture as a scene for engines: hull, points, depth."

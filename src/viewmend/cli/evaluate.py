@@ -19,8 +19,8 @@ class Options(RunOptions):
 
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="P|Q|P-long|Q-long|P-turn|CAPTURE...")]
     """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same for 41 frames,
-    the last ten scored, with a whole past. P-turn: people who turn. Anything else is a capture's folder: each of its
-    cameras is left out in turn."""
+    the last ten scored, with a whole past. P-turn: people who turn. Anything else is a capture: each of its
+    cameras is left out in turn; or a file of `viewmend splits`, whose scenes for tests are taken."""
     methods: str = "all"
     """Names with commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model's name, a
     model's folder, a baseline like dstt-o-def, FILE.py:NAME; all for everything that is shipped, baselines for those

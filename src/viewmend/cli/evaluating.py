@@ -35,6 +35,8 @@ class RunOptions:
     beside them."""
     motions: Path | None = None
     """Folder of BVH motions, if they are elsewhere."""
+    kind: str | None = None
+    """The capture's format, as docs/formats.md names it; by default it is recognised."""
     inputs: str = "all"
     """How many cameras of a capture are looked at: all, or a number of them, evenly around; several with commas."""
     closest: int = 3
@@ -164,12 +166,13 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
 
 
 def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
-    """The scenes of P, of Q, of the same with a whole past, of P-turn, or of a capture.
+    """The scenes of P, of Q, of the same with a whole past, of P-turn, of a capture, or of a file's splits.
 
     Raises:
         ValueError: the options do not fit the set.
     """
     from viewmend.leave_one_out.capture_scenes import capture_set
+    from viewmend.leave_one_out.capture_splits import is_splits, split_scenes
     from viewmend.leave_one_out.studio_scenes import (
         FRAMES,
         LONG_FRAMES,
@@ -198,10 +201,12 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         frames = LONG_FRAMES if name == "Q-long" else frames
         people = performer_set(options.performers, options.motions, frames, options.size)
         return list((lengthened(people) if name == "Q-long" else people)[part])
+    if is_splits(Path(name)):
+        return list(split_scenes(Path(name), options.frames)[part])
     inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
     if not inputs:
         raise ValueError("expected --inputs all or a number of cameras, got none; leave it away for all")
-    return [s for number in inputs for s in capture_set(Path(name), number, options.frames)[part]]
+    return [s for number in inputs for s in capture_set(Path(name), number, options.frames, options.kind)[part]]
 
 
 def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":

@@ -24,9 +24,11 @@ class Options:
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
-    """A capture folder (with cameras.json and masks)."""
+    """A capture of any format that is read, with masks."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder for the scene."""
+    kind: str | None = None
+    """The capture's format, as docs/formats.md names it; by default it is recognised."""
     views: int = 8
     """How many views about the subject are mended at every time."""
     path: Path | None = None
@@ -63,7 +65,7 @@ def run(options: Options) -> int:
     from viewmend.stream import Stream
 
     demand_openexr()
-    opened = open_masked(options.capture)
+    opened = open_masked(options.capture, kind=options.kind)
     times = chosen_times(options.frames, len(opened.frame_ids))
     stream = Stream(load_named(options.model, options.device), bounds=opened.bounds)
     with OutputFolder(options.out) as folder:

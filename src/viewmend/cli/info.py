@@ -20,7 +20,9 @@ class Options:
     """Say what a capture or a model is; for a capture, also draw a picture that checks its calibration."""
 
     target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|MODEL")]
-    """A capture folder (with cameras.json), or a model: a name or a folder with config.json and model.safetensors."""
+    """A capture of any format that is read, or a model: a name or a folder with config.json and model.safetensors."""
+    kind: str | None = None
+    """The capture's format, as docs/formats.md names it; by default it is recognised."""
     out: Path | None = None
     """Where to write the check picture of a capture (.png or .jpg)."""
     time: int = 0
@@ -72,7 +74,7 @@ def _look_at_capture(options: Options) -> "CaptureDescription":
     from viewmend.capture.plain import open_capture
     from viewmend.cli.console import busy, say
 
-    capture = open_capture(options.target)
+    capture = open_capture(options.target, kind=options.kind)
     if not 0 <= options.time < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
         raise ValueError(f"{options.target}: expected --time of 0 to {last}, got {options.time}; choose again")

@@ -29,7 +29,7 @@ class Options:
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
-    """A capture folder (with cameras.json and masks)."""
+    """A capture of any format that is read, with masks."""
     out: Path
     """Folder for the results; it is made if it is not there."""
     leave_out: str | None = None
@@ -39,6 +39,8 @@ class Options:
     "world_from_camera" and, if wanted, "K", "width" and "height". One pose per frame, or one for all."""
     use_cameras: str | None = None
     """Names of the input cameras, with commas; all by default."""
+    kind: str | None = None
+    """The capture's format, as docs/formats.md names it; by default it is recognised."""
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
     error_rule: str | None = None
@@ -150,7 +152,7 @@ def _open(options: Options, held: tuple[str, ...]) -> "CaptureSource":
     if options.use_cameras is not None:
         names = [name.strip() for name in options.use_cameras.split(",") if name.strip()]
         names = list(dict.fromkeys([*names, *held]))
-    capture = open_masked(options.capture, names, held=len(held))
+    capture = open_masked(options.capture, names, held=len(held), kind=options.kind)
     if not set(held) <= set(capture.cameras.names):
         known, got = list(capture.cameras.names), options.leave_out
         raise CaptureError(f"{options.capture}: expected --leave-out among {known}, got '{got}'")

@@ -27,9 +27,11 @@ class Options:
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = "studio"
-    """A capture folder (with cameras.json and masks); a rig's TOML file, which names its cameras (webcams, network
+    """A capture of any format that is read, with masks; a rig's TOML file, which names its cameras (webcams, network
     streams, videos as if they were live); 'studio' for a synthetic scene made on the spot; or 'live' for a rig that
     pushes its frames."""
+    kind: str | None = None
+    """The capture's format, as docs/formats.md names it; by default it is recognised."""
     port: int = 8008
     """Port; 0 takes a free one."""
     host: str = "127.0.0.1"
@@ -182,6 +184,6 @@ def _capture(options: Options) -> "Callable[[], CaptureSource]":
     from viewmend.capture.prepare import open_masked, prepare
     from viewmend.cli.alignment import say_alignment
 
-    prepared = prepare(open_masked(options.source), longest_px=options.width, align=options.align)
+    prepared = prepare(open_masked(options.source, kind=options.kind), longest_px=options.width, align=options.align)
     say_alignment(prepared.alignment)
     return lambda: prepared

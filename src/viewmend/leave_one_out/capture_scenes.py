@@ -27,6 +27,8 @@ class CaptureScene(LeaveOneOutScene):
     """Frames from the first."""
     fingerprint: str
     """Hash of the capture's files."""
+    kind: str | None = None
+    """The capture's format, None to recognise it."""
 
     @property
     def definition(self) -> str:
@@ -35,7 +37,7 @@ class CaptureScene(LeaveOneOutScene):
 
     def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """Frames in which the camera that was left out, and at least two of the inputs, have images."""
-        capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1), self.inputs)
+        capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1, kind=self.kind), self.inputs)
         bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):
             frame = capture.read(time).to(device)
@@ -43,7 +45,9 @@ class CaptureScene(LeaveOneOutScene):
                 yield LeaveOneOut({time: frame}, bounds).frame(self.held, time)
 
 
-def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) -> tuple[CaptureScene, ...]:
+def capture_set(
+    folder: Path, inputs: str = "all", frames: int | None = None, kind: str | None = None
+) -> tuple[CaptureScene, ...]:
     """Every camera of a capture left out in turn.
 
     Args:
@@ -51,19 +55,20 @@ def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) ->
         inputs: "all" the others are looked at, or a number of cameras, `evenly_around`; where the camera that is left
             out is one of these, the rest.
         frames: how many from the first; None for all.
+        kind: the capture's format, None to recognise it.
 
     Raises:
         CaptureError: the capture cannot be read, has no masks, or too few cameras.
         ValueError: `inputs` or `frames` is no such number.
     """
-    capture = open_masked(folder, held=1)
+    capture = open_masked(folder, held=1, kind=kind)
     names = capture.cameras.names
     if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
         raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
     if frames is not None and frames < 1:
         raise ValueError(f"expected --frames of at least 1, got {frames}; leave it away for all")
     looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
-    fingerprint, count = _fingerprint(folder), min(frames or len(capture.frame_ids), len(capture.frame_ids))
+    fingerprint, count = _fingerprint(folder, kind), min(frames or len(capture.frame_ids), len(capture.frame_ids))
     return tuple(
         CaptureScene(
             name=f"{capture.name}-{held}-from-{inputs}",
@@ -75,6 +80,7 @@ def capture_set(folder: Path, inputs: str = "all", frames: int | None = None) ->
             inputs=tuple(name for name in looking if name != held),
             count=count,
             fingerprint=fingerprint,
+            kind=kind,
         )
         for held in names
     )
@@ -96,9 +102,10 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
     return tuple(cameras.names[order[i * len(order) // count]] for i in range(count))
 
 
-def _fingerprint(folder: Path) -> str:
+def _fingerprint(folder: Path, kind: str | None) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
-    plain = read_any_calibration(folder.parent if folder.name == CALIBRATION and folder.is_file() else folder)
+    is_file = folder.name == CALIBRATION and folder.is_file()
+    plain = read_any_calibration(folder.parent if is_file else folder, kind)
     folder = plain.folder
     named = {c.file(stream, frame) for c in plain.cameras for stream in c.streams for frame in plain.frames}
     files = sorted({container_of(folder / name) for name in named})
