@@ -306,3 +306,11 @@ def test_the_time_looked_at_longest_ago_is_forgotten_first():
     seen.push(photograph(SPARSE, 2))  # at hand already: somebody wants it
     walk(seen, [4], A)
     assert seen.times == (2, 3, 4)
+
+
+def test_all_cameras_of_a_frame_are_the_frame_itself():
+    """Frames are megabytes, and are asked for without nobody at every time of a live rig."""
+    frame = photograph(ring(3, 16))
+    assert frame.select(frame.cameras.names) is frame and frame.without([]) is frame
+    turned = frame.select(frame.cameras.names[::-1])
+    assert turned.cameras.names == ("c2", "c1", "c0") and torch.equal(turned.rgb[0], frame.rgb[2])

@@ -41,6 +41,8 @@ class MultiViewFrame:
 
     def select(self, names: Sequence[str]) -> "MultiViewFrame":
         """The same time seen by these cameras alone, in this order; ValueError for an unknown name."""
+        if tuple(names) == self.cameras.names:
+            return self
         cameras = self.cameras.select(names)
         index = torch.tensor([self.cameras.names.index(n) for n in names], device=self.rgb.device, dtype=torch.long)
         # Drop the padding that only the others needed: a stack is as large as its largest image.
