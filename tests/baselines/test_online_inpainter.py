@@ -13,6 +13,7 @@ from viewmend.baselines.dstt import DSTT
 from viewmend.baselines.framing import Window
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter
 from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.views import ContextViews, MultiViewFrame
 
 SIZE = (48, 48)
 FRAMINGS = ("def", "win", "mul")
@@ -204,6 +205,18 @@ def test_a_camera_shows_what_a_window_looks_at_in_the_views_scale():
     assert float((seen - own).abs()[:, :, inside].mean()) < 0.05
     shifted = camera_windows(foreground(views), views, aim(rendered, Window(14, 25), SIZE), SIZE)
     assert float((shifted - own).abs()[:, :, inside].mean()) > 0.15
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_camera_of_a_longer_lens_shows_the_same_part_of_the_subject(times):
+    """Its image grows by a 255th a pixel, so the differences between a window's pixels say how far apart they are."""
+    cameras = camera("left").resized(times * WIDTH, times * HEIGHT)
+    rgb = torch.arange(times * WIDTH, dtype=torch.uint8).expand(1, 3, times * HEIGHT, -1).contiguous()
+    frame = MultiViewFrame(cameras, rgb, torch.full_like(rgb[:, 0], 255), 0)
+    views = ContextViews(frame, torch.full(rgb[:, 0].shape, 2.0))
+    seen = camera_windows(foreground(views), views, aim(plate(0, None), Window(14, 21), SIZE), SIZE)
+    apart = 255 / 2 * seen[0, 0, 24].diff()
+    assert float(apart.median()) == pytest.approx(times, abs=1e-3)
 
 
 def test_a_window_without_depth_looks_where_the_view_does_and_a_blind_view_shows_whole_images():
