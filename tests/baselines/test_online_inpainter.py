@@ -157,6 +157,8 @@ def test_another_size_starts_a_new_stream_and_going_back_in_time_forgets_the_fut
     views = [plate(5), plate(6), plate(5), plate(6, width=130)]
     past = lambda: network.memories[-1][1] if memory else network.clips[-1].neighbours  # noqa: E731
     assert [len(past()) for _ in stream(inpainter, views)] == [0, 1, 0, 0]
+    again = [plate(5), plate(6), plate(5), plate(7)]
+    assert [len(past()) for _ in stream(inpainter, again)] == [0, 1, 0, 1], "6 was seen by another look"
 
 
 def test_streams_do_not_touch_one_another():
