@@ -6,7 +6,8 @@ import pytest
 import torch
 from reference.ball import BallCapture, camera_at, photograph, ring
 
-from viewmend.capture.prepare import prepare, reduced
+from viewmend.capture.prepare import prepare
+from viewmend.capture.reduction import reduced
 from viewmend.geometry.cameras import concatenate_cameras
 
 SHIFT_PX = 0.8

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from viewmend.baselines.classical import Unfilled
-from viewmend.capture.prepare import prepare, reduced
+from viewmend.capture.prepare import prepare
+from viewmend.capture.reduction import reduced
 from viewmend.evaluation.frame_scores import true_view
 from viewmend.geometry.hull import HullConfig
 from viewmend.leave_one_out.scenes import LeaveOneOut

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from viewmend.capture.diagnosis import Finding, diagnose
+from viewmend.capture.diagnosis import diagnose
+from viewmend.capture.finding import Finding
 from viewmend.contact_sheet import Tile, contact_sheet, in_rows, picture
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds

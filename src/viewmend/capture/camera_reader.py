@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.images import as_mask, read_depth, read_mask, read_rgb
+from viewmend.capture.images import as_mask, exif_turn, read_depth, read_mask, read_rgb
 from viewmend.capture.plain_format import PlainCamera, Stream
 from viewmend.capture.run_lengths import RUN_LENGTHS, read_runs
 from viewmend.capture.videos import VideoFile, is_video
@@ -32,6 +32,9 @@ class CameraReader:
 
     def __init__(self, folder: Path, camera: PlainCamera):
         self.camera = camera
+        self.turn: str | None = None
+        """How the EXIF of the first image that was read says that it should be turned; '' where it should not."""
+        self.turn_is_said = False
         self._folder = folder
         self._undistortion = Undistortion(camera)
         streams = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
@@ -47,7 +50,9 @@ class CameraReader:
         camera = self.camera
         path, where = self._locate("video" if camera.video else "image", frame)
         rgb = self._video.read(index, where) if self._video else read_rgb(path, where)
-        self._check_size(rgb, where)
+        if self.turn is None:
+            self.turn = "" if self._video else exif_turn(path) or ""
+        self._check_size(rgb, where, self.turn)
         rgb = self._coloured(rgb)
         mask, depth = None, None
         if camera.mask:
@@ -82,12 +87,15 @@ class CameraReader:
         path = self._folder / self.camera.file(stream, frame)
         return path, f"{path}: camera '{self.camera.name}', frame '{frame}'"
 
-    def _check_size(self, image: np.ndarray, where: str) -> None:
+    def _check_size(self, image: np.ndarray, where: str, turn: str = "") -> None:
         height, width = image.shape[:2]
         if (width, height) != (self.camera.width, self.camera.height):
+            advice = "correct width, height and K there, or the file"
+            if turn:
+                advice = f"its EXIF says that it is to be {turn}: write it upright (exiftran -ai), or {advice}"
             raise CaptureError(
                 f"{where}: expected {self.camera.width} x {self.camera.height} pixels as the calibration says, "
-                f"got {width} x {height}; correct width, height and K there, or the file"
+                f"got {width} x {height}; {advice}"
             )
 
 

@@ -5,16 +5,20 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.capture.colour_check import odd_colours
+from viewmend.capture.finding import Finding
+from viewmend.capture.peers import odd_camera
+from viewmend.capture.reduction import reduced
 from viewmend.geometry.alignment import LEAST_IOU, silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import FOREGROUND
+from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
 from viewmend.views import MultiViewFrame
 
@@ -24,8 +28,12 @@ EMPTIED_SHARE = 0.25
 """An empty mask is wrong where the other cameras' hull would cover this share of what their own masks cover."""
 EXPLAINS = 0.1
 """A change of the calibration explains what is wrong if hull and masks then agree better by this much (IoU)."""
-SWAPPED_CAMERAS = 16
+LONGEST_PX = 384
+"""Larger images are reduced first: what is looked for here is no matter of a pixel."""
+SWAPPED_CAMERAS = 24
 """In larger rigs pairs are not tried, since each costs a hull."""
+PAIRS_PX = 192
+PAIRS_HULL = HullConfig(resolution=48)
 LEAST_CAMERA_IOU = 0.5
 """A camera whose mask and hull agree less is wrong itself, however well the others agree."""
 SMALLEST_M, LARGEST_M = 0.05, 20.0
@@ -33,26 +41,13 @@ SMALLEST_M, LARGEST_M = 0.05, 20.0
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong, in words."""
-
-    text: str
-    """What was expected, what came, the next step."""
-    fatal: bool = False
-    """Nothing useful can be rendered from such a capture."""
-    camera: str | None = None
-    """The camera to leave out; the others are right."""
-    always: bool = False
-    """The camera's calibration is in doubt, so that no time is better than another."""
-
-
 def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Finding, ...]:
     """What is wrong with one frame of a capture; () for a good one and for one without masks.
 
-    A good frame costs one hull. Of a bad one the usual mistakes are undone, one at a time: what makes hull and masks
-    agree is what the finding names. `bounds` are the capture's.
+    A good frame costs a hull, and a small one for each camera. Of a bad one the usual mistakes are undone, one at a
+    time: what makes hull and masks agree is what the finding names. `bounds` are the capture's.
     """
+    frame = reduced(frame, LONGEST_PX)
     if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > FOREGROUND).any()):
         return ()
     found = faulty_masks(frame, frame.cameras.names, bounds)
@@ -66,8 +61,9 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Findi
         return (*found, _explained(left, bounds, iou))
     if not SMALLEST_M <= size_m <= LARGEST_M:
         text = f"expected a subject of about {SMALLEST_M} to {LARGEST_M:g} m, got {size_m:.3g} m; check metres_per_unit"
-        return (*found, Finding(text))
-    return found
+        found = (*found, Finding(text))
+    found = (*found, *odd_camera(left, bounds))
+    return (*found, *odd_colours(left.without([finding.camera for finding in found if finding.camera]), bounds))
 
 
 def faulty_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds | None) -> tuple[Finding, ...]:
@@ -126,14 +122,16 @@ def _emptied(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[Finding]:
             yield Finding(f"{text}, and is left out; segment it again", camera=name)
 
 
-def _agreement(frame: MultiViewFrame, cameras: Cameras, bounds: Bounds | None) -> tuple[float, float]:
+def _agreement(
+    frame: MultiViewFrame, cameras: Cameras, bounds: Bounds | None, config: HullConfig | None = None
+) -> tuple[float, float]:
     """IoU of hull and masks with these cameras, and the longest side of the hull in metres; zeros without one.
 
     It is the mean, or that of a camera below `LEAST_CAMERA_IOU` unless its mask is small.
     """
     assert frame.mask is not None
     try:
-        proxy = reconstruct(frame.mask, cameras, bounds)
+        proxy = reconstruct(frame.mask, cameras, bounds, config)
     except ValueError:
         return 0.0, 0.0
     if not len(proxy.mesh.vertices):
@@ -153,6 +151,11 @@ def _explained(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Find
         text = f"{what}; cameras.json wants R and t that map world to camera in OpenCV axes: convert them"
         cameras = replace(frame.cameras, camera_from_world=pose)
         tried.append((_agreement(frame, cameras, bounds)[0], Finding(text, fatal=True)))
+    for factor in (0.5, 2.0):
+        text = f"K is of images {factor:g} times as large; scale fx, fy, cx, cy and the skew by {1 / factor:g}"
+        K = frame.cameras.K.clone()
+        K[:, :2] /= factor
+        tried.append((_agreement(frame, replace(frame.cameras, K=K), bounds)[0], Finding(text, fatal=True)))
     if bounds is not None:
         free, size_m = _agreement(frame, frame.cameras, None)
         text = f"the bounds do not hold the subject of {size_m:.3g} m; check metres_per_unit, t's unit and the bounds"
@@ -174,7 +177,7 @@ def _explained(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Find
 
 def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float, Finding]]:
     """Every pair of cameras with the other's calibration: the IoU then, and what would be wrong."""
-    names = frame.cameras.names
+    names, frame = frame.cameras.names, reduced(frame, PAIRS_PX)
     for first, second in itertools.combinations(range(len(names)), 2):
         order = list(range(len(names)))
         order[first], order[second] = second, first
@@ -182,7 +185,7 @@ def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float
             continue
         cameras = replace(frame.cameras[order], names=names)
         text = f"cameras '{names[first]}' and '{names[second]}' are swapped; exchange their files or calibrations"
-        yield _agreement(frame, cameras, bounds)[0], Finding(text, fatal=True)
+        yield _agreement(frame, cameras, bounds, PAIRS_HULL)[0], Finding(text, fatal=True)
 
 
 def _poses(cameras: Cameras) -> Iterator[tuple[str, Float[Tensor, "view 4 4"]]]:

@@ -39,6 +39,21 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
+def exif_turn(path: Path) -> str | None:
+    """How the file's EXIF says that its image should be turned, in words; None where it should not, or is no image."""
+    import cv2
+
+    small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(path.read_bytes(), np.uint8)
+    stored, turned = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION), cv2.imdecode(data, small)
+    if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
+        return None
+    if stored.shape != turned.shape or not any(
+        (stored[::y, ::x] == turned).all() for y, x in ((-1, -1), (1, -1), (-1, 1))
+    ):
+        return "turned by 90 degrees"
+    return "turned by 180 degrees" if (stored[::-1, ::-1] == turned).all() else "mirrored"
+
+
 def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
     """An 8-bit image file with alpha, as its pixels are stored.
 

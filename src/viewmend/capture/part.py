@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.capture.prepare import resized_frame
+from viewmend.capture.reduction import resized_frame
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, concatenate_cameras

@@ -1,6 +1,7 @@
 """Plain capture folders: `cameras.json` and the files that it names, as a source of frames."""
 
 import functools
+import logging
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -130,6 +131,7 @@ class PlainCapture:
         frame_id = self.frame_ids[time]
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
             images = list(pool.map(lambda view: self._readers[view].read(frame_id, time), views))
+        self._say_turned()
         frame = stack_images(images, self._cameras[views], time)
         if frame.mask is not None and int(frame.mask.max()) <= FOREGROUND:
             raise CaptureError(self._no_foreground(self._plain[views[0]], frame_id, int(frame.mask.max())))
@@ -145,6 +147,18 @@ class PlainCapture:
         """
         self.cameras.select([camera])
         return self._readers[self.cameras.names.index(camera)].straightened(rgb)
+
+    def _say_turned(self) -> None:
+        turned = [reader for reader in self._readers if reader.turn and not reader.turn_is_said]
+        if turned:
+            names = ", ".join(f"'{reader.camera.name}'" for reader in turned)
+            logging.getLogger("viewmend").warning(
+                f"{self.name}: EXIF says that images are to be {turned[0].turn}, but pixels are taken as they are "
+                f"stored: cameras {names}; where calibration and masks are of upright images, write these upright, too "
+                "(exiftran -ai)"
+            )
+        for reader in turned:
+            reader.turn_is_said = True
 
     def _no_foreground(self, camera: PlainCamera, frame: str, highest: int) -> str:
         return (

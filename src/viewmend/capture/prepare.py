@@ -10,18 +10,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
-from torch.nn import functional as F
 
-from viewmend.capture.diagnosis import Finding, diagnose, faulty_masks
+from viewmend.capture.diagnosis import diagnose, faulty_masks
 from viewmend.capture.errors import CaptureError
+from viewmend.capture.finding import Finding
+from viewmend.capture.peers import REACH, late_camera
 from viewmend.capture.plain import PlainCapture, open_capture
+from viewmend.capture.reduction import reduced, reduced_cameras
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.alignment import Alignment, shared_offset
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras, concatenate_cameras
+from viewmend.geometry.cameras import Cameras
 from viewmend.views import MultiViewFrame
 
 
@@ -44,7 +45,7 @@ class PreparedCapture:
     def cameras(self) -> Cameras:
         """All cameras, those that are no inputs too, moved by the shift and resized with their images."""
         x_px, y_px = self.alignment.offset_px if self.alignment else (0.0, 0.0)
-        return _reduced_cameras(self.source.cameras.moved(x_px, y_px), self.longest_px)
+        return reduced_cameras(self.source.cameras.moved(x_px, y_px), self.longest_px)
 
     @property
     def name(self) -> str:
@@ -108,7 +109,8 @@ def prepare(
             and no pixel of it changes anything.
         longest_px: images are reduced to at most this length of their longer side.
         align: look for a shift that all images share, in the masks of the first frame from `first` on that two inputs
-            with any foreground are in. The shift is found at full size.
+            with any foreground are in, and for a camera that is late, in the frames around it. The shift is found at
+            full size.
         first: index of the first frame that will be used.
 
     Raises:
@@ -132,6 +134,8 @@ def prepare(
     left_out = tuple(finding.camera for finding in found if finding.camera and finding.always)
     frame = frame.without([finding.camera for finding in found if finding.camera])
     alignment = None
+    if align:
+        _refuse_or_warn(source.name, late_camera(*_around(source, frame), source.bounds), said)
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
     return PreparedCapture(source, alignment, longest_px, named, left_out, said)
@@ -168,49 +172,12 @@ def open_masked(
     return capture
 
 
-def reduced(frame: MultiViewFrame, longest_px: int | None) -> MultiViewFrame:
-    """The frame with every image reduced, never enlarged, to at most this length of its longer side.
-
-    Images and masks are filtered (bilinear, antialiased). A frame that is small enough comes back itself; another one
-    loses its depth, which has no mean.
-    """
-    return resized_frame(frame, _reduced_cameras(frame.cameras, longest_px))
-
-
-def resized_frame(frame: MultiViewFrame, cameras: Cameras) -> MultiViewFrame:
-    """The frame with images of the sizes of `cameras`, which are its own cameras resized; without depth.
-
-    Where `cameras` are the very ones of the frame, it comes back itself.
-    """
-    if cameras is frame.cameras:
-        return frame
-    layers = frame.rgb if frame.mask is None else torch.cat([frame.rgb, frame.mask[:, None]], 1)
-    width, height = cameras.max_size_px
-    small = layers.new_zeros(*layers.shape[:2], height, width)
-    sizes = zip(cameras.size_px.tolist(), frame.cameras.size_px.tolist(), strict=True)
-    for view, ((w, h), (full_w, full_h)) in enumerate(sizes):
-        small[view, :, :h, :w] = _resized(layers[view, :, :full_h, :full_w], h, w)
-    mask = None if frame.mask is None else small[:, 3]
-    return MultiViewFrame(cameras, small[:, :3], mask, frame.time)
-
-
-def _resized(
-    image: UInt8[Tensor, "channel full_height full_width"], height: int, width: int
-) -> UInt8[Tensor, "channel height width"]:
-    small = F.interpolate(image[None].float(), (height, width), mode="bilinear", antialias=True, align_corners=False)
-    return small[0].round().clamp(0, 255).to(torch.uint8)
-
-
-def _reduced_cameras(cameras: Cameras, longest_px: int | None) -> Cameras:
-    """The cameras of reduced images; themselves where all images are small enough."""
-    if longest_px is None or int(cameras.size_px.max()) <= longest_px:
-        return cameras
-    scales = [min(1.0, longest_px / max(size)) for size in cameras.size_px.tolist()]
-    sizes = [
-        [max(1, round(side * scale)) for side in size]
-        for size, scale in zip(cameras.size_px.tolist(), scales, strict=True)
-    ]
-    return concatenate_cameras([cameras[view].resized(*size) for view, size in enumerate(sizes)])
+def _around(source: CaptureSource, frame: MultiViewFrame) -> tuple[list[MultiViewFrame], int]:
+    """The frames of the same cameras before and after this one, with it, and where it is among them."""
+    times = range(max(0, frame.time - REACH), min(len(source.frame_ids), frame.time + REACH + 1))
+    others = {time: source.read(time) for time in times if time != frame.time} | {frame.time: frame}
+    there = [name for name in frame.cameras.names if all(name in other.cameras.names for other in others.values())]
+    return [others[time].select(there) for time in times], frame.time - times[0]
 
 
 def _first_masked(source: CaptureSource, inputs: Sequence[str] | None, first: int) -> MultiViewFrame | None:

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
 
-from viewmend.capture.prepare import PreparedCapture, prepare, reduced
+from viewmend.capture.prepare import PreparedCapture, prepare
+from viewmend.capture.reduction import reduced
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.cameras import Cameras
 from viewmend.leave_one_out.scenes import LeaveOneOut

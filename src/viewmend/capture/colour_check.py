@@ -1,0 +1,59 @@
+"""Whether the cameras' images show the same surface: one that shows another picture, or another sharpness, is named."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.capture.finding import Finding
+from viewmend.capture.reduction import reduced
+from viewmend.capture.surface_colours import nearest_agreement, surface_colours
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.hull import FOREGROUND, HullConfig
+from viewmend.geometry.proxy import reconstruct
+from viewmend.views import MultiViewFrame
+
+LONGEST_PX = 256
+HULL = HullConfig(resolution=64)
+FAR = 2.2
+"""A camera shows something else if its colours are so many times as far from all others' as is usual."""
+FARTHER, LESS_ALIKE = 1.55, 0.65
+"""Or if they are so many times as far, and their correlation with any other's is lower than usual by this factor."""
+BLURRED, NOISY = 0.45, 2.0
+"""Differences of neighbouring pixels, beside the usual ones, below which an image is blurred, above which noisy."""
+
+
+def odd_colours(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, ...]:
+    """The cameras whose images do not fit the others', as findings; () where they all do, or nobody can tell."""
+    small = reduced(frame, LONGEST_PX)
+    if small.mask is None or len(small.cameras) < 3:
+        return ()
+    try:
+        colours = surface_colours(small, reconstruct(small.mask, small.cameras, bounds, HULL))
+    except ValueError:
+        return ()
+    found = []
+    distance, correlation = nearest_agreement(colours, colours)
+    typical, alike = distance.nanmedian(), correlation.nanmedian()
+    detail = _detail(small)
+    usual = detail.nanmedian()
+    for view, name in enumerate(small.cameras.names):
+        if bool(distance[view] > FAR * typical) or (
+            bool(distance[view] > FARTHER * typical) and bool(correlation[view] < LESS_ALIKE * alike)
+        ):
+            text = (
+                f"camera '{name}': its images do not show what the others see (colours are off by "
+                f"{100 * distance[view]:.0f} %, usually by {100 * typical:.0f} %); check whether they are "
+                "another camera's or another time's, turned, mirrored, BGR or of another exposure"
+            )
+            found.append(Finding(text))
+        elif bool(detail[view] < BLURRED * usual) or bool(detail[view] > NOISY * usual):
+            what = "blurred" if bool(detail[view] < usual) else "noisy"
+            found.append(Finding(f"camera '{name}': its images are {what} beside the others'; check focus and gain"))
+    return tuple(found)
+
+
+def _detail(frame: MultiViewFrame) -> Float[Tensor, "view"]:
+    """Mean difference of neighbouring pixels of the subject, in each camera; NaN without foreground."""
+    assert frame.mask is not None
+    grey, inside = frame.rgb.float().mean(1), frame.mask > FOREGROUND
+    both = inside[:, :, 1:] & inside[:, :, :-1]
+    return ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))
