@@ -309,7 +309,7 @@ class Outcome:
     what: str
     camera: str
     kind: str
-    """'refused', 'named', 'harmless' or 'silent'."""
+    """'refused', 'named', 'misnamed' (a warning, but of another camera), 'harmless' or 'silent'."""
     said: str
     loss_db: float | None
 
@@ -337,7 +337,10 @@ class Judge:
         if held not in self._scores:
             self._scores[held] = self._score(self.good, held, [])
         loss = self._scores[held] - score
-        kind = "named" if said else "harmless" if loss < LEAST_LOSS_DB else "silent"
+        kind = "harmless" if loss < LEAST_LOSS_DB else "silent"
+        if said:
+            whole = any(word in what for word in ("all", "two cameras", "metres_per_unit", "convention"))
+            kind = "named" if whole or camera in " ".join(said) else "misnamed"
         return Outcome(seed, what, camera, kind, "; ".join(said), loss)
 
     def _neighbour(self, camera: str) -> str:

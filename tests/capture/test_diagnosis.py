@@ -171,3 +171,127 @@ def test_a_subject_of_another_unit_is_named(folder, caplog):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"metres_per_unit": 0.01}))
     prepare(open_capture(folder), align=False)
     assert "check metres_per_unit" in caplog.text
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    path = tmp_path_factory.mktemp("moving") / "studio"
+    write_capture(Studio(StudioConfig(seed=2, cameras=8, frames=7, fps=10, size_px=128)), path, images="png")
+    return path
+
+
+def said_of(path, change=lambda folder: None, folder=None):
+    import shutil
+
+    folder = shutil.copytree(path, folder)
+    change(folder)
+    records = []
+    handler = logging.Handler()
+    handler.emit = lambda record: records.append(record.getMessage())
+    logging.getLogger("viewmend").addHandler(handler)
+    try:
+        prepare(open_capture(folder), first=3)
+    finally:
+        logging.getLogger("viewmend").removeHandler(handler)
+    return records
+
+
+def shifted_in_time(*streams):
+    def change(folder):
+        for stream in streams:
+            files = sorted((folder / stream / names_of(folder)[3]).glob("*.png"))
+            data = [file.read_bytes() for file in files]
+            for time, file in enumerate(files):
+                file.write_bytes(data[max(0, time - 2)])
+
+    return change
+
+
+def spoilt_images(spoil):
+    def change(folder):
+        for file in folder.glob(f"image/{names_of(folder)[3]}/*.png"):
+            cv2.imwrite(str(file), spoil(cv2.imread(str(file))))
+
+    return change
+
+
+def half_a_mask(folder):
+    def upper(mask):
+        rows = np.flatnonzero(mask.any(1))
+        mask[: (rows[0] + rows[-1]) // 2] = 0
+        return mask
+
+    change_masks(folder, upper, names_of(folder)[3])
+
+
+def exchanged_images(folder):
+    first, second = (folder / "image" / names_of(folder)[view] for view in (3, 5))
+    first.rename(folder / "aside")
+    second.rename(first)
+    (folder / "aside").rename(second)
+
+
+ODD = {
+    "late": (shifted_in_time("image", "mask"), "late by about 2 frames"),
+    "images late": (shifted_in_time("image"), "the images of camera '{}'"),
+    "half a mask": (half_a_mask, "'{}'"),
+    "a wide mask": (lambda f: change_masks(f, lambda m: cv2.dilate(m, np.ones((13, 13))), names_of(f)[3]), "'{}'"),
+    "negative": (spoilt_images(lambda image: 255 - image), "do not show what the others see"),
+    "upside down": (spoilt_images(lambda image: image[::-1]), "do not show what the others see"),
+    "blurred": (spoilt_images(lambda image: cv2.GaussianBlur(image, (0, 0), 4)), "'{}'"),
+    "exchanged images": (exchanged_images, "do not show what the others see"),
+}
+
+
+def test_nothing_is_said_of_a_good_capture_in_motion(moving, tmp_path):
+    assert said_of(moving, folder=tmp_path / "good") == []
+
+
+@pytest.mark.parametrize("what", ODD)
+def test_one_camera_unlike_its_peers_is_named(moving, tmp_path, what):
+    change, words = ODD[what]
+    said = said_of(moving, change, tmp_path / "odd")
+    name = names_of(moving)[3]
+    assert any(words.format(name) in text and f"'{name}'" in text for text in said), said
+
+
+def test_intrinsics_of_images_of_another_size_are_named_and_refused(folder):
+    file = folder / "cameras.json"
+    description = json.loads(file.read_text())
+    for camera in description["cameras"]:
+        camera["K"] = [[2 * x for x in row] for row in camera["K"][:2]] + [[0, 0, 1]]
+    file.write_text(json.dumps(description))
+    with pytest.raises(ValueError, match="K is of images 2 times as large"):
+        prepare(open_capture(folder))
+
+
+@pytest.mark.parametrize("code, words", [(3, "turned by 180 degrees"), (2, "mirrored")])
+def test_a_turn_in_exif_is_said_once(folder, caplog, code, words):
+    as_jpeg(folder, code)
+    capture = open_capture(folder)
+    capture.read(0)
+    capture.read(1)
+    said = [text for text in caplog.messages if "EXIF" in text]
+    assert len(said) == 1 and words in said[0] and f"'{names_of(folder)[3]}'" in said[0] and "exiftran" in said[0]
+
+
+def test_a_turn_by_90_degrees_is_named_where_the_size_is_wrong(folder):
+    as_jpeg(folder, 6, crop=64)
+    with pytest.raises(
+        ValueError, match="expected 96 x 96 .* got 96 x 64; its EXIF says that it is to be turned by 90"
+    ):
+        open_capture(folder).read(0)
+
+
+def as_jpeg(folder, code, crop=96):
+    """The images of one camera as JPEGs whose EXIF has this orientation."""
+    file = folder / "cameras.json"
+    description = json.loads(file.read_text())
+    camera = description["cameras"][3]
+    for path in folder.glob(f"image/{camera['name']}/*.png"):
+        done, data = cv2.imencode(".jpg", cv2.imread(str(path))[:crop])
+        tiff = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([code]) + b"\0\0\0\0\0\0"
+        head = b"\xff\xd8\xff\xe1" + (len(tiff) + 2).to_bytes(2, "big") + tiff
+        path.with_suffix(".jpg").write_bytes(head + data.tobytes()[2:])
+    camera["image"] = camera["image"].replace(".png", ".jpg")
+    file.write_text(json.dumps(description))

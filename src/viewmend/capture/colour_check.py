@@ -13,9 +13,9 @@ from viewmend.views import MultiViewFrame
 
 LONGEST_PX = 256
 HULL = HullConfig(resolution=64)
-FAR = 2.2
+FAR = 2.5
 """A camera shows something else if its colours are so many times as far from all others' as is usual."""
-FARTHER, LESS_ALIKE = 1.55, 0.65
+FARTHER, LESS_ALIKE = 1.55, 0.72
 """Or if they are so many times as far, and their correlation with any other's is lower than usual by this factor."""
 BLURRED, NOISY = 0.45, 2.0
 """Differences of neighbouring pixels, beside the usual ones, below which an image is blurred, above which noisy."""

@@ -35,7 +35,7 @@ CANDIDATES = 3
 """So many cameras are tried: the one across the rig looks late, too."""
 WORTH_SHIFTING = 0.002
 """The camera is late if the masks with its own of another time are explained by that much more."""
-IMAGES_NEARER = 0.8
+IMAGES_NEARER = 0.75
 """Images are late if those of another time are nearer to the others' colours by this factor."""
 
 
@@ -180,7 +180,8 @@ def late_images(frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | 
     distances = torch.stack([nearest_agreement(colours, now)[0] for colours in then]).nan_to_num(torch.inf)
     ratio = distances.amin(0) / distances[middle]
     view = int(ratio.nan_to_num(1.0).argmin())
-    if float(ratio[view]) > IMAGES_NEARER:
+    usual = distances[middle][distances[middle].isfinite()]
+    if float(ratio[view]) > IMAGES_NEARER or float(distances[middle, view]) < float(usual.median()):
         return ()
     name = frame.cameras.names[view]
     return (_late(f"the images of camera '{name}'", int(distances[:, view].argmin()) - middle, "images", "images"),)

@@ -19,7 +19,7 @@ LEAST_MASK = 0.99
 """A point nearer to a camera's outline than this mask value is not looked at."""
 BIAS = 0.01
 """A point is hidden if it lies this much behind the proxy's depth, as a share of the subject's size."""
-LEAST_SHARED = 50
+LEAST_SHARED = 80
 """Points that two cameras must both see to be compared."""
 
 
