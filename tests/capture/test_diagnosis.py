@@ -278,7 +278,7 @@ def test_a_turn_in_exif_is_said_once(folder, caplog, code, words):
 def test_a_turn_by_90_degrees_is_named_where_the_size_is_wrong(folder):
     as_jpeg(folder, 6, crop=64)
     with pytest.raises(
-        ValueError, match="expected 96 x 96 .* got 96 x 64; its EXIF says that it is to be turned by 90"
+        ValueError, match=r"expected 96 x 96 .* got 96 x 64; its EXIF says that it is to be turned by 90"
     ):
         open_capture(folder).read(0)
 
@@ -289,7 +289,7 @@ def as_jpeg(folder, code, crop=96):
     description = json.loads(file.read_text())
     camera = description["cameras"][3]
     for path in folder.glob(f"image/{camera['name']}/*.png"):
-        done, data = cv2.imencode(".jpg", cv2.imread(str(path))[:crop])
+        _, data = cv2.imencode(".jpg", cv2.imread(str(path))[:crop])
         tiff = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([code]) + b"\0\0\0\0\0\0"
         head = b"\xff\xd8\xff\xe1" + (len(tiff) + 2).to_bytes(2, "big") + tiff
         path.with_suffix(".jpg").write_bytes(head + data.tobytes()[2:])
