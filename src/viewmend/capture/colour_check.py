@@ -16,7 +16,7 @@ HULL = HullConfig(resolution=64)
 FAR = 2.5
 """A camera shows something else if its colours are so many times as far from all others' as is usual."""
 FARTHER, LESS_ALIKE = 1.55, 0.72
-"""Or if they are so many times as far, and their correlation with any other's is lower than usual by this factor."""
+"""So many times as far is enough where the correlation with any other is lower than usual by this factor."""
 BLURRED, NOISY = 0.45, 2.0
 """Differences of neighbouring pixels, beside the usual ones, below which an image is blurred, above which noisy."""
 

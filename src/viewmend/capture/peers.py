@@ -26,7 +26,7 @@ TAKES, TAKING_LEFT_OUT = 0.004, 0.06
 """A camera is odd if it alone takes away such a share of the others' masks, beyond one and a half times what is usual;
 and left out from the larger share on: a smaller error costs less than a camera."""
 TOO_LARGE, LARGE_LEFT_OUT = 0.15, 0.3
-"""Or if such a share of its own mask lies outside the others' hull, beyond three times what is usual."""
+"""With such a share of its mask outside the others' hull, beyond three times what is usual, it is odd, too."""
 REACH = 3
 """Cameras may be late or early by so many frames at most."""
 LATE = 0.008
@@ -44,7 +44,7 @@ class Peers:
     """What the others say of each camera. The true subject lies within every hull, so good masks do, too."""
 
     silhouettes: Bool[Tensor, "view height width"]
-    """Of the hull of all others."""
+    """What the hull of all others covers in it."""
     takes: Float[Tensor, "view"]
     """The share of the others' masks that this camera alone takes away from the hull."""
     sticks_out: Float[Tensor, "view"]
