@@ -105,8 +105,8 @@ def observe(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig) ->
     """
     if frame.mask is None:
         raise ValueError(
-            "expected a capture with masks, got one without: the visual hull is carved from them; segment the "
-            "foreground and name the files as each camera's 'mask'"
+            "expected a capture with masks, got one without: the visual hull is carved from them; make "
+            "them with viewmend masks CAPTURE OUT --method ..., or name their files as each camera's 'mask'"
         )
     device = frame.rgb.device
     start = now_s(device)

@@ -1,11 +1,21 @@
-"""Masks of images that have none: by a plate, by a model of the background."""
+"""Masks of images that have none: each method, and what cleans them."""
+
+import math
 
 import numpy as np
 import pytest
+import torch
 
+from viewmend.capture.masks.across import agreed
+from viewmend.capture.masks.chroma import ChromaMasks, without_spill
+from viewmend.capture.masks.colours import by_colours
 from viewmend.capture.masks.maker import MaskMaker
 from viewmend.capture.masks.model import ModelMasks
+from viewmend.capture.masks.over_time import lasting
 from viewmend.capture.masks.plate import PlateMasks, median_plate
+from viewmend.capture.masks.stitched import stitched_plate
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers
+from viewmend.geometry.rigid import look_at
 
 HEIGHT, WIDTH = 120, 160
 
@@ -91,6 +101,109 @@ def test_a_running_model_forgets_who_stays():
     for seed in range(20):
         maker.mask(image(plate(), shape() & False, seed=seed))
     first = maker.mask(image(plate(), shape(), seed=50))
-    for seed in range(200):
+    for seed in range(100):
         last = maker.mask(image(plate(), shape(), seed=seed))
     assert iou(first, shape()) > 0.9 and not last.any()
+
+
+def test_a_screen_is_told_by_its_colour_in_light_and_shadow():
+    screen = np.full((HEIGHT, WIDTH, 3), (30, 150, 60), float)
+    screen *= np.linspace(0.5, 1.2, WIDTH)[None, :, None]
+    mask = ChromaMasks("green").mask(image(screen.astype(np.uint8), shape()))
+    assert iou(mask, shape()) > 0.95
+    blue = screen[..., [0, 2, 1]].astype(np.uint8)
+    assert iou(ChromaMasks("blue").mask(image(blue, shape())), shape()) > 0.95
+
+
+def test_dark_walls_are_background_where_that_is_said():
+    stage = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    stage[70:] = (30, 150, 60)
+    rgb = image(stage, shape())
+    assert iou(ChromaMasks("green", dark=True).mask(rgb), shape()) > 0.95
+    assert iou(ChromaMasks("green").mask(rgb), shape()) < 0.3
+
+
+def test_spill_goes_from_the_edge_and_stays_within():
+    rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8) + np.uint8([20, 200, 40])
+    rgb[30:100, 60:120] = (150, 170, 140)  # a grey coat that the screen tints
+    rgb[60:70, 85:95] = (20, 180, 30)  # and a green badge
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[30:100, 60:120] = 255
+    screen = np.zeros_like(rgb) + np.uint8([20, 200, 40])
+    clean = without_spill(rgb, mask, screen)
+    assert clean[50, 60].tolist() == [150, 150, 140] and clean[65, 90].tolist() == [20, 180, 30]
+    grey = without_spill(rgb, mask, np.full_like(rgb, 120))
+    assert np.array_equal(grey, rgb)  # a grey wall throws no green
+
+
+def test_what_is_there_at_one_time_only_goes():
+    mask = shape().astype(np.uint8) * 255
+    flash = mask.copy()
+    flash[5:15, 130:150] = 255
+    moved = np.roll(mask, 3, axis=1)
+    assert np.array_equal(lasting(flash, mask, moved), mask)
+    assert np.array_equal(lasting(flash, flash, mask), flash)
+    assert np.array_equal(lasting(flash, None, None), flash)  # a static capture has one time
+
+
+def rig_masks() -> tuple[torch.Tensor, Cameras]:
+    """Eight cameras round a ball, a metre wide."""
+    poses = []
+    for view in range(8):
+        angle = torch.tensor(view * math.pi / 4)
+        eye = torch.stack([3 * angle.cos(), torch.tensor(0.4), 3 * angle.sin()])
+        pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+        poses.append(pinhole(0.7, 120, 120, pose, f"cam{view}"))
+    cameras = concatenate_cameras(poses)
+    uv = pixel_centers(120, 120)
+    ball = ((uv - 60).norm(dim=-1) < 27).to(torch.uint8) * 255
+    return ball.repeat(8, 1, 1), cameras
+
+
+def test_cameras_drop_what_no_other_supports_and_fill_what_all_do():
+    truth, cameras = rig_masks()
+    spoilt = truth.clone()
+    spoilt[0, 5:20, 5:20] = 255  # something behind that is no subject
+    spoilt[3, 58:62, 58:63] = 0  # a hole of the background's colour
+    cleaned = agreed(spoilt, cameras, None)
+    assert not cleaned[0, 5:20, 5:20].any() and bool((cleaned[3, 58:62, 58:63] == 255).all())
+    assert bool(((cleaned > 127) != (truth > 127)).float().mean() < 0.002)
+    assert torch.equal(agreed(spoilt[:2], cameras[:2], None), spoilt[:2])
+
+
+def test_one_empty_mask_among_eight_spoils_no_other():
+    truth, cameras = rig_masks()
+    spoilt = truth.clone()
+    spoilt[5] = 0
+    cleaned = agreed(spoilt, cameras, None)
+    others = [view for view in range(8) if view != 5]
+    agreement = ((cleaned > 127) & (truth > 127))[others].sum() / (truth > 127)[others].sum()
+    assert float(agreement) > 0.99
+
+
+def staying(count: int = 24) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Somebody who stays in one place at three of four times, and steps aside at the others."""
+    insides = [shape(68 + {5: 40, 6: -40}.get(n % 8, n % 3 - 1)) for n in range(count)]
+    return [image(plate(), inside, seed=n) for n, inside in enumerate(insides)], insides
+
+
+def test_a_plate_is_stitched_of_times_at_which_nobody_is_there():
+    images, insides = staying()
+    often = np.mean(insides, 0) > 0.7
+    off = np.abs(stitched_plate(images).astype(int) - plate()).mean(-1)
+    medians = np.abs(median_plate(images).astype(int) - plate()).mean(-1)
+    assert off[often].mean() < 4 and medians[often].mean() > 40
+    with pytest.raises(ValueError, match="at least one image"):
+        stitched_plate([])
+
+
+def test_colours_decide_within_what_others_support():
+    rgb, inside = image(plate(), shape()), shape()
+    unsure = np.zeros_like(inside)
+    unsure[50:80, 60:104] = True  # the background is not known around the subject's middle
+    mask = (inside & ~unsure).astype(np.uint8) * 255
+    seen = np.zeros_like(inside)
+    seen[20:110, 55:110] = True
+    found = by_colours(rgb, mask, unsure, seen)
+    assert iou(found, inside) > 0.93
+    assert not by_colours(rgb, mask, unsure, np.zeros_like(seen)).any()

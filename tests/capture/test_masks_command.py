@@ -1,15 +1,18 @@
 """`viewmend masks` upon a capture folder without masks."""
 
+import math
 import shutil
 
 import cv2
 import numpy as np
 import pytest
-from jaxtyping import UInt8
+import torch
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.capture.plain import open_capture
 from viewmend.cli import main
+from viewmend.geometry.cameras import Cameras, pixel_centers, unproject
 
 SIZE = (160, 128)
 """Four times that of the folder `plain`."""
@@ -91,3 +94,95 @@ def test_a_model_learns_from_the_capture(unmasked, tmp_path):
     options = ["--method", "model", "--model", "median", "--frames", "1:2"]
     assert main(["masks", str(unmasked.path), str(out), *options]) == 0
     assert agreement(unmasked, open_capture(out).read(0).mask, "001") > 0.95
+
+
+def ball_at(camera: Cameras, centre: Float[Tensor, "3"], radius_m: float) -> np.ndarray:
+    """Pixels whose ray passes so near to the centre."""
+    uv = pixel_centers(*camera.max_size_px).reshape(1, -1, 2)
+    far = unproject(uv, torch.full(uv.shape[:2], 5.0), camera)[0]
+    ray = torch.nn.functional.normalize(far - camera.centers, dim=-1)
+    to = centre - camera.centers
+    across = to - (to * ray).sum(-1, keepdim=True) * ray
+    return (across.norm(dim=-1).view(*camera.max_size_px[::-1]) < radius_m).numpy()
+
+
+def test_a_capture_that_nobody_leaves_teaches_its_background(unmasked, tmp_path):
+    """A ball that sways by less than its width: each pixel of the middle shows it more often than not."""
+    times = [f"{n:03d}" for n in range(9)]
+    cameras = open_capture(unmasked.path).cameras
+    unmasked.edit(lambda d: d.update(frames=times))
+    rng = np.random.default_rng(5)
+    for view, name in enumerate("abcd"):
+        stage = unmasked.get(f"plates/{name}.png")
+        for n, frame in enumerate(times):
+            centre = 0.22 * torch.tensor([math.sin(n), 0.3 * math.cos(n), math.cos(1.7 * n)])
+            inside = ball_at(cameras[view], centre, 0.3)
+            image = np.where(inside[..., None], np.uint8([30, 30, 190]), stage) + rng.normal(0, 2, stage.shape)
+            unmasked.put(f"images/{name}_{frame}.png", image.clip(0, 255).astype(np.uint8))
+            unmasked.put(f"truth/{name}_{frame}.png", inside.astype(np.uint8) * 255)
+    out = tmp_path / "masked"
+    assert main(["masks", str(unmasked.path), str(out), "--method", "model", "--frames", "4:6"]) == 0
+    masked = open_capture(out)
+    assert agreement(unmasked, masked.read(0).mask, "004") > 0.9
+    assert agreement(unmasked, masked.read(1).mask, "005") > 0.9
+
+
+def test_too_few_times_teach_nothing(unmasked, tmp_path, capsys):
+    assert main(["masks", str(unmasked.path), str(tmp_path / "out"), "--method", "model"]) == 2
+    assert "8 times or more with all cameras there, got 2; give clean plates" in capsys.readouterr().err
+
+
+def test_the_images_own_alpha_is_a_mask(unmasked, tmp_path, capsys):
+    command = ["masks", str(unmasked.path), str(tmp_path / "out"), "--method", "alpha"]
+    assert main(command) == 2
+    assert "a_000.png: camera 'a': expected RGB and alpha of 8 bit" in capsys.readouterr().err
+    for name in "abcd":
+        for frame in ("000", "001"):
+            file = f"images/{name}_{frame}.png"
+            unmasked.put(file, np.dstack([unmasked.get(file), unmasked.get(f"truth/{name}_{frame}.png")]))
+    assert main(command) == 0
+    assert agreement(unmasked, open_capture(tmp_path / "out").read(0).mask, "000") == 1
+
+
+def test_a_screen_is_keyed(unmasked, tmp_path):
+    for name in "abcd":
+        for frame in ("000", "001"):
+            mask = unmasked.get(f"truth/{name}_{frame}.png")[..., None] > 127
+            unmasked.put(f"images/{name}_{frame}.png", np.where(mask, np.uint8([90, 90, 90]), np.uint8([60, 160, 30])))
+    out = tmp_path / "out"
+    assert main(["masks", str(unmasked.path), str(out), "--method", "chroma", "--images", "png"]) == 0
+    frame = open_capture(out).read(0)
+    assert agreement(unmasked, frame.mask, "000") > 0.95
+    inside = frame.mask > 127
+    red, green, blue = (frame.rgb[:, c][inside].int() for c in range(3))
+    assert int((green - torch.maximum(red, blue)).max()) <= 0  # no pixel of the subject is green
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--method", "plate", "--plate", "x", "--plate-frames", "0:1"], "--plate or --plate-frames"),
+        (["--method", "chroma", "--plate", "x"], "expected plates with --method plate or onnx"),
+        (["--method", "onnx"], "expected --network with --method onnx"),
+        (["--method", "model", "--network", "x.onnx"], "expected --network with --method onnx"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(unmasked, tmp_path, capsys, options, told):
+    assert main(["masks", str(unmasked.path), str(tmp_path / "out"), *options]) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_whoever_needs_masks_hears_of_the_command(unmasked, tmp_path, capsys):
+    assert main(["mend", str(unmasked.path), "--path", "orbit", "--out", str(tmp_path / "out")]) == 2
+    assert f"viewmend masks {unmasked.path} OUT --method" in capsys.readouterr().err
+    assert main(["info", str(unmasked.path)]) == 0
+    assert "none (viewmend masks makes them)" in capsys.readouterr().out
+
+
+def test_nobodys_folder_is_written_over(unmasked, tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("mine")
+    plates = str(unmasked.path / "plates")
+    assert main(["masks", str(unmasked.path), str(tmp_path / "out"), "--method", "plate", "--plate", plates]) == 2
+    assert "got one in use" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.txt"]

@@ -5,6 +5,7 @@ import logging
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from viewmend.capture.camera_reader import CameraReader, stack_images
 from viewmend.capture.containers import names_in
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.formats.recognition import read_any_calibration
+from viewmend.capture.images import read_rgba
 from viewmend.capture.plain_format import CALIBRATION, PlainCamera, stays_inside
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -24,10 +26,13 @@ from viewmend.geometry.rigid import rigid
 from viewmend.views import MultiViewFrame
 
 
-def open_capture(path: Path | str, cameras: Sequence[str] | None = None, kind: str | None = None) -> "PlainCapture":
+def open_capture(
+    path: Path | str, cameras: Sequence[str] | None = None, kind: str | None = None, *, alpha: bool = False
+) -> "PlainCapture":
     """Open a capture: a folder of any format that is read (docs/formats.md), or a plain one's `cameras.json`.
 
-    `cameras` are the names to use (default: all). `kind` names the format where the folder could be of several.
+    `cameras` are the names to use (default: all). `kind` names the format where the folder could be of several. With
+    `alpha` the masks are the images' own alpha.
 
     Raises:
         CaptureError: the calibration is wrong, files are missing, or a name is unknown (see `PlainCapture`).
@@ -47,26 +52,32 @@ def open_capture(path: Path | str, cameras: Sequence[str] | None = None, kind: s
         torch.Size([4, 3, 64, 64])
     """
     path = Path(path)
-    return PlainCapture(path.parent if path.name == CALIBRATION and path.is_file() else path, cameras, kind)
+    folder = path.parent if path.name == CALIBRATION and path.is_file() else path
+    return PlainCapture(folder, cameras, kind, alpha)
 
 
 class PlainCapture:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
     A camera whose image or mask is missing at a time is absent from that frame (a gap). Images and masks are
-    undistorted, K kept, and padded right and below to the largest of the frame.
+    undistorted, K kept, and padded right and below to the largest of the frame. With `alpha` the masks are the images'
+    own alpha.
 
     Raises:
         CaptureError: `cameras.json` is wrong; a camera never has its files; a frame has no camera; masks or depths are
             there for some of the cameras only; a file lies outside the folder; `cameras` names one that is not there.
     """
 
-    def __init__(self, path: Path, cameras: Sequence[str] | None = None, kind: str | None = None):
+    def __init__(
+        self, path: Path, cameras: Sequence[str] | None = None, kind: str | None = None, alpha: bool = False
+    ):
         calibration = read_any_calibration(path, kind)
         self.folder = folder = calibration.folder
         self._name = path.stem if path.is_file() else folder.resolve().name
         self._file = calibration.file
         self._plain = _select(calibration.cameras, cameras, self._file)
+        if alpha:
+            self._plain = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._plain)
         self._calibration = calibration
         self.has_masks = self._all_or_none("mask")
         self.has_depth = self._all_or_none("depth")
@@ -210,6 +221,19 @@ def _select(cameras: tuple[PlainCamera, ...], names: Sequence[str] | None, file:
     if unknown or not names or len(set(names)) < len(names):
         raise CaptureError(f"{file}: expected different cameras among {list(by_name)}, got {list(names)}; choose again")
     return tuple(by_name[name] for name in names)
+
+
+def _with_alpha(camera: PlainCamera, folder: Path, frames: Sequence[str]) -> PlainCamera:
+    """The camera with its images as masks; CaptureError where the first that is there has no alpha."""
+    if camera.image is None:
+        raise CaptureError(
+            f"{folder}: camera '{camera.name}': expected images with alpha, got a video; use another --method"
+        )
+    for file in (folder / camera.file("image", frame) for frame in frames):
+        if file.is_file():
+            read_rgba(file, f"{file}: camera '{camera.name}'")
+            break
+    return replace(camera, mask=camera.image)
 
 
 def _never(file: Path, folder: Path, camera: PlainCamera, frames: Sequence[str], has: Callable[[str], bool]) -> str:

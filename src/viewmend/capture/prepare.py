@@ -164,7 +164,7 @@ def open_masked(
     if not capture.has_masks:
         raise CaptureError(
             f"{path}: expected a 'mask' for every camera, got none: the visual hull is carved from them, and the truth "
-            "cut out; segment the foreground and name the files in cameras.json"
+            f"cut out; make them with viewmend masks {path} OUT --method ..., or name their files in cameras.json"
         )
     count = len(capture.cameras) - held
     if count < 2:

@@ -80,7 +80,7 @@ class Publisher:
             ValueError: the frame has no masks.
         """
         if frame.mask is None:
-            raise ValueError("expected a frame with masks, got one without; segment the images first")
+            raise ValueError("expected a frame with masks, got one without; make them (viewmend masks)")
         images: list[dict[str, Any]] = []
         parts: list[bytes] = []
         for view, name in enumerate(frame.cameras.names):

@@ -1,0 +1,28 @@
+"""IoU of masks that `viewmend masks` made with the masks that a capture has: benchmarks/masks.py CAPTURE MADE."""
+
+import json
+import sys
+
+import numpy as np
+
+from viewmend.capture.plain import open_capture
+
+
+def main() -> None:
+    truth, made = (open_capture(path) for path in sys.argv[1:3])
+    scores: dict[str, list[float]] = {}
+    for time, frame_id in enumerate(made.frame_ids):
+        found, right = made.read(time), truth.read(truth.frame_ids.index(frame_id))
+        assert found.mask is not None and right.mask is not None
+        for view, name in enumerate(found.cameras.names):
+            width, height = found.cameras.size_px[view].tolist()
+            a = found.mask[view, :height, :width].numpy() > 127
+            b = right.mask[right.cameras.names.index(name), :height, :width].numpy() > 127
+            scores.setdefault(name, []).append(float((a & b).sum() / max((a | b).sum(), 1)))
+    means = {name: round(float(np.mean(own)), 3) for name, own in scores.items()}
+    lowest = round(min(min(own) for own in scores.values()), 3)
+    print(json.dumps({"mean": round(float(np.mean(list(means.values()))), 3), "lowest": lowest, "cameras": means}))
+
+
+if __name__ == "__main__":
+    main()
