@@ -182,8 +182,8 @@ def test_one_empty_mask_among_eight_spoils_no_other():
 
 
 def staying(count: int = 24) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Somebody who stays in one place at three of four times, and steps aside at the others."""
-    insides = [shape(68 + {5: 40, 6: -40}.get(n % 8, n % 3 - 1)) for n in range(count)]
+    """Somebody who sways in one place at three of four times, and steps aside at the others."""
+    insides = [shape(68 + {5: 40, 6: -40}.get(n % 8, 5 * n % 17 - 8)) for n in range(count)]
     return [image(plate(), inside, seed=n) for n, inside in enumerate(insides)], insides
 
 

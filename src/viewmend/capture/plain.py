@@ -31,8 +31,11 @@ def open_capture(
 ) -> "PlainCapture":
     """Open a capture: a folder of any format that is read (docs/formats.md), or a plain one's `cameras.json`.
 
-    `cameras` are the names to use (default: all). `kind` names the format where the folder could be of several. With
-    `alpha` the masks are the images' own alpha.
+    Args:
+        path: the folder, or its `cameras.json`.
+        cameras: the names to use; all by default.
+        kind: names the format where the folder could be of several.
+        alpha: the masks are the images' own alpha.
 
     Raises:
         CaptureError: the calibration is wrong, files are missing, or a name is unknown (see `PlainCapture`).

@@ -12,7 +12,7 @@ SURE, POSSIBLE = 0.5, 0.3
 DARK = 24
 """A key that is darker than this, in levels, is black: what is brighter is foreground."""
 EDGE = 1 / 100
-"""By this share of the image's longer side from the outline, spill is taken away."""
+"""Spill is taken away up to this share of the image's longer side from the outline."""
 
 
 class ChromaMasks:

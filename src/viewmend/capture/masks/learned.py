@@ -27,7 +27,7 @@ SWEPT = 0.02
 PASSING = 0.3
 """Where the mask is set at a smaller share of the times it shows the subject, not what a wrong plate hides."""
 MARGIN = 1 / 24
-"""By this share of the longer side such places are widened."""
+"""This share of the longer side is how far such places are widened."""
 ROUNDS = 3
 LEAST_TIMES = 2
 """At so many times a pixel must be free to be known."""

@@ -5,7 +5,7 @@ import numpy as np
 from viewmend.capture.masks.maker import Mask
 
 MOVES = 1 / 60
-"""By this share of the longer side a part may move from one time to the next."""
+"""This share of the longer side is how far a part may move from one time to the next."""
 
 
 def lasting(mask: Mask, before: Mask | None, after: Mask | None) -> Mask:
