@@ -71,9 +71,7 @@ class PlainCapture:
             there for some of the cameras only; a file lies outside the folder; `cameras` names one that is not there.
     """
 
-    def __init__(
-        self, path: Path, cameras: Sequence[str] | None = None, kind: str | None = None, alpha: bool = False
-    ):
+    def __init__(self, path: Path, cameras: Sequence[str] | None = None, kind: str | None = None, alpha: bool = False):
         calibration = read_any_calibration(path, kind)
         self.folder = folder = calibration.folder
         self._name = path.stem if path.is_file() else folder.resolve().name
