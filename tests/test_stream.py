@@ -15,9 +15,9 @@ from viewmend.inpainting.config import small
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
-from viewmend.observation import observe
+from viewmend.observation import WINDOW, observe
 from viewmend.rendering.view import render_view
-from viewmend.stream import WINDOW, Stream, StreamConfig
+from viewmend.stream import Stream, StreamConfig
 from viewmend.views import CompletedView, IncompleteView, MultiViewFrame
 
 CONFIG = StreamConfig(hull=HullConfig(resolution=32))

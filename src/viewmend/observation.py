@@ -1,5 +1,6 @@
 """One time of a stream, with its geometry proxy: what does not depend on a view."""
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -17,6 +18,9 @@ from viewmend.inpainting.protocol import Memory
 from viewmend.own_pages import size_bytes, to_own_pages
 from viewmend.timing import ms_since, now_s
 from viewmend.views import ContextViews, MultiViewFrame
+
+WINDOW = 33
+"""k_w n_w + n_c: how far back, in frames, the inpainters' windows reach."""
 
 
 @runtime_checkable
@@ -114,3 +118,14 @@ def observe(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig) ->
         reconstruct(frame.mask, frame.cameras, bounds if bounds is None else bounds.to(device), config)
     )
     return Observation(frame, proxy, ms_since(start, device))
+
+
+def forget(observations: OrderedDict[int, Observation], time: int, memory_mb: float | None) -> None:
+    """Drop the times looked at longest ago until the others fit; without a limit, those too far before `time`."""
+    if memory_mb is None:
+        for old in [other for other in observations if other < time - WINDOW]:
+            del observations[old]
+        return
+    bytes_left = sum(observation.size for observation in observations.values())
+    while bytes_left > 1e6 * memory_mb and len(observations) > 1:
+        bytes_left -= observations.popitem(last=False)[1].size

@@ -24,14 +24,12 @@ from viewmend.inpainting.protocol import (
     own_error_rule,
 )
 from viewmend.inpainting.wrong import narrowed
-from viewmend.observation import DepthProvider, Observation, observe
+from viewmend.observation import DepthProvider, Observation, forget, observe
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.view import RenderConfig, render_view
+from viewmend.rig_fit import RigFit
 from viewmend.timing import StageTimes, ms_since, now_s
 from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame
-
-WINDOW = 33
-"""k_w n_w + n_c: how far back, in frames, the inpainters' windows reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +47,9 @@ class StreamConfig:
     render: RenderConfig = field(default_factory=RenderConfig)
     """How views are rendered from the cameras."""
     memory_mb: float | None = 1000.0
-    """The times looked at longest ago are forgotten above this. None: those more than `WINDOW` frames old are."""
+    """The times looked at longest ago are forgotten above this. None: those older than any window reaches are."""
+    fit_rig: bool = True
+    """Whether an inpainter that can is fitted to the rig when the first frame comes (`rig_fit`)."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,15 @@ class Stream:
             config: how frames become proxies and views.
             bounds: the volume that may hold the subject; None to find it from the masks.
         """
-        self.inpainter = inpainter
         self.config = config or StreamConfig()
+        self._fit = RigFit(inpainter, self.config.fit_rig)
         self.bounds = bounds
         self._observations: OrderedDict[int, Observation] = OrderedDict()
+
+    @property
+    def inpainter(self) -> ViewInpainter:
+        """What fills the holes; it may be fitted to the rig."""
+        return self._fit.inpainter
 
     @property
     def error_rule(self) -> str:
@@ -116,7 +121,7 @@ class Stream:
     def rendered_by(self, render: RenderConfig) -> "Stream":
         """The same times and memory, with views rendered in another way."""
         other = Stream(self.inpainter, replace(self.config, render=render), self.bounds)
-        other._observations = self._observations
+        other._observations, other._fit = self._observations, self._fit
         return other
 
     @property
@@ -141,8 +146,10 @@ class Stream:
             frame = replace(frame, depth=None)  # the truth of synthetic captures: nobody looks at it here
             given = None if geometry is None else Observation(frame, geometry)
             self._observations[frame.time] = given or observe(frame, self.bounds, self.config.hull)
+            if given is None:
+                self._fit.see(frame, self.bounds, self.config.hull, self.config.render)
         self._observations.move_to_end(frame.time)
-        self._forget(frame.time)
+        forget(self._observations, frame.time, self.config.memory_mb)
         return self._observations[frame.time]
 
     def observation(self, time: int | None = None) -> Observation:
@@ -275,7 +282,7 @@ class Stream:
             completed, viewer = self.inpainter.step(view, context, viewer)
         inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms if quality.mend else 0.0
         self._observations.move_to_end(view.time)
-        self._forget(view.time)
+        forget(self._observations, view.time, self.config.memory_mb)
         times = StageTimes(geometry=now.pay_geometry(), context=context.encoding_ms, inpainting=inpainting_ms)
         return StreamView(completed, viewer, times)
 
@@ -287,13 +294,3 @@ class Stream:
             return {}
         self._observations.move_to_end(time)
         return self._observations[time].encoded
-
-    def _forget(self, time: int) -> None:
-        """Drops the times looked at longest ago until the others fit, or those that lie too far before `time`."""
-        if self.config.memory_mb is None:
-            for old in [t for t in self._observations if t < time - WINDOW]:
-                del self._observations[old]
-            return
-        bytes_left = sum(observation.size for observation in self._observations.values())
-        while bytes_left > 1e6 * self.config.memory_mb and len(self._observations) > 1:
-            bytes_left -= self._observations.popitem(last=False)[1].size

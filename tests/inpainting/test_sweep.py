@@ -8,7 +8,7 @@ import torch
 
 from viewmend.inpainting.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
 from viewmend.inpainting.coarse_fill import SmoothFill
-from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
+from viewmend.inpainting.protocol import ContextProvider, HeldOut, RenderQuality, State
 from viewmend.inpainting.ray_sampling import sample_along_rays, subject_size_m
 from viewmend.inpainting.sweep import _lookup_torch, lookup, pyramids
 from viewmend.inpainting.sweep._lookup_numba import look_up_numba
@@ -34,7 +34,7 @@ def scene():
     studio = Studio(StudioConfig(seed=7, cameras=7, frames=1, size_px=(96, 83)))
     frame = studio.read(0)
     held, net = frame.cameras.names[2], SweepNet(SMALL)
-    stream = Stream(net, StreamConfig(render=RenderConfig(error_rule="all"), memory_mb=None))
+    stream = Stream(net, StreamConfig(render=RenderConfig(error_rule="all"), memory_mb=None, fit_rig=False))
     observation = stream.push(frame.without([held]))
     view = stream.render(frame.cameras.select([held]))
     seen = observation.context(view.closest_views(4))
@@ -428,3 +428,60 @@ def test_finding_what_is_wrong_is_paid_by_inpainting(scene, teller, monkeypatch)
     monkeypatch.setattr(teller, "error_map", lambda *given: time.sleep(1.0) or whole(*given))
     times = own.view(view.camera, quality=RenderQuality(read_fraction=0.3)).times
     assert times.inpainting > 1000 > times.rendering
+
+
+def test_a_slope_softens_alpha_and_the_colours_that_lie_under_it(scene):
+    stream, view, _ = scene
+    context = ContextProvider(lambda _, names: stream.observation().context(names))
+    net = stream.inpainter
+    plain, _ = net.step(view, context, State())
+    net.alpha_slope = 0.5
+    try:
+        soft, _ = net.step(view, context, State())
+    finally:
+        net.alpha_slope = 1.0
+    read = (view.error > 0) & (plain.alpha > 0.001) & (plain.alpha < 0.999)
+    assert int(read.sum()) > 50
+    torch.testing.assert_close(soft.alpha[read], (0.5 * plain.alpha[read].logit()).sigmoid(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        soft.rgb[:, read] / soft.alpha[read], plain.rgb[:, read] / plain.alpha[read], atol=1e-3, rtol=0
+    )
+    assert torch.equal(soft.rgb[:, view.error == 0], view.rgb[:, view.error == 0])
+
+
+def test_a_net_is_fitted_by_what_cameras_saw_and_the_net_that_is_asked_stays(scene):
+    """Truth that is the net's own view made softer: it is found, and read by no other weights."""
+    stream, view, _ = scene
+    context = ContextProvider(lambda _, names: stream.observation().context(names))
+    net = stream.inpainter
+    net.alpha_slope = 0.6
+    truth = net.step(view, context, State())[0].rgb
+    net.alpha_slope = 1.0
+    fitted = net.fitted_to_rig([HeldOut(view, context, truth)])
+    assert fitted.alpha_slope == pytest.approx(0.6) and net.alpha_slope == 1.0
+    assert fitted.fitted_to_rig([HeldOut(view, context, truth)]).alpha_slope == pytest.approx(0.6)
+    assert next(fitted.parameters()) is next(net.parameters())
+
+
+def test_holes_show_mostly_what_rays_read(scene):
+    """And nothing of it where they were guessed from their surroundings, or by a net without rays."""
+    stream, view, _ = scene
+    net = SweepNet(replace(SMALL, coarse_fill="rays")).eval()
+    context = ContextProvider(lambda _, names: stream.observation().context(names))
+    hidden = replace(
+        view, weights=torch.where((view.mask > 0) & (torch.arange(view.mask.shape[1]) < 48), 0, view.weights)
+    )
+    assert int(hidden.holes.sum()) > 100
+    seen = stream.observation().context(hidden.closest_views(4))
+    guess = net.coarse_guess(hidden, seen)
+    own = net(hidden, Rig.of(seen, hidden.silhouettes), guess=guess, read=hidden.error > 0)
+    own = scattered(own.rgb, own.pixels, hidden.mask.shape)
+    found = net.step(hidden, context, State())[0].rgb
+    wanted = torch.where(hidden.holes, 0.7 * guess + 0.3 * own, own)
+    read = hidden.error > 0
+    torch.testing.assert_close(found[:, read], wanted[:, read], atol=1e-4, rtol=0)
+    quick = ContextProvider(lambda _, names: stream.observation().context(names), RenderQuality(read_fraction=0.5))
+    from_around = net.coarse_guess(hidden, seen, quick=True)
+    own = net(hidden, Rig.of(seen, hidden.silhouettes), guess=from_around, read=hidden.error > 0)
+    own = scattered(own.rgb, own.pixels, hidden.mask.shape)
+    torch.testing.assert_close(net.step(hidden, quick, State())[0].rgb[:, read], own[:, read], atol=1e-4, rtol=0)

@@ -90,7 +90,7 @@ class Mender:
         """
         if self._viewer is None:
             # Once unseen, so that what is compiled at first use is in no time that is shown.
-            warm = Stream(self._stream.inpainter, self._config, self._stream.bounds)
+            warm = Stream(self._stream.inpainter, replace(self._config, fit_rig=False), self._stream.bounds)
             warm.push(frame)
             warm.view(target, quality=self._quality, exclude=self._exclude)
         observation = self._stream.push(frame)

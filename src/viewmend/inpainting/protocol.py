@@ -4,6 +4,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from jaxtyping import Float
+from torch import Tensor
+
 from viewmend.own_pages import to_own_pages
 from viewmend.timing import ms_since, now_s
 from viewmend.views import CompletedView, ContextViews, IncompleteView
@@ -168,6 +171,25 @@ class ViewInpainter(Protocol):
 
         `context` is asked for no time later than the view's own. `state` is what this inpainter gave before.
         """
+        ...
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A view of a camera of the rig that was left out, and what the camera saw: what `fitted_to_rig` learns from."""
+
+    view: IncompleteView
+    context: ContextProvider
+    truth: Float[Tensor, "3 height width"]
+    """Upon black, in [0, 1]."""
+
+
+@runtime_checkable
+class FitsRig(Protocol):
+    """An inpainter that learns a few numbers of a rig before its first view."""
+
+    def fitted_to_rig(self, held: Sequence[HeldOut]) -> ViewInpainter:
+        """The same inpainter for this rig; the one that is asked stays as it is."""
         ...
 
 

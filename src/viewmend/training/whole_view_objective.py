@@ -15,7 +15,8 @@ from viewmend.geometry.cameras import project, unproject
 from viewmend.geometry.sampling import in_view
 from viewmend.inpainting.sweep.cells import CELL_PX, nearest_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS
-from viewmend.inpainting.sweep.sweep_net import Reading, SweepNet
+from viewmend.inpainting.sweep.reading import Reading
+from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.training.losses import LEAST_SQUARE, ImageLoss
 from viewmend.training.objective import StepOutput
 from viewmend.training.plan import ViewLossWeights

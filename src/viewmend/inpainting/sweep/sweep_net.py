@@ -5,8 +5,9 @@ cameras show there, and convolutions over the view decide among places (as over 
 full resolution cameras are looked up at the depth that was found: textures stay sharp, and neighbours agree.
 """
 
+import copy
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,14 +17,16 @@ from torch.nn import functional as F
 from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
-from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
+from viewmend.inpainting.protocol import ContextProvider, HeldOut, RenderQuality, State
 from viewmend.inpainting.ray_blend_net import RayBlendNet
+from viewmend.inpainting.sweep.alpha_fit import fitted_slope, recomposed, with_slope
 from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet
 from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
-from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
+from viewmend.inpainting.sweep.place_net import PlaceNet
 from viewmend.inpainting.sweep.pyramids import Rig
+from viewmend.inpainting.sweep.reading import Reading, Swept
 from viewmend.inpainting.sweep.unet import UNet
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
@@ -38,37 +41,8 @@ JOINT = 0.03
 """Pixels whose depth differs from their cell's by less than so many subject sizes are of its surface."""
 LEAST_MASK = 0.1
 MARGIN_PX = 16
-
-
-class Swept(NamedTuple):
-    """What was decided for the cells of a view."""
-
-    cells: Int[Tensor, "cell 2"]
-    """Row and column."""
-    depth: Float[Tensor, "rows columns"]
-    """The proxy's nearest z-depth in each cell that is read, metres, else 0."""
-    logits: Float[Tensor, "cell place"]
-    """How much speaks for each place being the surface."""
-    weighed: Weighed
-    """What was made of each place."""
-    decided: Float[Tensor, "1 feature rows columns"]
-
-
-class Reading(NamedTuple):
-    """What was read of a view, pixel by pixel."""
-
-    pixels: Int[Tensor, "pixel 2"]
-    """Row and column."""
-    rgb: Float[Tensor, "pixel 3"]
-    """Upon black."""
-    alpha: Float[Tensor, "pixel"]
-    confidence: Float[Tensor, "pixel"]
-    """Probability that no channel is off by a tenth."""
-    depth: Float[Tensor, "pixel"]
-    """z-depth, metres."""
-    trust: Float[Tensor, "pixel view"]
-    """Shares of the cameras."""
-    swept: Swept
+HOLE_GUESS = 0.7
+"""Weight of what `RayBlendNet` reads in holes; the rest is this reader's, which saw few holes in training."""
 
 
 class SweepNet(Network):
@@ -83,6 +57,7 @@ class SweepNet(Network):
         super().__init__()
         config = config or SweepConfig()
         self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.alpha_slope = 1.0
         self.coarse = RayBlendNet(config.num_views) if config.coarse_fill == "rays" else SmoothFill()
         self.coarse.requires_grad_(False)
         self.errors = ErrorNet(config.error_features) if config.error_features else None
@@ -155,6 +130,19 @@ class SweepNet(Network):
         """Whether it can say where most is to be gained."""
         return self.errors is not None
 
+    @torch.no_grad()
+    def fitted_to_rig(self, held: Sequence[HeldOut]) -> "SweepNet":
+        """The same layers, with alpha as soft as views of the rig's own cameras say."""
+        plain, views = copy.copy(self), []
+        plain.alpha_slope = 1.0
+        for own in held:
+            found, _ = plain.step(own.view, own.context, plain.initial_state())
+            at = found.opacity > 0
+            views.append((found.rgb[:, at], found.opacity[at], own.truth[:, at]))
+        fitted = copy.copy(self)
+        fitted.alpha_slope = fitted_slope(views)
+        return fitted
+
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """What is around the subject tells where its outline is."""
         return max(MARGIN_PX, self.coarse.crop_margin_px(quality))
@@ -169,12 +157,17 @@ class SweepNet(Network):
         if seen is None:
             rgb = view.rgb if view.fade is None else blend(view.rgb, view.error, 0 * view.rgb, fades.to(view.rgb))
             return CompletedView(view, rgb), state
-        guess = self.coarse_guess(view, seen, quick=context.quality.read_fraction is not None)
+        quick = context.quality.read_fraction is not None
+        guess = self.coarse_guess(view, seen, quick)
         found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read, guess=guess), view.error
         rgb, alpha, confidence, depth = (
             scattered(values, found.pixels, view.mask.shape)
             for values in (found.rgb, found.alpha[:, None], found.confidence[:, None], found.depth[:, None])
         )
+        soft = with_slope(alpha, self.alpha_slope)
+        rgb, alpha = recomposed(rgb, alpha[0], soft[0]), soft
+        if not quick and isinstance(self.coarse, RayBlendNet):
+            rgb = torch.where(read & view.holes, HOLE_GUESS * guess + (1 - HOLE_GUESS) * rgb, rgb)
         return CompletedView(
             view,
             blend(view.rgb, E, rgb, (read | fades).to(E)),
