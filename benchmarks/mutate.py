@@ -38,7 +38,7 @@ ROOMS = {
     "rendering": ("rendering", "test_stream.py"),
     "inpainting": ("inpainting", "laws", "test_stream.py"),
     "evaluation": ("evaluation", "cli/test_evaluate.py", "cli/test_mend.py"),
-    "training": ("training", "cli/test_train.py", "cli/test_samples.py"),
+    "training": ("training", "cli/test_train.py", "cli/test_samples_command.py"),
     "leave_one_out": ("leave_one_out", "evaluation/test_runner.py", "training/test_samples.py"),
     "live": ("live",),
     "cli": ("cli",),
