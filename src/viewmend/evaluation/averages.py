@@ -20,7 +20,7 @@ class Row:
 
     method: str
     scores: Records = field(repr=False)
-    """Its figures, one of each scene; of each set in a table over all."""
+    """The method's figures, one of each scene; of each set in a table over all."""
     over_reference: float | None
     """PSNR in the holes over that of `REFERENCE`, mean over the scenes where both have it."""
     below_reference: int

@@ -39,7 +39,7 @@ class Records:
         return iter(self.all)
 
     def where(self, **facts: str) -> "Records":
-        """Those of this method, this set and so on."""
+        """The figures of a method, a set and so on: where(method="telea", set="P")."""
         return Records(tuple(r for r in self.all if all(getattr(r, name) == fact for name, fact in facts.items())))
 
     def by_scene(self, metric: str, region: str) -> dict[str, float]:
