@@ -99,7 +99,7 @@ def test_nothing_to_average_is_none(make_cell, make_frame):
 
 def test_every_score_of_a_frame_is_a_record_of_its_own(make_cell, make_frame):
     values = {f.name: float(n) for n, f in enumerate(fields(Scores))}
-    found = records([make_cell("s", "telea", "A", [make_frame(**values)])])
+    found = records([make_cell("s", "telea", "A", [make_frame(**values, past_px=60)])])
     places = {(r.metric, r.region): r.value for r in found if r.metric != "hole_fraction"}
     assert sorted(places.values()) == sorted(values.values())
     assert {metric for metric, _ in places} == {

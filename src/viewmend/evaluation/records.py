@@ -39,7 +39,7 @@ class Records:
         return iter(self.all)
 
     def where(self, **facts: str) -> "Records":
-        """The figures of a method, a set and so on: where(method="telea", set="P")."""
+        """The figures of one method, one set and so on, by the names of the records' fields."""
         return Records(tuple(r for r in self.all if all(getattr(r, name) == fact for name, fact in facts.items())))
 
     def by_scene(self, metric: str, region: str) -> dict[str, float]:
