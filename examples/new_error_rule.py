@@ -26,6 +26,9 @@ class Careful(Telea):
 
     error_rule = "disagreement"
 
+    def __init__(self, device: str) -> None:
+        """Methods in a file are made from the device."""
+
 
 def missing(rule: str) -> float:
     """Part of the subject's pixels that a rule asks to be mended, in a view of a scene made on the spot."""
