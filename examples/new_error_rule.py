@@ -3,6 +3,7 @@
 import torch
 
 from viewmend import Evidence, RenderConfig, Stream, StreamConfig, make_method
+from viewmend.baselines.classical import Telea
 from viewmend.rendering.error_rules import ERROR_RULES, unseen
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
@@ -18,6 +19,15 @@ def disagreement(evidence: Evidence) -> torch.Tensor:
 
 
 ERROR_RULES["disagreement"] = disagreement
+
+
+class Careful(Telea):
+    """OpenCV's fill wherever the rule asks: commands take it as examples/new_error_rule.py:Careful."""
+
+    error_rule = "disagreement"
+
+    def __init__(self, device: str) -> None:
+        """Methods in a file are made from the device."""
 
 
 def missing(rule: str) -> float:

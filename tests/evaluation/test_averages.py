@@ -1,11 +1,14 @@
 """From frames to tables, against plain loops."""
 
 import statistics
+from dataclasses import fields
 
 import pytest
 import torch
 
-from viewmend.evaluation.averages import average_cell, speed, tables, tables_by_kind
+from viewmend.evaluation.averages import speed, tables, tables_by_kind
+from viewmend.evaluation.frame_scores import Scores
+from viewmend.evaluation.records import records
 
 METHODS = ("ours", "telea")
 
@@ -55,9 +58,9 @@ def test_tables_are_means_of_frames_then_scenes_then_sets(cells):
             ("psnr_whole", 0, "hole_px"),
         ):
             expected = [twin(own, method, score, enough, pixels) for own in sets]
-            got = [getattr(table.rows[n].scores, score) for table in per_set]
+            got = [table.rows[n].scores.mean(*score.split("_", 1)) for table in per_set]
             assert got == pytest.approx(expected)
-            assert getattr(overall.rows[n].scores, score) == pytest.approx(statistics.fmean(expected))
+            assert overall.rows[n].scores.mean(*score.split("_", 1)) == pytest.approx(statistics.fmean(expected))
 
 
 def test_the_gain_is_over_scenes_that_both_have(cells):
@@ -88,14 +91,30 @@ def test_one_set_needs_no_overall_table_and_one_kind_no_kinds(cells):
 
 
 def test_nothing_to_average_is_none(make_cell, make_frame):
-    scores = average_cell(make_cell("s", "telea", "A", [make_frame(hole_px=0, hole_fg_px=0)])).scores
-    assert scores.psnr_holes is None and scores.flicker is None and scores.psnr_whole == 30
-    assert scores.holes_of_hull == scores.holes_of_image == 0
+    scores = records([make_cell("s", "telea", "A", [make_frame(hole_px=0, hole_fg_px=0)])])
+    assert scores.mean("psnr", "holes") is None and scores.mean("flicker", "holes") is None
+    assert scores.mean("psnr", "whole") == 30
+    assert scores.mean("hole_fraction", "hull") == scores.mean("hole_fraction", "image") == 0
+
+
+def test_every_score_of_a_frame_is_a_record_of_its_own(make_cell, make_frame):
+    values = {f.name: float(n) for n, f in enumerate(fields(Scores))}
+    found = records([make_cell("s", "telea", "A", [make_frame(**values, past_px=60)])])
+    places = {(r.metric, r.region): r.value for r in found if r.metric != "hole_fraction"}
+    assert sorted(places.values()) == sorted(values.values())
+    assert {metric for metric, _ in places} == {
+        "psnr", "psnr_rendered", "ssim", "lpips_alex", "lpips_vgg", "alpha_iou", "flicker", "change", "change_truth",
+        "warp_error", "warp_error_truth",
+    }  # fmt: skip
+    assert places["psnr", "holes_fg"] == values["psnr_holes_fg"] and places["flicker", "holes"] == values["flicker"]
+    assert places["change", "still"] == values["change_still"]
+    assert places["psnr_rendered", "whole"] == values["psnr_whole_rendered"]
+    assert found.where(method="other").all == () and len(found.where(method="telea", region="masked").all) == 4
 
 
 def test_speed_is_of_frames_with_holes(make_cell, make_frame):
     frames = [make_frame(step_ms=float(ms)) for ms in range(1, 101)]
-    taken = speed([average_cell(make_cell("s", "telea", "A", [*frames, make_frame(hole_px=0, step_ms=1e9)]))])
+    taken = speed([make_cell("s", "telea", "A", [*frames, make_frame(hole_px=0, step_ms=1e9)])])
     assert taken is not None
     assert (taken.fps, taken.ms_p50, taken.ms_p95) == (pytest.approx(1000 / 50.5), 50.5, 96)
-    assert speed([average_cell(make_cell("s", "telea", "A", []))]) is None
+    assert speed([make_cell("s", "telea", "A", [])]) is None

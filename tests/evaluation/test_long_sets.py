@@ -7,7 +7,7 @@ import torch
 
 from viewmend.baselines.classical import Telea
 from viewmend.evaluation import scene_run
-from viewmend.evaluation.averages import average_cell
+from viewmend.evaluation.records import records
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
 from viewmend.inpainting.chain import build
 from viewmend.inpainting.config import paper_small
@@ -111,5 +111,6 @@ def test_a_scored_view_is_what_a_stream_of_all_frames_gives(turning, monkeypatch
 
 def test_the_region_has_its_own_mean(make_cell, make_frame):
     frames = [make_frame(psnr_past=20.0, past_px=60), make_frame(psnr_past=10.0, past_px=3)]
-    scores = average_cell(make_cell("s", "telea", "P-turn", frames)).scores
-    assert scores.psnr_past == 20.0 and scores.past_of_surface == pytest.approx((1 + 0.05) / 2)
+    scores = records([make_cell("s", "telea", "P-turn", frames)])
+    assert scores.mean("psnr", "past") == 20.0
+    assert scores.mean("hole_fraction", "only_past") == pytest.approx((1 + 0.05) / 2)

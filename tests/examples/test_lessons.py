@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import torch
 
+from viewmend import Stream, make_method
 from viewmend.baselines.classical import Telea
 from viewmend.rendering.error_rules import ERROR_RULES
 
@@ -38,5 +39,6 @@ def test_a_rule_of_ones_own_asks_for_more():
     try:
         rule = runpy.run_path(str(EXAMPLES / "new_error_rule.py"))
         assert rule["missing"]("disagreement") > 1.5 * rule["missing"]("unseen") > 0
+        assert Stream(make_method(f"{EXAMPLES / 'new_error_rule.py'}:Careful")).error_rule == "disagreement"
     finally:
         ERROR_RULES.pop("disagreement", None)

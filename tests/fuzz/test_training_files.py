@@ -21,9 +21,9 @@ from safetensors.torch import save, save_file
 from torch import Tensor
 
 from viewmend.evaluation import scorers
-from viewmend.evaluation.averages import average_cell
 from viewmend.evaluation.cells import Cell, CellKey, CellStore
 from viewmend.evaluation.frame_scores import FrameScores
+from viewmend.evaluation.records import records
 from viewmend.evaluation.scene_run import MethodRun
 from viewmend.inpainting.config import small
 from viewmend.leave_one_out.scenes import LeaveOneOut
@@ -313,5 +313,5 @@ def test_cells(tmp_path):
 def demand_usual(found: Cell | None) -> None:
     """A cell that is there can be averaged."""
     if found is not None:
-        average_cell(found)
+        records([found])
         json.dumps(asdict(found.key))

@@ -31,8 +31,11 @@ class OnlineConfig:
     """Height and width that the network is run at."""
     dilation_px: int = 4
     """Holes are widened by so many steps of a 3 x 3 cross before the network sees the frame."""
-    overlap_px: int = 48
-    """Neighbouring windows overlap by at least so much, and are blended there."""
+
+    @property
+    def overlap_px(self) -> int:
+        """Neighbouring windows overlap by at least so much, and are blended there: 48 at the authors' size."""
+        return min(self.size_px) // 5
 
 
 @dataclass(frozen=True)
@@ -54,17 +57,12 @@ class OnlineInpainter:
     alone change.
 
     Raises:
-        ValueError: the network cannot take frames of `config.size_px`, or windows overlap more than they are large.
+        ValueError: the network cannot take frames of `config.size_px`.
     """
 
     def __init__(self, network: OnlineNetwork, config: OnlineConfig | None = None) -> None:
         self.network, self.config = network, config or OnlineConfig()
         network.check_size(*self.config.size_px)
-        if not 0 <= self.config.overlap_px < min(self.config.size_px):
-            raise ValueError(
-                f"expected windows of {self.config.size_px} to overlap by less than that, got "
-                f"{self.config.overlap_px} px; lower overlap_px"
-            )
 
     def initial_state(self) -> OnlineState:
         """A stream without a past."""

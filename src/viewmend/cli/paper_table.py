@@ -78,7 +78,7 @@ def run(options: Options) -> int:
 def _text(table: int, sets: tuple[str, ...], grid: str, report: "Report") -> str:
     from viewmend.evaluation.report_grids import holes_line, not_available, setting_lines
 
-    scenes = len({cell.cell.key.scene for cell in report.cells})
+    scenes = len({cell.key.scene for cell in report.cells})
     lines = [
         f"# Table {table}, on {', '.join(sets)}",
         "Columns (here) were measured here, columns (paper) are printed in the paper: other data, another image size "

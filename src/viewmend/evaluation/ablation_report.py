@@ -1,13 +1,13 @@
 """What an ablation found: each variant against the full model, seed by seed; quality against top-k; plots."""
 
 import json
-import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from viewmend.evaluation.averages import Row, average_cell, tables
+from viewmend.evaluation.averages import Row, gains, tables
 from viewmend.evaluation.cells import Cell
+from viewmend.evaluation.records import Records, mean, records
 from viewmend.evaluation.report_plot import ablation_plot
 
 
@@ -54,17 +54,18 @@ class Ablation:
     def of(cls, trained: Sequence[Trained], cells: Sequence[Cell]) -> "Ablation":
         """The ablation from the cells of all these models, whose methods are their folders, and of telea."""
         methods = ["telea", *(str(one.folder) for one in trained)]
+        scores = records(cells)
         rows = {row.method: row for row in tables(cells, methods)[0].rows}
         whole = [one for one in trained if one.top_k is None]
         variants = list(dict.fromkeys(one.variant for one in whole))
         full = [one for one in trained if one.variant == "full"]
         counts = sorted({one.top_k for one in full if one.top_k is not None})
         return cls(
-            telea=rows["telea"].scores.psnr_holes,
+            telea=rows["telea"].scores.mean("psnr", "holes"),
             scenes=len({cell.key.scene for cell in cells}),
-            variants=tuple(_line(v, [o for o in whole if o.variant == v], whole, rows, cells) for v in variants),
+            variants=tuple(_line(v, [o for o in whole if o.variant == v], whole, rows, scores) for v in variants),
             top_k=tuple(
-                _line("all" if k is None else str(k), [o for o in full if o.top_k == k], whole, rows, cells)
+                _line("all" if k is None else str(k), [o for o in full if o.top_k == k], whole, rows, scores)
                 for k in (*counts, None)
             ),
         )
@@ -97,39 +98,35 @@ def plots(ablation: Ablation) -> str:
         MissingMatplotlibError: matplotlib is not installed.
     """
     losses = [(line.name, [v for v in line.loss if v is not None]) for line in ablation.variants[1:]]
-    points = [(line.name, line.ms, _mean(line.holes)) for line in ablation.top_k]
+    points = [(line.name, line.ms, mean(line.holes)) for line in ablation.top_k]
     known = [(name, ms, db) for name, ms, db in points if ms is not None and db is not None]
     return ablation_plot(losses, known, "loss in the holes against full, dB")
 
 
 def _line(
-    name: str, models: Sequence[Trained], whole: Sequence[Trained], rows: dict[str, Row], cells: Sequence[Cell]
+    name: str, models: Sequence[Trained], whole: Sequence[Trained], rows: dict[str, Row], scores: Records
 ) -> Line:
     own = [rows[str(one.folder)] for one in models]
     full = {one.seed: str(one.folder) for one in whole if one.variant == "full"}
-    losses = [_losses(str(one.folder), full[one.seed], cells) for one in models]
-    styles = sorted({cell.style for cell in cells})
+    losses = [_losses(str(one.folder), full[one.seed], scores) for one in models]
+    styles = sorted({record.style for record in scores})
     return Line(
         name=name,
-        holes=tuple(row.scores.psnr_holes for row in own),
-        whole=tuple(row.scores.psnr_whole for row in own),
-        ms=_mean([row.speed.ms_p50 if row.speed else None for row in own]),
-        loss=tuple(_mean([loss for _, loss in each]) for each in losses),
+        holes=tuple(row.scores.mean("psnr", "holes") for row in own),
+        whole=tuple(row.scores.mean("psnr", "whole") for row in own),
+        ms=mean([row.speed.ms_p50 if row.speed else None for row in own]),
+        loss=tuple(mean([loss for _, loss in each]) for each in losses),
         loss_by_style={
-            style: _mean([_mean([loss for s, loss in each if s == style]) for each in losses]) for style in styles
+            style: mean([mean([loss for s, loss in each if s == style]) for each in losses]) for style in styles
         },
     )
 
 
-def _losses(method: str, full: str, cells: Sequence[Cell]) -> list[tuple[str, float]]:
+def _losses(method: str, full: str, scores: Records) -> list[tuple[str, float]]:
     """Style and loss of each scene that both have."""
-    scores = {(c.key.scene, c.key.method): (c.style, average_cell(c).scores.psnr_holes) for c in cells if not c.error}
-    found = []
-    for (scene, of), (style, holes) in scores.items():
-        _, best = scores.get((scene, full), (style, None))
-        if of == method and holes is not None and best is not None:
-            found.append((style, best - holes))
-    return found
+    own = scores.where(method=method)
+    styles = {record.scene: record.style for record in own}
+    return [(styles[scene], loss) for scene, loss in gains(scores.where(method=full), own).items()]
 
 
 def _cells(line: Line, styles: Sequence[str]) -> list[str]:
@@ -142,13 +139,8 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _seeds(values: Sequence[float | None]) -> str:
-    return f"{_figure(_mean(values))} ({', '.join(map(_figure, values))})"
+    return f"{_figure(mean(values))} ({', '.join(map(_figure, values))})"
 
 
 def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return statistics.fmean(known) if known else None

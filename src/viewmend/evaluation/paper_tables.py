@@ -5,12 +5,12 @@ columns of their own and nothing is computed from both.
 """
 
 import re
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from viewmend.evaluation.averages import MeanScores, Row, mean_scores
+from viewmend.evaluation.averages import Row
+from viewmend.evaluation.records import mean
 from viewmend.evaluation.report import Report
 from viewmend.evaluation.report_grids import Grid, number
 
@@ -155,18 +155,18 @@ TABLE_3: tuple[PaperRow, ...] = (
 """The ablation, on DNA-Rendering."""
 TABLES: dict[int, tuple[PaperRow, ...]] = {1: TABLE_1, 2: TABLE_2, 3: TABLE_3}
 OUR_COLUMNS = (
-    ("PSNR", "psnr_whole", 3),
-    ("SSIM", "ssim_whole", 4),
-    ("LPIPS", "lpips_alex_whole", 4),
-    ("VFID", "whole_eval", 4),
-    ("PSNR holes (a)", "psnr_holes", 3),
-    ("PSNR masked (b)", "psnr_masked", 3),
-    ("SSIM masked", "ssim_masked", 5),
-    ("LPIPS masked", "lpips_alex_masked", 5),
-    ("FPS", "fps", 2),
-    ("ms p95", "ms_p95", 1),
+    ("PSNR", "psnr", "whole", 3),
+    ("SSIM", "ssim", "whole", 4),
+    ("LPIPS", "lpips_alex", "whole", 4),
+    ("VFID", "vfid", "whole_eval", 4),
+    ("PSNR holes (a)", "psnr", "holes", 3),
+    ("PSNR masked (b)", "psnr", "masked", 3),
+    ("SSIM masked", "ssim", "masked", 5),
+    ("LPIPS masked", "lpips_alex", "masked", 5),
+    ("FPS", "speed", "fps", 2),
+    ("ms p95", "speed", "ms_p95", 1),
 )
-"""Heading, field of our scores, decimals."""
+"""Heading, metric and region of our records (or a field of a row and one of its own), decimals."""
 PAPER_DIGITS = {
     "psnr": 3,
     "ssim": 4,
@@ -215,7 +215,7 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
     for row in rows:
         names = methods.get(row.method, (row.method,))
         done = [of[name] for name in names if name in of and of[name].scenes]
-        ours = [number(value, 1, digits, "n/a") for value, (_, _, digits) in zip(_ours(done), OUR_COLUMNS, strict=True)]
+        ours = [number(_ours(done, metric, of), 1, digits, "n/a") for _, metric, of, digits in OUR_COLUMNS]
         printed = [number(getattr(row.figures, name), 1, digits) for name, digits in PAPER_DIGITS.items()]
         shown = ", ".join(Path(name).name for name in names) or "none"
         failed = sum(one.failed for one in done)
@@ -223,15 +223,7 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
     return Grid((*heads, *paper), tuple(lines))
 
 
-def _ours(rows: Sequence[Row]) -> list[float | None]:
-    """Our figures in the order of `OUR_COLUMNS`: means over the rows."""
-    scores = mean_scores([row.scores for row in rows])
-    found: list[float | None] = []
-    for _, field, _ in OUR_COLUMNS:
-        if field in {f.name for f in fields(MeanScores)}:
-            found.append(getattr(scores, field))
-        else:
-            values = [getattr(row.vfid if hasattr(row.vfid, field) else row.speed, field, None) for row in rows]
-            there = [value for value in values if value is not None]
-            found.append(statistics.fmean(there) if there else None)
-    return found
+def _ours(rows: Sequence[Row], metric: str, of: str) -> float | None:
+    """Our figure in a column: the mean over the rows."""
+    parts = [getattr(row, metric, None) for row in rows]
+    return mean(getattr(part, of, None) or row.scores.mean(metric, of) for part, row in zip(parts, rows, strict=True))

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from viewmend.evaluation.averages import CellScores, Table, average_cell, tables, tables_by_kind
+from viewmend.evaluation.averages import Table, tables, tables_by_kind
 from viewmend.evaluation.cells import PROTOCOL, Cell
 from viewmend.evaluation.provenance import Provenance
+from viewmend.evaluation.records import Records, records
 from viewmend.evaluation.scene_run import SLOW_MS, RunSettings
 from viewmend.methods import REFERENCE
 from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
@@ -60,7 +61,9 @@ class Report:
     """Over all sets if there are several, then each set."""
     kinds: tuple[Table, ...]
     """Each set's rigs and styles."""
-    cells: tuple[CellScores, ...]
+    scores: Records
+    """Every figure of every method and scene."""
+    cells: tuple[Cell, ...]
     """All of them, also those that failed."""
     missing: dict[str, str]
     """Methods without what they need here, which have no cells, and the reason: their rows are n/a."""
@@ -87,7 +90,8 @@ def make_report(
         identities=identities,
         tables=tuple(tables(cells, methods)),
         kinds=tuple(tables_by_kind(cells, methods)),
-        cells=tuple(average_cell(cell) for cell in cells),
+        scores=records(cells),
+        cells=tuple(cells),
         missing=missing or {},
         missing_networks=missing_networks or {},
         origins=origins,

@@ -3,34 +3,32 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from viewmend.evaluation.averages import MeanScores, Row, Table
+from viewmend.evaluation.averages import Row, Table
 from viewmend.evaluation.report import Report
 from viewmend.methods import PRIVILEGED, REFERENCE
 
 COLUMNS = (
-    ("holes, dB", "psnr_holes", 1, 2),
-    ("in mask", "psnr_holes_fg", 1, 2),
-    ("only past", "psnr_past", 1, 2),
-    ("masked", "psnr_masked", 1, 2),
-    ("SSIM masked", "ssim_masked", 1, 5),
-    ("whole, dB", "psnr_whole", 1, 2),
-    ("rendered", "psnr_whole_rendered", 1, 2),
-    ("SSIM whole", "ssim_whole", 1, 4),
-    ("subject, dB", "psnr_subject", 1, 2),
-    ("alpha IoU", "alpha_iou", 1, 4),
-    ("flicker", "flicker", 255, 2),
-    ("flicker whole", "flicker_whole", 255, 2),
-    ("still", "change_still", 255, 2),
-    ("warp", "warp_error", 255, 2),
-    ("change", "change", 255, 2),
+    ("holes, dB", "psnr", "holes", 1, 2),
+    ("in mask", "psnr", "holes_fg", 1, 2),
+    ("only past", "psnr", "past", 1, 2),
+    ("masked", "psnr", "masked", 1, 2),
+    ("SSIM masked", "ssim", "masked", 1, 5),
+    ("whole, dB", "psnr", "whole", 1, 2),
+    ("rendered", "psnr_rendered", "whole", 1, 2),
+    ("SSIM whole", "ssim", "whole", 1, 4),
+    ("subject, dB", "psnr", "subject", 1, 2),
+    ("alpha IoU", "alpha_iou", "whole", 1, 4),
+    ("flicker", "flicker", "holes", 255, 2),
+    ("flicker whole", "flicker", "whole", 255, 2),
+    ("still", "change", "still", 255, 2),
+    ("warp", "warp_error", "holes", 255, 2),
+    ("change", "change", "holes", 255, 2),
 )
-"""Columns of the main table: heading, field of `MeanScores`, factor, decimals."""
-TRUTHS = ("warp_error", "change")
-"""Scores that the truth has, too."""
+"""Columns of the main table: heading, metric, region, factor, decimals."""
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
-"""How each score is read, and the end of its field."""
+"""How each score is read, and the region."""
 SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 5), ("LPIPS Alex", "lpips_alex", 4), ("LPIPS VGG", "lpips_vgg", 4))
-"""Each score, the beginning of its field, decimals."""
+"""Each score, the metric, decimals."""
 VFIDS = ("VFID whole", "VFID masked", "VFID whole, train", "VFID masked, train")
 
 
@@ -62,8 +60,8 @@ def holes_line(table: Table) -> str:
     """How much there is to fill, and what is left out."""
     sizes = " and ".join(f"{width} x {height}" for width, height in table.sizes_px)
     of_hull, of_image, of_surface = (
-        next((v for row in table.rows if (v := getattr(row.scores, name)) is not None), None)
-        for name in ("holes_of_hull", "holes_of_image", "past_of_surface")
+        next((v for row in table.rows if (v := row.scores.mean("hole_fraction", of)) is not None), None)
+        for of in ("hull", "image", "only_past")
     )
     past = f"; only the past shows {number(of_surface, 100, 2)} % of the missing surface" if of_surface else ""
     return (
@@ -77,7 +75,7 @@ def main_grid(table: Table) -> Grid:
     """The scores that tell most, speed, and what failed; the truth's own change in the last row."""
     heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "FPS", "ms", "ms p95", "scenes", "failed")
     rows = [_method_row(row, len(heads)) for row in table.rows]
-    return Grid(heads, (*rows, _truth_row([row.scores for row in table.rows], len(heads))))
+    return Grid(heads, (*rows, _truth_row(table.rows, len(heads))))
 
 
 def readings_grid(table: Table) -> Grid:
@@ -86,9 +84,9 @@ def readings_grid(table: Table) -> Grid:
     rows = []
     for row in table.rows:
         cells = [
-            number(getattr(row.scores, f"{field}_{end}"), 1, digits, "n/a")
-            for _, field, digits in SCORES
-            for _, end in READINGS
+            number(row.scores.mean(metric, region), 1, digits, "n/a")
+            for _, metric, digits in SCORES
+            for _, region in READINGS
         ]
         rows.append((row.method, *cells, *(number(value, 1, 4, "n/a") for value in asdict(row.vfid).values())))
     return Grid(heads, tuple(rows))
@@ -97,7 +95,10 @@ def readings_grid(table: Table) -> Grid:
 def kinds_grid(report: Report) -> Grid:
     """PSNR in the holes by rig and style, and the gain over the reference."""
     rows = [
-        (table.title, *(f"{number(r.scores.psnr_holes, 1, 2)} ({_signed(r.over_reference)})" for r in table.rows))
+        (
+            table.title,
+            *(f"{number(r.scores.mean('psnr', 'holes'), 1, 2)} ({_signed(r.over_reference)})" for r in table.rows),
+        )
         for table in report.kinds
     ]
     return Grid(("kind", *report.methods), tuple(rows))
@@ -105,16 +106,13 @@ def kinds_grid(report: Report) -> Grid:
 
 def scenes_grid(report: Report) -> Grid:
     """PSNR in the holes of each scene."""
-    of = {(c.cell.key.scene, c.cell.key.method): c for c in report.cells}
-    rows = []
-    for scene in dict.fromkeys(c.cell.key.scene for c in report.cells):
-        own = [of.get((scene, method)) for method in report.methods]
-        shown = [
-            "n/a" if c is None else "**failed**" if c.cell.error is not None else number(c.scores.psnr_holes, 1, 2)
-            for c in own
-        ]
-        share = next((c.scores.holes_of_hull for c in own if c is not None and c.cell.error is None), None)
-        rows.append((scene, number(share, 100, 2), *shown))
+    holes = {(r.scene, r.method): number(r.value, 1, 2) for r in report.scores.where(metric="psnr", region="holes")}
+    cells = {(c.key.scene, c.key.method): "-" if c.error is None else "**failed**" for c in report.cells} | holes
+    shares = report.scores.by_scene("hole_fraction", "hull")
+    rows = [
+        (scene, number(shares.get(scene), 100, 2), *(cells.get((scene, method), "n/a") for method in report.methods))
+        for scene in dict.fromkeys(scene for scene, _ in cells)
+    ]
     return Grid(("scene", "holes, % of the hull", *report.methods), tuple(rows))
 
 
@@ -137,17 +135,19 @@ def _method_row(row: Row, width: int) -> tuple[str, ...]:
     return (
         name,
         _signed(row.over_reference),
-        *(number(getattr(row.scores, field), factor, digits) for _, field, factor, digits in COLUMNS),
+        *(number(row.scores.mean(metric, of), factor, digits) for _, metric, of, factor, digits in COLUMNS),
         *(number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
         str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
         f"**{row.failed}**" if row.failed else "0",
     )
 
 
-def _truth_row(scores: Sequence[MeanScores], width: int) -> tuple[str, ...]:
+def _truth_row(rows: Sequence[Row], width: int) -> tuple[str, ...]:
     """The truth's own change, which a perfect method would show."""
-    of = {name: next((v for s in scores if (v := getattr(s, f"{name}_truth")) is not None), None) for name in TRUTHS}
-    shown = [number(of[field], factor, digits) if field in of else "" for _, field, factor, digits in COLUMNS]
+    shown = []
+    for _, metric, region, factor, digits in COLUMNS:
+        means = (row.scores.mean(f"{metric}_truth", region) for row in rows)
+        shown.append(number(next((value for value in means if value is not None), None), factor, digits, ""))
     return ("*truth*", "", *shown, *[""] * (width - 2 - len(shown)))
 
 

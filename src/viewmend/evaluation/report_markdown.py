@@ -26,7 +26,7 @@ def markdown(report: Report) -> str:
         by_kind = written(kinds_grid(report))
         parts += ["## By rig and style", f"PSNR in the holes, dB; gain over {REFERENCE}.", by_kind]
     parts += ["## Scenes", "PSNR in the holes, dB.", written(scenes_grid(report))]
-    failed = [c.cell for c in report.cells if c.cell.error is not None]
+    failed = [cell for cell in report.cells if cell.error is not None]
     if failed:
         lines = [f"* {cell.key.scene}, {cell.key.method}: {cell.error}" for cell in failed]
         parts += ["## Failed", "\n".join(lines)]

@@ -61,9 +61,9 @@ def _first_scenes(cells: Sequence[Cell], count: int) -> list[str]:
 
 def _table(table: Table) -> str:
     points = [
-        Point(row.method, row.speed.ms_p50, row.scores.psnr_holes)
+        Point(row.method, row.speed.ms_p50, db)
         for row in table.rows
-        if row.speed is not None and row.scores.psnr_holes is not None
+        if row.speed is not None and (db := row.scores.mean("psnr", "holes")) is not None
     ]
     try:
         plot = trade_off(points, "PSNR in the holes, dB", f"{table.title}: quality against milliseconds")

@@ -46,8 +46,7 @@ def training_clip(sample: Sample, size_px: tuple[int, int], framing: Literal["de
     truths = [make(s.truth.float() / 255, none, size_px, 0).image for s, none in zip(sample.clip, whole, strict=True)]
     window = Window(0, 0)
     if framing != "def":
-        overlap_px = min(OnlineConfig().overlap_px, min(size_px) // 2)
-        windows = windows_over(canvases[-1].holes, size_px, overlap_px)
+        windows = windows_over(canvases[-1].holes, size_px, OnlineConfig(size_px=size_px).overlap_px)
         window = windows[int(torch.randint(len(windows), ()))] if windows else window
     references = torch.zeros(0, 3, *size_px, device=sample.view.rgb.device)
     if framing == "mul":

@@ -1,0 +1,123 @@
+"""What single switches are worth: python benchmarks/switches.py [--captures DIR ...] [--scenes N] [--write].
+
+Every n-th scene of P and views of captures, each with one switch changed: PSNR of the rendered and the mended whole
+view, PSNR in the holes, and the IoU of hull and true mask. Switches of hull and renderer change what is missing, so
+their figure is that of the whole view; those of the network are changed in the trained `small`.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from measure import write
+from torch import nn
+
+from viewmend.geometry.hull import HullConfig
+from viewmend.inpainting.chain import Chain
+from viewmend.inpainting.checkpoint import load_network
+from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.patches import PATCH_CELLS
+from viewmend.leave_one_out.capture_scenes import capture_set
+from viewmend.leave_one_out.scenes import LeaveOneOutScene
+from viewmend.leave_one_out.studio_scenes import procedural_set
+from viewmend.metrics.view_scores import mean_over_frames, score_view
+from viewmend.rendering.blending import BlendConfig
+from viewmend.rendering.view import RenderConfig
+from viewmend.stream import Stream, StreamConfig
+
+AS_IT_IS = StreamConfig(memory_mb=None)
+STREAMS = {
+    "as it is": AS_IT_IS,
+    "pixels_per_voxel: no pooling": replace(AS_IT_IS, hull=HullConfig(pixels_per_voxel=1e9)),
+    "min_share 0": replace(AS_IT_IS, hull=HullConfig(min_share=0.0)),
+    "depth_bias 0": replace(AS_IT_IS, render=RenderConfig(blend=BlendConfig(depth_bias=0.0))),
+    "depth_bias 0.02": replace(AS_IT_IS, render=RenderConfig(blend=BlendConfig(depth_bias=0.02))),
+    "slope_px 0": replace(AS_IT_IS, render=RenderConfig(blend=BlendConfig(slope_px=0.0))),
+}
+METRICS = ("psnr_whole", "psnr_valid", "psnr_holes", "hull_iou")
+
+
+def main() -> None:
+    """Measure, and print or write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--captures", nargs="*", type=Path, default=[], help="each camera is left out, seen from eight")
+    parser.add_argument("--scenes", type=int, default=4, help="so many of each set, evenly")
+    parser.add_argument("--frames", type=int, default=2)
+    parser.add_argument("--size", type=int, default=240, help="of the views of P, pixels")
+    parser.add_argument("--write", action="store_true", help="keep the result under benchmarks/results")
+    options = parser.parse_args()
+    sets: dict[str, Sequence[LeaveOneOutScene]] = {"P": procedural_set(options.frames, options.size)}
+    sets |= {folder.name: capture_set(folder, "8", options.frames) for folder in options.captures}
+    found = {
+        name: judge(scenes[:: max(1, len(scenes) // options.scenes)][: options.scenes]) for name, scenes in sets.items()
+    }
+    config = {"scenes": options.scenes, "frames": options.frames, "size_px": options.size}
+    print(write("switches", "cpu", config, found) if options.write else json.dumps(found, indent=1))
+
+
+@torch.no_grad()
+def judge(scenes: Sequence[LeaveOneOutScene]) -> dict[str, dict[str, float | None]]:
+    """Means over all views of each switch: of the rendered view, and as `small` mends it."""
+    frames = [list(scene.frames("cpu")) for scene in scenes]
+    runs = {name: (config, unchanged) for name, config in STREAMS.items()}
+    runs |= {name: (AS_IT_IS, change) for name, change in NETWORKS.items()}
+    return {name: _means(frames, *run) for name, run in runs.items()}
+
+
+def unchanged(_: Chain) -> None:
+    """`small` as it is."""
+
+
+def by_config(**changes: object) -> Callable[[Chain], None]:
+    """A change of what the transformer looks up in its config at each forward."""
+
+    def change(chain: Chain) -> None:
+        transformer = chain.patches.transformer
+        transformer.config = replace(transformer.config, **changes)
+
+    return change
+
+
+def without_colour_skip(chain: Chain) -> None:
+    """Patches carry no colours beside their features: neither into tokens nor out of them."""
+    config: InpainterConfig = chain.config
+    features = config.widths[-1] * PATCH_CELLS**2
+    linear: nn.Linear = chain.patches.tokeniser.linear
+    linear.weight[:, features:] = 0
+    decode: nn.Linear = chain.patches.decoder.linear
+    decode.weight[features:], decode.bias[features:] = 0, 0
+
+
+NETWORKS = {
+    "rope_unit image": by_config(rope_unit="image"),
+    "rope_values off": by_config(rope_values=False),
+    "colour_skip off": without_colour_skip,
+}
+
+
+def _means(
+    frames: Sequence[Sequence], config: StreamConfig, change: Callable[[Chain], None]
+) -> dict[str, float | None]:
+    network = load_network("small")
+    assert isinstance(network, Chain), "small reads rays, then patches"
+    change(network)
+    scores = []
+    for scene in frames:
+        stream, viewer = Stream(network.eval(), config, scene[0].bounds), None
+        for frame in scene:
+            stream.push(frame.inputs)
+            view = stream.render(frame.truth.cameras)
+            mended = stream.mend(view, viewer)
+            viewer, mask = mended.viewer, frame.truth.mask[0]
+            truth = frame.truth.rgb[0] / 255 * (mask / 255)
+            scores.append([score_view(view, rgb, truth, mask > 127) for rgb in (view.rgb, mended.completed.rgb)])
+    holes = [rendered.holes_px for rendered, _ in scores]
+    found = {f"mended {name}": mean_over_frames([getattr(m, name) for _, m in scores], holes) for name in METRICS}
+    return {"rendered psnr_whole": mean_over_frames([r.psnr_whole for r, _ in scores]), **found}
+
+
+if __name__ == "__main__":
+    main()
