@@ -161,7 +161,7 @@ def test_a_report_that_was_killed_half_way_is_made_again(tmp_path):
         (out / "report.md").write_text("first")
     program = (
         "import os, sys; from pathlib import Path; from viewmend.cli.evaluating import report_folder\n"
-        "out = Path(sys.argv[1]); report_folder(out).__enter__()\n"
+        "out = Path(sys.argv[1]); held = report_folder(out); held.__enter__()\n"
         "(out / 'report.md').write_text('second'); (out / 'cells').mkdir(); (out / 'cells/.half-9-x').write_text('x')\n"
         "os.kill(os.getpid(), 9)\n"
     )
