@@ -8,6 +8,7 @@ processor: on few cores the share says how much of it they leave, too.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import re
@@ -100,13 +101,13 @@ def main() -> None:
         assert address is not None
         said: list[str] = []
         threading.Thread(target=lambda: said.extend(server.stderr or []), daemon=True).start()
-        outcomes = []
-        with Client(f"ws{address[1]}", TOKEN, timeout_s=120) as viewer:
+        outcomes: list[Outcome] = []
+        with contextlib.ExitStack() as ends, Client(f"ws{address[1]}", TOKEN, timeout_s=120) as viewer:
+            ends.callback(server.terminate)  # else who fails here waits for ever
             look_on(viewer, 10)
             for kinds in waves:
                 outcomes.append(attack(viewer, int(address[2]), server.pid, kinds, given.seconds))
                 print(json.dumps(asdict(outcomes[-1])), flush=True)
-        server.terminate()
         began = time.monotonic()
         code = server.wait(60)
     report = {"waves": [asdict(one) for one in outcomes], "exit_code": code, "lines_said": len(said)}

@@ -1,10 +1,13 @@
 """One run at a time, and nobody's files are replaced but our own."""
 
+import contextlib
+import shutil
 import subprocess
 import sys
 
 import pytest
 
+from viewmend.cli.evaluating import report_folder
 from viewmend.output_folder import OutputFolder
 
 NAMES = ("pictures", "sheet.png")
@@ -119,3 +122,58 @@ def test_a_damaged_manifest_knows_nothing(text, tmp_path):
     (tmp_path / ".viewmend/files.json").write_text(text)
     with pytest.raises(ValueError, match="expected no such file"):
         published(tmp_path)
+
+
+@pytest.mark.parametrize("name", [".viewmend", ".viewmend/draft", ".viewmend/lock", ".viewmend/files.json", ".half-x"])
+def test_links_lead_no_run_to_what_is_elsewhere(name, tmp_path):
+    theirs, out = tmp_path / "theirs", tmp_path / "out"
+    (theirs / "draft").mkdir(parents=True)
+    (theirs / "draft/precious").write_text("precious")
+    (theirs / "lock").write_text("precious")
+    (out / name).parent.mkdir(parents=True)
+    (out / name).symlink_to(theirs / ("lock" if name.endswith(("lock", "json", "x")) else ""))
+    with contextlib.suppress(ValueError, OSError):
+        published(out)
+    assert (theirs / "draft/precious").read_text() == (theirs / "lock").read_text() == "precious"
+    assert seen(theirs) == ["draft/precious", "lock"]
+
+
+def test_a_folder_that_looks_unfinished_is_nobodys(tmp_path):
+    (tmp_path / ".half-notes").mkdir()
+    (tmp_path / ".half-notes/mine").write_text("mine")
+    published(tmp_path)
+    assert (tmp_path / ".half-notes/mine").read_text() == "mine"
+
+
+def test_what_a_run_leaves_is_removed_while_it_still_has_the_lock(tmp_path, monkeypatch):
+    """Else it could be the next run's."""
+    locked, rmtree = [], shutil.rmtree
+    folder = OutputFolder(tmp_path / "out")
+    removed = lambda *a, **k: (locked.append(folder._lock.is_locked), rmtree(*a, **k))  # noqa: E731
+    with folder:
+        monkeypatch.setattr(shutil, "rmtree", removed)
+    assert locked == [True, True] and not (tmp_path / "out").exists()
+
+
+def test_a_report_that_was_killed_half_way_is_made_again(tmp_path):
+    out = tmp_path / "out"
+    with report_folder(out):
+        (out / "report.md").write_text("first")
+    program = (
+        "import os, sys; from pathlib import Path; from viewmend.cli.evaluating import report_folder\n"
+        "out = Path(sys.argv[1]); held = report_folder(out); held.__enter__()\n"
+        "(out / 'report.md').write_text('second'); (out / 'cells').mkdir(); (out / 'cells/.half-9-x').write_text('x')\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", program, str(out)], check=False).returncode == -9
+    with report_folder(out):
+        assert list((out / "cells").iterdir()) == []
+        (out / "report.md").write_text("third")
+    (out / "report.md").write_text("edited")
+    with pytest.raises(ValueError, match=r"report\.md"), report_folder(out):
+        pass
+    (out / "report.md").unlink()
+    (out / "report.csv").write_text("mine")
+    with pytest.raises(ValueError, match=r"report\.csv"), report_folder(out):
+        pass
+    assert (out / "report.csv").read_text() == "mine"

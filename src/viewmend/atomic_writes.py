@@ -36,6 +36,13 @@ def write_atomically(path: Path, write: Callable[[Path], object], durable: bool 
         beside.unlink(missing_ok=True)
 
 
+def remove_halves(folder: Path) -> None:
+    """Remove what killed runs have left unfinished in a folder that this one alone writes to."""
+    for half in folder.glob(f"{HALF}*"):
+        if half.is_symlink() or not half.is_dir():
+            half.unlink(missing_ok=True)
+
+
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """A safetensors file, whole or not there; tensors are taken from any device.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from viewmend.atomic_writes import HALF, write_atomically
+from viewmend.atomic_writes import remove_halves, write_atomically
 
 HIDDEN = ".viewmend"
 """The folder that holds the lock, the manifest and what is not finished."""
@@ -36,11 +36,13 @@ class OutputFolder:
         """Begin.
 
         Raises:
-            ValueError: another run writes there, or it is a file.
+            ValueError: another run writes there, it is a file, or has a link where runs keep what they know.
             OSError: it cannot be made.
         """
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path}: expected a folder for the results, got a file; choose another --out")
+        if (hidden := self.path / HIDDEN).is_symlink() or (hidden.exists() and not hidden.is_dir()):
+            raise ValueError(f"{hidden}: expected a folder that a run has made, got something else; move it away")
         self._new = not self.path.exists()
         (self.path / HIDDEN).mkdir(parents=True, exist_ok=True)
         try:
@@ -51,18 +53,18 @@ class OutputFolder:
                 "or choose another folder"
             ) from None
         shutil.rmtree(self.draft, ignore_errors=True)
-        for half in self.path.glob(f"{HALF}*"):
-            half.unlink(missing_ok=True)
+        remove_halves(self.path)
         self.draft.mkdir()
         return self
 
     def __exit__(self, *_: object) -> None:
         shutil.rmtree(self.draft, ignore_errors=True)
-        self._lock.release()
+        # Before the lock is let go: what the next run makes in there is not this one's to remove.
         if self._new and [entry.name for entry in self.path.iterdir()] == [HIDDEN]:
             shutil.rmtree(self.path, ignore_errors=True)
         elif not self._manifest.exists():
             shutil.rmtree(self.path / HIDDEN, ignore_errors=True)
+        self._lock.release()
 
     @property
     def listed(self) -> bool:
@@ -86,12 +88,17 @@ class OutputFolder:
                 )
 
     def made(self, *patterns: str, changing: bool = False) -> None:
-        """List files as made here; those that go on `changing` by their patterns alone, before they are there."""
+        """List files as made here; those that go on `changing` by their patterns alone, before they are there.
+
+        What was listed as changing by one of these very patterns is from now on known by what is in it.
+        """
         if changing:
-            self._write(self._read() | {pattern: [] for pattern in patterns})
+            others = {n: value for n, value in self._read().items() if not any(fnmatch(n, p) for p in patterns)}
+            self._write(others | {pattern: [] for pattern in patterns})
             return
         found = {file.relative_to(self.path).as_posix(): [_digest(file)] for file in self._files(patterns)}
-        kept = {name: value for name, value in self._read().items() if value == [] or (self.path / name).is_file()}
+        known = {name: value for name, value in self._read().items() if name not in patterns}
+        kept = {name: value for name, value in known.items() if value == [] or (self.path / name).is_file()}
         self._write(kept | found)
 
     def publish(self, *names: str) -> None:

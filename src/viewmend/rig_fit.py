@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.protocol import (
     ContextProvider,
     FitsRig,
@@ -74,6 +75,7 @@ def _held_out(
         observation = observe(frame.without([name]), bounds, hull)
     except ValueError:  # no foreground is left
         return None
+    assert isinstance(observation.proxy, GeometryProxy), "it was carved"
     view = render_view(observation.frame, observation.proxy, own.cameras, render, source_depth=observation.depth)
     truth = own.rgb[0].float() / 255 * (own.mask[0].float() / 255)
     margin_px = crop_margin_px(inpainter, RenderQuality())

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -71,6 +71,22 @@ class MultiViewFrame:
 
 
 @dataclass(frozen=True)
+class WindowPart:
+    """What must be known of the whole images where images are parts of them; training learns from such parts."""
+
+    whole_size_px: tuple[int, int]
+    """Width and height of the whole, of the first image of several."""
+    reference_m: Float[Tensor, "view"]
+    """Median depth of each whole image, metres."""
+    inner: Bool[Tensor, "view height width"]
+    """Only patches within count; what is around them is there for the encoder."""
+
+    def select(self, index: Int[Tensor, "view"], height: int, width: int) -> "WindowPart":
+        """The parts of some images, cut to this size."""
+        return replace(self, reference_m=self.reference_m[index], inner=self.inner[index, :height, :width])
+
+
+@dataclass(frozen=True)
 class ContextViews:
     """Camera images of one time with the geometry proxy's depth in them: all that an inpainter sees of a rig.
 
@@ -86,17 +102,21 @@ class ContextViews:
     frame: MultiViewFrame
     depth: Float[Tensor, "view height width"]
     """z-depth of G[t] in each camera, metres; 0 where the proxy is not seen."""
+    part: WindowPart | None = None
+    """Where each image is a part of a camera's own."""
 
     def to(self, device: torch.device | str) -> "ContextViews":
         """The same on `device`."""
-        return ContextViews(self.frame.to(device), self.depth.to(device))
+        return replace(self, frame=self.frame.to(device), depth=self.depth.to(device))
 
     def select(self, names: Sequence[str]) -> "ContextViews":
         """What those of these cameras that are there saw, in the order of `names`."""
         own = self.frame.cameras.names
         frame = self.frame.select([n for n in names if n in own])
         index = torch.tensor([own.index(n) for n in frame.cameras.names], device=self.depth.device, dtype=torch.long)
-        return ContextViews(frame, self.depth[index, : frame.rgb.shape[2], : frame.rgb.shape[3]])
+        height, width = frame.rgb.shape[2:]
+        part = None if self.part is None else self.part.select(index, height, width)
+        return ContextViews(frame, self.depth[index, :height, :width], part)
 
 
 @dataclass(frozen=True)
@@ -163,6 +183,8 @@ class IncompleteView:
     fade: Float[Tensor, "height width"] | None = None
     """How much of a pixel with E > 0 is known to be background, in [0, 1]: it only fades by that, nobody need look. 0
     where a pixel must be looked at. None where nobody knows."""
+    part: WindowPart | None = None
+    """Where the view is a part of a larger one."""
 
     @property
     def read(self) -> Bool[Tensor, "height width"]:

@@ -98,12 +98,15 @@ def report_folder(out: Path) -> "Iterator[None]":
     Raises:
         ValueError: another run writes there, or somebody else's file has the name of one that will be written.
     """
+    from viewmend.atomic_writes import remove_halves
     from viewmend.output_folder import OutputFolder
 
     cells = any((out / "cells").glob("*--*--*.json"))
     with OutputFolder(out) as folder:
         if folder.listed or not cells:
             folder.demand_own(*WRITTEN)
+        folder.made(*WRITTEN, changing=True)  # killed in the middle, they are ours to the next run
+        remove_halves(out / "cells")
         try:
             yield
         finally:

@@ -47,7 +47,7 @@ def assemble(
     """Pads the targets' input tokens, and their context: the frames and then their own complete patches."""
     queries, asking, keys, context = [], [], [], []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
-        uvs = F.pad(centers_px(target.places) / target.view.camera.size_px, (0, 1))  # where they are, now
+        uvs = F.pad(centers_px(target.places) / whole_size_px(target.view), (0, 1))  # where they are, now
         queries.append(target.tokens[target.incomplete])
         asking.append((uvs[target.incomplete], torch.ones_like(uvs[target.incomplete, 0], dtype=torch.bool)))
         carried = [_carried(frame, frames, target.view, config) for frame in frames]
@@ -63,6 +63,12 @@ def assemble(
     return Batch(queries, _placed(asking, targets, length), keys_values, _placed(context, targets, most))
 
 
+def whole_size_px(view: IncompleteView) -> Int[Tensor, "2"]:
+    """Width and height of a view, or of that of which it is a part: what (u, v) are measured in."""
+    own = view.camera.size_px[0]
+    return own if view.part is None else own.new_tensor(view.part.whole_size_px)
+
+
 def _carried(
     frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: InpainterConfig
 ) -> tuple[Float[Tensor, "patch 3"], Bool[Tensor, "patch"]]:
@@ -73,6 +79,7 @@ def _carried(
         if now:
             points, valid = frame.lifted_by(now[0])
     uv, counts = reproject(points, valid, view.camera)
+    uv = uv * (view.camera.size_px[0] / whole_size_px(view))
     s = torch.full_like(uv[:, :1], (view.time - frame.time) / config.window)
     return torch.cat([uv, s], 1), counts
 
@@ -81,7 +88,7 @@ def _placed(
     parts: Sequence[tuple[Float[Tensor, "_ 3"], Bool[Tensor, "_"]]], targets: Sequence[Target], length: int
 ) -> TokenPositions:
     uvs = torch.stack([_padded(uvs, length) for uvs, _ in parts])
-    sizes = torch.stack([F.pad(t.view.camera.size_px[0] / STEP_PX, (0, 1), value=1.0) for t in targets])
+    sizes = torch.stack([F.pad(whole_size_px(t.view) / STEP_PX, (0, 1), value=1.0) for t in targets])
     return TokenPositions(uvs, uvs * sizes[:, None], torch.stack([_padded(present, length) for _, present in parts]))
 
 

@@ -68,13 +68,19 @@ def reproject(
     return torch.where(counts[:, None], uv[0] / target.size_px[0], 0.0), counts
 
 
-def relative_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view height width"]:
-    """4 (z / z_ref - 1) with z_ref the median depth of each image; 0 where there is no surface.
+def reference_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view"]:
+    """The median depth of each image, metres; 1 where there is no surface."""
+    seen = depth > 0
+    return torch.stack([d[s].median() if bool(s.any()) else d.new_ones(()) for d, s in zip(depth, seen, strict=True)])
+
+
+def relative_depth(
+    depth: Float[Tensor, "view height width"], reference: Float[Tensor, "view"] | None = None
+) -> Float[Tensor, "view height width"]:
+    """4 (z / z_ref - 1) with z_ref the `reference`, by default each image's `reference_depth`; 0 without a surface.
 
     It depends on the rig's scale no more than on the target, so what is encoded from it can be cached.
     """
     seen = depth > 0
-    reference = torch.stack(
-        [d[s].median() if bool(s.any()) else d.new_ones(()) for d, s in zip(depth, seen, strict=True)]
-    )
+    reference = reference_depth(depth) if reference is None else reference
     return torch.where(seen, 4 * (depth / reference[:, None, None] - 1), 0.0)

@@ -19,7 +19,7 @@ from viewmend.inpainting.patches import (
     crop_windows,
     split,
 )
-from viewmend.views import ContextViews, IncompleteView
+from viewmend.views import ContextViews, IncompleteView, WindowPart
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def context_images(views: ContextViews, config: InpainterConfig) -> Images:
     if config.background != "recorded":
         white = (inside * (1 - mask))[:, None]  # beyond an image there is nothing, not even a background
         rgb = rgb * mask[:, None] + (config.background == "white") * white
-    return _images(rgb, mask, views.depth, inside, mask > config.min_foreground, config)
+    return _images(rgb, mask, views.depth, inside, mask > config.min_foreground, config, views.part)
 
 
 def target_images(view: IncompleteView, rgb: Float[Tensor, "3 height width"], config: InpainterConfig) -> Images:
@@ -61,20 +61,29 @@ def target_images(view: IncompleteView, rgb: Float[Tensor, "3 height width"], co
         rgb = rgb + (1 - mask)
         rgb = rgb * (1 - view.error) if config.coarse_fill == "none" else rgb
     foreground = (mask > 0) | (view.error[None] > 0)
-    return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], foreground, config)
+    return _images(rgb[None], mask, view.depth[None], 1 - view.error[None], foreground, config, view.part)
 
 
 def _images(
-    rgb: Tensor, mask: Tensor, depth: Tensor, validity: Tensor, foreground: Tensor, config: InpainterConfig
+    rgb: Tensor,
+    mask: Tensor,
+    depth: Tensor,
+    validity: Tensor,
+    foreground: Tensor,
+    config: InpainterConfig,
+    part: WindowPart | None,
 ) -> Images:
     channels = [rgb]
     if config.use_mask:
         channels.append(mask[:, None])
     if config.use_depth:
-        channels.append(relative_depth(depth)[:, None])
+        channels.append(relative_depth(depth, None if part is None else part.reference_m)[:, None])
     if config.use_validity:
         channels.append(validity[:, None])
-    return Images(torch.cat(channels, 1), foreground, any_in_patch(foreground))
+    kept = any_in_patch(foreground)
+    if part is not None:
+        kept &= ~any_in_patch(~part.inner)
+    return Images(torch.cat(channels, 1), foreground, kept)
 
 
 class Tokeniser(nn.Module):

@@ -47,6 +47,10 @@ class Objective(nn.Module):
             made = [torch.where(p.coverage > 0, image, p.upon_own.detach()) for p, image in pairs]
             counted = [torch.ones_like(coverage) for coverage in counted]
         truth = [true_image(s, self.model.background) for s in views]
-        image = image_loss(made, counted, [s.view.error for s in views], truth, weights.channels)
+        error = [s.view.error for s in views]
+        for n, part in enumerate(s.view.part for s in views):
+            if part is not None:
+                error[n], counted[n] = error[n] * part.inner[0], counted[n] * part.inner[0]
+        image = image_loss(made, counted, error, truth, weights.channels)
         total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
         return StepOutput(image, total, tuple(p.upon_own for p in predictions))

@@ -38,6 +38,10 @@ class DataPlan:
     """How many of the earlier times are context; each target takes one of these."""
     least_past: int = 0
     """So many earlier times a target has at least; 6 of `times` make a whole window of the paper's."""
+    windows: int = 0
+    """So many windows of a sample are learned from, each around something that is missing; 0: whole views."""
+    search_px: int = 16
+    """How far around where a window reprojects to its context reaches, beyond what the encoder sees."""
     context: bool = True
     """Whether samples have context; rays alone need none, and are smaller without."""
     least_context: int = 0

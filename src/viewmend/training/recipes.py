@@ -112,6 +112,13 @@ def paper_small(data: DataPlan) -> Recipe:
     )
 
 
+def windows(data: DataPlan) -> Recipe:
+    """`paper_small` on windows around what is missing, eight of each view."""
+    recipe = paper_small(data)
+    plan = replace(recipe.data, windows=8, held_cameras=2, imperfect_fraction=0.3, sizes_px=(320, 512))
+    return replace(recipe, name="windows", data=plan, new_per_batch=4, replay_size=600)
+
+
 def base(data: DataPlan) -> Recipe:
     """The paper's size with all of our additions, rays and patches together; for a data-centre GPU."""
     return replace(
@@ -157,5 +164,6 @@ RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {
     "base": base,
     "paper": paper,
     "paper_small": paper_small,
+    "windows": windows,
     "finetune": finetune,
 }

@@ -3,6 +3,7 @@
 import io
 import json
 import tarfile
+import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -25,14 +26,16 @@ from viewmend.training.ray_batches import RayBatch
 from viewmend.training.samples import Sample
 from viewmend.training.stored_scenes import StoredScene, StoredView
 from viewmend.training.whole_views import WholeView
-from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes, WindowPart
 
-PARTS = (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, Bounds, RayBatch)
+PARTS = (Sample, IncompleteView, ContextViews, WindowPart, MultiViewFrame, Silhouettes, Cameras, Bounds, RayBatch)
 STORED = (StoredScene, StoredView, WholeView, Rig, Scale, Pyramid)
 Trained = Sample | RayBatch | WholeView
 Stored = Trained | StoredScene
 KINDS = {kind.__name__: kind for kind in (*PARTS, *STORED)}
 """The dataclasses that a sample is made of, and what is looked up of one."""
+PACKED, FASTEST = ".z", 1
+"""How names of files end that zlib packed: windows, most of which is black or flat; and its level."""
 STRUCTURE = "structure"
 """Name of the tensor that holds the sample without its tensors, as JSON."""
 
@@ -98,9 +101,10 @@ def read_shard(path: Path, member: int | None = None) -> list[Stored]:
             if odd:
                 raise ShardError(f"{odd[0]!r} is no plain file within it")
             wanted = members if member is None else members[member : member + 1]
-            files = [tar.extractfile(each) for each in wanted]
-            return [sample_from_bytes(file.read()) for file in files if file is not None]
-    except (tarfile.TarError, OSError, ShardError) as error:
+            files = [(each.name.endswith(PACKED), tar.extractfile(each)) for each in wanted]
+            read = [(packed, file.read()) for packed, file in files if file is not None]
+            return [sample_from_bytes(zlib.decompress(data) if packed else data) for packed, data in read]
+    except (tarfile.TarError, OSError, zlib.error, ShardError) as error:
         raise ShardError(f"{path}: expected a tar of samples ({error}); make this shard again") from error
 
 
@@ -187,8 +191,9 @@ def _write_shard(samples: list[Stored], path: Path) -> Path:
     def write(beside: Path) -> None:
         with tarfile.open(beside, "w") as tar:
             for number, sample in enumerate(samples):
-                data = sample_to_bytes(sample)
-                member = tarfile.TarInfo(f"{path.stem}-{number:04d}.safetensors")
+                data, packed = sample_to_bytes(sample), isinstance(sample, Sample) and sample.view.part is not None
+                data = zlib.compress(data, FASTEST) if packed else data
+                member = tarfile.TarInfo(f"{path.stem}-{number:04d}.safetensors{PACKED if packed else ''}")
                 member.size = len(data)
                 tar.addfile(member, io.BytesIO(data))
 

@@ -10,6 +10,7 @@ from viewmend.training.samples import Sample
 from viewmend.training.scenes import SceneSource, StudioScenes
 from viewmend.training.stored_scenes import StoredSamples, StoredScene, StudioStore
 from viewmend.training.whole_views import WholeViewScenes, untrained
+from viewmend.training.windows import WindowScenes
 
 
 def training_source(recipe: Recipe, seed: str) -> SceneSource[Trained]:
@@ -41,7 +42,7 @@ def stored_source(recipe: Recipe, seed: str, split: Split = "training") -> Scene
 
 
 def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneSource[Sample]:
-    """Shards where they are given; else captures and the studio, as the plan shares them out.
+    """Shards where they are given; else captures and the studio, as the plan shares them out; in windows by the plan.
 
     Scenes for validation are the studio's with procedural people, whatever else there is.
 
@@ -51,6 +52,11 @@ def scene_source(plan: DataPlan, seed: str, split: Split = "training") -> SceneS
     """
     if plan.shards is not None and split == "training":
         return ShardScenes(plan.shards, seed, (Sample,), plan.clip_length)
+    scenes = _whole_scenes(plan, seed, split)
+    return WindowScenes(scenes, plan, seed) if plan.windows and split == "training" else scenes
+
+
+def _whole_scenes(plan: DataPlan, seed: str, split: Split) -> SceneSource[Sample]:
     studio = StudioScenes(plan, seed, split)
     if not (folders := recordings(split, plan.captures)):
         return studio
