@@ -68,7 +68,8 @@ def judge(
         shown = {}
         for model, completed, truth in mended(scene, models):
             scores[model].append(score_frame(completed, truth, None, 0.0))
-            shown |= {f"{model} {scores[model][-1].psnr_whole:.2f} dB": completed.rgb, "truth": truth.rgb}
+            shown[f"{model} {scores[model][-1].psnr_whole:.2f} dB"] = completed.rgb
+            shown["truth"] = shown.pop("truth", truth.rgb)  # at the end
         if sheets:
             save(shown, sheets / f"{scene.name}.png")
     means = {model: mean_scores(own) for model, own in scores.items()}

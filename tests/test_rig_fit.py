@@ -67,9 +67,9 @@ def test_streams_of_a_rig_share_what_was_learned():
     assert first.inpainter is other.inpainter and len(first.inpainter.held) == 3
 
 
-@pytest.mark.parametrize("why", ["geometry", "two cameras", "switched off"])
+@pytest.mark.parametrize("why", ["geometry", "three cameras", "switched off"])
 def test_nothing_is_learned_where_nothing_can_be(why):
-    learner, rig = Learner(), RIG.select(["c0", "c1"]) if why == "two cameras" else RIG
+    learner, rig = Learner(), RIG.select(["c0", "c1", "c2"]) if why == "three cameras" else RIG
     config = StreamConfig(hull=HullConfig(resolution=32), fit_rig=why != "switched off")
     stream = Stream(learner, config)
     stream.push(photograph(rig), proxy() if why == "geometry" else None)

@@ -21,8 +21,8 @@ from viewmend.views import MultiViewFrame
 
 LEFT_OUT = 3
 """So many cameras are left out in turn, as far apart in the rig's order as can be."""
-FEWEST_CAMERAS = 3
-"""Rigs of fewer cameras tell nothing: a hull wants two beside the one that is left out."""
+FEWEST_CAMERAS = 4
+"""Rigs of fewer cameras are not fitted: what two of them show says little about what three show."""
 
 
 class RigFit:
