@@ -7,14 +7,18 @@ import shutil
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
 
+import msgspec
 from filelock import FileLock, Timeout
 
 from viewmend.atomic_writes import remove_halves, write_atomically
 
 HIDDEN = ".viewmend"
 """The folder that holds the lock, the manifest and what is not finished."""
+
+
+class _Manifest(msgspec.Struct):
+    files: dict[str, list[str]]
 
 
 class OutputFolder:
@@ -126,19 +130,18 @@ class OutputFolder:
             for found in sorted(path for path in self.path.glob(pattern) if path.name != HIDDEN):
                 yield from _below(self.path, [found.relative_to(self.path).as_posix()])
 
-    def _read(self) -> dict[str, Any]:
+    def _read(self) -> dict[str, list[str]]:
         try:
-            listed = json.loads(self._manifest.read_text(encoding="utf-8"))
-            return {n: d for n, d in listed["files"].items() if isinstance(d, list)}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            return msgspec.json.decode(self._manifest.read_bytes(), type=_Manifest).files
+        except (OSError, msgspec.MsgspecError, RecursionError):
             return {}  # nothing is known to be ours
 
-    def _write(self, files: dict[str, Any]) -> None:
+    def _write(self, files: dict[str, list[str]]) -> None:
         text = json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True)
         write_atomically(self._manifest, lambda path: path.write_text(text, encoding="utf-8"))
 
 
-def _any(known: dict[str, Any], name: str) -> list[str] | None:
+def _any(known: dict[str, list[str]], name: str) -> list[str] | None:
     """No digests where a pattern of changing files fits the name; None where it is not known."""
     return [] if any(value == [] and fnmatch(name, pattern) for pattern, value in known.items()) else None
 

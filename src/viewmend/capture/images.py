@@ -43,7 +43,7 @@ def exif_turn(path: Path) -> str | None:
     """How the file's EXIF says that its image should be turned, in words; None where it should not, or is no image."""
     import cv2
 
-    small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(path.read_bytes(), np.uint8)
+    small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(read_bytes(path), np.uint8)
     stored, turned = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION), cv2.imdecode(data, small)
     if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
         return None
