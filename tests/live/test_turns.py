@@ -5,6 +5,7 @@ import contextlib
 import json
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,8 @@ def test_turns_are_given_one_after_the_other_and_newcomers_first(monkeypatch):
         await asyncio.sleep(0.5)
         gate.ask(lambda: given.append((4, time.monotonic())), False)
 
-    asyncio.run(ask())
+    with ThreadPoolExecutor(1) as own:  # a browser's tests leave a loop running in this one
+        own.submit(asyncio.run, ask()).result()
     assert [number for number, _ in given] == [0, 3, 1, 2, 4]
     at = [when for _, when in given]
     assert at[1] - at[0] > 0.03 + 4 * 0.03 - 0.001 and at[2] - at[1] > 0.019 and at[3] - at[2] > 0.019
@@ -75,7 +77,7 @@ def test_a_crowd_of_strangers_keeps_nobody_waiting(first, more, caplog):
             slowest = max(slowest, time.monotonic() - began)
         assert slowest < 5.0
         sockets = [c for c in server.server.server_state.connections if isinstance(c, SocketDoor) and not c.admitted]
-        assert all(c.queue.qsize() == 0 for c in sockets)
+        assert all(c.queue.qsize() <= 1 for c in sockets), "the question that waits for its turn is all that is kept"
     assert not caplog.records
 
 

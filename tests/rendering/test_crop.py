@@ -60,7 +60,7 @@ def test_the_margin_is_what_patches_look_around_themselves(monkeypatch):
         found = subject_crop(incomplete, margin_px)
         part, _ = net.step(found.of_view(incomplete), Rig(**size), net.initial_state())
         errors.append(float((part.rgb - found.of_image(whole.rgb)).abs().max()))
-    assert errors[0] < 1e-5 < errors[1]
+    assert errors[0] < 2e-5 < errors[1]
 
 
 def test_a_view_without_holes_shown_keeps_its_identity(scene):

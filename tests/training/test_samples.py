@@ -69,7 +69,9 @@ def test_training_is_shown_what_evaluation_is():
         assert sample is not None and sample.truth.any()
         view, near = stream.render(frame.truth.cameras), observation.context(sample.view.candidate_views)
         truth = (255 * true_view(frame.truth, None).rgb).round().to(torch.uint8)
-        assert same(sample, Sample(view, sample.context, near, truth)) and len(near.depth) == 4
+        assert (
+            same(sample, Sample(view, sample.context, near, truth, alpha=frame.truth.mask[0])) and len(near.depth) == 4
+        )
 
 
 def test_truth_is_black_where_the_mask_is_and_context_is_past(plan):

@@ -306,7 +306,9 @@ def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
     assert small(plan).part == "patches" and small_rays(plan).part == "rays"
     parameters = sum(p.numel() for p in build(RECIPES["base"](plan).model).parameters())
     assert parameters < 40e6
-    assert RECIPES["paper"](plan).loss == LossWeights(adversarial=0.01), "the paper's objective, exactly"
+    assert RECIPES["paper"](plan).loss == LossWeights(adversarial=0.01, channels="sum", outside="image"), (
+        "the paper's objective, exactly"
+    )
 
 
 @pytest.mark.parametrize(
