@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import time
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +12,9 @@ from jaxtyping import Float, UInt8
 
 from viewmend.live.pictures import PackedDepth, from_jpeg, unpack_depth
 from viewmend.live.protocol import VERSION, token_query, unpack
+
+PACE = 0.9
+"""Part of the messages a second that the server takes."""
 
 
 class ServerSocket:
@@ -88,16 +92,23 @@ class Client:
 
     def __enter__(self) -> "Client":
         self._socket = ServerSocket(f"{self.url}/ws", self.token)
-        self._looks = 0
+        self._looks, self._at_most_per_s = 0, math.inf
+        self._may_send, self._since_s = 1.0, time.monotonic()
         self.send("hello", version=VERSION, codecs=["jpeg"])
-        self.wait_for("welcome")
+        self._at_most_per_s = PACE * self.wait_for("welcome")["limits"]["messages_per_s"]
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._socket.close()
 
     def send(self, kind: str, **values: object) -> None:
-        """Send a message of the protocol."""
+        """Send a message of the protocol, as soon as the server takes one more: it drops what comes too quickly."""
+        if self._at_most_per_s < math.inf:
+            now, most = time.monotonic(), self._at_most_per_s
+            self._may_send = min(most, self._may_send + (now - self._since_s) * most) - 1
+            self._since_s = now
+            if self._may_send < 0:
+                time.sleep(-self._may_send / most)
         self._socket.send(json.dumps({"type": kind, **values}))
 
     def look(self, **values: object) -> int:
