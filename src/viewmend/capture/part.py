@@ -2,18 +2,14 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
-from torch import Tensor
-
 from viewmend.capture.reduction import resized_frame
-from viewmend.capture.source import CaptureSource
-from viewmend.geometry.bounds import Bounds
+from viewmend.capture.source import CaptureSource, OfSource
 from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.views import MultiViewFrame
 
 
 @dataclass(frozen=True)
-class CapturePart:
+class CapturePart(OfSource):
     """Some times of a source, as a source."""
 
     source: CaptureSource
@@ -21,11 +17,6 @@ class CapturePart:
     """Indices of the source's frames."""
     scale: float = 1.0
     """How the images' sides are scaled, at most 1; below 1 depth is left out."""
-
-    @property
-    def name(self) -> str:
-        """The source's name."""
-        return self.source.name
 
     @property
     def cameras(self) -> Cameras:
@@ -36,21 +27,6 @@ class CapturePart:
     def frame_ids(self) -> tuple[str, ...]:
         """Ids of the part's frames."""
         return tuple(self.source.frame_ids[time] for time in self.times)
-
-    @property
-    def fps(self) -> float | None:
-        """The source's."""
-        return self.source.fps
-
-    @property
-    def up(self) -> Float[Tensor, "3"] | None:
-        """The source's."""
-        return self.source.up
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """The source's."""
-        return self.source.bounds
 
     def read(self, time: int) -> MultiViewFrame:
         """The frame at index `time` of the part.

@@ -10,24 +10,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from jaxtyping import Float
-from torch import Tensor
-
 from viewmend.capture.diagnosis import diagnose, faulty_masks
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.finding import Finding
 from viewmend.capture.peers import REACH, late_camera
 from viewmend.capture.plain import PlainCapture, open_capture
 from viewmend.capture.reduction import reduced, reduced_cameras
-from viewmend.capture.source import CaptureSource
+from viewmend.capture.source import CaptureSource, OfSource
 from viewmend.geometry.alignment import Alignment, shared_offset
-from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.views import MultiViewFrame
 
 
 @dataclass(frozen=True)
-class PreparedCapture:
+class PreparedCapture(OfSource):
     """A `CaptureSource` whose cameras are aligned, and whose images are reduced, as `prepare` was asked."""
 
     source: CaptureSource
@@ -46,31 +42,6 @@ class PreparedCapture:
         """All cameras, those that are no inputs too, moved by the shift and resized with their images."""
         x_px, y_px = self.alignment.offset_px if self.alignment else (0.0, 0.0)
         return reduced_cameras(self.source.cameras.moved(x_px, y_px), self.longest_px)
-
-    @property
-    def name(self) -> str:
-        """The source's."""
-        return self.source.name
-
-    @property
-    def frame_ids(self) -> tuple[str, ...]:
-        """The source's."""
-        return self.source.frame_ids
-
-    @property
-    def fps(self) -> float | None:
-        """The source's."""
-        return self.source.fps
-
-    @property
-    def up(self) -> Float[Tensor, "3"] | None:
-        """The source's."""
-        return self.source.up
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """The source's."""
-        return self.source.bounds
 
     def read(self, time: int) -> MultiViewFrame:
         """All cameras that are there and right at index `time`, with `cameras`' calibration.

@@ -52,3 +52,39 @@ class CaptureSource(Protocol):
             IndexError: `time` is not in the capture.
         """
         ...
+
+
+class OfSource:
+    """What a capture made from another has from it; whoever changes one of these says so."""
+
+    source: CaptureSource
+
+    @property
+    def name(self) -> str:
+        """The source's."""
+        return self.source.name
+
+    @property
+    def cameras(self) -> Cameras:
+        """The source's."""
+        return self.source.cameras
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """The source's."""
+        return self.source.frame_ids
+
+    @property
+    def fps(self) -> float | None:
+        """The source's."""
+        return self.source.fps
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """The source's."""
+        return self.source.up
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The source's."""
+        return self.source.bounds

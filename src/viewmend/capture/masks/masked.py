@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from viewmend.capture.masks.across import agreed, supported
@@ -13,14 +13,13 @@ from viewmend.capture.masks.chroma import without_spill
 from viewmend.capture.masks.colours import by_colours
 from viewmend.capture.masks.maker import MaskMaker, Rgb
 from viewmend.capture.masks.over_time import lasting
-from viewmend.capture.source import CaptureSource
-from viewmend.geometry.bounds import Bounds
+from viewmend.capture.source import CaptureSource, OfSource
 from viewmend.geometry.cameras import Cameras
 from viewmend.views import MultiViewFrame
 
 
 @dataclass
-class MaskedCapture:
+class MaskedCapture(OfSource):
     """A source with masks, by a maker a camera. Makers that remember want it read in order of time."""
 
     source: CaptureSource
@@ -33,36 +32,6 @@ class MaskedCapture:
     """What lies behind each camera's subject: its green or blue is taken off the edges. None: it stays."""
     _near: dict[int, MultiViewFrame] = field(default_factory=dict)
     """Frames with masks as the makers gave them, of the times around the last."""
-
-    @property
-    def name(self) -> str:
-        """The source's name."""
-        return self.source.name
-
-    @property
-    def cameras(self) -> Cameras:
-        """The source's cameras."""
-        return self.source.cameras
-
-    @property
-    def frame_ids(self) -> tuple[str, ...]:
-        """The source's ids."""
-        return self.source.frame_ids
-
-    @property
-    def fps(self) -> float | None:
-        """The source's."""
-        return self.source.fps
-
-    @property
-    def up(self) -> Float[Tensor, "3"] | None:
-        """The source's."""
-        return self.source.up
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """The source's."""
-        return self.source.bounds
 
     def read(self, time: int) -> MultiViewFrame:
         """The source's frame, with masks.
