@@ -1,37 +1,29 @@
 """How many small bugs the tests find: python benchmarks/mutate.py [--rooms ...] [--count 20] [--again] [--write].
 
 Bugs are drawn by a seed, as many of each kind, and put into a copy of the tree, one at a time. The tests that run
-through the line are run, then all of their files; without such a test, all of the room's. What a test fails for, or
-what does not end in time, is found. The state in --work is written after each bug: the same command goes on, --again
-tries those that survived against the tests of now. Each run of tests is a fork of a process that has imported the
-libraries.
+through the line are run, the quick ones first; without such a test, all of the room's. What a test fails for, or what
+does not end in time, is found. The state in --work is written after each bug: the same command goes on, --again tries
+those that survived against the tests of now.
 """
 
 import argparse
-import contextlib
+import hashlib
 import json
 import os
 import random
-import resource
 import shutil
-import signal
 import sys
 import time
 import tomllib
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import coverage
-import pytest
 from measure import write
+from mutated_tree import ALWAYS, ROOT, Copy, Watch, collect_failed, forked, found_by
 from mutations import Mutation, applied, mutations
 
-# Imported once, for all runs; viewmend itself never, so that each run imports it as it is then.
-import cv2, einops, msgspec, numba, safetensors.torch, starlette, torch, tyro, uvicorn, websockets  # noqa: E401, F401  # isort: skip
-
-ROOT = Path(__file__).resolve().parents[1]
 NAMED = Path(__file__).with_name("named_bugs.toml")
 ROOMS = {
     "geometry": ("geometry", "laws/test_geometry_laws.py", "rendering/test_blending.py"),
@@ -44,10 +36,7 @@ ROOMS = {
     "cli": ("cli",),
 }
 """The tests of each room of src/viewmend."""
-IMPORTED = "-Wignore::pytest.PytestAssertRewriteWarning"
-ALWAYS = ["-q", "-x", "-p", "no:cacheprovider", "--no-header", "--ignore=tests/live/browser", IMPORTED]
-Change = Callable[[str], str | None]
-LEAST_S, TIMES_AS_LONG, PATIENCE = 30.0, 3.0, 20.0
+LEAST_S, TIMES_AS_LONG, AT_ONCE = 30.0, 3.0, 200
 
 
 @dataclass
@@ -62,66 +51,6 @@ class Bug:
     by: str = ""
     """The test that failed."""
     seconds: float = 0.0
-
-
-class Copy:
-    """A copy of the tree, in which files are broken and mended again."""
-
-    def __init__(self, work: Path) -> None:
-        self.root = work / "tree"
-        shutil.rmtree(self.root, ignore_errors=True)
-        ignored = shutil.ignore_patterns(".git", "out", "node_modules", ".venv", ".hypothesis", ".pytest_cache")
-        shutil.copytree(ROOT, self.root, symlinks=True, ignore=ignored)
-        shared = ROOT.parent / "shared"
-        if shared.is_dir() and not (work / "shared").exists():
-            (work / "shared").symlink_to(shared)
-        self._stamp = time.time()
-
-    def with_bug(self, bug: str, change: Change, run: Callable[[], tuple[str, str]]) -> tuple[str, str]:
-        """`run` while this file is changed; it is mended whatever happens."""
-        path = self.root / bug
-        good, stat = path.read_text(), path.stat()
-        broken = change(good)
-        if broken is None:
-            return "gone", ""
-        caches = [*path.parent.glob("__pycache__/*.nb[ic]")]
-        held = {cache: cache.read_bytes() for cache in caches}  # compiled callers know nothing of a callee's change
-        try:
-            path.write_text(broken)
-            self._stamp += 1  # what was compiled of another bug a moment ago is of another time
-            os.utime(path, (self._stamp, self._stamp))
-            for cache in caches:
-                cache.unlink()
-            return run()
-        finally:
-            path.write_text(good)
-            os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-            for cache in path.parent.glob("__pycache__/*.nb[ic]"):
-                cache.unlink()
-            for cache, data in held.items():
-                cache.write_bytes(data)
-
-
-class Watch:
-    """A plugin of pytest: which test failed first, how long each took, and which lines it ran."""
-
-    def __init__(self, lines: coverage.Coverage | None = None) -> None:
-        self.lines, self.failed = lines, ""
-        self.seconds: dict[str, float] = {}
-
-    @pytest.hookimpl(tryfirst=True)
-    def pytest_runtest_protocol(self, item: pytest.Item) -> None:
-        if self.lines is not None:
-            self.lines.switch_context(item.nodeid)
-
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
-        if report.failed and not self.failed:
-            self.failed = report.nodeid
-
-    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
-        if report.failed and not self.failed:
-            self.failed = f"{report.nodeid} (import)"
 
 
 def main() -> None:
@@ -195,7 +124,7 @@ class Ways:
 
 
 def tests_by_line(copy: Copy, room: str, work: Path) -> Ways:
-    """Run the room's tests once, without a bug."""
+    """Run the room's tests once, without a bug, unless that was done with this very tree."""
     file = work / f"{room}--lines.json"
     tests = tuple(f"tests/{name}" for name in ROOMS[room] if (copy.root / "tests" / name).exists())
 
@@ -212,27 +141,24 @@ def tests_by_line(copy: Copy, room: str, work: Path) -> Ways:
             }
             for name in data.measured_files()
         }
-        file.write_text(json.dumps({"failing": failed, "lines": by_file, "seconds": watch.seconds}))
+        values = {"of": now, "failing": failed, "lines": by_file, "seconds": watch.seconds}
+        file.write_text(json.dumps(values))
 
+    before, now = (json.loads(file.read_text()) if file.exists() else {}), fingerprint(copy.root)
+    if before.get("of") == now:
+        return Ways(tests, tuple(before["failing"]), before["lines"], before["seconds"])
     if forked(run, 3600, copy.root, work / f"{room}--baseline.log") != 0:
         raise RuntimeError(f"{room}: the tests did not run; see {work / room}--baseline.log")
     found = json.loads(file.read_text())
     return Ways(tests, tuple(found["failing"]), found["lines"], found["seconds"])
 
 
-def collect_failed(watch: Watch, arguments: list[str]) -> list[str]:
-    """All tests that fail, without a bug."""
-    failed: list[str] = []
-
-    class Failures:
-        def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-            if report.failed:
-                failed.append(report.nodeid)
-
-    code = pytest.main(arguments, plugins=[watch, Failures()])
-    if code not in (0, 1):
-        raise RuntimeError(f"the tests could not be collected: pytest left with {int(code)}")
-    return failed
+def fingerprint(root: Path) -> str:
+    """Of all code and tests of a tree."""
+    found = hashlib.sha256()
+    for path in sorted(file for part in ("src", "tests") for file in (root / part).rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()
 
 
 def try_bug(copy: Copy, bug: Bug, ways: Ways, work: Path) -> None:
@@ -257,25 +183,6 @@ def judged(copy: Copy, bug: Bug, ways: Ways, work: Path) -> tuple[str, str]:
     return "survived", ""
 
 
-def found_by(copy: Copy, tests: list[str], within_s: float, work: Path) -> tuple[str, str]:
-    """The outcome of these tests, and the one that failed."""
-    said = work / "failed.txt"
-    said.unlink(missing_ok=True)
-
-    def run() -> None:
-        watch = Watch()
-        code = pytest.main([*ALWAYS, *tests], plugins=[watch])
-        if code not in (0, 5):
-            said.write_text(watch.failed or f"pytest left with {int(code)}")
-
-    status = forked(run, within_s, copy.root, work / "last.log")
-    if status is None:
-        return "timeout", ""
-    if status or said.exists():
-        return "killed", said.read_text() if said.exists() else f"the process died ({status})"
-    return "survived", ""
-
-
 def try_named(copy: Copy, work: Path) -> int:
     """The bugs of `NAMED`, each against its tests; how many are not found."""
     missed = 0
@@ -293,14 +200,13 @@ def try_named(copy: Copy, work: Path) -> int:
 
 
 def selections(bug: Bug, ways: Ways) -> Iterator[list[str]]:
-    """The tests that run through the bug's lines, the quick ones first; then all in their files; else the room's."""
+    """The tests that run through the bug's lines, the quick ones first; where there is none, all of the room's."""
     of_file = ways.lines.get(bug.path, {})
     span = range(bug.mutation.line, bug.mutation.line + bug.mutation.old.count("\n"))
     through = {test for line in span for test in of_file.get(str(line), ()) if test in ways.seconds}
     if through:
         exact = sorted(through, key=lambda test: ways.seconds[test])
-        yield exact[:200]
-        yield sorted({test.split("::")[0] for test in through})
+        yield from (exact[n : n + AT_ONCE] for n in range(0, len(exact), AT_ONCE))
     else:
         stem = Path(bug.path).stem.strip("_").split("_")[0]
         yield sorted(expand(ways), key=lambda file: stem not in file)
@@ -309,47 +215,6 @@ def selections(bug: Bug, ways: Ways) -> Iterator[list[str]]:
 def expand(ways: Ways) -> list[str]:
     """The room's files of tests."""
     return sorted({test.split("::")[0] for test in ways.seconds})
-
-
-def forked(work: Callable[[], object], within_s: float, where: Path, log: Path) -> int | None:
-    """The status of `work` in a process of its own, in a folder; None if it took too many seconds of the processor.
-
-    By the clock it may take `PATIENCE` times as long.
-    """
-    child = os.fork()
-    if not child:
-        try:
-            os.setsid()
-            os.chdir(where)
-            output = os.open(log, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
-            os.dup2(output, 1)
-            os.dup2(output, 2)
-            os.environ["PYTHONPATH"] = str(where / "src")
-            # The checkout's own packages, and this folder's modules, some of which are called as folders of tests are.
-            sys.path[:] = [
-                str(where / "src"),
-                *(p for p in sys.path if Path(p) not in (ROOT / "src", Path(__file__).parent)),
-            ]
-            resource.setrlimit(resource.RLIMIT_CPU, (round(within_s), round(within_s) + 5))
-            work()
-            sys.stdout.flush()
-            os._exit(0)
-        except BaseException:
-            traceback.print_exc()
-            sys.stderr.flush()
-        finally:
-            os._exit(1)
-    end = time.monotonic() + PATIENCE * within_s
-    ended = status = 0
-    while not ended and time.monotonic() < end:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        time.sleep(0.05)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)
-    if not ended:
-        os.waitpid(child, 0)
-    timed_out = not ended or (os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL))
-    return None if timed_out else status
 
 
 def load(state: Path) -> list[Bug]:

@@ -1,7 +1,10 @@
 """Files that are whole or not there: written beside their place, then renamed."""
 
+import errno
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from safetensors import SafetensorError
@@ -10,6 +13,22 @@ from torch import Tensor
 
 HALF = ".half-"
 """How the name of a file begins that is being written."""
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have what finds no room on the disk say where: the errors of writes do not know their file.
+
+    Raises:
+        OSError: there was no room, with `path` unless it names a file.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM or error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def write_atomically(path: Path, write: Callable[[Path], object], durable: bool = False) -> None:
@@ -22,18 +41,20 @@ def write_atomically(path: Path, write: Callable[[Path], object], durable: bool 
     """
     beside = path.with_name(f"{HALF}{os.getpid()}-{path.name}")
     try:
-        write(beside)
-        if durable:
-            _flush_to_disk(beside)
-        beside.replace(path)
-        if durable and os.name == "posix":  # elsewhere folders cannot be opened
-            _flush_to_disk(path.parent)
-    except OSError as error:
-        if error.errno is None or error.filename is not None:
-            raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        with naming(path):
+            write(beside)
+            if durable:
+                _flush_to_disk(beside)
+            beside.replace(path)
+            if durable and os.name == "posix":  # elsewhere folders cannot be opened
+                _flush_to_disk(path.parent)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """A file of text in UTF-8, whole or not there; raises as `write_atomically` does."""
+    write_atomically(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
 
 def remove_halves(folder: Path) -> None:
@@ -41,6 +62,27 @@ def remove_halves(folder: Path) -> None:
     for half in folder.glob(f"{HALF}*"):
         if half.is_symlink() or not half.is_dir():
             half.unlink(missing_ok=True)
+
+
+def remove_half_of(path: Path) -> None:
+    """Remove what killed runs have left unfinished of one file, in a folder that others may write to, too."""
+    name = re.compile(rf"{re.escape(HALF)}(\d+)-{re.escape(path.name)}")
+    for entry in path.parent.iterdir() if path.parent.is_dir() else ():
+        if (half := name.fullmatch(entry.name)) and not is_running(half[1]) and not entry.is_dir():
+            entry.unlink(missing_ok=True)
+
+
+def is_running(process: str) -> bool:
+    """Whether a process of this machine has that number; True where it cannot be found out."""
+    if os.name != "posix" or not process.isdigit():
+        return True
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 from filelock import FileLock, Timeout
 
-from viewmend.atomic_writes import remove_halves, write_atomically
+from viewmend.atomic_writes import remove_halves, write_text
 
 HIDDEN = ".viewmend"
 """The folder that holds the lock, the manifest and what is not finished."""
@@ -138,7 +138,7 @@ class OutputFolder:
 
     def _write(self, files: dict[str, list[str]]) -> None:
         text = json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True)
-        write_atomically(self._manifest, lambda path: path.write_text(text, encoding="utf-8"))
+        write_text(self._manifest, text)
 
 
 def _any(known: dict[str, list[str]], name: str) -> list[str] | None:

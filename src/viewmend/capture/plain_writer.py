@@ -13,6 +13,7 @@ from typing import Literal
 
 import torch
 
+from viewmend.atomic_writes import is_running, naming
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import write_depth, write_image
 from viewmend.capture.plain_format import CALIBRATION, FORMAT, stays_inside
@@ -62,28 +63,16 @@ def whole_folder(out: Path | str) -> Iterator[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.parent / f".{out.name}.unfinished-{os.getpid()}"
     for left in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
-        if not _is_running(left.name.rpartition("-")[2]):
+        if not is_running(left.name.rpartition("-")[2]):
             shutil.rmtree(left, ignore_errors=True)
     try:
-        yield unfinished
+        with naming(out):
+            yield unfinished
         if out.exists():
             out.rmdir()
         unfinished.rename(out)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-
-
-def _is_running(process: str) -> bool:
-    """Whether a process of this machine has that number; True where it cannot be found out."""
-    if os.name != "posix" or not process.isdigit():
-        return True
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):
-        return True
-    return True
 
 
 class _Writer:

@@ -48,6 +48,7 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; 1 if an evaluation failed, else 0."""
+    from viewmend.atomic_writes import write_text
     from viewmend.cli.console import say, show
     from viewmend.cli.evaluating import report_folder
     from viewmend.evaluation.ablation_report import Ablation, markdown, plots, to_json
@@ -60,9 +61,8 @@ def run(options: Options) -> int:
         trained = _train(options, recipes)
         cells = _evaluate(options, trained)
         ablation = Ablation.of(trained, cells)
-        options.out.joinpath("ablation.md").write_text(markdown(ablation), encoding="utf-8")
-        options.out.joinpath("ablation.json").write_text(to_json(ablation), encoding="utf-8")
-        options.out.joinpath("ablation.svg").write_text(plots(ablation), encoding="utf-8")
+        for suffix, text in {"md": markdown(ablation), "json": to_json(ablation), "svg": plots(ablation)}.items():
+            write_text(options.out / f"ablation.{suffix}", text)
     say(f"wrote {options.out}")
     show(markdown(ablation).rstrip())
     return 1 if any(cell.error is not None for cell in cells) else 0
@@ -97,6 +97,7 @@ def _make_samples(options: Options, recipe: "Recipe") -> None:
     """Write the samples, unless all are there."""
     from itertools import islice
 
+    from viewmend.atomic_writes import write_text
     from viewmend.cli.console import track
     from viewmend.training.replay import samples_in_order
     from viewmend.training.sample_files import write_shards
@@ -115,7 +116,7 @@ def _make_samples(options: Options, recipe: "Recipe") -> None:
     samples = (sample for _, _, sample in islice(made, options.samples))
     for _ in write_shards(track(samples, "samples", options.samples), folder):
         pass
-    done.write_text(made_of)
+    write_text(done, made_of)
 
 
 def _train(options: Options, recipes: "dict[str, Recipe]") -> "list[Trained]":

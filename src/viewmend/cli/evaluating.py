@@ -2,7 +2,6 @@
 
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -106,7 +105,8 @@ def report_folder(out: Path) -> "Iterator[None]":
         if folder.listed or not cells:
             folder.demand_own(*WRITTEN)
         folder.made(*WRITTEN, changing=True)  # killed in the middle, they are ours to the next run
-        remove_halves(out / "cells")
+        for place in ("cells", "sheets"):
+            remove_halves(out / place)
         try:
             yield
         finally:
@@ -150,7 +150,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> Evalua
 
 def write_report(options: RunOptions, found: Evaluated) -> None:
     """OUT/report.md, .csv, .json and .html, and OUT/sheets/."""
-    from viewmend.atomic_writes import write_atomically
+    from viewmend.atomic_writes import write_text
     from viewmend.cli.console import say
     from viewmend.evaluation.report_data import report_csv, report_json
     from viewmend.evaluation.report_markdown import markdown
@@ -163,7 +163,7 @@ def write_report(options: RunOptions, found: Evaluated) -> None:
     forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
     forms["html"] = page(report, cells, store, options.shown, options.video)
     for name, text in forms.items():
-        write_atomically(options.out / f"report.{name}", partial(Path.write_text, data=text, encoding="utf-8"))
+        write_text(options.out / f"report.{name}", text)
     write_sheets(cells, store, options.out / "sheets")
     say(f"wrote {options.out}")
 

@@ -68,6 +68,7 @@ def _is_model(target: str) -> bool:
 
 
 def _look_at_capture(options: Options) -> "CaptureDescription":
+    from viewmend.atomic_writes import remove_half_of
     from viewmend.capture.calibration_check import check_calibration, check_picture
     from viewmend.capture.description import describe_capture
     from viewmend.capture.images import write_image
@@ -81,6 +82,7 @@ def _look_at_capture(options: Options) -> "CaptureDescription":
     with busy("carving the subject"):
         check = check_calibration(capture.read(options.time), capture.bounds)
     if options.out is not None:
+        remove_half_of(options.out)
         with busy("drawing the check picture"):
             write_image(options.out, check_picture(check, capture.up))
         say(f"wrote {options.out}")

@@ -37,6 +37,7 @@ class Options(RunOptions):
 
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
+    from viewmend.atomic_writes import write_text
     from viewmend.cli.console import show
     from viewmend.cli.evaluating import evaluate, report_folder, write_report
     from viewmend.evaluation.paper_tables import NO_FIGURES, OURS, TABLES, PaperRow, ablation_models, paper_grid
@@ -65,12 +66,11 @@ def run(options: Options) -> int:
         write_report(options, found)
         grid = paper_grid(rows, found.report, methods)
         text = _text(options.table, sets, written(grid), found.report)
-        stem = options.out / f"table{options.table}"
-        stem.with_suffix(".md").write_text(text, encoding="utf-8")
-        stem.with_suffix(".json").write_text(
-            json.dumps([dict(zip(grid.heads, r, strict=True)) for r in grid.rows], indent=1)
-        )
-        stem.with_suffix(".csv").write_text("\n".join(_csv_line(line) for line in (grid.heads, *grid.rows)) + "\n")
+        by_head = [dict(zip(grid.heads, row, strict=True)) for row in grid.rows]
+        forms = {"md": text, "json": json.dumps(by_head, indent=1)}
+        forms["csv"] = "\n".join(_csv_line(line) for line in (grid.heads, *grid.rows)) + "\n"
+        for suffix, form in forms.items():
+            write_text(options.out / f"table{options.table}.{suffix}", form)
     show(text.rstrip())
     return 1 if found.failed else 0
 

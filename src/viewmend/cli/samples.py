@@ -105,11 +105,11 @@ def _demand_same(out: Path, recipe: Recipe) -> None:
     Raises:
         ValueError: they are made by another plan or seed.
     """
-    from viewmend.atomic_writes import write_atomically
+    from viewmend.atomic_writes import write_text
 
     plan, file = f"seed {recipe.seed}, {recipe.data}\n", out / PLAN
     if not file.exists():
-        write_atomically(file, lambda path: path.write_text(plan))
+        write_text(file, plan)
     elif file.read_text() != plan:
         raise ValueError(
             f"{out}: expected scenes of the same plan and seed, got {file.read_text().strip()}; give the options that "

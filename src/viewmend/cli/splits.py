@@ -34,7 +34,7 @@ def run(options: Options) -> int:
     """Run the command; the exit code."""
     import re
 
-    from viewmend.atomic_writes import write_atomically
+    from viewmend.atomic_writes import remove_half_of, write_text
     from viewmend.cli.console import say, show
     from viewmend.leave_one_out.capture_splits import make_splits, splits_json
 
@@ -44,8 +44,7 @@ def run(options: Options) -> int:
         raise ValueError(f"expected a regular expression for --subject, got '{options.subject}': {error}") from None
     if not 0 < options.test_share < 1:
         raise ValueError(f"expected --test-share above 0 and below 1, got {options.test_share}; the paper has 7 of 79")
-    if options.out.exists():
-        raise ValueError(f"{options.out}: expected no such file, got one; splits that were cited must not change")
+    remove_half_of(options.out)
     splits = make_splits(
         options.captures,
         options.out.parent,
@@ -55,7 +54,12 @@ def run(options: Options) -> int:
         kind=options.kind,
     )
     text = splits_json(splits)
-    write_atomically(options.out, lambda beside: beside.write_text(text, encoding="utf-8"))
+    if options.out.exists() and options.out.read_text("utf-8", "replace") != text:
+        raise ValueError(
+            f"{options.out}: expected no such file, or the same splits, got others; splits that were cited must not "
+            "change: choose another --out"
+        )
+    write_text(options.out, text)
     for split in ("training", "test"):
         own = [scene for scene in splits.scenes if scene.split == split]
         show(f"{split}: {len(own)} scenes of {len({scene.subject for scene in own})} subjects")

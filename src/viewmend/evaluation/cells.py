@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from viewmend.atomic_writes import write_atomically
+from viewmend.atomic_writes import write_atomically, write_text
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import read_rgb, write_image
 from viewmend.evaluation.film import FILM_FRAMES, Picture, frames_of
@@ -112,7 +112,7 @@ class CellStore:
             self._write_features(f"{cell.key.stem}.npz", run.features)
         values = asdict(replace(cell, features=None, true_features=None))
         text = json.dumps({name: values[name] for name in REMEMBERED}, indent=1, allow_nan=False) + "\n"
-        write_atomically(self.folder / f"{cell.key.stem}.json", lambda path: path.write_text(text))
+        write_text(self.folder / f"{cell.key.stem}.json", text)
 
     def save_scene(self, key: CellKey, run: SceneRun) -> None:
         """Remember what all methods of a scene share: rendered view, E, truth, and its videos' features."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.atomic_writes import write_atomically
+from viewmend.atomic_writes import write_text
 from viewmend.capture.images import write_image
 from viewmend.export.camera_files import blender_script, usd_scene
 from viewmend.export.cutout import cutout
@@ -100,7 +100,7 @@ def _write_cameras(
         "open_in_blender.py": blender_script(groups, rotation, fps, times, pictures),
     }
     for name, text in texts.items():
-        write_atomically(out / name, lambda path, text=text: path.write_text(text, encoding="utf-8"))
+        write_text(out / name, text)
 
 
 def _write_hull(observation: Observation, rotation: Float[Tensor, "3 3"], path: Path) -> int:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from viewmend.atomic_writes import write_atomically, write_tensors
+from viewmend.atomic_writes import write_tensors, write_text
 from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.network import auto_dtype, set_compute_dtype
@@ -95,8 +95,8 @@ def save_inpainter(network: Mender, folder: str | Path, card: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     kind = {NETWORK: SWEEP} if isinstance(network, SweepNet) else {}
     config = {"viewmend_format": FORMAT} | kind | network.config.to_dict()
-    write_atomically(folder / CONFIG, lambda path: path.write_text(json.dumps(config, indent=2) + "\n"))
-    write_atomically(folder / CARD, lambda path: path.write_text(card))
+    write_text(folder / CONFIG, json.dumps(config, indent=2) + "\n")
+    write_text(folder / CARD, card)
     write_tensors(folder / WEIGHTS, network.state_dict(), {"format": "pt"})
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from viewmend.atomic_writes import write_tensors
+from viewmend.atomic_writes import write_tensors, write_text
 from viewmend.baselines.e2fgvi import E2FGVI
 from viewmend.baselines.frame_coder import SLOPE
 from viewmend.baselines.published import NETWORKS, TRAINED
@@ -103,7 +103,7 @@ class BaselineRun(Run):
         card = (
             model_card(self.recipe, self.state) + f"\nBegan with {begun}. A method: {self.recipe.name}-o-def@FOLDER.\n"
         )
-        (self.out / "README.md").write_text(card)
+        write_text(self.out / "README.md", card)
 
 
 def _draw_as_he(network: TokenTransformer | E2FGVI) -> None:

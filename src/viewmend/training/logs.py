@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from viewmend.atomic_writes import write_atomically
+from viewmend.atomic_writes import naming, write_text
 from viewmend.training.schedule import Pace
 from viewmend.training.validation import ValidationScores, WholeViewScores
 
@@ -48,10 +48,10 @@ class Log:
         self._file = self._board = None
         if not writes:
             return
-        path = out / "log.jsonl"
+        self._path = path = out / "log.jsonl"
         lines = path.read_text().splitlines(keepends=True) if path.exists() else []
         kept = "".join(line for line in lines if line.endswith("\n") and not _is_later(line, step))
-        write_atomically(path, lambda beside: beside.write_text(kept))
+        write_text(path, kept)
         self._file = path.open("a")
         try:
             from torch.utils.tensorboard import SummaryWriter  # type: ignore[attr-defined]
@@ -85,8 +85,9 @@ class Log:
 
     def _write(self, values: Mapping[str, object]) -> None:
         if self._file is not None:
-            self._file.write(json.dumps(values) + "\n")
-            self._file.flush()
+            with naming(self._path):
+                self._file.write(json.dumps(values) + "\n")
+                self._file.flush()
 
     def _plot(self, step: int, values: Mapping[str, float]) -> None:
         if self._board is not None:

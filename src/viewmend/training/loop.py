@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel
 
+from viewmend.atomic_writes import write_atomically
 from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.checkpoint import save_inpainter
 from viewmend.inpainting.network import set_compute_dtype
@@ -217,7 +218,8 @@ class Run:
         folder = self.out / f"not-finite-{step:06d}"
         folder.mkdir(exist_ok=True)
         for number, sample in enumerate(batch):
-            (folder / f"{number:02d}.safetensors").write_bytes(sample_to_bytes(sample))
+            data = sample_to_bytes(sample)
+            write_atomically(folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data))
         raise FloatingPointError(
             f"expected a finite loss, got {float(total)} at step {step}; its batch is in {folder}: look at it, or "
             "lower the learning rate and begin with the last checkpoint"

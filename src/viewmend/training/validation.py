@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.baselines.classical import Telea
+from viewmend.capture.images import write_image
 from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.inpainting.upon_white import UponWhite
 from viewmend.metrics.image_quality import psnr
@@ -109,9 +110,7 @@ def _score(rgb: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height 
 
 def write_picture(rows: list[Float[Tensor, "3 _h _w"]], path: Path) -> None:
     """Writes `picture`."""
-    import cv2
-
-    cv2.imwrite(str(path), picture(rows).permute(1, 2, 0).flip(2).numpy())
+    write_image(path, picture(rows).permute(1, 2, 0).contiguous().numpy())
 
 
 def picture(rows: list[Float[Tensor, "3 _h _w"]]) -> UInt8[Tensor, "3 height width"]:

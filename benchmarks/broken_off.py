@@ -1,0 +1,260 @@
+"""Commands that are broken off: python benchmarks/broken_off.py [--commands mend ...] [--points 5] [--write].
+
+Each command that writes runs once as a whole; what it opens to write, renames, makes and removes is counted. Then it is
+killed (kill -9) at some of these points, each time just after a file was opened, and run once more: a kill may leave
+files by an unfinished name alone, and the next run ends as the whole one did and removes them. The same with SIGTERM,
+which may leave none; and with a disk of a part of the room (a tmpfs; needs the right to mount): one line with the path,
+an exit code other than 0, and nothing half-written. Prints a table; leaves with 1 where something else happened.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from measure import write
+
+# Imported once, for all runs, each of which is a fork.
+import cv2, einops, msgspec, numba, safetensors.torch, torch, tyro  # noqa: E401, F401  # isort: skip
+from viewmend.cli import main as viewmend
+
+TRAIN = "--steps 2 --batch 2 --workers 0 --validate-every 2 --validation-views 1 --checkpoint-every 1"
+SMALL = "--frames 2 --size 96 --model telea"
+COMMANDS = {
+    "demo": f"demo --out AREA/out {SMALL}",
+    "mend": "mend CAPTURE --out AREA/out --path orbit --model telea --alpha --depth",
+    "studio": "studio AREA/out --scenes 2 --cameras 4 --frames 2 --size 96",
+    "train": f"train finetune --captures CAPTURE --from small --out AREA/out {TRAIN}",
+    "train dstt": "train dstt --out AREA/out --steps 1 --batch 1 --workers 0 --shards SHARDS",
+    "samples": "samples finetune --captures CAPTURE --out AREA/out --count 2 --workers 0",
+    "ablation": "ablation --out AREA/out --variants no-rope --seeds 1 --samples 2 --steps 1 --scenes 1 --frames 1 "
+    "--size 96 --jobs 1",
+    "evaluate": "evaluate P --out AREA/out --methods telea --scenes 1 --frames 2 --size 96 --jobs 1",
+    "evaluate paper-table": "evaluate paper-table 1 P --ours telea --out AREA/out --scenes 1 --frames 1 --size 96",
+    "masks": "masks CAPTURE AREA/out --method chroma --dark --no-clean",
+    "splits": "splits CAPTURE SECOND --out AREA/splits.json",
+    "convert": "convert CAPTURE AREA/out",
+    "convert to riftcast": "convert CAPTURE AREA/out --to riftcast",
+    "export-scene": "export-scene CAPTURE AREA/out --views 2 --model telea",
+    "info": "info CAPTURE --out AREA/check.png",
+}
+"""Every command that writes, on little."""
+UNFINISHED = re.compile(r"(^|/)(\.half-|\.viewmend(/|$)|\.[^/]+\.unfinished-\d+(/|$))")
+GROWING = re.compile(r"(^|/)(log\.jsonl$|tensorboard(/|$))")
+"""Files of a run that grow line by line, of which every line is whole by itself."""
+PAGE = 4096
+PARTS_OF_THE_ROOM = (0.05, 0.5, 0.9)
+Struck = Callable[[int, str, str], None]
+
+
+@dataclass
+class Outcome:
+    """What a command did when it was broken off."""
+
+    points: int = 0
+    """Files opened, renamed, made and removed by a whole run."""
+    killed: int = 0
+    ended: int = 0
+    """By SIGTERM."""
+    full: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+class Area:
+    """A folder for one command, and what a run of it does there."""
+
+    def __init__(self, root: Path, command: str) -> None:
+        self.root, self.command = root, command.replace("AREA", str(root)).split()
+
+    def run(self, strike: Struck = lambda *_: None) -> tuple[int, str, str]:
+        """Run it in a fork, which strikes at each point; exit code (negative: signal), standard error, the points."""
+        with tempfile.TemporaryDirectory() as beside:
+            said, points = Path(beside) / "said", Path(beside) / "points"
+            child = os.fork()
+            if not child:
+                self._child(said, points, strike)
+            code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGKILL)
+            return code, said.read_text(), points.read_text()
+
+    def _child(self, said: Path, points: Path, strike: Struck) -> None:
+        try:
+            os.setsid()
+            for number in (1, 2):
+                os.dup2(os.open(said, os.O_CREAT | os.O_APPEND | os.O_WRONLY), number)
+            log, own, count, root = points.open("w"), os.getpid(), 0, str(self.root)
+
+            def hook(event: str, arguments: tuple[object, ...]) -> None:
+                nonlocal count
+                if event not in ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir") or os.getpid() != own:
+                    return
+                path = os.fspath(arguments[0]) if isinstance(arguments[0], str | os.PathLike) else ""
+                written = event != "open" or (
+                    isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)
+                )
+                if str(path).startswith(root) and written:
+                    count += 1
+                    log.write(f"{event} {path}\n")
+                    log.flush()
+                    strike(count, event, str(path))
+
+            sys.addaudithook(hook)
+            os._exit(viewmend(self.command))
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stderr.flush()
+            os._exit(1)
+
+    def files(self) -> dict[str, int]:
+        """Size of each file by its path; of folders of unfinished names, too."""
+        paths = [path for path in self.root.rglob("*") if path.is_file() or UNFINISHED.search(str(path))]
+        return {path.relative_to(self.root).as_posix(): path.stat().st_size for path in paths}
+
+    def unfinished(self, killed: bool) -> list[str]:
+        """What must not lie there: after a kill what is half-written, else all that has an unfinished name, too."""
+        bad = []
+        for name, size in self.files().items():
+            if UNFINISHED.search(name):
+                bad += [] if killed or _kept(name) else [name]
+            elif not size and not GROWING.search(name):
+                bad.append(f"{name} (empty)")
+            elif name.endswith(".json"):
+                with contextlib.suppress(ValueError):
+                    json.loads((self.root / name).read_text())
+                    continue
+                bad.append(f"{name} (half)")
+        return bad
+
+
+def _kept(name: str) -> bool:
+    """Whether a run leaves this in the end: its manifest and lock."""
+    return name.endswith((".viewmend", ".viewmend/files.json", ".viewmend/lock"))
+
+
+def killed_at(number: int, sent: signal.Signals) -> Struck:
+    """Strike at this point: the file is opened, and then the signal comes."""
+
+    def strike(count: int, event: str, path: str) -> None:
+        if count == number:
+            if event == "open" and sent == signal.SIGKILL:
+                os.close(os.open(path, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o644))
+            os.kill(os.getpid(), sent)
+
+    return strike
+
+
+@contextlib.contextmanager
+def disk(folder: Path, free_bytes: int) -> Iterator[Path]:
+    """A file system with so much room, in whole pages; none below one."""
+    place = folder / "disk"
+    place.mkdir()
+    pages = free_bytes // PAGE + 1
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={pages * PAGE}", "tmpfs", place], check=True)
+    try:
+        (place / "full").write_bytes(bytes(PAGE))
+        yield place
+    finally:
+        subprocess.run(["umount", "-l", place], check=True)
+        place.rmdir()
+
+
+def broken_off(command: str, points: int, folder: Path) -> Outcome:
+    """Everything that is done to one command."""
+    outcome = Outcome()
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        area = Area(Path(place), command)
+        code, said, log = area.run()
+        lines, whole = log.splitlines(), area.files()
+        outcome.points, room = len(lines), sum(whole.values())
+        opened = [path for event, _, path in (line.partition(" ") for line in lines) if event == "open"]
+        plain = {p for p in opened if not UNFINISHED.search(p) and not GROWING.search(p)}
+        outcome.faults += [f"{path} is written in its place" for path in sorted(plain)]
+        if code or not whole:
+            outcome.faults.append(f"a whole run: {code}, {said[-600:]}")
+            return outcome
+    for n in range(points):
+        number = 1 + round(n * (len(lines) - 1) / max(1, points - 1))
+        for sent in (signal.SIGKILL, signal.SIGTERM):
+            with tempfile.TemporaryDirectory(dir=folder) as place:
+                faults = _struck(Area(Path(place), command), number, sent, set(whole))
+            outcome.killed += sent == signal.SIGKILL
+            outcome.ended += sent == signal.SIGTERM
+            outcome.faults += [f"{sent.name} at {number} ({lines[number - 1][-80:]}): {fault}" for fault in faults]
+    for part in PARTS_OF_THE_ROOM:
+        with contextlib.suppress(subprocess.CalledProcessError, FileNotFoundError):
+            with disk(folder, int(part * room)) as place:
+                faults = _full(Area(place, command))
+            outcome.full += 1
+            outcome.faults += [f"a disk of {part:.0%}: {fault}" for fault in faults]
+    return outcome
+
+
+def _struck(area: Area, number: int, sent: signal.Signals, whole: set[str]) -> list[str]:
+    """Send a signal at this point, and run again: what should not have been."""
+    code, said, _ = area.run(killed_at(number, sent))
+    expected = -9 if sent == signal.SIGKILL else 143
+    faults = [] if code == expected or (code == 0 and "stopping after this step" in said) else [f"exit code {code}"]
+    faults += [] if sent == signal.SIGKILL or "Traceback" not in said else [said[-600:]]
+    faults += [f"left {name}" for name in area.unfinished(sent == signal.SIGKILL)]
+    code, said, _ = area.run()
+    faults += [f"the next run: {code}, {said[-600:]}"] if code else []
+    faults += [f"the next run leaves {name}" for name in area.unfinished(False)]
+    missing = {name for name in whole - set(area.files()) if not GROWING.search(name)}
+    return faults + [f"the next run lacks {name}" for name in sorted(missing)[:3]]
+
+
+def _full(area: Area) -> list[str]:
+    code, said, _ = area.run()
+    errors = [line for line in said.splitlines() if line.startswith("viewmend: error:")]
+    good = code == 2 and len(errors) == 1 and str(area.root) in errors[0] and "Traceback" not in said
+    return ([] if good else [f"exit code {code}, {said[-600:]}"]) + [f"left {n}" for n in area.unfinished(False)]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--commands", nargs="+", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--points", type=int, default=5, help="kills, and as many SIGTERMs, of each command")
+    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    given = parser.parse_args()
+    outcomes: dict[str, Outcome] = {}
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        inputs = {
+            "CAPTURE": folder / "inputs/scene_00003",
+            "SECOND": folder / "inputs/scene_00004",
+            "SHARDS": folder / "shards",
+        }
+        making = ["studio AREA/inputs --seed 3 --scenes 2 --cameras 5 --frames 2 --size 128"]
+        making += [f"samples finetune --captures {inputs['CAPTURE']} --out AREA/shards --clip-length 5 --count 1"]
+        for command in making[: 1 + ("train dstt" in given.commands)]:
+            code, said, _ = Area(folder, command).run()
+            assert code == 0, said
+        for name in given.commands:
+            began, command = time.monotonic(), COMMANDS[name]
+            for word, path in inputs.items():
+                command = command.replace(word, str(path))
+            one = outcomes[name] = broken_off(command, given.points, folder)
+            print(
+                f"| {name} | {one.points} | {one.killed} | {one.ended} | {one.full} | {len(one.faults)} |", flush=True
+            )
+            print(*one.faults, f"{time.monotonic() - began:.0f} s", sep="\n", file=sys.stderr, flush=True)
+    if given.write:
+        results = {name: vars(one) for name, one in outcomes.items()}
+        print(write("broken_off", "cpu", {"points": given.points}, results))
+    return any(one.faults for one in outcomes.values())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
