@@ -314,3 +314,20 @@ def test_all_cameras_of_a_frame_are_the_frame_itself():
     assert frame.select(frame.cameras.names) is frame and frame.without([]) is frame
     turned = frame.select(frame.cameras.names[::-1])
     assert turned.cameras.names == ("c2", "c1", "c0") and torch.equal(turned.rgb[0], frame.rgb[2])
+
+
+@pytest.mark.parametrize("part", ["rgb", "alpha", "confidence", "depth"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_that_are_not_finite_never_leave_a_stream(part, value):
+    class Broken(Telea):
+        def step(self, view, context, state):
+            completed, state = super().step(view, context, state)
+            image = (completed.rgb if part == "rgb" else view.mask.float()).clone()
+            image[..., 20, 20] = value
+            return replace(completed, **{part: image}), state
+
+    stream = Stream(Broken(), CONFIG)
+    stream.push(photograph(SPARSE, 0))
+    for look in (stream.view, lambda camera: stream.mend(stream.render(camera))):
+        with pytest.raises(ValueError, match="expected finite colours from Broken, got others"):
+            look(A)

@@ -196,7 +196,8 @@ class Stream:
             exclude: names of cameras whose images must not be used.
 
         Raises:
-            ValueError: the view's time is not at hand, or it names cameras that are not in the frame.
+            ValueError: the view's time is not at hand, it names cameras that are not in the frame, or the inpainter
+                gives numbers that are not finite.
         """
         quality = quality or RenderQuality()
         view.demand_cameras(self.observation(view.time).frame.cameras.names)
@@ -226,7 +227,7 @@ class Stream:
             exclude: names of cameras whose images must not be used.
 
         Raises:
-            ValueError: as `render`'s.
+            ValueError: as `render`'s and `mend`'s.
         """
         quality = quality or RenderQuality()
         margin_px = crop_margin_px(self.inpainter, quality)
@@ -280,6 +281,7 @@ class Stream:
         if quality.mend:
             view = self._narrowed(view, fraction, exclude)
             completed, viewer = self.inpainter.step(view, context, viewer)
+            completed.demand_finite(type(self.inpainter).__name__)
         inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms if quality.mend else 0.0
         self._observations.move_to_end(view.time)
         forget(self._observations, view.time, self.config.memory_mb)

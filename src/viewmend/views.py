@@ -245,6 +245,16 @@ class CompletedView:
     depth: Float[Tensor, "height width"] | None = None
     """Refined z-depth of the subject, metres, 0 where there is none. None where the proxy's is all there is."""
 
+    def demand_finite(self, by: str) -> None:
+        """See that all that was mended is a finite number.
+
+        Raises:
+            ValueError: something is not.
+        """
+        images = (self.rgb, self.alpha, self.confidence, self.depth)
+        if not all(bool(image.isfinite().all()) for image in images if image is not None):
+            raise ValueError(f"expected finite colours from {by}, got others; take another model, or train it again")
+
     @property
     def opacity(self) -> Float[Tensor, "height width"]:
         """`alpha`, or M where the inpainter does not tell."""

@@ -13,6 +13,9 @@ WRAPPER = "netG"
 COUNTER = "num_batches_tracked"
 """Files from before batch norms counted their batches lack these entries, which inference does not need."""
 
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+"""What weights may be stored in; smaller kinds need scales beside them."""
+
 Network = TypeVar("Network", bound=nn.Module)
 
 
@@ -63,7 +66,7 @@ def load_weights(
         "unknown": sorted(weights.keys() - own.keys()),
         "of another shape": reshaped,
         "of another kind of number": _of_other_numbers(weights, own),
-        "not finite": sorted(key for key, value in weights.items() if not bool(value.isfinite().all())),
+        "not finite": sorted(key for key, value in weights.items() if key in own and not _is_finite(value, own[key])),
     }
     if any(wrong.values()):
         counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
@@ -77,8 +80,21 @@ def load_weights(
 
 
 def _of_other_numbers(weights: dict[str, Tensor], own: dict[str, Tensor]) -> list[str]:
-    kinds = {key: (value.is_floating_point(), value.is_complex()) for key, value in weights.items()}
-    return sorted(k for k, kind in kinds.items() if k in own and kind != (own[k].is_floating_point(), False))
+    kinds = {
+        key: value.dtype in FLOATS if own[key].is_floating_point() else not _has_a_point(value)
+        for key, value in weights.items()
+        if key in own
+    }
+    return sorted(key for key, fits in kinds.items() if not fits)
+
+
+def _has_a_point(value: Tensor) -> bool:
+    return value.is_floating_point() or value.is_complex()
+
+
+def _is_finite(value: Tensor, own: Tensor) -> bool:
+    """Whether a network's tensor is, once it has these values in its own precision."""
+    return value.dtype not in FLOATS or bool(value.to(own.dtype).isfinite().all())
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:

@@ -91,6 +91,9 @@ def test_weights_of_another_config(saved, changes):
     ("spoilt", "said"),
     [
         (lambda value: value.to(torch.int8), "of another kind of number"),
+        (lambda value: value.to(torch.float8_e4m3fn), "of another kind of number"),
+        (lambda value: value.to(torch.complex64), "of another kind of number"),
+        (lambda value: torch.full_like(value, 1e300, dtype=torch.float64), "not finite"),
         (lambda value: torch.full_like(value, float("nan")), "not finite"),
         (lambda value: torch.full_like(value, float("-inf")), "not finite"),
     ],

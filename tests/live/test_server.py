@@ -7,6 +7,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -268,27 +269,32 @@ def test_a_source_that_fails_is_said_and_recovers():
         wait_until(lambda: get(f"{server.url}/health")[0] == 200)
 
 
-def test_a_model_that_fails_shows_holes_and_recovers():
+@pytest.mark.parametrize("way", ["out of memory", "not finite"])
+def test_a_model_that_fails_shows_holes_and_recovers(way):
     from viewmend.inpainting.coarse_fill import SmoothFill
 
     class Fragile(SmoothFill):
         broken = False
 
         def step(self, view, context, state):
-            if self.broken:
+            if self.broken and way == "out of memory":
                 raise RuntimeError("out of memory")
-            return super().step(view, context, state)
+            completed, state = super().step(view, context, state)
+            return (replace(completed, rgb=completed.rgb / 0) if self.broken else completed), state
 
     model = Fragile()
+    said = (
+        "RuntimeError: out of memory" if way == "out of memory" else "ValueError: expected finite colours from Fragile"
+    )
     with running(inpainter=model) as server, Client(server.ws) as viewer:
         viewer.send("clock", seek=0, playing=False)
         good = viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[0, "mended"]
         model.broken = True
         bad = viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[0, "mended"]
         assert np.abs(good.astype(int) - bad).mean() > 2
-        wait_until(lambda: viewer.wait_for("state")["model_error"] == "RuntimeError: out of memory")
+        wait_until(lambda: (viewer.wait_for("state")["model_error"] or "").startswith(said))
         status, _, body = get(f"{server.url}/health")
-        assert status == 503 and b"out of memory" in body
+        assert status == 503 and said.encode() in body
         model.broken = False
         again = viewer.frame(viewer.look(width=48, height=48, camera={"azimuth": 200.0})).images[0, "mended"]
         assert (again == good).all() and get(f"{server.url}/health")[0] == 200

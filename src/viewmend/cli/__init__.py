@@ -14,13 +14,13 @@ SIGTERM with 143; either way what was begun is removed.
 import importlib
 import re
 import sys
-import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from viewmend import __version__
 from viewmend.cli.console import say
 from viewmend.cli.signals import ended_by_sigterm
+from viewmend.terminal import log_to_terminal, printable_traceback
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if empty:
         before = arguments[empty[0] - (not arguments[empty[0]].strip())]
         return _fail(f"expected a value after '{before.rstrip('= ')}', got an empty one; is a variable unset?")
+    log_to_terminal()
     with ended_by_sigterm():
         return _run(command, arguments[len(command.name.split()) :])
 
@@ -103,8 +104,8 @@ def _run(command: Command, arguments: list[str]) -> int:
         return _fail(f"{error}{advice}")
     except ValueError as error:
         return _fail(str(error))
-    except Exception:
-        traceback.print_exc()
+    except Exception as error:
+        print(printable_traceback(error), file=sys.stderr, flush=True)
         return 1
 
 

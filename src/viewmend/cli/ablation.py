@@ -64,7 +64,7 @@ def run(options: Options) -> int:
         for suffix, text in {"md": markdown(ablation), "json": to_json(ablation), "svg": plots(ablation)}.items():
             write_text(options.out / f"ablation.{suffix}", text)
     say(f"wrote {options.out}")
-    show(markdown(ablation).rstrip())
+    show(*markdown(ablation).rstrip().split("\n"))
     return 1 if any(cell.error is not None for cell in cells) else 0
 
 

@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+from viewmend.terminal import printable
+
 _Item = TypeVar("_Item")
 QUIET_S = 2.0
 """A bar appears only after this long: what is quick needs none."""
@@ -101,17 +103,9 @@ def say(message: str) -> None:
     print(printable(message), file=sys.stderr, flush=True)
 
 
-def show(text: str) -> None:
+def show(*lines: str) -> None:
     """Lines of a result, on standard output."""
-    print("\n".join(map(printable, text.split("\n"))), flush=True)
-
-
-def printable(text: str) -> str:
-    """The text with all that is no visible character or space escaped.
-
-    Names come from files and folders that others made: no such name moves a cursor, hides a line or turns one around.
-    """
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    print("\n".join(map(printable, lines)), flush=True)
 
 
 def print_json(value: object) -> None:

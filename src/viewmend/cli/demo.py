@@ -84,7 +84,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(_report(summary))
     else:
-        show("\n".join(_table(summary, steps)))
+        show(*_table(summary, steps))
     return 0
 
 

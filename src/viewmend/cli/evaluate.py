@@ -39,5 +39,6 @@ def run(options: Options) -> int:
     with report_folder(options.out):
         found = evaluate(options, options.sets, options.methods)
         write_report(options, found)
-    show((report_json(found.report) if options.json else summary(found.report)).rstrip())
+    text = report_json(found.report) if options.json else summary(found.report)
+    show(*text.rstrip().split("\n"))
     return 1 if found.failed else 0

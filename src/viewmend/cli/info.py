@@ -13,11 +13,16 @@ if TYPE_CHECKING:
 
 DOUBTFUL_IOU = 0.8
 """Below this, a calibration or a mask is wrong more often than not."""
+TRIED_PX = 64
+"""Width and height of what a model is tried on."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Say what a capture or a model is; for a capture, also draw a picture that checks its calibration."""
+    """Say what a capture or a model is; for a capture, also draw a picture that checks its calibration.
+
+    A model mends a small view: one whose weights make no finite colours is refused.
+    """
 
     target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|MODEL")]
     """A capture of any format that is read, or a model: a name or a folder with config.json and model.safetensors."""
@@ -42,6 +47,7 @@ def run(options: Options) -> int:
         if options.out is not None:
             raise ValueError(f"expected --out with a capture, got the model {options.target}; leave --out away")
         model = describe_model(options.target)
+        _try_out(options.target)
         description, lines = asdict(model), _model_in_words(model)
     else:
         capture = _look_at_capture(options)
@@ -49,7 +55,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(description)
     else:
-        show("\n".join(lines))
+        show(*lines)
     return 0
 
 
@@ -65,6 +71,24 @@ def _is_model(target: str) -> bool:
     if (folder / "cameras.json").exists():
         return False
     return not folder.exists() or any((folder / name).exists() for name in (CONFIG, WEIGHTS))
+
+
+def _try_out(model: str) -> None:
+    """Have a model mend a small view, so that weights that make no finite colours show.
+
+    Raises:
+        ValueError: they do.
+    """
+    from viewmend.cli.console import busy
+    from viewmend.inpainting.checkpoint import load_inpainter
+    from viewmend.stream import Stream
+    from viewmend.studio.rigs import orbit
+    from viewmend.studio.stage import Studio, StudioConfig
+
+    with busy("trying the model out"):
+        stream = Stream(load_inpainter(model))
+        stream.push(Studio(StudioConfig(cameras=4, frames=1, size_px=TRIED_PX)).read(0))
+        stream.view(orbit([0.4], (TRIED_PX, TRIED_PX), elevation_rad=0.2))
 
 
 def _look_at_capture(options: Options) -> "CaptureDescription":
@@ -93,7 +117,8 @@ def _model_in_words(model: "ModelDescription") -> list[str]:
     width = max(len(key) for key in model.config)
     lines = [f"{model.path}: an inpainting model of {model.parameters / 1e6:.2f} million parameters", ""]
     lines += [f"  {key:<{width}}  {value}" for key, value in model.config.items()]
-    return [*lines, "", model.card.strip() if model.card else "There is no model card: what trained it is not known."]
+    card = model.card.strip() if model.card else "There is no model card: what trained it is not known."
+    return [*lines, "", *card.split("\n")]
 
 
 def _capture_in_words(capture: "CaptureDescription") -> list[str]:

@@ -118,7 +118,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(summary.as_json())
     else:
-        show("\n".join(_in_words(summary)))
+        show(*_in_words(summary))
     return 0
 
 

@@ -71,7 +71,7 @@ def run(options: Options) -> int:
         forms["csv"] = "\n".join(_csv_line(line) for line in (grid.heads, *grid.rows)) + "\n"
         for suffix, form in forms.items():
             write_text(options.out / f"table{options.table}.{suffix}", form)
-    show(text.rstrip())
+    show(*text.rstrip().split("\n"))
     return 1 if found.failed else 0
 
 

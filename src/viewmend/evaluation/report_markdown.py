@@ -13,6 +13,7 @@ from viewmend.evaluation.report_grids import (
     setting_lines,
 )
 from viewmend.methods import REFERENCE
+from viewmend.terminal import printable
 
 
 def markdown(report: Report) -> str:
@@ -28,7 +29,7 @@ def markdown(report: Report) -> str:
     parts += ["## Scenes", "PSNR in the holes, dB.", written(scenes_grid(report))]
     failed = [cell for cell in report.cells if cell.error is not None]
     if failed:
-        lines = [f"* {cell.key.scene}, {cell.key.method}: {cell.error}" for cell in failed]
+        lines = [printable(f"* {cell.key.scene}, {cell.key.method}: {cell.error}") for cell in failed]
         parts += ["## Failed", "\n".join(lines)]
     parts += ["## What the figures mean", "\n".join(f"* {rule}" for rule in RULES)]
     parts += ["## Methods", "\n".join(f"* {name}: `{report.identities.get(name, '?')}`" for name in report.methods)]
@@ -43,8 +44,8 @@ def summary(report: Report) -> str:
 def written(grid: Grid) -> str:
     """A grid as a table of Markdown."""
     lines = [grid.heads, ["---"] * len(grid.heads), *grid.rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(printable(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def _main(table: Table) -> str:
-    return f"## {table.title}\n\n{holes_line(table)}\n\n{written(main_grid(table))}"
+    return f"## {printable(table.title)}\n\n{holes_line(table)}\n\n{written(main_grid(table))}"

@@ -17,6 +17,7 @@ from viewmend.evaluation.ray_cluster import run_on_ray
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
 from viewmend.evaluation.tasks import Task
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
+from viewmend.terminal import log_to_terminal
 
 
 def run_evaluation(
@@ -130,6 +131,7 @@ def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
 def _begin(threads: int) -> None:
     """What a worker does first."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent says what it means
+    log_to_terminal()
     torch.set_num_threads(threads)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
 

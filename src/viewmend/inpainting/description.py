@@ -5,6 +5,9 @@ from pathlib import Path
 
 from viewmend.inpainting.checkpoint import CARD, SHIPPED, load_network
 
+LONGEST_CARD = 100_000
+"""Bytes of a model card that are looked at."""
+
 
 @dataclass(frozen=True)
 class ModelDescription:
@@ -32,5 +35,10 @@ def describe_model(name_or_path: str) -> ModelDescription:
         path=str(folder),
         parameters=sum(parameter.numel() for parameter in network.parameters()),
         config=network.config.to_dict(),
-        card=card.read_text(encoding="utf-8") if card.is_file() else None,
+        card=_read(card) if card.is_file() else None,
     )
+
+
+def _read(card: Path) -> str:
+    with card.open("rb") as file:
+        return file.read(LONGEST_CARD).decode(errors="replace")

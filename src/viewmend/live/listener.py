@@ -37,6 +37,7 @@ class Server(uvicorn.Server):
                 ws_per_message_deflate=False,
                 limit_concurrency=CONNECTIONS,
                 timeout_graceful_shutdown=5,
+                log_config=None,  # what is logged is escaped, as all that a terminal shows
                 log_level="error",  # strangers can cause warnings as they like
                 access_log=False,
                 server_header=False,
