@@ -40,6 +40,8 @@ COMMANDS = {
         out,
         "--methods",
         model,
+        "--error-rule",
+        "all",
         *SMALL,
     ],
     "export-scene": lambda model, capture, out: ["export-scene", capture, out, "--model", model, "--views", "1"],
