@@ -6,9 +6,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from inpainting.plates import NAMES, Rig, tiny, view
+from reference.ball import camera_at
 
+from viewmend.geometry.cameras import unproject
 from viewmend.inpainting.config import paper
-from viewmend.inpainting.context import window_times
+from viewmend.inpainting.context import ContextFrame, window_times
 from viewmend.inpainting.protocol import REMEMBERED_TIMES, ContextProvider, RenderQuality
 
 
@@ -83,3 +85,16 @@ def test_less_quality_looks_at_less_of_the_window():
     assert [time for time, _ in rig.asked] == [8], "for rays alone"
     coarse, _ = net.coarse.step(view(8), Rig(), net.initial_state())
     assert torch.equal(completed.rgb, coarse.rgb)
+
+
+def test_a_frame_carried_by_another_has_no_points_where_that_one_has_no_depth():
+    places, uv = torch.tensor([[0, 0], [0, 1], [1, 0], [5, 5]]), torch.rand(4, 2) * 40
+    nothing, tokens = torch.zeros(4, 3), torch.zeros(4, 8)
+    valid = torch.ones(4, dtype=torch.bool)
+    camera, memory = camera_at(10, "c"), torch.zeros(1, 2, 4, 8)
+    older = ContextFrame(camera, 3, places, uv, nothing, valid, torch.ones(6, 6), tokens, memory)
+    now = replace(older, time=4, depths=torch.tensor([[2.0, 0.0], [1.5, 3.0]]))
+    points, lifted = older.lifted_by(now)
+    assert lifted.tolist() == [True, False, True, False]
+    expected = unproject(uv[None, [0, 2]], torch.tensor([[2.0, 1.5]]), camera)[0]
+    torch.testing.assert_close(points[[0, 2]], expected)

@@ -8,6 +8,7 @@ import torch
 from reference.ball import camera_at, photograph, proxy, ring
 from reference.blend_twin import blend_twin
 
+from viewmend.geometry.cameras import unproject
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering._blend_numba import blend_numba
 from viewmend.rendering._blend_torch import blend_torch
@@ -160,3 +161,17 @@ def test_disagreement_is_the_spread_of_the_samples():
     sources = ContextViews(MultiViewFrame(sources.frame.cameras, rgb, None, 0), sources.depth)
     spread = blend(target, depth, normals, sources, BIAS_M, BlendConfig()).disagreement
     assert float(spread[24, 24]) == pytest.approx(25 / 255, abs=1e-4)
+
+
+@pytest.mark.parametrize("fast", [blend_torch, blend_numba])
+def test_a_surface_that_faces_a_camera_counts_in_every_pixel(fast):
+    """Where the cosine is 1, rounding makes some larger, and such a pixel's slope no number."""
+    target, depth, _, sources = scene(camera_at(0, "t"), camera_at(0, "c"))
+    row, column = (depth > 0).nonzero(as_tuple=True)
+    points = unproject((torch.stack([column, row], -1) + 0.5)[None], depth[row, column][None], target)[0]
+    normals = torch.zeros(*depth.shape, 3)
+    normals[row, column] = torch.nn.functional.normalize(target.centers[0] - points, dim=-1)
+    frame = replace(sources.frame, mask=EVERYWHERE)
+    weights = fast(target, depth, normals, ContextViews(frame, sources.depth), BIAS_M, BlendConfig()).weights[0]
+    inner = depth[row, column] < depth[depth > 0].quantile(0.5)
+    assert len(row) > 500 and float(weights[row, column][inner].min()) > 0.99
