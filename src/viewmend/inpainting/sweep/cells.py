@@ -34,6 +34,11 @@ def scattered(
     return image.index_copy(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
 
 
+def stacked(*images: Shaped[Tensor, "_channel rows columns"]) -> Shaped[Tensor, "1 channel rows columns"]:
+    """Images one upon another, with channels last in memory, as `scattered` lays them: nothing is transposed."""
+    return torch.cat([image.movedim(0, 2) for image in images], 2)[None].movedim(3, 1)
+
+
 def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
     """An image with the index of the point at each row and column; -1 where there is none."""
     image = torch.full(shape, -1, dtype=torch.long, device=at.device)

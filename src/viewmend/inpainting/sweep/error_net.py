@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.inpainting.network import Network
-from viewmend.inpainting.sweep.cells import CELL_PX, nearest_depth, rim_depth, scattered
+from viewmend.inpainting.sweep.cells import CELL_PX, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.lookup import STATS, Rays, Scale, look_up
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.unet import UNet
@@ -100,7 +100,7 @@ class ErrorNet(Network):
         with self.autocast():
             behind = self._stats(view, rig, scale, nearest_depth(near), BEHIND, 2 * CELL_PX, self.behind)
             told.append(F.interpolate(behind[None].float(), scale_factor=2, mode="nearest")[0])
-            found = self.tell(self.decide(torch.cat(told)[None]))
+            found = self.tell(self.decide(stacked(*told)))
         found = F.pixel_shuffle(found.float().sigmoid(), CELL_PX)[0, :, :height, :width]
         return ErrorMap(*torch.where(depth[:height, :width] > 0, found, 0.0))
 

@@ -38,8 +38,10 @@ class PlaceNet(nn.Module):
     def forward(self, places: Places, prior: Float[Tensor, "ray place view"] | None = None) -> Weighed:
         """The places, weighed; cameras are trusted by `prior` at first, or by the lookup's own opinion."""
         features, stats = places.features, places.stats
-        hidden = F.relu(self.camera(features) + self.all_cameras(stats)[:, :, None])
         prior = places.prior if prior is None else prior
+        if features.device.type == "cpu" and not torch.is_grad_enabled():
+            return self._weighed_numba(places, prior)
+        hidden = F.relu(self.camera(features) + self.all_cameras(stats)[:, :, None])
         score = self.trust(hidden)[..., 0].float() + (prior + 1e-3).log()
         inside = features[..., IN_VIEW]
         trust = inside * score.masked_fill(inside == 0, -1e4).softmax(2)
@@ -50,6 +52,17 @@ class PlaceNet(nn.Module):
         variance = CONTRAST * (square - agreed[..., COLOUR].square()).clamp_min(0)
         certain = trust.square().sum(2, keepdim=True)
         out = self.place(torch.cat([kept.float(), agreed, variance, stats, certain], -1))
+        return Weighed(agreed[..., COLOUR], agreed[..., MASK], out[..., :-1], out[..., -1], trust)
+
+    def _weighed_numba(self, places: Places, prior: Float[Tensor, "ray place view"]) -> Weighed:
+        """The same in float32 by a compiled loop, since sums over so few cameras are slow in torch."""
+        from viewmend.inpainting.sweep._weigh_numba import weigh_numba
+
+        with torch.autocast("cpu", enabled=False):
+            hidden, shared = self.camera(places.features), self.all_cameras(places.stats)
+            weight, bias = self.trust.weight[0].float(), float(self.trust.bias)
+            told, trust = weigh_numba(places, prior.contiguous(), hidden, shared, weight, bias)
+            out, agreed = self.place(told), told[..., len(weight) :]
         return Weighed(agreed[..., COLOUR], agreed[..., MASK], out[..., :-1], out[..., -1], trust)
 
 

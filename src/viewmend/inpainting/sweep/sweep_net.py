@@ -20,11 +20,11 @@ from viewmend.inpainting.network import Network
 from viewmend.inpainting.protocol import ContextProvider, HeldOut, RenderQuality, State
 from viewmend.inpainting.ray_blend_net import RayBlendNet
 from viewmend.inpainting.sweep.alpha_fit import fitted_slope, recomposed, with_slope
-from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered
+from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet
 from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
-from viewmend.inpainting.sweep.place_net import PlaceNet
+from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.reading import Reading, Swept
 from viewmend.inpainting.sweep.unet import UNet
@@ -40,6 +40,8 @@ of the place, and how sure its depth is."""
 JOINT = 0.03
 """Pixels whose depth differs from their cell's by less than so many subject sizes are of its surface."""
 LEAST_MASK = 0.1
+RAYS_AT_ONCE = 1024
+"""So many are weighed together: what is looked up along more does not fit a cache."""
 MARGIN_PX = 16
 HOLE_GUESS = 0.7
 """Weight of what `RayBlendNet` reads in holes; the rest is this reader's, which saw few holes in training."""
@@ -189,15 +191,19 @@ class SweepNet(Network):
         cells = torch.nonzero(depth > 0)
         along = depth[tuple(cells.T)][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
         middles = CELL_PX * (cells.flip(1).double() + 0.5)
-        places = look_up(Rays(view.camera, middles, along), rig, view.source_views, float(CELL_PX), scale)
+        rays = [
+            Rays(view.camera, *part)
+            for part in zip(middles.split(RAYS_AT_ONCE), along.split(RAYS_AT_ONCE), strict=True)
+        ]
         front = nearest_depth(view.depth)
         beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = F.avg_pool2d(shown[None], CELL_PX, ceil_mode=True)[0]
         with self.autocast():
-            weighed = self.places(places)
+            parts = [self.places(look_up(part, rig, view.source_views, float(CELL_PX), scale)) for part in rays]
+            weighed = Weighed(*map(torch.cat, zip(*parts, strict=True)))
             volume = scattered(weighed.features.flatten(1), cells, depth.shape)
             told = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(volume)
-            decided = self.decide(torch.cat([volume, told])[None])
+            decided = self.decide(stacked(volume, told))
             logits = self.logits(decided)[0, :, cells[:, 0], cells[:, 1]].T.float() + weighed.score.float()
         return Swept(cells, depth, logits, weighed, decided)
 
@@ -262,9 +268,8 @@ class SweepNet(Network):
         """What convolutions over the view make of its pixels."""
         with self.autocast():
             near = F.interpolate(decided, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
-            image = scattered(told.to(near), pixels, shape)[None]
-            image = torch.cat([near[:, :, : shape[0], : shape[1]], image], 1)
-            out = self.finish(image.contiguous(memory_format=torch.channels_last))
+            near = near[0, :, : shape[0], : shape[1]]
+            out = self.finish(stacked(near, scattered(told.to(near), pixels, shape)))
         return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
 
 
