@@ -96,15 +96,9 @@ def test_names_that_a_file_does_not_have_are_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("shipped", "default", "live"),
-    [
-        (("base", "small", "views"), "views", "small"),
-        (("base", "small"), "small", "small"),
-        (("base",), "base", "base"),
-        (("views",), "views", "views"),
-        ((), "telea", "telea"),
-    ],
+    ("shipped", "default"),
+    [(("base", "small", "views"), "views"), (("base", "small"), "small"), (("base",), "base"), ((), "telea")],
 )
-def test_the_default_mends_whole_views(monkeypatch, shipped, default, live):
+def test_the_default_mends_whole_views(monkeypatch, shipped, default):
     monkeypatch.setattr(methods, "shipped_models", lambda: shipped)
-    assert (methods.default_method(), methods.default_method(live=True)) == (default, live)
+    assert methods.default_method() == default

@@ -103,14 +103,10 @@ def make_method(name: str, device: str = "cpu", precision: str = "auto") -> View
     )
 
 
-def default_method(live: bool = False) -> str:
-    """The model that is shipped, of several `views`, which mends whole views; where none is, OpenCV's Telea.
-
-    For a `live` view it is `small`, which shows more pixels in the same milliseconds.
-    """
+def default_method() -> str:
+    """The model that is shipped, of several `views`, which mends whole views; where none is, OpenCV's Telea."""
     shipped = shipped_models()
-    wanted = ("small", "views") if live else ("views", "small")
-    return next((name for name in (*wanted, *shipped) if name in shipped), "telea")
+    return next((name for name in ("views", "small", *shipped) if name in shipped), "telea")
 
 
 def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[str, ...], dict[str, str]]:

@@ -321,6 +321,7 @@ def test_what_is_background_fades_and_is_not_read(scene, teller):
     nothing = replace(view, error=part.fade, fade=part.fade)
     dark, _ = stream.inpainter.step(nothing, ContextProvider(lambda *_: None), State())
     torch.testing.assert_close(dark.rgb, (1 - part.fade) * view.rgb)
+    assert dark.alpha is not None and torch.equal(dark.alpha, (1 - part.fade) * view.mask)
     half = faded(replace(view, error=0.5 * view.error), ErrorMap(rest, rest, 0 * alpha, rest), 0.3)
     assert float(half.error.max()) == 0.5, "never more than was asked"
     whole, crop = Crop(16, 16, 80, 83), view.camera
@@ -417,6 +418,23 @@ def test_a_quality_may_allow_only_a_part(scene, teller):
     assert int((mended_px("unseen", 0.4)[0].completed.view.error > 0).sum()) == holes
     untouched = mended_px("all", 0.4, mend=False)[0].completed.view
     assert torch.equal(untouched.error, view.error), "nobody was to look"
+
+
+def test_where_nothing_is_to_be_read_background_fades_and_holes_are_filled_from_around(scene, teller, monkeypatch):
+    stream, view, _ = scene
+    own = Stream(teller, StreamConfig())
+    own.push(stream.observation().frame, stream.observation().proxy)
+    monkeypatch.setattr(teller, "forward", lambda *given, **more: pytest.fail("nothing is read"))
+    mended = own.view(view.camera, quality=RenderQuality(read_fraction=0.0)).completed
+    assert mended.view.fade is not None and mended.confidence is not None
+    part, filled = mended.view, SmoothFill()([replace(view, error=view.holes.float())], [None])[0]
+    assert torch.equal(part.read, view.holes) and bool(view.holes.any())
+    assert int((mended.view.fade > 0).sum()) > 20
+    torch.testing.assert_close(mended.rgb[:, view.holes], filled[:, view.holes], atol=1e-3, rtol=0)
+    rest = ~view.holes
+    torch.testing.assert_close(mended.rgb[:, rest], ((1 - part.error) * view.rgb)[:, rest], atol=1e-5, rtol=0)
+    torch.testing.assert_close(mended.opacity[rest], ((1 - part.error) * view.mask)[rest])
+    assert not bool(mended.confidence[view.holes].any()) and bool((mended.confidence[rest] == view.mask[rest]).all())
 
 
 def test_finding_what_is_wrong_is_paid_by_inpainting(scene, teller, monkeypatch):

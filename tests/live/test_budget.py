@@ -23,7 +23,7 @@ class Device:
         """Filling has a part that no picture size shrinks below a third; without context it is the first fill's."""
         size = 0.3 + 0.7 * level.scale**2
         context = 1 - self.context_share * (1 - level.context_times / 7) if level.context_times else 0.25
-        context *= 0.2 + 0.8 * (level.read_fraction or 1.0)
+        context *= 1.0 if level.read_fraction is None else 0.2 + 0.8 * level.read_fraction
         by = 1 + self.noise * self.chance.uniform(-1, 1)
         encoding = 0.2 * self.relative_cost * by if level.context_times else 0.0
         filling = 0.8 * self.relative_cost * size * context * by
@@ -105,7 +105,7 @@ def test_who_can_tell_errors_reads_a_part_instead_of_taking_less_context():
     assert ladder_for(SweepNet(SweepConfig(error_features=8))) is READING_LADDER
     assert ladder_for(SweepNet(SweepConfig())) is CONTEXT_LADDER and ladder_for(Telea()) is CONTEXT_LADDER
     assert all(level.context_times == FULL.context_times for level in READING_LADDER.levels)
-    assert all(0 < level.read_fraction < 1 for level in READING_LADDER.levels[:-1])
+    assert all(0 <= level.read_fraction < 1 for level in READING_LADDER.levels[:-1])
 
 
 def test_impossible_budgets_are_refused():

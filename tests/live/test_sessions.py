@@ -117,7 +117,7 @@ def test_a_model_that_tells_errors_reads_a_part_while_it_is_looked_for():
     desk.pause()
     desk.look(id=1, moving=True, width=200, height=100)
     request = desk.due()
-    assert desk.size(request) == (100, 50) and request.quality.read_fraction == READING_LADDER.moving.read_fraction
+    assert desk.size(request) == (200, 100) and request.quality.read_fraction == 0
     desk = Desk(budget_ms=50.0, ladder=READING_LADDER)
     desk.pause()
     desk.look(id=1)

@@ -25,7 +25,7 @@ def check_people(performers: Path | None, motions: Path | None) -> None:
             raise ValueError(f"{folder}: expected people or motions, found nothing; check --performers and --motions")
 
 
-def load_named(name: str | None, device: str, live: bool = False) -> "ViewInpainter":
+def load_named(name: str | None, device: str) -> "ViewInpainter":
     """The method of this name (`methods.make_method`); without a name the model that is shipped, else Telea.
 
     Raises:
@@ -35,7 +35,7 @@ def load_named(name: str | None, device: str, live: bool = False) -> "ViewInpain
     from viewmend.methods import default_method, make_method
 
     check_device(device)
-    if name is None and (name := default_method(live)) == "telea":
+    if name is None and (name := default_method()) == "telea":
         say("no model is shipped with this version: the holes are filled by OpenCV's Telea")
     return make_method(name, device)
 

@@ -42,8 +42,8 @@ class Options:
     token_file: Path | None = None
     """A file whose first line is the token."""
     model: str | None = None
-    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills. By default 'small',
-    which is the fastest; 'views' mends whole views, as `viewmend mend` does by default."""
+    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills. By default 'views',
+    as `viewmend mend` has: of a view whose time does not suffice for all of it, the most useful part is mended."""
     fps: float | None = None
     """Frames a second, instead of the capture's."""
     budget_ms: float = 100.0
@@ -106,11 +106,11 @@ def run(options: Options) -> int:
         port=options.port,
         token=token,
         budget_ms=options.budget_ms or None,
-        model=options.model or default_method(live=True),
+        model=options.model or default_method(),
         limits=Limits(viewers=options.viewers),
     )
     supply = _supply(options)
-    inpainter = load_named(options.model, options.device, live=True)
+    inpainter = load_named(options.model, options.device)
     render = RenderConfig(cameras=options.context, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
     stream = StreamConfig(render=render, memory_mb=options.memory_mb / 2)
     renderer = Renderer(supply, inpainter, stream, options.device)

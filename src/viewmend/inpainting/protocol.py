@@ -39,7 +39,8 @@ class RenderQuality:
     no camera image is encoded: a model with a coarse fill shows that alone, others have but the view's own patches."""
     read_fraction: float | None = None
     """At most this part of the proxy's pixels is mended, where most is to be gained, beside what no camera colours;
-    None is for all that E asks. Rules that ask for no more than that are not changed by it."""
+    None is for all that E asks. Rules that ask for no more than that are not changed by it. With 0 a reader of whole
+    views reads nothing: it fills what no camera colours from around it, and fades what seems to be background."""
 
 
 class ContextProvider:

@@ -31,8 +31,10 @@ MAX_UP_AFTER_FRAMES = 256
 PROBATION_FRAMES = 12
 COARSE_FILL_COST = 0.15
 """Cost of a fill without the transformer, relative to the full level's."""
-READING_FIXED, READING_COST = 0.05, 0.15
-"""Costs of what no resolution changes, and of finding out where most is to be gained, relative to reading all."""
+READING_FIXED, READING_COST = 0.1, 0.3
+"""Costs of what no resolution changes, and of reading however little, relative to reading all."""
+FADING_FIXED, FADING_COST = 0.05, 0.13
+"""The same costs of finding out what is background, where nothing is read."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,13 @@ class QualityLevel:
     top_k: int | None
     """Context tokens that survive pruning; None for all."""
     read_fraction: float | None = None
-    """The part of the subject that is read; None for all that the error rule asks."""
+    """The part of the subject that is read; None for all that the error rule asks. With 0 background fades alone."""
 
     @property
     def relative_cost(self) -> float:
         """Cost of inpainting, relative to the full level's."""
+        if self.read_fraction == 0:
+            return FADING_FIXED + self.scale**2 * FADING_COST
         if self.read_fraction is not None:
             read = (1 - READING_FIXED - READING_COST) * self.read_fraction
             return READING_FIXED + self.scale**2 * (READING_COST + read)
@@ -89,12 +93,12 @@ CONTEXT_LADDER = Ladder(
 )
 READING_LADDER = Ladder(
     (
-        *(QualityLevel(scale, 7, None, 0.1) for scale in SCALES),
-        *(QualityLevel(1.0, 7, None, fraction) for fraction in (0.15, 0.25, 0.4, 0.6)),
+        *(QualityLevel(scale, 7, None, 0.0) for scale in SCALES),
+        *(QualityLevel(1.0, 7, None, fraction) for fraction in (0.1, 0.25, 0.5)),
         FULL,
     ),
-    moving=QualityLevel(0.5, 7, None, 0.15),
-    still=QualityLevel(1.0, 7, None, 0.15),
+    moving=QualityLevel(1.0, 7, None, 0.0),
+    still=QualityLevel(1.0, 7, None, 0.1),
 )
 
 

@@ -41,7 +41,7 @@ class ServerConfig:
     port: int = 8008
     token: str | None = None
     budget_ms: float | None = 100.0
-    model: str = "small"
+    model: str = "views"
     """What `welcome` and /health call it."""
     limits: Limits = field(default_factory=Limits)
 

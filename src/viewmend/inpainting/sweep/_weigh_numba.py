@@ -37,10 +37,11 @@ def weigh_numba(
     count, each, views, width = hidden.shape
     told = np.zeros((count, each, width + FEATURES + 3 + places.stats.shape[2] + 1), np.float32)
     trust = np.empty((count, each, views), np.float32)
-    arrays = [t.numpy() for t in (places.features, places.stats, prior, hidden, shared, weight)]
+    tensors = (places.features, places.stats, prior, hidden, shared, weight)
+    arrays = [*(tensor.numpy() for tensor in tensors), told, trust]
 
     def work(band: int) -> None:
-        weigh(band * BAND, min(count, (band + 1) * BAND), *arrays, bias, told, trust)
+        weigh(band * BAND, min(count, (band + 1) * BAND), bias, *arrays)
 
     parallel_for(work, -(-count // BAND))
     return torch.from_numpy(told), torch.from_numpy(trust)
@@ -51,7 +52,7 @@ def weigh_numba(
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 @no_type_check
-def weigh(first, end, features, stats, prior, hidden, shared, weight, bias, told, trust):
+def weigh(first, end, bias, features, stats, prior, hidden, shared, weight, told, trust):
     """A softmax over the cameras that have the place in view, and sums over them, of rays first to end - 1."""
     _, places, views, width = hidden.shape
     shown, channels = features.shape[3], stats.shape[2]

@@ -5,16 +5,17 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
 from viewmend.inpainting.sweep.cells import CELL_PX, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.lookup import STATS, Rays, Scale, look_up
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.unet import UNet
-from viewmend.views import IncompleteView
+from viewmend.views import CompletedView, IncompleteView
 
 SHOWN_CHANNELS = 7
 """RGB, M, what is coloured, the largest of the source views' shares, and the depth in subject sizes."""
@@ -65,6 +66,21 @@ def faded(view: IncompleteView, found: ErrorMap, fraction: float) -> IncompleteV
     background = torch.where((read == 0) & (view.mask > 0), torch.minimum(1 - found.alpha, view.error), 0.0)
     fade = torch.where(background > LEAST_FADE, background, 0.0)
     return replace(view, error=torch.where(read > 0, view.error, fade), fade=fade)
+
+
+def unread(
+    view: IncompleteView, fades: Bool[Tensor, "height width"], fill: Float[Tensor, "3 height width"] | None = None
+) -> CompletedView:
+    """A view of which nothing is read: what is background fades, and holes show the fill, of which nobody is sure."""
+    E, filled = view.error, view.holes if fill is not None else torch.zeros_like(view.holes)
+    shown = view.rgb.new_zeros(view.rgb.shape) if fill is None else fill * filled
+    return CompletedView(
+        view,
+        blend(view.rgb, E, shown, (fades | filled).to(E)),
+        torch.where(fades, (1 - E) * view.mask, view.mask),
+        torch.where(filled, (1 - E) * view.mask, view.mask),
+        view.depth,
+    )
 
 
 class ErrorNet(Network):

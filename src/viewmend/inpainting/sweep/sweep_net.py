@@ -22,7 +22,7 @@ from viewmend.inpainting.ray_blend_net import RayBlendNet
 from viewmend.inpainting.sweep.alpha_fit import fitted_slope, recomposed, with_slope
 from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
-from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet
+from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet, unread
 from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig
@@ -102,7 +102,7 @@ class SweepNet(Network):
 
     @torch.no_grad()
     def coarse_guess(
-        self, view: IncompleteView, seen: ContextViews, quick: bool = False
+        self, view: IncompleteView, seen: ContextViews | None, quick: bool = False
     ) -> Float[Tensor, "3 height width"]:
         """The whole view, with what no source view coloured filled by what the cameras show or by its surroundings.
 
@@ -151,14 +151,18 @@ class SweepNet(Network):
 
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        """The view with all of E read, on the proxy and its rim, or faded; a view without E comes back at once."""
+        """The view with all of E read, on the proxy and its rim, or faded; a view without E comes back at once.
+
+        With a `RenderQuality.read_fraction` of 0 nothing is read: holes are filled from their surroundings.
+        """
         read = view.read & (rim_depth(view.depth) > 0)
         fades = torch.zeros_like(read) if view.fade is None else view.fade > 0
         names = view.closest_views(self.config.num_views)
+        if context.quality.read_fraction == 0 and bool((read | fades).any()):
+            return unread(view, fades, self.coarse_guess(view, None, quick=True)), state
         seen = context(view.time, names) if names and bool(read.any()) else None
         if seen is None:
-            rgb = view.rgb if view.fade is None else blend(view.rgb, view.error, 0 * view.rgb, fades.to(view.rgb))
-            return CompletedView(view, rgb), state
+            return (CompletedView(view, view.rgb) if view.fade is None else unread(view, fades)), state
         quick = context.quality.read_fraction is not None
         guess = self.coarse_guess(view, seen, quick)
         found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read, guess=guess), view.error
