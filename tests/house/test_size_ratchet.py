@@ -21,6 +21,7 @@ MANY_ARGUMENTS: set[str] = {
     "viewmend/inpainting/sweep/_lookup_numba.py:_sample",
     "viewmend/inpainting/sweep/_lookup_numba.py:look_up_camera",
     "viewmend/inpainting/sweep/_lookup_numba.py:look_up_silhouette",
+    "viewmend/inpainting/sweep/_weigh_numba.py:weigh",
     "viewmend/rendering/_blend_numba.py:_blend_rows",
     "viewmend/rendering/_blend_numba.py:_weigh",
 }
