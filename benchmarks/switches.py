@@ -32,7 +32,7 @@ AS_IT_IS = StreamConfig(memory_mb=None)
 STREAMS = {
     "as it is": AS_IT_IS,
     "pixels_per_voxel: no pooling": replace(AS_IT_IS, hull=HullConfig(pixels_per_voxel=1e9)),
-    "min_share 0": replace(AS_IT_IS, hull=HullConfig(min_share=0.0)),
+    "min_fraction 0": replace(AS_IT_IS, hull=HullConfig(min_fraction=0.0)),
     "depth_bias 0": replace(AS_IT_IS, render=RenderConfig(blend=BlendConfig(depth_bias=0.0))),
     "depth_bias 0.02": replace(AS_IT_IS, render=RenderConfig(blend=BlendConfig(depth_bias=0.02))),
     "slope_px 0": replace(AS_IT_IS, render=RenderConfig(blend=BlendConfig(slope_px=0.0))),
@@ -47,24 +47,26 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=4, help="so many of each set, evenly")
     parser.add_argument("--frames", type=int, default=2)
     parser.add_argument("--size", type=int, default=240, help="of the views of P, pixels")
+    parser.add_argument("--switches", nargs="*", default=[], help="these alone, beside `as it is`")
     parser.add_argument("--write", action="store_true", help="keep the result under benchmarks/results")
     options = parser.parse_args()
     sets: dict[str, Sequence[LeaveOneOutScene]] = {"P": procedural_set(options.frames, options.size)}
     sets |= {folder.name: capture_set(folder, "8", options.frames) for folder in options.captures}
     found = {
-        name: judge(scenes[:: max(1, len(scenes) // options.scenes)][: options.scenes]) for name, scenes in sets.items()
+        name: judge(scenes[:: max(1, len(scenes) // options.scenes)][: options.scenes], options.switches)
+        for name, scenes in sets.items()
     }
     config = {"scenes": options.scenes, "frames": options.frames, "size_px": options.size}
     print(write("switches", "cpu", config, found) if options.write else json.dumps(found, indent=1))
 
 
 @torch.no_grad()
-def judge(scenes: Sequence[LeaveOneOutScene]) -> dict[str, dict[str, float | None]]:
+def judge(scenes: Sequence[LeaveOneOutScene], switches: Sequence[str] = ()) -> dict[str, dict[str, float | None]]:
     """Means over all views of each switch: of the rendered view, and as `small` mends it."""
     frames = [list(scene.frames("cpu")) for scene in scenes]
     runs = {name: (config, unchanged) for name, config in STREAMS.items()}
     runs |= {name: (AS_IT_IS, change) for name, change in NETWORKS.items()}
-    return {name: _means(frames, *run) for name, run in runs.items()}
+    return {name: _means(frames, *run) for name, run in runs.items() if not switches or name in ("as it is", *switches)}
 
 
 def unchanged(_: Chain) -> None:
@@ -72,11 +74,11 @@ def unchanged(_: Chain) -> None:
 
 
 def by_config(**changes: object) -> Callable[[Chain], None]:
-    """A change of what the transformer looks up in its config at each forward."""
+    """A change of what is looked up in the config at each forward."""
 
     def change(chain: Chain) -> None:
-        transformer = chain.patches.transformer
-        transformer.config = replace(transformer.config, **changes)
+        for part in (chain.patches, chain.patches.transformer):
+            part.config = replace(part.config, **changes)
 
     return change
 
@@ -92,6 +94,8 @@ def without_colour_skip(chain: Chain) -> None:
 
 
 NETWORKS = {
+    "min_foreground 0": by_config(min_foreground=0.0),
+    "patch_depth centre": by_config(patch_depth="centre"),
     "rope_unit image": by_config(rope_unit="image"),
     "rope_values off": by_config(rope_values=False),
     "colour_skip off": without_colour_skip,

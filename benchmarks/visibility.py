@@ -73,9 +73,9 @@ def shares(scene: StudioScene) -> dict[str, float] | None:
     now, recent, further = by([NOW], own), by(RECENT, own), by(FURTHER, own)
     others, everyone = by([NOW], near), by([NOW], inputs.cameras.names)
     counted = {
-        "chosen, now": now,
-        "chosen, now or up to 3 frames ago": now | recent,
-        "chosen, the whole window": now | recent | further,
+        "source views, now": now,
+        "source views, now or up to 3 frames ago": now | recent,
+        "source views, the whole window": now | recent | further,
         "8 cameras, now": others,
         "all cameras, now": everyone,
         "all cameras, now, or chosen, the whole window": everyone | recent | further,

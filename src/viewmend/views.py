@@ -172,8 +172,8 @@ class IncompleteView:
     """z-depth of the proxy, metres; 0 where there is none."""
     source_views: tuple[str, ...]
     """Names of the cameras that coloured the view."""
-    weights: Float[Tensor, "chosen height width"]
-    """Share of each chosen camera in each pixel; the sum is 1 where a pixel is coloured, else 0."""
+    weights: Float[Tensor, "source height width"]
+    """Weight of each source view in each pixel; the sum is 1 where a pixel is coloured, else 0."""
     time: int
     candidate_views: tuple[str, ...] = ()
     """Names of all cameras that an inpainter may look at, the closest first; () where the renderer does not say."""
@@ -193,11 +193,11 @@ class IncompleteView:
 
     @property
     def holes(self) -> Bool[Tensor, "height width"]:
-        """Pixels of the proxy that no chosen camera colours: the paper's E, whatever the error rule."""
+        """Pixels of the proxy that no source view colours: the paper's E, whatever the error rule."""
         return (self.mask > 0) & ~(self.weights > 0).any(0)
 
     def closest_views(self, count: int) -> tuple[str, ...]:
-        """Names of this many cameras: the chosen ones, then the closest others."""
+        """Names of this many cameras: the source views, then the closest others."""
         return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
 
     def demand_cameras(self, known: Sequence[str]) -> None:

@@ -118,7 +118,7 @@ def test_samples_in_files(kind, request):
 
 def test_what_is_of_another_size_or_kind_is_no_sample(sample):
     good = sample_to_bytes(sample)
-    for field, value in (("view", None), ("truth", {"tensor": "0"}), ("nearby", []), ("alpha", 3)):
+    for field, value in (("view", None), ("truth", {"tensor": "0"}), ("ray_views", []), ("alpha", 3)):
         structure = structure_of(good)
         structure["fields"][field] = value
         with pytest.raises(ShardError, match=r"expected a sample, got [0-9]+ bytes that do not read"):

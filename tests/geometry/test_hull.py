@@ -91,7 +91,7 @@ def test_points_behind_a_camera_never_count(path):
     cameras = concatenate_cameras([dome(4), camera_at((0.0, 0.0, 1.0), target=(0.0, 0.0, 3.0), name="away")])
     masks = ball_masks(cameras)
     assert not masks[4].any()
-    config = replace(SMALL, min_share=0.0)
+    config = replace(SMALL, min_fraction=0.0)
     with_it = visual_hull(masks, cameras, around(0.6), config)
     without = visual_hull(masks[:4], cameras[0:4], around(0.6), config)
     assert torch.equal(with_it.values, without.values)

@@ -128,10 +128,14 @@ def test_a_model_of_format_1_loads_as_it_was(saved):
     """Of the time when one network had switches; so is the shipped `small`."""
     before = load_network(saved)
     values = json.loads((saved / "config.json").read_text()) | {"viewmend_format": 1}
-    for new, old in (("colour_skip", "colour_path"), ("num_ray_views", "rays")):
+    for new, old in (
+        ("colour_skip", "colour_path"),
+        ("num_ray_views", "rays"),
+        ("identity_init", "copier_start"),
+    ):
         values[old] = values.pop(new)
     assert values.pop("coarse_fill") == "rays"
-    values |= {"prefill": True, "steady": 0.7, "grid": "relative", "attention_scale": "model"}
+    values |= {"prefill": True, "steady": 0.7, "grid": "relative", "attention_scale": "model", "clamp_fill": True}
     values.pop("temporal_accumulation")
     (saved / "config.json").write_text(json.dumps(values))
     weights = load_file(saved / "model.safetensors")

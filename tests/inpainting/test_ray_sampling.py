@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from inpainting.plates import Rig, camera, context, look, tiny, view
-from reference.rays_twin import far_twin, follow_twin
+from reference.rays_twin import far_twin, rays_twin
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.coarse_fill import fill
@@ -37,17 +37,17 @@ def turned(cameras: Cameras, angle: float) -> Cameras:
 
 def test_following_equals_its_twin(rng):
     incomplete = view(5)
-    nearby = context(5, ("left", "third", "right"))
-    depth = nearby.depth + 0.2 * torch.rand(nearby.depth.shape, generator=rng) * (nearby.depth > 0)
-    frame = replace(nearby.frame, cameras=turned(nearby.frame.cameras, 0.55))
-    nearby = replace(nearby, frame=frame, depth=depth)
+    ray_views = context(5, ("left", "third", "right"))
+    depth = ray_views.depth + 0.2 * torch.rand(ray_views.depth.shape, generator=rng) * (ray_views.depth > 0)
+    frame = replace(ray_views.frame, cameras=turned(ray_views.frame.cameras, 0.55))
+    ray_views = replace(ray_views, frame=frame, depth=depth)
     rig = context(5, ("left", "third", "right", "novel")).frame
     masks = (torch.rand(rig.rgb[:, 0].shape, generator=rng) * 256).byte()
     incomplete = replace(incomplete, silhouettes=Silhouettes(masks, turned(rig.cameras, 0.55)))
     pixels = torch.nonzero(incomplete.error > 0)
     pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
-    samples = sample_along_rays(incomplete, pixels, nearby)
-    features, occupancy = follow_twin(incomplete, pixels, nearby, OFFSETS, NEAR, FAR, OUTLINE, PATCH)
+    samples = sample_along_rays(incomplete, pixels, ray_views)
+    features, occupancy = rays_twin(incomplete, pixels, ray_views, OFFSETS, NEAR, FAR, OUTLINE, PATCH)
     assert 0 < samples.features.in_view.mean() < 1, "some points are out of view"
     assert torch.allclose(samples.features.stack().double(), torch.from_numpy(features), atol=2e-3)
     assert torch.allclose(samples.consistency.stack().double(), torch.from_numpy(occupancy), atol=2e-3)
@@ -55,7 +55,7 @@ def test_following_equals_its_twin(rng):
     again = RayFeatures.unstack(samples.features.stack())
     assert all(torch.equal(a, b) for a, b in zip(again, samples.features, strict=True))
     alone = samples.features.stack()[:, OFFSETS.index(0.09)]
-    one = sample_along_rays(incomplete, pixels, nearby, offsets=(0.09,)).features
+    one = sample_along_rays(incomplete, pixels, ray_views, offsets=(0.09,)).features
     assert torch.allclose(one.stack()[:, 0], alone, atol=1e-6)
 
 
@@ -76,11 +76,11 @@ def test_farther_surroundings_equal_their_twin(rng):
 
 
 def test_without_silhouettes_the_nearby_masks_count():
-    incomplete, nearby = view(5), context(5)
-    assert nearby.frame.mask is not None
+    incomplete, ray_views = view(5), context(5)
+    assert ray_views.frame.mask is not None
     pixels = torch.nonzero(incomplete.error > 0)[::20]
-    told = replace(incomplete, silhouettes=Silhouettes(nearby.frame.mask, nearby.frame.cameras))
-    without, with_them = (sample_along_rays(v, pixels, nearby).consistency.stack() for v in (incomplete, told))
+    told = replace(incomplete, silhouettes=Silhouettes(ray_views.frame.mask, ray_views.frame.cameras))
+    without, with_them = (sample_along_rays(v, pixels, ray_views).consistency.stack() for v in (incomplete, told))
     assert torch.equal(without, with_them)
 
 
@@ -96,7 +96,7 @@ def test_cameras_agree_on_the_colour_of_a_point_on_the_surface():
 
 @pytest.mark.parametrize("unit", [1.0, 0.001, 10.0])
 def test_the_unit_of_length_does_not_matter(unit):
-    incomplete, nearby = view(5), context(5)
+    incomplete, ray_views = view(5), context(5)
     pixels = torch.nonzero(incomplete.error > 0)[::40]
 
     def scaled(cameras):
@@ -105,9 +105,9 @@ def test_the_unit_of_length_does_not_matter(unit):
         return replace(cameras, camera_from_world=pose)
 
     other = replace(incomplete, camera=scaled(incomplete.camera), depth=incomplete.depth * unit)
-    frame = replace(nearby.frame, cameras=scaled(nearby.frame.cameras))
-    seen = sample_along_rays(other, pixels, replace(nearby, frame=frame, depth=nearby.depth * unit))
-    before = sample_along_rays(incomplete, pixels, nearby)
+    frame = replace(ray_views.frame, cameras=scaled(ray_views.frame.cameras))
+    seen = sample_along_rays(other, pixels, replace(ray_views, frame=frame, depth=ray_views.depth * unit))
+    before = sample_along_rays(incomplete, pixels, ray_views)
     assert torch.allclose(seen.features.stack(), before.features.stack(), atol=1e-3)
 
 

@@ -58,7 +58,7 @@ def test_more_views_never_grow_the_hull(some, another):
     """Where enough cameras see a point in both cases, one more mask only takes away."""
     cameras = dome(8)
     masks = ball_masks(cameras, center=(0.1, 0.0, -0.1))
-    config = replace(CONFIG, min_share=0.0)
+    config = replace(CONFIG, min_fraction=0.0)
     grid = visual_hull(masks[some], cameras[some], around(0.7), config)
     more_views = sorted({*some, another})
     more = visual_hull(masks[more_views], cameras[more_views], around(0.7), config).values

@@ -187,10 +187,10 @@ def test_a_batch_equals_one_by_one(top_k, changes):
     net = tiny(**changes)
     views = [view(5), view(6, (30, 34, 40, 44)), view(7, hole=None), view(4, width=64, height=48)]
     contexts = [[context(5), context(4), context(3)], [context(6)], [], [context(4, width=120, height=100)]]
-    nearby = [context(5), None, None, context(4, ("left", "third", "right"), width=120, height=100)]
+    ray_views = [context(5), None, None, context(4, ("left", "third", "right"), width=120, height=100)]
     with torch.no_grad():
-        together = net(views, contexts, nearby, top_k)
-        for one, v, c, n in zip(together, views, contexts, nearby, strict=True):
+        together = net(views, contexts, ray_views, top_k)
+        for one, v, c, n in zip(together, views, contexts, ray_views, strict=True):
             alone = net([v], [c], [n], top_k)[0]
             assert close(one.completed, alone.completed) and close(one.inpainted, alone.inpainted)
             assert torch.equal(one.coverage, alone.coverage)

@@ -29,7 +29,7 @@ def made(captures, **options):
 @settings(max_examples=8, deadline=None, database=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(0.01, 0.9))
 def test_no_subject_is_in_both_parts(captures, seed, share):
-    splits = made(captures, seed=seed, test_share=share)
+    splits = made(captures, seed=seed, test_fraction=share)
     parts = {split: {s.subject for s in splits.scenes if s.split == split} for split in ("training", "test")}
     assert parts["training"] and parts["test"] and not parts["training"] & parts["test"]
     tested = sum(scene.split == "test" for scene in splits.scenes)
@@ -97,7 +97,7 @@ def test_what_cannot_be_split_is_refused(captures, tmp_path, capsys):
         ([one[0], one[0]], "got ['0001_01'] twice"),
         ([*one, "--subject", "^x(.*)"], "expected a subject by --subject '^x(.*)' in '0001_01'"),
         ([*one, "--subject", "("], "expected a regular expression for --subject"),
-        ([*one, "--test-share", "1"], "expected --test-share above 0 and below 1"),
+        ([*one, "--test-fraction", "1"], "expected --test-fraction above 0 and below 1"),
     ):
         assert main(["splits", *arguments, "--out", str(tmp_path / "a.json")]) == 2
         assert message in capsys.readouterr().err

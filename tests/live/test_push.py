@@ -62,7 +62,7 @@ def test_a_rig_that_goes_is_missed_and_another_one_may_come():
             rig.push(photograph(others))
             wait_until(lambda: len(viewer.wait_for("rig")["cameras"]) == 4)
             shown = viewer.frame(viewer.look(width=32, height=32))
-            assert shown.header["time"] == 1 and set(shown.header["chosen"]) <= set(others.names)
+            assert shown.header["time"] == 1 and set(shown.header["source_views"]) <= set(others.names)
             with pytest.raises(ConnectionError, match="another rig is pushing"):
                 publisher(server)
             assert get(f"{server.url}/health")[0] == 200

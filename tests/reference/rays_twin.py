@@ -4,21 +4,21 @@ import numpy as np
 from reference.blend_twin import unit
 
 
-def follow_twin(view, pixels, nearby, offsets, near, far, outline, patch):
+def rays_twin(view, pixels, ray_views, offsets, near, far, outline, patch):
     """Features [pixel point view 14] and occupancy [pixel point 4], in double precision."""
     depth = view.depth.double().numpy()
     focal = np.sqrt(float(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
     covered = np.sort(depth[depth > 0])
     size_m = np.sqrt((view.mask > 0).sum().item()) * covered[(len(covered) - 1) // 2] / focal
     pose = np.linalg.inv(view.camera.camera_from_world[0].double().numpy())
-    features = np.zeros((len(pixels), len(offsets), len(nearby.frame.cameras), 14))
+    features = np.zeros((len(pixels), len(offsets), len(ray_views.frame.cameras), 14))
     occupancy = np.ones((*features.shape[:2], 4))
     for number, (row, column) in enumerate(pixels.tolist()):
         ray = np.linalg.inv(view.camera.K[0].double().numpy()) @ [column + 0.5, row + 0.5, 1]
         for point, offset in enumerate(offsets):
             at = pose[:3, :3] @ (ray * (depth[row, column] + offset * size_m)) + pose[:3, 3]
             for camera in range(features.shape[2]):
-                seen = look(at, pose[:3, 3], view, nearby, camera, size_m, near, far, outline, patch)
+                seen = look(at, pose[:3, 3], view, ray_views, camera, size_m, near, far, outline, patch)
                 features[number, point, camera] = seen
             seen = [see_mask(at, view.silhouettes, i, outline) for i in range(len(view.silhouettes.cameras))]
             masks, around = zip(*seen, strict=True)
@@ -26,9 +26,9 @@ def follow_twin(view, pixels, nearby, offsets, near, far, outline, patch):
     return features, occupancy
 
 
-def look(point, viewer, view, nearby, index, size_m, near, far, outline, patch):
+def look(point, viewer, view, ray_views, index, size_m, near, far, outline, patch):
     """The features of one point in one camera; zeros where it is out of view."""
-    camera, frame = nearby.frame.cameras[index], nearby.frame
+    camera, frame = ray_views.frame.cameras[index], ray_views.frame
     pose = camera.camera_from_world[0].double().numpy()
     x, y, z = pose[:3, :3] @ point + pose[:3, 3]
     width, height = camera.size_px[0].tolist()
@@ -40,7 +40,7 @@ def look(point, viewer, view, nearby, index, size_m, near, far, outline, patch):
     rgb, mask, coverage, surface = np.zeros(3), 0.0, 0.0, 0.0
     for row, column, share in four_beyond(u, v):
         if 0 <= row < frame.rgb.shape[2] and 0 <= column < frame.rgb.shape[3]:
-            there = float(nearby.depth[index, row, column])
+            there = float(ray_views.depth[index, row, column])
             fore = float(frame.mask[index, row, column]) / 255
             rgb += share * fore * frame.rgb[index, :, row, column].double().numpy() / 255
             mask += share * fore
@@ -50,7 +50,7 @@ def look(point, viewer, view, nearby, index, size_m, near, far, outline, patch):
     centre = -pose[:3, :3].T @ pose[:3, 3]
     cosine = unit(centre - point) @ unit(viewer - point)
     chosen = camera.names[0] in view.source_views
-    masks, proxy = frame.mask.double().numpy() / 255, (nearby.depth.numpy() > 0).astype(float)
+    masks, proxy = frame.mask.double().numpy() / 255, (ray_views.depth.numpy() > 0).astype(float)
     size_px = float(np.sqrt(masks.sum((1, 2)).mean()))
     side, half = max(1, round(outline * size_px)), max(1, round(patch / 2 * size_px))
     black = frame.rgb[index].double().numpy() / 255 * masks[index]

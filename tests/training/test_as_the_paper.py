@@ -40,9 +40,8 @@ CHECKLIST = {
     "rope_values": ("6: values are not rotated", False),
     "top_k": ("6: k, which the paper leaves open", 512),
     "colour_skip": ("7: features alone, no colours", False),
-    "clamp_fill": ("7, 13: no clamp before the blend", False),
     "background": ("13: white", "white"),
-    "copier_start": ("13: no copier start", False),
+    "identity_init": ("13: no copier start", False),
     "token_norms": ("13: no norms of tokens", False),
     "coarse_fill": ("1: nothing fills before", "none"),
     "temporal_accumulation": ("9: nothing is accumulated", 0.0),
@@ -125,7 +124,7 @@ def test_what_is_missing_outside_the_subject_is_filled():
 
 def test_the_start_is_not_a_copier():
     torch.manual_seed(0)
-    nets = [build(replace(paper_small(), copier_start=start)) for start in (False, True)]
+    nets = [build(replace(paper_small(), identity_init=start)) for start in (False, True)]
     biases = [float(net.transformer.keys_values.bias.detach().abs().max()) for net in nets]
     assert 0 < biases[0] < 0.2 and biases[1] > 1
     assert not any(isinstance(norm, torch.nn.LayerNorm) for norm in (nets[0].tokeniser.norm, nets[0].decoder.norm))

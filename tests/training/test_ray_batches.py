@@ -25,7 +25,7 @@ def test_they_cost_what_the_fill_of_the_whole_sample_costs(tiny):
     assert len(samples) == len(lookups) > 1
     with torch.no_grad():
         outcome = RaysObjective(model, tiny)(lookups)
-        filled = model.coarse([s.view for s in samples], [s.nearby for s in samples])
+        filled = model.coarse([s.view for s in samples], [s.ray_views for s in samples])
     nowhere = [torch.zeros_like(s.view.error) for s in samples]
     missing = [(s.view.error > 0).float() for s in samples]
     expected = image_loss(filled, nowhere, missing, [s.truth.float() / 255 for s in samples])

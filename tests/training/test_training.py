@@ -226,7 +226,7 @@ def test_validation_scores_the_averaged_weights_and_leaves_a_picture(tiny, tmp_p
     views, model, found = Validation(tiny, tmp_path)._views(), load_network(tmp_path).eval(), []
     for sample in views:
         with torch.no_grad():
-            made = model([sample.view], [list(sample.context)], ray_views=[sample.nearby])[0]
+            made = model([sample.view], [list(sample.context)], ray_views=[sample.ray_views])[0]
         telea, _ = Telea().step(sample.view, ContextProvider(lambda *_: None), State())
         missing = sample.view.error > 0
         off = [(rgb - sample.truth / 255)[:, missing] for rgb in (made.completed, telea.rgb, made.coarse)]

@@ -89,7 +89,7 @@ def test_a_stored_scene_is_the_rig_without_a_camera(studio, stored):
         assert float((sample.depth - true.depth[0]).abs().max()) < 1e-4
         black = (true.rgb[0] * (true.mask[0] / 255)).round()
         assert float((sample.truth - black).abs().max()) <= 1
-        seen = sample.nearby.frame
+        seen = sample.ray_views.frame
         assert seen.cameras.names == view.closest_views(4)
         own = frame.select(seen.cameras.names)
         inside = own.mask > 0
@@ -137,7 +137,7 @@ def test_other_colours_are_those_of_cameras_view_and_truth_alike(stored):
     for before, after in (
         (sample.view.rgb, other.view.rgb),
         (sample.truth / 255, other.truth / 255),
-        (sample.nearby.frame.rgb[0] / 255, other.nearby.frame.rgb[0] / 255),
+        (sample.ray_views.frame.rgb[0] / 255, other.ray_views.frame.rgb[0] / 255),
     ):
         means, changed = before.mean((1, 2)).sort().values, after.mean((1, 2)).sort().values
         gains.append(changed / means)
@@ -204,7 +204,7 @@ def test_holes_are_guessed_by_the_reader_of_rays_of_another_model(stored, tmp_pa
     whole = WholeView.of(sample, net)
     holes = whole.view.holes
     assert int(holes.sum()) > 30 and torch.equal(whole.guess[:, ~holes], whole.view.rgb[:, ~holes])
-    wanted = small.coarse([replace(whole.view, error=holes.float())], [sample.nearby])[0]
+    wanted = small.coarse([replace(whole.view, error=holes.float())], [sample.ray_views])[0]
     torch.testing.assert_close(whole.guess, wanted, atol=1e-5, rtol=0)
     torch.manual_seed(3)
     window = random_window(whole)

@@ -21,7 +21,7 @@ FRONTAL_POWER = 8.0
 class ReprojectionFill:
     """Each pixel of E takes the colour that cameras show at its point of the proxy, by geometry alone.
 
-    The cameras nearest to the view are asked first, at its own time, then the chosen ones at past times, latest
+    The cameras nearest to the view are asked first, at its own time, then the source views at past times, latest
     first; where none saw the point, the hole is filled smoothly from its surroundings.
     """
 

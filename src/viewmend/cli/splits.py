@@ -22,7 +22,7 @@ class Options:
     subject: str = "(.*)"
     """Whose capture it is: a regular expression, whose first group in the capture's name is the subject. By default
     every capture is somebody else's; '^(.*)_' for DNA-Rendering's 0012_11."""
-    test_share: float = 0.1
+    test_fraction: float = 0.1
     """At least this part of the scenes is for tests."""
     seed: int = 0
     """Chooses subjects and cameras."""
@@ -42,14 +42,16 @@ def run(options: Options) -> int:
         re.compile(options.subject)
     except re.error as error:
         raise ValueError(f"expected a regular expression for --subject, got '{options.subject}': {error}") from None
-    if not 0 < options.test_share < 1:
-        raise ValueError(f"expected --test-share above 0 and below 1, got {options.test_share}; the paper has 7 of 79")
+    if not 0 < options.test_fraction < 1:
+        raise ValueError(
+            f"expected --test-fraction above 0 and below 1, got {options.test_fraction}; the paper has 7 of 79"
+        )
     remove_half_of(options.out)
     splits = make_splits(
         options.captures,
         options.out.parent,
         seed=options.seed,
-        test_share=options.test_share,
+        test_fraction=options.test_fraction,
         subject=options.subject,
         kind=options.kind,
     )

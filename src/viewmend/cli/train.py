@@ -134,6 +134,6 @@ def _line(progress: "Progress") -> str:
     pace = progress.pace
     left = "?" if pace.eta_s is None else f"{pace.eta_s / 60:.0f} min"
     return (
-        f"step {progress.step}, {100 * progress.progress:.0f} %, {left} left: L_in {progress.costs.inside:.4f}, "
-        f"L_out {progress.costs.outside:.4f}, {pace.samples_per_s:.1f} samples/s, {100 * pace.waiting:.0f} % waiting"
+        f"step {progress.step}, {100 * progress.progress:.0f} %, {left} left: L_in {progress.losses.inside:.4f}, "
+        f"L_out {progress.losses.outside:.4f}, {pace.samples_per_s:.1f} samples/s, {100 * pace.waiting:.0f} % waiting"
     )

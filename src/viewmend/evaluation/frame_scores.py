@@ -61,7 +61,7 @@ class Scores:
     change_truth: float | None
     """The truth's."""
     psnr_past: float | None = None
-    """PSNR over the holes whose surface no chosen camera sees now, and one saw at an earlier time of the window."""
+    """PSNR over the holes whose surface no source view sees now, and one saw at an earlier time of the window."""
 
 
 @dataclass(frozen=True, kw_only=True)

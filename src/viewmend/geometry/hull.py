@@ -43,7 +43,7 @@ class HullConfig:
     """Mask pixels are pooled until a voxel spans about so many, and smoothed: else the surface shows their steps."""
     min_views: int = 2
     """Space that fewer cameras see is empty."""
-    min_share: float = 0.5
+    min_fraction: float = 0.5
     """Space that a smaller share of the cameras sees is empty."""
 
 
@@ -104,7 +104,7 @@ def occupied_bounds(
 
 def needed_views(views: int, config: HullConfig) -> int:
     """How many of `views` cameras must see a point for it to count."""
-    return max(min(config.min_views, views), math.ceil(config.min_share * views))
+    return max(min(config.min_views, views), math.ceil(config.min_fraction * views))
 
 
 def _divide(bounds: Bounds, resolution: int) -> tuple[float, tuple[int, int, int]]:

@@ -68,12 +68,10 @@ class InpainterConfig:
     """Cameras at the view's own time that `RayBlendNet` looks at: the source views, then the closest others."""
     temporal_accumulation: float = 0.0
     """Weight of a stream's last fill, carried by the proxy, where the new one hardly differs; 0 to below 1. Ours."""
-    copier_start: bool = True
+    identity_init: bool = True
     """Start attention at what lands nearest, and tokens as copies of it, instead of at random. Ours."""
     token_norms: bool = True
     """Normalise tokens where patches become tokens, and before they are decoded. Ours."""
-    clamp_fill: bool = True
-    """Clamp Ftilde to [0, 1] before it is blended, and not Fhat afterwards alone. Ours."""
     top_k: int | None = None
     """Context tokens that survive pruning, in training, too; None keeps all. A step may ask for another number."""
     context_cameras: int | None = None
@@ -146,8 +144,8 @@ class InpainterConfig:
     def from_dict(cls, values: dict[str, Any]) -> "InpainterConfig":
         """Inverse of `to_dict`; what a config does not name yet has its default, which is as it was before.
 
-        Names of earlier versions (`prefill`, `rays`, `steady`, `colour_path`, `black_background`) are read as what they
-        are called now.
+        Names of earlier versions (`prefill`, `rays`, `steady`, `colour_path`, `copier_start`, `black_background`) are
+        read as what they are called now.
 
         Raises:
             ValueError: a key is unknown, or a value is impossible.
@@ -171,7 +169,12 @@ def _renamed(values: dict[str, Any]) -> dict[str, Any]:
     for name, only in (("attention_scale", "model"), ("grid", "relative")):
         if values.pop(name, only) != only:
             raise ValueError(f"expected {name} '{only}', the only one left, got another; train the model anew")
-    for old, new in (("colour_path", "colour_skip"), ("steady", "temporal_accumulation")):
+    values.pop("clamp_fill", None)  # it changed nothing that was shown
+    for old, new in (
+        ("colour_path", "colour_skip"),
+        ("steady", "temporal_accumulation"),
+        ("copier_start", "identity_init"),
+    ):
         if old in values:
             values[new] = values.pop(old)
     if "black_background" in values:
@@ -191,9 +194,8 @@ def paper() -> InpainterConfig:
         use_validity=False,
         background="white",
         min_foreground=0.0,
-        copier_start=False,
+        identity_init=False,
         token_norms=False,
-        clamp_fill=False,
         top_k=PAPER_TOP_K,
         context_cameras=3,
         past_geometry="current",

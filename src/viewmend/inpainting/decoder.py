@@ -80,7 +80,7 @@ def blend(
 ) -> Float[Tensor, "3 height width"]:
     """Fhat = E Ftilde + (1 - E) F; bit for bit F where E is 0 or where no patch was decoded.
 
-    With `clamp`, Ftilde is clamped to [0, 1] first: what a loss is then given is what is shown.
+    With `clamp`, Ftilde is clamped to [0, 1] first.
     """
     mended = error * (inpainted.clamp(0, 1) if clamp else inpainted) + (1 - error) * known
     return torch.where((error > 0) & (coverage > 0), mended, known)

@@ -1,4 +1,4 @@
-"""How an inpainter with a colour path starts: as a copier of blurred, rightly shifted colours. Ours.
+"""How an inpainter with a colour skip starts: as a copier of blurred, rightly shifted colours. Ours.
 
 A head of a token holds one colour of its patch as plane waves, cosine and sine in a pair. Values turn by wave vector x
 distance between context patch and query, which is the shift theorem: what arrives is the context patch as seen from

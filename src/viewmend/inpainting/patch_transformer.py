@@ -44,7 +44,7 @@ class Prediction:
     coarse: Float[Tensor, "3 height width"]
     """The colours that the encoder was shown: the view's, its holes filled where there is a coarse fill."""
     completed: Float[Tensor, "3 height width"]
-    """Fhat = E Ftilde + (1 - E) F, Ftilde clamped where the config says so; F, upon black, bit for bit where E is 0."""
+    """Fhat = E Ftilde + (1 - E) F, not clamped; F, upon black, bit for bit where E is 0."""
     alpha: Float[Tensor, "height width"] | None
     """What is not background of a view upon white: M, and all of E that was painted. None upon black, where it is M."""
 
@@ -63,7 +63,7 @@ class PatchTransformer(Network):
         self.tokeniser = Tokeniser(config)
         self.transformer = Transformer(config)
         self.decoder = Decoder(config)
-        if config.colour_skip and config.copier_start:
+        if config.colour_skip and config.identity_init:
             identity_init(self.tokeniser.linear, self.decoder.linear, config)
 
     @property
@@ -244,7 +244,7 @@ def _prediction(
     inpainted = merged[0, :3]
     if len(merged[0]) > 3:
         inpainted = torch.lerp(target.shown[:3] * coverage, inpainted, merged[0, 3])
-    completed = blend(view.rgb, view.error, inpainted, coverage[0], config.clamp_fill)
+    completed = blend(view.rgb, view.error, inpainted, coverage[0], clamp=False)
     return Prediction(inpainted, coverage[0], target.shown[:3], completed, alpha)
 
 

@@ -184,7 +184,7 @@ def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_
 
 def look_around(
     view: IncompleteView,
-    nearby: ContextViews | None,
+    ray_views: ContextViews | None,
     pixels: Int[Tensor, "pixel 2"],
     guess: Float[Tensor, "3 height width"] | None = None,
 ) -> RayInputs:
@@ -194,8 +194,8 @@ def look_around(
     """
     guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
     shown = torch.cat([view.rgb, view.mask[None], view.error[None], guess])
-    if nearby is not None and len(pixels):
-        features, consistency = (values.stack() for values in sample_along_rays(view, pixels, nearby))
+    if ray_views is not None and len(pixels):
+        features, consistency = (values.stack() for values in sample_along_rays(view, pixels, ray_views))
     else:
         shape = (len(pixels), len(OFFSETS))
         features, consistency = view.depth.new_zeros(*shape, 0, RAY_CHANNELS), view.depth.new_ones(*shape, 4)

@@ -1,6 +1,6 @@
 """What the cameras show along the rays of missing pixels. Ours.
 
-A hole is where no chosen camera sees the proxy. The true surface is at or behind the proxy's, and what it looks like is
+A hole is where no source view sees the proxy. The true surface is at or behind the proxy's, and what it looks like is
 in the images: where a ray passes it, cameras that see it agree. So the ray is followed from the proxy inwards, and each
 of its points looked up in each camera (as in IBRNet, Wang et al., CVPR 2021, which renders whole views so).
 """
@@ -114,14 +114,14 @@ def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
 
 
 def sample_along_rays(
-    view: IncompleteView, pixels: Int[Tensor, "pixel 2"], nearby: ContextViews, offsets: Sequence[float] = OFFSETS
+    view: IncompleteView, pixels: Int[Tensor, "pixel 2"], ray_views: ContextViews, offsets: Sequence[float] = OFFSETS
 ) -> RaySamples:
     """Looks up the rays of these pixels (row, column) in every camera.
 
     The view needs a depth somewhere; a pixel without takes it from around. `offsets` are z-depths behind the proxy, in
     subject sizes.
     """
-    cameras, shape = nearby.frame.cameras, (len(pixels), len(offsets))
+    cameras, shape = ray_views.frame.cameras, (len(pixels), len(offsets))
     size_m = subject_size_m(view)
     index = tuple(pixels.unbind(1))
     depth = view.depth[index]
@@ -136,11 +136,11 @@ def sample_along_rays(
     to_viewer = F.normalize(view.camera.centers[0] - points, dim=-1)
     cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1, keepdim=True)
     is_source = z.new_tensor([name in view.source_views for name in cameras.names])[:, None, None].expand_as(cosine)
-    mask = nearby.frame.mask if nearby.frame.mask is not None else 255 * (nearby.depth > 0).to(torch.uint8)
+    mask = ray_views.frame.mask if ray_views.frame.mask is not None else 255 * (ray_views.depth > 0).to(torch.uint8)
 
-    colour, own_mask, coverage, depth = _at_points(nearby, at).split((3, 1, 1, 1), -1)
+    colour, own_mask, coverage, depth = _at_points(ray_views, at).split((3, 1, 1, 1), -1)
     behind = torch.where(coverage > 0.3, (z[..., None] - depth / coverage.clamp_min(0.05)) / size_m, 0.0)
-    mean_mask, mean_colour, mean_coverage = _means_at_points(nearby.frame.rgb, mask, nearby.depth > 0, at)
+    mean_mask, mean_colour, mean_coverage = _means_at_points(ray_views.frame.rgb, mask, ray_views.depth > 0, at)
     features = RayFeatures(
         colour=colour,
         mask=own_mask,
@@ -197,13 +197,13 @@ def windows(
     return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
 
 
-def _at_points(nearby: ContextViews, at: Float[Tensor, "view point 2"]) -> Float[Tensor, "view point 6"]:
+def _at_points(ray_views: ContextViews, at: Float[Tensor, "view point 2"]) -> Float[Tensor, "view point 6"]:
     """RGB before black, mask, whether the proxy is there and its depth, bilinearly; zeros beyond the image."""
-    frame, (height, width) = nearby.frame, nearby.depth.shape[1:]
+    frame, (height, width) = ray_views.frame, ray_views.depth.shape[1:]
     view = torch.arange(len(frame.cameras), device=at.device)[:, None]
     total = at.new_zeros(*at.shape[:2], 6)
     for tap in bilinear_taps(at, width, height):
-        depth = nearby.depth[view, tap.row, tap.column]
+        depth = ray_views.depth[view, tap.row, tap.column]
         covered = (depth > 0).to(at)
         mask = covered if frame.mask is None else frame.mask[view, tap.row, tap.column].to(at) / 255
         rgb = frame.rgb[view, :, tap.row, tap.column].to(at) / 255 * mask[..., None]

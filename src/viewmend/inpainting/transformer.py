@@ -63,11 +63,11 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.total_blocks))
         self.register_buffer("score_frequencies", rope.score_frequencies(head_dim), persistent=False)
         self.register_buffer("value_frequencies", rope.value_frequencies(head_dim), persistent=False)
-        if config.copier_start:
-            self._start_as_copier()
+        if config.identity_init:
+            self._identity_init()
 
-    def _start_as_copier(self) -> None:
-        """Start as one that looks at what lands nearest, add half of it.
+    def _identity_init(self) -> None:
+        """Begin by looking at what lands nearest, and adding half of it.
 
         With RoPE, constant biases of queries and keys make the score contain the sum of cos(frequency x distance).
         """

@@ -53,7 +53,7 @@ def make_splits(
     base: Path,
     *,
     seed: int = 0,
-    test_share: float = 0.1,
+    test_fraction: float = 0.1,
     subject: str = "(.*)",
     kind: str | None = None,
 ) -> SplitFile:
@@ -66,7 +66,7 @@ def make_splits(
         captures: folders, or files that stand for them.
         base: the folder that paths are relative to.
         seed: chooses subjects and cameras.
-        test_share: at least this part of the scenes is for tests; at least one subject.
+        test_fraction: at least this part of the scenes is for tests; at least one subject.
         subject: a regular expression, whose first group in a capture's name is its subject.
         kind: the captures' format, None to recognise it.
 
@@ -82,7 +82,7 @@ def make_splits(
         raise ValueError(f"expected captures of different names and of two subjects or more, got {got}; see --subject")
     tested: set[str] = set()
     for one in subjects[:-1]:
-        if tested and sum(scene.subject in tested for scene in scenes) >= test_share * len(scenes):
+        if tested and sum(scene.subject in tested for scene in scenes) >= test_fraction * len(scenes):
             break
         tested.add(one)
     split = [structs.replace(s, split="test" if s.subject in tested else "training") for s in scenes]

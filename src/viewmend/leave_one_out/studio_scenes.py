@@ -117,7 +117,7 @@ def procedural_set(
 def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
     """P-turn: 24 people who turn or spin on an empty stage, seen by two rings; both rigs and motions take turns.
 
-    Some of what is missing no chosen camera sees now, and one saw some frames ago.
+    Some of what is missing no source view sees now, and one saw some frames ago.
     """
     scenes = []
     for n, seed in enumerate(TURN_SEEDS):

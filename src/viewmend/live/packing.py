@@ -79,7 +79,7 @@ def frame_message(
         "height": first.mask.shape[0],
         "full": info.full,
         "cameras": [{k: c[k] for k in keys} for v in result.completed for c in cameras_json(v.view.camera)],
-        "chosen": list(first.source_views),
+        "source_views": list(first.source_views),
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(float(first.holes.sum()) / max(1.0, float((first.mask > 0).sum())), 5),
         "confidence": mean_confidence(result.completed[0]),

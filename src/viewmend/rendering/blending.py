@@ -37,7 +37,7 @@ class Blend:
 
     rgb: Float[Tensor, "3 height width"]
     """The weighted mean of the samples, in [0, 1]; black where no camera has weight."""
-    weights: Float[Tensor, "chosen height width"]
+    weights: Float[Tensor, "source height width"]
     """Raw weights, not normalised."""
     disagreement: Float[Tensor, "height width"]
     """Weighted standard deviation of the samples about `rgb`, mean of the channels; 0 for a single camera."""

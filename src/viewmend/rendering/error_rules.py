@@ -65,5 +65,8 @@ def error_rule(name: str) -> ErrorRule:
         'unseen'
     """
     if name not in ERROR_RULES:
-        raise ValueError(f"expected an error rule among {sorted(ERROR_RULES)}, got '{name}'; choose one of them")
+        raise ValueError(
+            f"expected an error rule among {sorted(ERROR_RULES)}, got '{name}'; choose one of them, or name a method "
+            "that brings its own"
+        )
     return ERROR_RULES[name]

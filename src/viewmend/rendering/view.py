@@ -32,9 +32,9 @@ class RenderConfig:
     cameras: int = 3
     """How many cameras colour a view: those closest to it in angle (the paper: 3)."""
     blend: BlendConfig = field(default_factory=BlendConfig)
-    """How the chosen cameras' colours are weighted."""
+    """How the source views' colours are weighted."""
     error_rule: str | None = None
-    """What must be mended: 'unseen', the pixels that no chosen camera colours, 'all' of the subject, or what a model
+    """What must be mended: 'unseen', the pixels that no source view colours, 'all' of the subject, or what a model
     takes for 'wrong'. None is for what the stream's inpainter is made for."""
     wrong_fraction: float = 0.15
     """Rule 'wrong': at most this part of the proxy's pixels is mended, where most is to be gained; holes are always."""

@@ -17,7 +17,7 @@ from viewmend.training.samples import Sample
 
 
 @dataclass(frozen=True)
-class BaselineOutcome(StepOutput):
+class BaselineOutput(StepOutput):
     """`completed` is each clip's last view."""
 
     flow: Float[Tensor, ""]
@@ -40,7 +40,7 @@ class BaselineObjective(nn.Module):
         self.model, self.size_px, self.autocast = model, size_px, bfloat16
         self.teacher = deepcopy(start).requires_grad_(False).eval() if isinstance(start, E2FGVI) else None
 
-    def forward(self, batch: list[Sample]) -> BaselineOutcome:
+    def forward(self, batch: list[Sample]) -> BaselineOutput:
         """The terms of `batch`, each sample in a random framing."""
         clips = [training_clip(s, self.size_px, FRAMINGS[int(torch.randint(len(FRAMINGS), ()))]) for s in batch]
         made, flow_terms = zip(*(self._complete(clip) for clip in clips), strict=True)
@@ -50,7 +50,7 @@ class BaselineObjective(nn.Module):
         composed = tuple(
             torch.where(clip.holes[:, None], out, clip.frames) for out, clip in zip(made, clips, strict=True)
         )
-        return BaselineOutcome(
+        return BaselineOutput(
             image=ImageLoss(inside, outside, torch.zeros_like(inside)),
             flow=flow,
             total=inside + outside + flow,

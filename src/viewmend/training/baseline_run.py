@@ -12,7 +12,7 @@ from viewmend.baselines.frame_coder import SLOPE
 from viewmend.baselines.published import NETWORKS, TRAINED
 from viewmend.baselines.token_transformer import NATIVE_PX, TokenTransformer
 from viewmend.training.adversary import BETAS, Adversary
-from viewmend.training.baseline_objective import BaselineObjective, BaselineOutcome
+from viewmend.training.baseline_objective import BaselineObjective, BaselineOutput
 from viewmend.training.loop import Run
 from viewmend.training.model_card import model_card
 from viewmend.training.objective import StepOutput
@@ -91,11 +91,11 @@ class BaselineRun(Run):
     def _rate_factor(self, step: int, progress: float) -> float:
         return 1.0 if progress < FULL_RATE else 0.1
 
-    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, weight: float):
-        assert isinstance(outcome, BaselineOutcome)
-        truth = [(clip.truth.transpose(0, 1) + 1) / 2 for clip in outcome.clips]
-        made = [(images.transpose(0, 1) + 1) / 2 for images in outcome.composed]
-        return adversary.judge_images(truth, made, [clip.holes.float() for clip in outcome.clips], weight)
+    def _judge(self, adversary: Adversary, batch: list[Any], output: StepOutput, weight: float):
+        assert isinstance(output, BaselineOutput)
+        truth = [(clip.truth.transpose(0, 1) + 1) / 2 for clip in output.clips]
+        made = [(images.transpose(0, 1) + 1) / 2 for images in output.composed]
+        return adversary.judge_images(truth, made, [clip.holes.float() for clip in output.clips], weight)
 
     def _write_model(self) -> None:
         write_tensors(self.out / TRAINED, self.averaged.state_dict(), {"format": "pt", "network": self.recipe.name})

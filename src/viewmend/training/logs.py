@@ -35,7 +35,7 @@ class Progress:
     progress: float
     """Share of the run before this one, 0 to 1."""
     learning_rate: float
-    costs: LossTerms
+    losses: LossTerms
     elapsed_s: float
     pace: Pace
 
@@ -70,17 +70,17 @@ class Log:
     def add(self, progress: Progress) -> None:
         """A step."""
         self._write(asdict(progress))
-        self._plot(progress.step, {f"loss/{n}": v for n, v in asdict(progress.costs).items()})
+        self._plot(progress.step, {f"loss/{n}": v for n, v in asdict(progress.losses).items()})
         rates = {"samples_per_s": progress.pace.samples_per_s, "waiting": progress.pace.waiting}
         rates["learning_rate"] = progress.learning_rate
         self._plot(progress.step, {f"rate/{n}": v for n, v in rates.items()})
 
-    def validated(self, judgement: ValidationScores | WholeViewScores) -> None:
+    def validated(self, scores: ValidationScores | WholeViewScores) -> None:
         """What the averaged weights scored after a step."""
-        self._write({"step": judgement.step, "validation": asdict(judgement)})
+        self._write({"step": scores.step, "validation": asdict(scores)})
         self._plot(
-            judgement.step,
-            {f"validation/{n}": v for n, v in asdict(judgement).items() if n != "step" and v is not None},
+            scores.step,
+            {f"validation/{n}": v for n, v in asdict(scores).items() if n != "step" and v is not None},
         )
 
     def _write(self, values: Mapping[str, object]) -> None:

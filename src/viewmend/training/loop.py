@@ -130,10 +130,10 @@ class Run:
                 rate = self.recipe.learning_rate * self._rate_factor(step, at)
                 for group in self.optimizer.param_groups:
                     group["lr"] = rate
-                costs = self._step(step, batches)
+                losses = self._step(step, batches)
                 step += 1
                 pace = schedule.made(step, sum(map(len, batches)) * self.own.count)
-                progress = Progress(step, at, rate, costs, schedule.elapsed_s(), pace)
+                progress = Progress(step, at, rate, losses, schedule.elapsed_s(), pace)
                 log.add(progress)
                 if step % self.recipe.checkpoint_every == 0:
                     self._save(step, schedule)
@@ -174,9 +174,9 @@ class Run:
     def _rate_factor(self, step: int, progress: float) -> float:
         return learning_rate_factor(step, progress, self.recipe.warmup)
 
-    def _judge(self, adversary: Adversary, batch: list[Any], outcome: StepOutput, weight: float):
+    def _judge(self, adversary: Adversary, batch: list[Any], output: StepOutput, weight: float):
         """See `Adversary.judge`."""
-        return adversary.judge(batch, outcome.completed, weight)
+        return adversary.judge(batch, output.completed, weight)
 
     def _write_model(self) -> None:
         assert isinstance(self.averaged, NETWORKS)
@@ -185,7 +185,7 @@ class Run:
     def _step(self, step: int, batches: list[list[Trained]]) -> LossTerms:
         """One step of all weights, with the mean of the streams' gradients."""
         self.optimizer.zero_grad(set_to_none=True)
-        costs = []
+        losses = []
         for number, batch in enumerate(batches):
             batch = [sample.to(self.own.device) for sample in batch]
             # Each stream draws from its own seed at each step: who computes it does not matter.
@@ -194,23 +194,23 @@ class Run:
             last = number + 1 == len(batches)
             # Gradients but the last add up here, and meet those of other processes in its backward pass.
             with self.shared.no_sync() if isinstance(self.shared, Ddp) and not last else nullcontext():
-                outcome = self.shared(batch)
-                assert isinstance(outcome, StepOutput)
-                total, adversarial, judged = outcome.total, 0.0, 0.0
+                output = self.shared(batch)
+                assert isinstance(output, StepOutput)
+                total, adversarial, judged = output.total, 0.0, 0.0
                 if self.adversary is not None:
-                    term, judged = self._judge(self.adversary, batch, outcome, 1 / len(batches))
+                    term, judged = self._judge(self.adversary, batch, output, 1 / len(batches))
                     total, adversarial = total + self.recipe.loss.adversarial * term, float(term.detach())
                 self._demand_finite(total.detach(), step, batch)
                 (total / len(batches)).backward()
-            image = outcome.image
+            image = output.image
             terms = [float(term.detach()) for term in (image.inside, image.outside, total)]
-            costs.append([*terms, adversarial, judged])
+            losses.append([*terms, adversarial, judged])
         torch.nn.utils.clip_grad_norm_(self.learned, self.recipe.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
             self.adversary.step()
-        return LossTerms(*self.own.mean(torch.tensor(costs, device=self.own.device).mean(0)).tolist())
+        return LossTerms(*self.own.mean(torch.tensor(losses, device=self.own.device).mean(0)).tolist())
 
     def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Trained]) -> None:
         if torch.isfinite(total):

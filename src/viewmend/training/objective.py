@@ -16,7 +16,7 @@ from viewmend.training.true_images import true_image
 
 @dataclass(frozen=True)
 class StepOutput:
-    """What a model made of a batch, and what that costs."""
+    """What a model made of a batch, and its loss."""
 
     image: ImageLoss
     total: Float[Tensor, ""]
@@ -39,7 +39,7 @@ class Objective(nn.Module):
         weights = self.recipe.loss
         views = [sample for last in batch for sample in last.clip]
         predictions = self.model(
-            [s.view for s in views], [list(s.context) for s in views], ray_views=[s.nearby for s in views]
+            [s.view for s in views], [list(s.context) for s in views], ray_views=[s.ray_views for s in views]
         )
         made, counted = [p.inpainted for p in predictions], [p.coverage for p in predictions]
         if weights.outside == "image":

@@ -21,9 +21,9 @@ from viewmend.training.samples import Sample, to_device
 from viewmend.training.scenes import SceneSource
 
 DARKEST = 0.6
-"""Least of the gains of varied colours."""
+"""Least of the gains of augmented colours."""
 BLINDED_SHARE, MOST_BLIND = 0.3, 3
-"""Share of the varied samples that lose cameras, and how many at most."""
+"""Share of the augmented samples that lose cameras, and how many at most."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def ray_batch(sample: Sample, most_px: int, random: Random) -> RayBatch:
     """The sample at no more than `most_px` of its missing pixels."""
     missing = torch.nonzero(sample.view.error > 0)
     pixels = missing[random.sample(range(len(missing)), min(most_px, len(missing)))]
-    seen = look_around(sample.view, sample.nearby, pixels)
+    seen = look_around(sample.view, sample.ray_views, pixels)
     return RayBatch(
         seen.features.half(),
         seen.consistency.half(),
@@ -81,14 +81,14 @@ def ray_batch(sample: Sample, most_px: int, random: Random) -> RayBatch:
     )
 
 
-def augmented(lookups: RayBatch) -> RayBatch:
+def augmented(batch: RayBatch) -> RayBatch:
     """The same pixels as they might have been, by torch's random numbers: other colours, turned, with fewer cameras.
 
     Channels change places and everything gets darker, for cameras, surroundings and truth alike; the surroundings are
     flipped and turned; of three tenths of the samples up to three cameras that did not colour the view see nothing.
     """
     channels, gain = torch.randperm(3), float(torch.empty(()).uniform_(DARKEST, 1))
-    features, around, far = (values.clone() for values in (lookups.features, lookups.around, lookups.far))
+    features, around, far = (values.clone() for values in (batch.features, batch.around, batch.far))
     seen = RayFeatures.unstack(features)
     for colour in (seen.colour, seen.mean_colour):
         colour[...] = gain * colour[..., channels]
@@ -100,10 +100,10 @@ def augmented(lookups: RayBatch) -> RayBatch:
         around, far = around.transpose(2, 3), far.transpose(2, 3)
     if bool(torch.rand(()) < BLINDED_SHARE) and features.numel():
         blind = torch.randperm(features.shape[2])[: int(torch.randint(1, MOST_BLIND + 1, ()))].to(features.device)
-        chosen = (seen.is_source[:, :, blind] > 0).flatten(0, 1).any(0)[:, 0]
-        features[:, :, blind[~chosen]] = 0
-    truth = (gain * lookups.truth[:, channels].float()).round().to(torch.uint8)
-    return RayBatch(features, lookups.occupancy, around, far, lookups.place, truth)
+        sources = (seen.is_source[:, :, blind] > 0).flatten(0, 1).any(0)[:, 0]
+        features[:, :, blind[~sources]] = 0
+    truth = (gain * batch.truth[:, channels].float()).round().to(torch.uint8)
+    return RayBatch(features, batch.occupancy, around, far, batch.place, truth)
 
 
 class RaysObjective(nn.Module):
@@ -117,8 +117,8 @@ class RaysObjective(nn.Module):
     def forward(self, batch: Sequence[RayBatch]) -> StepOutput:
         """Both terms, the means over the samples."""
         assert isinstance(self.model.coarse, RayBlendNet), "recipes that train rays have a model that reads them"
-        batch = [augmented(lookups) for lookups in batch] if self.recipe.augment else batch
-        told = RayInputs.cat([lookups.inputs() for lookups in batch])
+        batch = [augmented(one) for one in batch] if self.recipe.augment else batch
+        told = RayInputs.cat([one.inputs() for one in batch])
         colours = self.model.coarse.mix(told).float().split([len(b.truth) for b in batch])
         loss = mean_loss([pixel_loss(c, b.truth.float() / 255) for c, b in zip(colours, batch, strict=True)])
         weights = self.recipe.loss

@@ -34,6 +34,8 @@ Trained = Sample | RayBatch | WholeView
 Stored = Trained | StoredScene
 KINDS = {kind.__name__: kind for kind in (*PARTS, *STORED)}
 """The dataclasses that a sample is made of, and what is looked up of one."""
+RENAMED = {"nearby": "ray_views"}
+"""Fields by the names of earlier versions."""
 PACKED, FASTEST = ".z", 1
 """How names of files end that zlib packed: windows, most of which is black or flat; and its level."""
 STRUCTURE = "structure"
@@ -222,7 +224,7 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
         return tensors[value["tensor"]]
     if isinstance(value, dict):
         kind = KINDS[value["kind"]]
-        made = kind(**{n: _put_together(part, tensors) for n, part in value["fields"].items()})
+        made = kind(**{RENAMED.get(n, n): _put_together(part, tensors) for n, part in value["fields"].items()})
         if wrong := [name for name, hint in _hints(kind).items() if not _fits(getattr(made, name), hint)]:
             raise TypeError(f"{wrong[0]} of {value['kind']} is of another kind")
         return made

@@ -25,7 +25,7 @@ class Sample:
     view: IncompleteView
     context: tuple[ContextViews, ...]
     """The source views, one element a time, the view's own time first."""
-    nearby: ContextViews | None
+    ray_views: ContextViews | None
     """What the cameras near the view, the chosen ones first, saw at its time: for an inpainter that reads rays."""
     truth: UInt8[Tensor, "3 height width"]
     """F*, background black."""
@@ -84,7 +84,7 @@ class HeldOutCamera:
     ) -> Sample | None:
         """The pair at `time` with context from these `times`, its own first; None if fewer pixels are missing.
 
-        cameras: how many are context at least, and how many `nearby`.
+        cameras: how many are context at least, and how many `ray_views`.
         widened_px: by how much its holes are larger than what the source views do not see.
         """
         now = self.observation(time)
@@ -95,11 +95,11 @@ class HeldOutCamera:
         view = widened(view, widened_px)
         wanted = view.closest_views(max(len(view.source_views), cameras[0]))
         context = [self.observation(tau).context(wanted) for tau in times]
-        nearby, truth = now.context(view.closest_views(cameras[1])), self.rig.truth(self.held, time)
+        ray_views, truth = now.context(view.closest_views(cameras[1])), self.rig.truth(self.held, time)
         assert truth.mask is not None, "what trains has masks"
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
         seen = tuple(c for c in context if c is not None)
-        return Sample(view, seen, nearby, black.round().to(torch.uint8), alpha=truth.mask[0])
+        return Sample(view, seen, ray_views, black.round().to(torch.uint8), alpha=truth.mask[0])
 
 
 def widened(view: IncompleteView, reach_px: int) -> IncompleteView:

@@ -67,7 +67,7 @@ class StoredScene:
     depth_step_m: float
     held: tuple[StoredView, ...]
 
-    def sample(self, number: int, render: RenderConfig, nearby: int) -> Sample:
+    def sample(self, number: int, render: RenderConfig, ray_views: int) -> Sample:
         """What `number` of the held views is, rendered; with the views of so many cameras near it.
 
         Raises:
@@ -81,7 +81,7 @@ class StoredScene:
         target = rig.select([view.name])
         observation = stream.push(frame.without([view.name]), _proxy(view))
         rendered = stream.render(target)
-        names = rendered.closest_views(nearby)
+        names = rendered.closest_views(ray_views)
         context = observation.context(names)
         assert context is not None, "a rig has cameras beside the one that is left out"
         if frame.depth is not None:

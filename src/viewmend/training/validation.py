@@ -77,7 +77,7 @@ class Validation:
         ours, fills, shown = [], [], []
         for sample in self._samples:
             on_device = sample.to(device)
-            made = model([on_device.view], [list(on_device.context)], ray_views=[on_device.nearby])[0]
+            made = model([on_device.view], [list(on_device.context)], ray_views=[on_device.ray_views])[0]
             completed, truth = made.upon_own.float().clamp(0, 1).cpu(), true_image(sample, background)
             ours.append(_score(completed, truth, sample))
             filled = torch.where(sample.view.error > 0, made.coarse.float().cpu(), completed)

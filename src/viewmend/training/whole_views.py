@@ -57,9 +57,9 @@ class WholeView:
     @classmethod
     def of(cls, sample: Sample, net: SweepNet, quick: bool = False) -> "WholeView":
         """A sample that knows alpha and depth, and the cameras near it; `net` makes the guess, or a quick one."""
-        assert sample.nearby is not None and sample.alpha is not None and sample.depth is not None, "a stored scene's"
+        assert sample.ray_views is not None and sample.alpha is not None and sample.depth is not None, "a stored scene's"
         view, truth, alpha, depth = sample.view, sample.truth, sample.alpha, sample.depth
-        scale, rig = Scale.of(view), Rig.of(sample.nearby, view.silhouettes)
+        scale, rig = Scale.of(view), Rig.of(sample.ray_views, view.silhouettes)
         crop = subject_crop(view, MARGIN_PX)
         if crop is not None:
             view = crop.of_view(view)
@@ -123,14 +123,14 @@ def untrained(recipe: WholeViewRecipe) -> SweepNet:
 
 def recoloured(sample: Sample, random: Random) -> Sample:
     """The sample with channels that changed places, and everything darker."""
-    assert sample.nearby is not None, "a stored scene's"
+    assert sample.ray_views is not None, "a stored scene's"
     channels, gain = random.sample(range(3), 3), random.uniform(DARKEST, 1)
-    frame = sample.nearby.frame
+    frame = sample.ray_views.frame
     rgb, truth = (
         (gain * image.float()).round().to(torch.uint8) for image in (frame.rgb[:, channels], sample.truth[channels])
     )
     view = replace(sample.view, rgb=gain * sample.view.rgb[channels])
-    return replace(sample, view=view, nearby=replace(sample.nearby, frame=replace(frame, rgb=rgb)), truth=truth)
+    return replace(sample, view=view, ray_views=replace(sample.ray_views, frame=replace(frame, rgb=rgb)), truth=truth)
 
 
 def random_window(whole: WholeView) -> WholeView:

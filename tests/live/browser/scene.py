@@ -6,7 +6,7 @@ CENTER = np.array([0.0, 1.0, 0.0])
 BIG, SMALL = 0.5, 0.2
 CAMERAS = 4
 COLOURS = [[230, 120, 60], [70, 150, 230]]
-CHOSEN = ["cam00", "cam01"]
+SOURCES = ["cam00", "cam01"]
 PINK = (255, 38, 140)
 FRAMES = 40
 

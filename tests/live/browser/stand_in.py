@@ -195,7 +195,7 @@ class StandIn:
                 parts.append({"eye": eye, **about})
                 data.append(content)
         header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
-        header |= {"height": height, "full": part == 1.0, "cameras": cameras, "chosen": scene.CHOSEN, "holes": share}
+        header |= {"height": height, "full": part == 1.0, "cameras": cameras, "source_views": scene.SOURCES, "holes": share}
         header |= {
             "top_k": look.get("top_k"),
             "context_times": 3,

@@ -117,7 +117,7 @@ class Page {
       document.title = `${rig.name} · viewmend live`;
       this.motion.place(rig);
       this.cameras.set(rig);
-      this.chosen([], undefined);
+      this.showSources([], undefined);
       this.wake();
     });
     on(this.link, "state", (state) => this.notices.source(state));
@@ -129,7 +129,7 @@ class Page {
     this.canvas.addEventListener("webglcontextrestored", () => {
       this.stage.prepare();
       this.link.lastLook = "";
-      this.chosen([], undefined);
+      this.showSources([], undefined);
       this.wake();
     });
   }
@@ -149,7 +149,7 @@ class Page {
   take(shown) {
     const { header } = shown;
     this.stage.take(shown);
-    this.chosen(header.chosen, this.settings.modes.includes("coverage") ? header.colours : undefined);
+    this.showSources(header.source_views, this.settings.modes.includes("coverage") ? header.colours : undefined);
     this.transport.picture(header.time);
     this.notices.arrived(this.settings.modes.includes("confidence") && header.confidence === null);
     this.paint();
@@ -159,7 +159,7 @@ class Page {
   }
 
   /** @param {string[]} names @param {number[][] | undefined} colours */
-  chosen(names, colours) {
+  showSources(names, colours) {
     if (!this.motion.rig || (!this.cameras.use(names, colours) && this.stage.lines?.count)) return;
     this.stage.lines?.set(rigLines(this.motion.rig, names, colours));
   }

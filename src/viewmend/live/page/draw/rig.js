@@ -36,13 +36,13 @@ function box(low, high) {
 }
 
 /**
- * @param {any} rig @param {string[]} chosen names of the cameras in use @param {number[][]} [colours] theirs in "coverage"
+ * @param {any} rig @param {string[]} sources names of the cameras in use @param {number[][]} [colours] theirs in "coverage"
  * @returns {Line[]}
  */
-export function rigLines(rig, chosen, colours) {
+export function rigLines(rig, sources, colours) {
   const lines = box(rig.bounds.low, rig.bounds.high);
   for (const camera of rig.cameras) {
-    const place = chosen.indexOf(camera.name);
+    const place = sources.indexOf(camera.name);
     const own = colours?.[place]?.map((value) => value / 255);
     const colour = place < 0 ? IDLE : own ? [...own, 1] : USED;
     const thickness = place < 0 ? 1.25 : 2.25;

@@ -10,7 +10,7 @@
  * @property {number} height
  * @property {boolean} full
  * @property {{K: number[], R: number[], T: number[]}[]} cameras
- * @property {string[]} chosen
+ * @property {string[]} source_views
  * @property {number[][]} [colours]
  * @property {number} holes
  * @property {Record<string, number>} stage_ms

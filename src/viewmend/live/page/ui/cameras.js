@@ -43,13 +43,13 @@ export class CameraList {
     if (count) this.to((Math.max(this.last, steps < 0 ? 0 : -1) + steps + count) % count);
   }
 
-  /** Which cameras colour the picture. @param {string[]} chosen @param {number[][] | undefined} colours @returns {boolean} whether it changed */
-  use(chosen, colours) {
-    const used = JSON.stringify([chosen, colours]);
+  /** Which cameras colour the picture. @param {string[]} sources @param {number[][] | undefined} colours @returns {boolean} whether it changed */
+  use(sources, colours) {
+    const used = JSON.stringify([sources, colours]);
     if (used === this.used) return false;
     this.used = used;
     this.cameras.forEach((camera, index) => {
-      const place = chosen.indexOf(camera.name);
+      const place = sources.indexOf(camera.name);
       for (const list of ["cameras", "labels"]) {
         const button = byId(list).children[index];
         button.toggleAttribute("data-used", place >= 0);
@@ -57,7 +57,7 @@ export class CameraList {
         else button.style.removeProperty("--colour");
       }
     });
-    byId("camera-count").textContent = `${chosen.length} of ${this.cameras.length} in use`;
+    byId("camera-count").textContent = `${sources.length} of ${this.cameras.length} in use`;
     return true;
   }
 
