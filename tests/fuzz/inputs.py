@@ -141,3 +141,15 @@ def held(read: Callable[[], object], refusals: tuple[type[Exception], ...] = (Va
 def peak_mb() -> float:
     """The most memory that this process has ever had."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+
+
+def parts_of(data: bytes) -> tuple[dict, bytes]:
+    """A safetensors file's head, and its tensors."""
+    size = struct.unpack_from("<Q", data)[0]
+    return json.loads(data[8 : 8 + size]), data[8 + size :]
+
+
+def joined(head: object, tensors: bytes) -> bytes:
+    """Inverse of `parts_of`."""
+    text = text_of(head)
+    return File(struct.pack("<Q", len(text)) + text + tensors)

@@ -5,33 +5,23 @@ import json
 import struct
 import tarfile
 import zlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from random import Random
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from evaluation.conftest import ORIGIN
-from fuzz.inputs import FUZZED, File, changed, held, nested, spoilt, text_of
+from fuzz.inputs import FUZZED, File, changed, held, joined, nested, parts_of, spoilt, text_of
 from hypothesis import given
 from jaxtyping import UInt8
-from safetensors import safe_open
-from safetensors.torch import save, save_file
+from safetensors.torch import save
 from torch import Tensor
 
-from viewmend.evaluation import scorers
-from viewmend.evaluation.cells import Cell, CellKey, CellStore
-from viewmend.evaluation.frame_scores import FrameScores
-from viewmend.evaluation.records import records
-from viewmend.evaluation.scene_run import MethodRun
-from viewmend.inpainting.config import small
 from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.rendering.view import RenderConfig
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.training.logs import Log
-from viewmend.training.plan import DataPlan, Recipe
-from viewmend.training.run_files import FILE, RunError, RunState, load_run, save_run
+from viewmend.training.plan import DataPlan
 from viewmend.training.sample_files import (
     KINDS,
     STRUCTURE,
@@ -58,17 +48,6 @@ def stored() -> StoredScene:
 @pytest.fixture(scope="module")
 def sample(stored) -> Sample:
     return stored.sample(0, RenderConfig(), 2)
-
-
-def parts_of(data: bytes) -> tuple[dict, bytes]:
-    """A safetensors file's head, and its tensors."""
-    size = struct.unpack_from("<Q", data)[0]
-    return json.loads(data[8 : 8 + size]), data[8 + size :]
-
-
-def joined(head: object, tensors: bytes) -> bytes:
-    text = text_of(head)
-    return File(struct.pack("<Q", len(text)) + text + tensors)
 
 
 def with_structure(data: bytes, structure: object) -> bytes:
@@ -125,6 +104,13 @@ def test_what_is_of_another_size_or_kind_is_no_sample(sample):
             sample_from_bytes(with_structure(good, structure))
     with pytest.raises(ShardError, match="do not read"):
         sample_from_bytes(with_structure(good, nested(100_000)))
+
+
+def test_a_sample_of_an_earlier_version_reads_as_it_was(sample):
+    good = sample_to_bytes(sample)
+    structure = structure_of(good)
+    structure["fields"]["nearby"] = structure["fields"].pop("ray_views")
+    assert sample_to_bytes(sample_from_bytes(with_structure(good, structure))) == good
 
 
 @dataclass(frozen=True)
@@ -225,93 +211,3 @@ def test_what_is_being_written_is_no_shard(sample, stored, tmp_path):
     scenes, whole = ShardScenes(tmp_path / "samples", "0", (Sample,)), StoredShards(tmp_path / "scenes", "0")
     assert [path.name for path in (*scenes.paths, *whole.paths)] == ["shard-00000.tar"] * 2
     assert len(scenes.scene(1)) == len(whole.scene(1)) == 1
-
-
-def test_runs(tmp_path):
-    recipe = Recipe(name="a", model=small(), steps=1)
-    module = torch.nn.Linear(2, 3)
-    optimizer = torch.optim.AdamW(module.parameters())
-    module(torch.ones(1, 2)).sum().backward()
-    optimizer.step()
-    parts = ({"model": module}, {"optimizer": optimizer})
-    save_run(tmp_path, recipe, RunState(1, 2.0, ()), *parts)
-    path = tmp_path / FILE
-    good = path.read_bytes()
-    with safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-
-    def told(state):
-        save_file(tensors, path, metadata | {"state": text_of(state).decode()})
-        return File(path.read_bytes())
-
-    head, rest = parts_of(good)
-    state = json.loads(metadata["state"]) | {"positions": [{"scene": 0, "sample": 1, "buffered": 2}]}
-
-    @FUZZED
-    @given(changed(state).map(told) | changed(head).map(lambda other: joined(other, rest)) | spoilt(good).map(File))
-    def fuzz(data):
-        path.write_bytes(data)
-        held(lambda: load_run(path, recipe, *parts), (RunError,))
-
-    fuzz()
-
-
-def test_logs(tmp_path):
-    file = tmp_path / "log.jsonl"
-    good = b"".join(text_of({"step": step, "costs": {"total": 1.0}}) + b"\n" for step in range(4))
-
-    def read():
-        with Log(tmp_path, 2, True):
-            pass
-
-    @FUZZED
-    @given(changed([json.loads(line) for line in good.splitlines()]).map(lines_of) | spoilt(good))
-    def fuzz(data):
-        file.write_bytes(data)
-        held(read)
-
-    fuzz()
-
-
-def lines_of(values: object) -> bytes:
-    return b"".join(text_of(value) + b"\n" for value in values) if isinstance(values, list) else text_of(values)
-
-
-def cell() -> Cell:
-    names = FrameScores.__dataclass_fields__
-    frame = FrameScores(**{n: 1 if n in ("time", "width_px", "height_px") or n.endswith("_px") else 0.5 for n in names})
-    return Cell(CellKey("s", "m", "d", "e"), "P", "ring", "calm", "x", (frame,), None, ORIGIN)
-
-
-def test_cells(tmp_path):
-    store = CellStore(tmp_path)
-    features = {kind: np.zeros((1, 1024), np.float32) for kind in scorers.KINDS}
-    store.save(cell(), MethodRun("m", cell().frames, None, features=features))
-    key = cell().key
-    file, arrays = (tmp_path / f"{key.stem}.{suffix}" for suffix in ("json", "npz"))
-    good, packed = file.read_bytes(), arrays.read_bytes()
-    assert store.load(key) == cell() and store.load(key).features is not None
-
-    @FUZZED
-    @given(changed(json.loads(good)).map(text_of) | spoilt(good))
-    def fuzz(data):
-        file.write_bytes(data)
-        held(lambda: demand_usual(store.load(key)), ())
-
-    @FUZZED
-    @given(spoilt(packed))
-    def fuzz_features(data):
-        arrays.write_bytes(data)
-        held(lambda: store.load(key), ())
-
-    fuzz()
-    file.write_bytes(good)
-    fuzz_features()
-
-
-def demand_usual(found: Cell | None) -> None:
-    """A cell that is there can be averaged."""
-    if found is not None:
-        records([found])
-        json.dumps(asdict(found.key))

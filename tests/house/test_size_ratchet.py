@@ -7,6 +7,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
+OTHERS = sorted(p for part in ("tests", "benchmarks", "examples") for p in (ROOT / part).rglob("*.py"))
 MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_ARGUMENTS = 300, 50, 8
 
 LONG_FILES: set[str] = set()
@@ -58,6 +59,11 @@ def measured() -> tuple[set[str], set[str], set[str]]:
 )
 def test_only_listed_exceptions_are_large(measured, kind, allowed):
     assert measured[kind] == allowed, "make it smaller, or take it off the list when it became smaller"
+
+
+def test_tests_and_benchmarks_are_no_longer_files_than_sources():
+    names = [str(p.relative_to(ROOT)) for p in OTHERS if len(p.read_text().splitlines()) > MAX_FILE_LINES]
+    assert len(OTHERS) > 200 and set(names) <= {"benchmarks/mutate.py"}, "split it by what it tests"
 
 
 def test_the_ratchet_sees_what_is_too_large():

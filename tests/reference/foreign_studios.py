@@ -15,7 +15,10 @@ def world_from_camera(camera):
 
 
 def write_take(folder, rig, frames, gaps, image, mask, foreground=255):
-    """Every camera's images, each camera's a brightness of its own, and masks with a corner of background."""
+    """Every camera's images, each camera's a brightness of its own, and masks with a corner of background.
+
+    `image` and `mask` are paths of {c}, the camera's name, and {f}, the frame; or functions of camera and frame.
+    """
     for number, camera in enumerate(rig):
         size = camera["height"], camera["width"]
         for frame in frames:
@@ -24,7 +27,8 @@ def write_take(folder, rig, frames, gaps, image, mask, foreground=255):
             full = np.full(size, foreground, np.uint8)
             full[-2:, -2:] = 0
             for path, pixels in ((image, np.full((*size, 3), 60 + 20 * (number % 9), np.uint8)), (mask, full)):
-                file = folder / path(camera, frame)
+                own = path.format(c=camera["name"], f=frame) if isinstance(path, str) else path(camera, frame)
+                file = folder / own
                 file.parent.mkdir(parents=True, exist_ok=True)
                 cv2.imwrite(str(file), pixels)
 
@@ -51,14 +55,7 @@ def write_zju(folder, rig, frames, gaps=(), stamps=False, arrays=False, protocol
 
 
 def write_genebody(folder, rig, frames, gaps=(), protocol=4):
-    write_take(
-        folder,
-        rig,
-        frames,
-        gaps,
-        lambda c, f: f"image/{c['name']}/{f}.jpg",
-        lambda c, f: f"mask/{c['name']}/mask{f}.png",
-    )
+    write_take(folder, rig, frames, gaps, "image/{c}/{f}.jpg", "mask/{c}/mask{f}.png")
     cams = {}
     for camera in rig:
         c2w = world_from_camera(camera)
@@ -82,14 +79,7 @@ def save_object(file, value, protocol):
 
 def write_mvhumannet(folder, rig, frames, gaps=(), scale=120 / 65, full=(4096, 3000)):
     """The K of the first camera, of images of the full size, is that of all; lengths become metres by the scale."""
-    write_take(
-        folder,
-        rig,
-        frames,
-        gaps,
-        lambda c, f: f"images/{c['name']}/{f}_img.jpg",
-        lambda c, f: f"fmask/{c['name']}/{f}_img_fmask.png",
-    )
+    write_take(folder, rig, frames, gaps, "images/{c}/{f}_img.jpg", "fmask/{c}/{f}_img_fmask.png")
     K = rig[0]["K"].copy()
     K[:2] *= full[0] / rig[0]["width"]
     K[:2, 2] -= 0.5
@@ -104,14 +94,7 @@ def write_mvhumannet(folder, rig, frames, gaps=(), scale=120 / 65, full=(4096, 3
 
 
 def write_actorshq(folder, rig, frames, gaps=(), scale="4x", boxes=None):
-    write_take(
-        folder / scale,
-        rig,
-        frames,
-        gaps,
-        lambda c, f: f"rgbs/{c['name']}/{c['name']}_rgb{f}.jpg",
-        lambda c, f: f"masks/{c['name']}/{c['name']}_mask{f}.png",
-    )
+    write_take(folder / scale, rig, frames, gaps, "rgbs/{c}/{c}_rgb{f}.jpg", "masks/{c}/{c}_mask{f}.png")
     rows = [["name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]]
     for camera in rig:
         w, h, K = camera["width"], camera["height"], camera["K"]
@@ -130,14 +113,7 @@ def _write_table(file, rows):
 
 
 def write_panoptic(folder, rig, frames, gaps=(), kind="hd"):
-    write_take(
-        folder,
-        rig,
-        frames,
-        gaps,
-        lambda c, f: f"{kind}Imgs/{c['name']}/{c['name']}_{f}.jpg",
-        lambda c, f: f"masks/{c['name']}/{c['name']}_{f}.png",
-    )
+    write_take(folder, rig, frames, gaps, kind + "Imgs/{c}/{c}_{f}.jpg", "masks/{c}/{c}_{f}.png")
     cameras = []
     for camera in rig:
         entry = {"name": camera["name"], "type": kind, "resolution": [camera["width"], camera["height"]]}
@@ -151,14 +127,7 @@ def write_panoptic(folder, rig, frames, gaps=(), kind="hd"):
 
 def write_easyvolcap(folder, rig, frames, gaps=(), bounds=None, quoted=True):
     """As write_easymocap, with bounds, near and far of each camera; names without quotes are numbers to YAML."""
-    write_take(
-        folder,
-        rig,
-        frames,
-        gaps,
-        lambda c, f: f"images/{c['name']}/{f}.jpg",
-        lambda c, f: f"masks/{c['name']}/{f}.png",
-    )
+    write_take(folder, rig, frames, gaps, "images/{c}/{f}.jpg", "masks/{c}/{f}.png")
     write_easymocap(folder, rig)
     extra = []
     for camera in rig:
@@ -206,14 +175,7 @@ def write_dna(folder, rig, frames, gaps=(), apart=False, colours=None, name="001
 
 def write_riftcast(folder, rig, frames, gaps=(), meta=None):
     """calibration.json, images, and masks as run lengths, by the plainest of loops; `meta` as meta.json."""
-    write_take(
-        folder,
-        rig,
-        frames,
-        gaps,
-        lambda c, f: f"frame_{f}/rgb/rgb_{c['name']}.png",
-        lambda c, f: f"frame_{f}/mask/mask_{c['name']}.png",
-    )
+    write_take(folder, rig, frames, gaps, "frame_{f}/rgb/rgb_{c}.png", "frame_{f}/mask/mask_{c}.png")
     for png in folder.glob("frame_*/mask/*.png"):
         runs, before = [], None
         values = (cv2.imread(str(png), cv2.IMREAD_GRAYSCALE) > 0).ravel().tolist()

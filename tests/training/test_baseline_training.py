@@ -123,7 +123,7 @@ def test_a_network_learns_goes_on_and_is_a_method(recipe, tmp_path):
     train(recipe, tmp_path / "parts", kind=BaselineRun)
     whole, parts = (load_file(tmp_path / n / "model.safetensors") for n in ("whole", "parts"))
     assert whole.keys() == parts.keys() and all(torch.equal(whole[key], parts[key]) for key in whole)
-    costs = [[entry["costs"] for entry in log_of(tmp_path / n)] for n in ("whole", "parts")]
+    costs = [[entry["losses"] for entry in log_of(tmp_path / n)] for n in ("whole", "parts")]
     assert costs[0] == costs[1] and all(c["adversarial"] and c["discriminator"] for c in costs[0])
     assert [entry["learning_rate"] for entry in log_of(tmp_path / "whole")] == pytest.approx([1e-4, 1e-4, 1e-4])
     torch.manual_seed(recipe.seed)

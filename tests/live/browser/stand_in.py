@@ -195,8 +195,9 @@ class StandIn:
                 parts.append({"eye": eye, **about})
                 data.append(content)
         header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
-        header |= {"height": height, "full": part == 1.0, "cameras": cameras, "source_views": scene.SOURCES, "holes": share}
+        header |= {"height": height, "full": part == 1.0, "cameras": cameras, "holes": share}
         header |= {
+            "source_views": scene.SOURCES,
             "top_k": look.get("top_k"),
             "context_times": 3,
             "dropped": 0,

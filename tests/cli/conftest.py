@@ -1,0 +1,37 @@
+"""A small capture of a ball, and `viewmend mend` on it."""
+
+import json
+
+import pytest
+from reference.ball import BallCapture, camera_at
+
+from viewmend.capture.plain_writer import write_capture
+from viewmend.cli import main
+from viewmend.geometry.cameras import concatenate_cameras
+
+
+def rig():
+    """Six cameras about the ball at different heights, and `held` between two of them."""
+    heights = (0.0, 1.2, -0.8, 0.6, 1.4, -1.0)
+    around = [camera_at(60 * n, f"c{n}", height_m=height) for n, height in enumerate(heights)]
+    return concatenate_cameras([*around, camera_at(75, "held", height_m=0.3)])
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("mend") / "ball"
+    write_capture(BallCapture(rig()), path, images="png")
+    return path
+
+
+@pytest.fixture
+def mend(capsys):
+    """Runs the command: exit code, JSON and messages."""
+
+    def run(folder, out, *arguments):
+        model = [] if "--model" in arguments else ["--model", "telea"]
+        code = main(["mend", str(folder), "--out", str(out), "--json", *map(str, arguments), *model])
+        said = capsys.readouterr()
+        return code, json.loads(said.out) if code == 0 else said.out, said.err
+
+    return run

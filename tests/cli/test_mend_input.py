@@ -1,0 +1,151 @@
+"""`viewmend mend` says what is wrong with its input in one line, and leaves nothing half-written."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from viewmend.cli import main
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--leave-out", "nobody"], "expected --leave-out among"),
+        (["--leave-out", "held", "--use-cameras", "c0,nobody"], "nobody"),
+        (["--leave-out", "held", "--use-cameras", "c0"], "at least 2 input cameras, got 1"),
+        ([], "either --leave-out CAMERA or --path"),
+        (["--leave-out", "held", "--path", "orbit"], "either --leave-out CAMERA or --path"),
+        (["--leave-out", "held", "--frames", "5:9"], "--frames first:end within 0:2"),
+        (["--leave-out", "held", "--frames", "x"], "--frames first:end within 0:2"),
+        (["--leave-out", "held", "--context", "0"], "--context of at least 1"),
+        (["--leave-out", "held", "--device", "abacus"], "expected a device that is there"),
+        (["--leave-out", "held", "--model", "nothing"], "nothing"),
+        (["--leave-out", "held", "--error-rule", "some"], "expected an error rule among"),
+        (["--path", "missing.json"], "missing.json"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, mend, arguments, message):
+    code, out, err = mend(folder, tmp_path / "out", *arguments)
+    assert code == 2 and out == ""
+    assert message in err and err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "expected JSON"),
+        ("[]", "world_from_camera: expected a list that is not empty"),
+        ("[[[1, 0], [0, 1]]]", "world_from_camera[0]: expected a list of length 4"),
+        (json.dumps([(2 * torch.eye(4)).tolist()]), "pose 0: expected a rotation"),
+        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 30}), "'height'"),
+        (json.dumps([torch.eye(4).tolist()] * 3), "one for each of 2 frames, got 3"),
+        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "K": [[0] * 3] * 3}), "expected 'K' as"),
+        (
+            json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 10**8, "height": 9}),
+            "width: expected a whole number <= 16384",
+        ),
+        ("[" * 100_000, "expected JSON"),
+    ],
+)
+def test_a_bad_path_is_named(folder, tmp_path, mend, content, message):
+    file = tmp_path / "path.json"
+    file.write_text(content)
+    code, _, err = mend(folder, tmp_path / "out", "--path", file)
+    assert code == 2 and message in err
+    assert [f.name for f in tmp_path.iterdir()] == ["path.json"]
+
+
+def test_a_capture_without_masks_is_refused(folder, tmp_path, mend):
+    bare = tmp_path / "bare"
+    shutil.copytree(folder, bare)
+    description = json.loads((bare / "cameras.json").read_text())
+    for camera in description["cameras"]:
+        del camera["mask"]
+    (bare / "cameras.json").write_text(json.dumps(description))
+    code, _, err = mend(bare, tmp_path / "out", "--leave-out", "held")
+    assert code == 2 and "expected a 'mask'" in err and not (tmp_path / "out").exists()
+
+
+def test_an_unreadable_frame_leaves_nothing_half_written(folder, tmp_path, mend):
+    broken = tmp_path / "broken"
+    shutil.copytree(folder, broken)
+    last = broken / "image" / "c5" / "001.png"
+    last.write_bytes(b"no picture")
+    code, _, err = mend(broken, tmp_path / "out", "--leave-out", "held")
+    assert code == 2 and last.name in err
+    assert [f.name for f in tmp_path.iterdir()] == ["broken"]
+
+
+def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, mend):
+    notes = tmp_path / "holes/notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("precious")
+    code, _, err = mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
+    assert (
+        code == 2
+        and "notes.txt: expected no such file, or one that an earlier run made" in err
+        and notes.read_text() == "precious"
+    )
+    notes.unlink()
+    for _ in range(2):  # its own results are
+        assert mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")[0] == 0
+    assert {f.name for f in tmp_path.iterdir()} == {
+        ".viewmend",
+        "holes",
+        "mended",
+        "rendered",
+        "truth",
+        "contact_sheet.png",
+    }
+
+
+def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, mend, caplog):
+    spoiled = tmp_path / "spoiled"
+    shutil.copytree(folder, spoiled)
+    mask = spoiled / "mask" / "c5" / "000.png"
+    cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), 0)))
+    _, _, said = mend(spoiled, tmp_path / "out", "--leave-out", "held", "--frames", "0:1")
+    assert "principal points" not in said and "camera 'c5': its mask is empty" in caplog.text
+
+
+@pytest.fixture
+def shifted(folder, tmp_path):
+    """The same capture, whose calibration says that all images are a pixel further right."""
+    path = tmp_path / "shifted"
+    shutil.copytree(folder, path)
+    capture = json.loads((path / "cameras.json").read_text())
+    for camera in capture["cameras"]:
+        camera["K"][0][2] += 1.0
+    (path / "cameras.json").write_text(json.dumps(capture))
+    return path
+
+
+def test_a_shift_of_all_images_is_said_and_undone(folder, shifted, tmp_path, mend):
+    _, exact, nothing = mend(folder, tmp_path / "exact", "--leave-out", "held")
+    _, undone, said = mend(shifted, tmp_path / "undone", "--leave-out", "held")
+    _, left, also_nothing = mend(shifted, tmp_path / "left", "--leave-out", "held", "--no-align")
+    assert "principal points moved by (-" in said and "first_pixel_center" in said
+    assert "principal points" not in nothing + also_nothing
+    assert undone["hull_iou"]["held"] == pytest.approx(exact["hull_iou"]["held"], abs=0.02)
+    assert left["hull_iou"]["held"] < undone["hull_iou"]["held"] - 0.02
+
+
+def test_a_model_without_finite_colours_is_refused(folder, tmp_path, capsys):
+    (tmp_path / "broken.py").write_text(
+        "import torch\nfrom viewmend.inpainting.coarse_fill import SmoothFill\n\n"
+        "class Broken(SmoothFill):\n"
+        "    def __init__(self, device):\n        super().__init__()\n\n"
+        "    def step(self, view, context, state):\n"
+        "        completed, state = super().step(view, context, state)\n"
+        "        completed.rgb[:, 20:24] = float('nan')\n"
+        "        return completed, state\n"
+    )
+    options = ["--out", str(tmp_path / "out"), "--model", f"{tmp_path}/broken.py:Broken", "--leave-out", "held"]
+    code = main(["mend", str(folder), *options])
+    assert code == 2 and "expected finite colours from Broken" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
