@@ -57,7 +57,7 @@ class WholeView:
     @classmethod
     def of(cls, sample: Sample, net: SweepNet, quick: bool = False) -> "WholeView":
         """A sample that knows alpha and depth, and the cameras near it; `net` makes the guess, or a quick one."""
-        assert sample.ray_views is not None and sample.alpha is not None and sample.depth is not None, "a stored scene's"
+        assert sample.ray_views and sample.alpha is not None and sample.depth is not None, "a stored scene's"
         view, truth, alpha, depth = sample.view, sample.truth, sample.alpha, sample.depth
         scale, rig = Scale.of(view), Rig.of(sample.ray_views, view.silhouettes)
         crop = subject_crop(view, MARGIN_PX)
