@@ -224,7 +224,8 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
         return tensors[value["tensor"]]
     if isinstance(value, dict):
         kind = KINDS[value["kind"]]
-        made = kind(**{RENAMED.get(n, n): _put_together(part, tensors) for n, part in value["fields"].items()})
+        parts = {str(RENAMED.get(n, n)): _put_together(part, tensors) for n, part in value["fields"].items()}
+        made = kind(**parts)
         if wrong := [name for name, hint in _hints(kind).items() if not _fits(getattr(made, name), hint)]:
             raise TypeError(f"{wrong[0]} of {value['kind']} is of another kind")
         return made
