@@ -1,6 +1,7 @@
 """A small capture of a ball, and `viewmend mend` on it."""
 
 import json
+import shutil
 
 import pytest
 from reference.ball import BallCapture, camera_at
@@ -21,6 +22,18 @@ def rig():
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("mend") / "ball"
     write_capture(BallCapture(rig()), path, images="png")
+    return path
+
+
+@pytest.fixture
+def shifted(folder, tmp_path):
+    """The same capture, whose calibration says that all images are a pixel further right."""
+    path = tmp_path / "shifted"
+    shutil.copytree(folder, path)
+    capture = json.loads((path / "cameras.json").read_text())
+    for camera in capture["cameras"]:
+        camera["K"][0][2] += 1.0
+    (path / "cameras.json").write_text(json.dumps(capture))
     return path
 
 

@@ -113,18 +113,6 @@ def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, mend, caplog):
     assert "principal points" not in said and "camera 'c5': its mask is empty" in caplog.text
 
 
-@pytest.fixture
-def shifted(folder, tmp_path):
-    """The same capture, whose calibration says that all images are a pixel further right."""
-    path = tmp_path / "shifted"
-    shutil.copytree(folder, path)
-    capture = json.loads((path / "cameras.json").read_text())
-    for camera in capture["cameras"]:
-        camera["K"][0][2] += 1.0
-    (path / "cameras.json").write_text(json.dumps(capture))
-    return path
-
-
 def test_a_shift_of_all_images_is_said_and_undone(folder, shifted, tmp_path, mend):
     _, exact, nothing = mend(folder, tmp_path / "exact", "--leave-out", "held")
     _, undone, said = mend(shifted, tmp_path / "undone", "--leave-out", "held")
