@@ -2,13 +2,15 @@
 
 Every n-th scene of P and views of captures, each with one switch changed: PSNR of the rendered and the mended whole
 view, PSNR in the holes, and the IoU of hull and true mask. Switches of hull and renderer change what is missing, so
-their figure is that of the whole view; those of the network are changed in the trained `small`.
+their figure is that of the whole view; those of the network are changed in the trained `small`, and those of its start
+in a transformer that was never trained.
 """
 
 import argparse
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -19,7 +21,10 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.config import small as small_config
+from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.patches import PATCH_CELLS
+from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.leave_one_out.capture_scenes import capture_set
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.leave_one_out.studio_scenes import procedural_set
@@ -64,53 +69,57 @@ def main() -> None:
 def judge(scenes: Sequence[LeaveOneOutScene], switches: Sequence[str] = ()) -> dict[str, dict[str, float | None]]:
     """Means over all views of each switch: of the rendered view, and as `small` mends it."""
     frames = [list(scene.frames("cpu")) for scene in scenes]
-    runs = {name: (config, unchanged) for name, config in STREAMS.items()}
-    runs |= {name: (AS_IT_IS, change) for name, change in NETWORKS.items()}
+    runs = {name: (config, small) for name, config in STREAMS.items()}
+    runs |= {name: (AS_IT_IS, make) for name, make in NETWORKS.items()}
     return {name: _means(frames, *run) for name, run in runs.items() if not switches or name in ("as it is", *switches)}
 
 
-def unchanged(_: Chain) -> None:
-    """`small` as it is."""
+def small(**changes: object) -> Chain:
+    """The shipped `small`, with changes of what is looked up in the config at each forward."""
+    chain = load_network("small")
+    assert isinstance(chain, Chain), "small reads rays, then patches"
+    for part in (chain.patches, chain.patches.transformer):
+        part.config = replace(part.config, **changes)
+    return chain
 
 
-def by_config(**changes: object) -> Callable[[Chain], None]:
-    """A change of what is looked up in the config at each forward."""
-
-    def change(chain: Chain) -> None:
-        for part in (chain.patches, chain.patches.transformer):
-            part.config = replace(part.config, **changes)
-
-    return change
+def untrained(**changes: object) -> PatchTransformer:
+    """The transformer of `small` as it begins, upon what is rendered."""
+    torch.manual_seed(0)
+    config = replace(small_config(), coarse_fill="none", temporal_accumulation=0.0, **changes)
+    return PatchTransformer(config).eval()
 
 
-def without_colour_skip(chain: Chain) -> None:
+def without_colour_skip() -> Chain:
     """Patches carry no colours beside their features: neither into tokens nor out of them."""
+    chain = small()
     config: InpainterConfig = chain.config
     features = config.widths[-1] * PATCH_CELLS**2
     linear: nn.Linear = chain.patches.tokeniser.linear
     linear.weight[:, features:] = 0
     decode: nn.Linear = chain.patches.decoder.linear
     decode.weight[features:], decode.bias[features:] = 0, 0
+    return chain
 
 
 NETWORKS = {
-    "min_foreground 0": by_config(min_foreground=0.0),
-    "patch_depth centre": by_config(patch_depth="centre"),
-    "rope_unit image": by_config(rope_unit="image"),
-    "rope_values off": by_config(rope_values=False),
+    "min_foreground 0": partial(small, min_foreground=0.0),
+    "patch_depth centre": partial(small, patch_depth="centre"),
+    "rope_unit image": partial(small, rope_unit="image"),
+    "rope_values off": partial(small, rope_values=False),
     "colour_skip off": without_colour_skip,
+    "untrained": untrained,
+    "untrained, token_norms off": partial(untrained, token_norms=False),
+    "untrained, identity_init off": partial(untrained, identity_init=False),
 }
 
 
 def _means(
-    frames: Sequence[Sequence], config: StreamConfig, change: Callable[[Chain], None]
+    frames: Sequence[Sequence], config: StreamConfig, make: Callable[[], ViewInpainter]
 ) -> dict[str, float | None]:
-    network = load_network("small")
-    assert isinstance(network, Chain), "small reads rays, then patches"
-    change(network)
-    scores = []
+    network, scores = make(), []
     for scene in frames:
-        stream, viewer = Stream(network.eval(), config, scene[0].bounds), None
+        stream, viewer = Stream(network, config, scene[0].bounds), None
         for frame in scene:
             stream.push(frame.inputs)
             view = stream.render(frame.truth.cameras)
