@@ -178,8 +178,8 @@ def late_images(frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | 
     now = surface_colours(frame, proxy)
     then = [surface_colours(replace(frame, rgb=other.rgb), proxy) for other in frames]
     distances = torch.stack([nearest_agreement(colours, now)[0] for colours in then]).nan_to_num(torch.inf)
-    ratio = distances.amin(0) / distances[middle]
-    view = int(ratio.nan_to_num(1.0).argmin())
+    ratio = (distances.amin(0) / distances[middle]).nan_to_num(1.0)  # of cameras that share nothing: inf / inf
+    view = int(ratio.argmin())
     usual = distances[middle][distances[middle].isfinite()]
     if float(ratio[view]) > IMAGES_NEARER or float(distances[middle, view]) < float(usual.median()):
         return ()
