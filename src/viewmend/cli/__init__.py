@@ -46,6 +46,7 @@ COMMANDS = (
     Command("evaluate paper-table", "viewmend.cli.paper_table", "The paper's tables on your data, beside its figures."),
     Command("weights", "viewmend.cli.weights", "List and check weights of others' networks."),
     Command("masks", "viewmend.cli.masks", "Make masks for a capture that has none."),
+    Command("calibrate", "viewmend.cli.calibrate", "Find a rig's cameras from a board, or refine them by silhouettes."),
     Command(
         "splits", "viewmend.cli.splits", "Split captures for training and tests by the paper's protocol, as a file."
     ),

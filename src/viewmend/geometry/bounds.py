@@ -31,6 +31,12 @@ class Bounds:
         """Edge lengths, metres."""
         return self.high - self.low
 
+    @property
+    def corners(self) -> Float[Tensor, "8 3"]:
+        """All eight corners."""
+        axes = [torch.stack([low, high]) for low, high in zip(self.low, self.high, strict=True)]
+        return torch.cartesian_prod(*axes)
+
     def to(self, device: torch.device | str) -> "Bounds":
         """The same box on `device`."""
         return replace(self, low=self.low.to(device), high=self.high.to(device))

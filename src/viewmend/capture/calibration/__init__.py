@@ -1,0 +1,1 @@
+"""Cameras found: from a board that is moved about before them, and refined by silhouettes."""

@@ -1,0 +1,74 @@
+"""Whether refined cameras are better: judged by cameras that the refinement has not seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from viewmend.capture.calibration.silhouettes import Refinement, refine_by_silhouettes
+from viewmend.geometry.alignment import silhouette_iou
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.proxy import reconstruct
+from viewmend.views import MultiViewFrame
+
+LEFT_OUT = 3
+"""So many cameras are left out in turn, as far apart in the rig's order as can be."""
+MARGIN = 0.1
+"""How much larger than the hull the box is that may hold the subject, to each side."""
+
+
+@dataclass(frozen=True)
+class HeldOutIou:
+    """How a hull of the others' masks agrees with the mask of a camera that was left out."""
+
+    camera: str
+    before: float
+    """Intersection over union of its silhouette and the mask, with the cameras as given."""
+    after: float
+    """With the others refined by their masks alone; the camera itself is as it was."""
+
+
+def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None) -> HeldOutIou:
+    """Refine all cameras but one, and look at the hull through that one.
+
+    Raises:
+        CaptureError: the frames have no masks.
+        ValueError: the masks agree on no subject.
+    """
+    others = [frame.without([name]) for frame in frames]
+    refined = refined_all(others, bounds).cameras
+    held = [frame.select([name]) for frame in frames]
+    before, after = (_iou(others, held, cameras, bounds) for cameras in (others[0].cameras, refined))
+    return HeldOutIou(name, before, after)
+
+
+def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> Refinement:
+    """Refine all cameras of the frames; `bounds` are the capture's, where it has any.
+
+    Raises:
+        CaptureError: the frames have no masks.
+        ValueError: the masks agree on no subject.
+    """
+    return refine_by_silhouettes(frames, [_around_subject(frame, bounds) for frame in frames])
+
+
+def left_out(names: Sequence[str]) -> list[str]:
+    """Whom to leave out in turn."""
+    count = min(LEFT_OUT, len(names))
+    return [names[len(names) * number // count] for number in range(count)]
+
+
+def _around_subject(frame: MultiViewFrame, bounds: Bounds | None) -> Bounds:
+    assert frame.mask is not None
+    found = reconstruct(frame.mask, frame.cameras, bounds).bounds
+    return Bounds(found.low - MARGIN * found.size_m, found.high + MARGIN * found.size_m)
+
+
+def _iou(
+    others: Sequence[MultiViewFrame], held: Sequence[MultiViewFrame], cameras: Cameras, bounds: Bounds | None
+) -> float:
+    scores = []
+    for frame, own in zip(others, held, strict=True):
+        assert frame.mask is not None and own.mask is not None
+        proxy = reconstruct(frame.mask, cameras, bounds)
+        scores.append(float(silhouette_iou(proxy.depth(own.cameras) > 0, own.mask).nan_to_num(1.0).mean()))
+    return sum(scores) / len(scores)

@@ -1,0 +1,150 @@
+"""`viewmend calibrate`: cameras from a board that was moved about before them, or refined by silhouettes."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from viewmend.geometry.bounds import Bounds
+    from viewmend.views import MultiViewFrame
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Find the cameras of a rig, or refine them, and write them as OUT/cameras.json.
+
+    With --board SOURCE holds a video or a folder of images for each camera, named after it, all begun at the same
+    moment, of a ChArUco board that is carried about; OUT/residuals.png shows what the calibration misses. With
+    --silhouettes SOURCE is a capture with masks; cameras that are left out in turn must agree better with the others
+    afterwards, or nothing is written. Files are named in OUT/cameras.json as in SOURCE: put it there, or beside
+    footage of the same names.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """Footage of a board, or a capture."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
+    """Folder for what is written; it must not be in use."""
+    board: str | None = None
+    """The board, as COLUMNSxROWS:SQUARE_M:MARKER_M, counted in squares: 8x6:0.06:0.045."""
+    dictionary: str = "DICT_5X5_1000"
+    """OpenCV's name of the dictionary that the board's markers are of."""
+    every: int = 5
+    """The board is looked for in every so manieth frame."""
+    silhouettes: bool = False
+    """Refine the capture's poses and focal lengths by its masks."""
+    times: int = 12
+    """So many frames of a capture are looked at, spread over those that are chosen."""
+    frames: str | None = None
+    """Which frames, as FIRST:END by index; either may be left out."""
+    kind: str | None = None
+    """The capture's format, as docs/formats.md names it; by default it is recognised."""
+    json: bool = False
+    """Write the figures as one JSON object to standard output, and nothing else there."""
+
+
+def run(options: Options) -> int:
+    """Run the command; the exit code."""
+    from viewmend.capture.plain_writer import whole_folder
+    from viewmend.cli.console import print_json, say, show
+
+    if (options.board is not None) == options.silhouettes:
+        raise ValueError("expected either --board or --silhouettes, got both or neither; choose one of them")
+    if options.every < 1 or options.times < 1:
+        raise ValueError(f"expected --every and --times of at least 1, got {options.every} and {options.times}")
+    with whole_folder(options.out) as unfinished:
+        figures = (_by_silhouettes if options.silhouettes else _by_board)(options, unfinished)
+    if options.json:
+        print_json(figures)
+    else:
+        show(
+            "\n".join(
+                f"{name}  " + ", ".join(f"{key} {n:.4g}" for key, n in row.items()) for name, row in figures.items()
+            )
+        )
+    say(f"wrote {options.out}")
+    return 0
+
+
+Figures = dict[str, dict[str, int | float]]
+
+
+def _by_board(options: Options, out: Path) -> Figures:
+    from viewmend.capture.calibration.board import parse_board
+    from viewmend.capture.calibration.bundle import calibrate
+    from viewmend.capture.calibration.footage import look_for, open_footage
+    from viewmend.capture.calibration.report import residual_picture, write_calibration
+    from viewmend.capture.images import write_image
+    from viewmend.cli.checks import chosen_times
+    from viewmend.cli.console import busy, track
+
+    assert options.board is not None
+    board, footage = parse_board(options.board, options.dictionary), open_footage(options.source)
+    times = chosen_times(options.frames, len(footage.frames))[:: options.every]
+    seen = look_for(board, footage, times, lambda cameras: track(cameras, "looking for the board"))
+    sizes = [(camera.width, camera.height) for camera in footage.cameras]
+    with busy("adjusting all cameras"):
+        found = calibrate(seen, board, [camera.name for camera in footage.cameras], sizes)
+    cameras = tuple(
+        replace(camera, K=one.K, dist=one.dist, R=one.camera_from_world[:3, :3], t_m=one.camera_from_world[:3, 3])
+        for camera, one in zip(footage.cameras, found, strict=True)
+    )
+    up = -sum(camera.R[1] for camera in cameras)
+    out.mkdir()
+    write_calibration(out, replace(footage, cameras=cameras, up=up))
+    write_image(out / "residuals.png", residual_picture(cameras, found))
+    images = [sum(view == number for view, _ in seen) for number in range(len(cameras))]
+    return {
+        camera.name: {"images": count, "corners": len(one.corners), "rms_px": one.rms_px}
+        for camera, one, count in zip(cameras, found, images, strict=True)
+    }
+
+
+def _by_silhouettes(options: Options, out: Path) -> Figures:
+    from viewmend.capture.calibration.held_out import left_out, refined_all, refined_without
+    from viewmend.capture.calibration.report import with_cameras, write_calibration
+    from viewmend.capture.formats.recognition import read_any_calibration
+    from viewmend.cli.console import busy, say, track
+
+    frames, bounds = _frames(options)
+    names = frames[0].cameras.names
+    scores = [refined_without(frames, name, bounds) for name in track(left_out(names), "cameras left out in turn")]
+    for score in scores:
+        say(
+            f"{score.camera} left out: its mask and the others' hull agree to {score.before:.4f}, "
+            f"to {score.after:.4f} with these refined"
+        )
+    before, after = (sum(own) / len(scores) for own in zip(*((s.before, s.after) for s in scores), strict=True))
+    if after <= before:
+        raise ValueError(
+            "expected cameras that were left out to agree better with the others when these are refined, got an IoU "
+            f"of {after:.4f} for {before:.4f}; keep the calibration, use more frames (--times), or better masks"
+        )
+    with busy("refining all cameras"):
+        refined = refined_all(frames, bounds)
+    out.mkdir()
+    path = options.source.parent if options.source.is_file() else options.source
+    write_calibration(out, with_cameras(read_any_calibration(path, options.kind), refined.cameras))
+    held = {f"{score.camera} left out": {"iou": score.before, "refined": score.after} for score in scores}
+    return {"outlines": {"missed_px": refined.before_px, "refined_px": refined.after_px}} | held
+
+
+def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
+    """Some times at which all cameras are there and right, and the capture's bounds."""
+    from viewmend.capture.calibration.silhouettes import LEAST_CAMERAS
+    from viewmend.capture.prepare import open_masked, prepare
+    from viewmend.cli.checks import chosen_times
+
+    capture = open_masked(options.source, kind=options.kind)
+    times = chosen_times(options.frames, len(capture.frame_ids))
+    count = min(options.times, len(times))
+    prepared = prepare(capture, align=False, first=times[0])
+    read = [prepared.read(times[len(times) * number // count]) for number in range(count)]
+    most = max((frame.cameras.names for frame in read), key=len)
+    frames = [frame for frame in read if frame.cameras.names == most]
+    if len(most) < LEAST_CAMERAS + 1:
+        raise ValueError(
+            f"expected {LEAST_CAMERAS + 1} cameras or more with masks, got {len(most)}; fewer say too little of another"
+        )
+    return frames, capture.bounds

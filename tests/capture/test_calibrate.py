@@ -1,0 +1,172 @@
+"""Cameras from pictures of a board, and from silhouettes, both rendered by cameras that are known."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from reference.filmed_board import photograph, waved
+
+from viewmend.capture.calibration import held_out
+from viewmend.capture.calibration.board import parse_board
+from viewmend.capture.calibration.gauge import brought_to
+from viewmend.capture.calibration.silhouettes import Refinement
+from viewmend.capture.plain import open_capture, pinholes
+from viewmend.capture.plain_format import read_calibration
+from viewmend.capture.plain_writer import write_capture
+from viewmend.cli import main
+from viewmend.geometry.cameras import project
+from viewmend.studio.rigs import ring_rig
+from viewmend.studio.stage import Studio, StudioConfig
+
+BOARD, SMALL_BOARD, DICTIONARY = "8x6:0.12:0.09", "6x5:0.16:0.12", "DICT_5X5_1000"
+TIMES = 18
+BENT = np.array([-0.06, 0.02, 0, 0, 0])
+NOISE = 2.0
+
+
+def film(folder, cameras, board, count, yaw_rad=np.pi, bent=BENT, seed=0):
+    """Each camera's images of a board that is carried through the stage, a folder each."""
+    board, rng = parse_board(board, DICTIONARY), np.random.default_rng(seed)
+    size_m = board.columns * board.square_m, board.rows * board.square_m
+    K, poses = cameras.K.double().numpy(), cameras.camera_from_world.double().numpy()
+    sizes = cameras.size_px.tolist()
+    for time, pose in enumerate(waved(count, size_m, seed, yaw_rad)):
+        for view, name in enumerate(cameras.names):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            image = photograph(board, K[view], bent, poses[view] @ pose, sizes[view])
+            image = np.full(sizes[view][::-1], 110, np.uint8) if image is None else image
+            noisy = (0.85 * image + 10 + rng.normal(0, NOISE, image.shape)).clip(0, 255).astype(np.uint8)
+            assert cv2.imwrite(str(folder / name / f"{time:03d}.png"), noisy)
+
+
+def over_the_stage_px(found, cameras):
+    """How far points of the whole stage are from where the true cameras see them, mean of each camera."""
+    points = torch.from_numpy(np.random.default_rng(1).uniform([-0.7, 0, -0.7], [0.7, 1.9, 0.7], (1000, 3))).float()
+    seen = project(points, brought_to(pinholes(found), cameras, points))[0]
+    return (seen - project(points, cameras)[0]).norm(dim=-1).mean(1)
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    rig = ring_rig(8, (320, 384), seed=3)[[0, 1, 7]]
+    folder = tmp_path_factory.mktemp("board")
+    film(folder, rig, SMALL_BOARD, TIMES, yaw_rad=0.4)
+    return folder, rig
+
+
+def test_cameras_are_found_and_written(filmed, tmp_path, capsys):
+    folder, rig = filmed
+    out = tmp_path / "out"
+    assert main(["calibrate", str(folder), str(out), "--board", SMALL_BOARD, "--every", "1", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert list(figures) == list(rig.names) and all(f["rms_px"] < 0.3 and f["images"] > 5 for f in figures.values())
+    calibration = read_calibration(out)
+    assert calibration.cameras[1].image == f"{rig.names[1]}/{{frame}}.png" and len(calibration.frames) == TIMES
+    assert over_the_stage_px(calibration.cameras, rig).mean() < 0.5
+    baseline_m = np.linalg.norm(calibration.cameras[1].t_m)
+    assert baseline_m == pytest.approx(float((rig.centers[1] - rig.centers[0]).norm()), rel=0.005)
+    assert calibration.up[1] < -0.8
+    assert cv2.imread(str(out / "residuals.png")).shape[1] > 900
+
+
+@pytest.mark.slow
+def test_a_ring_of_eight_is_found_to_a_fifth_of_a_pixel(tmp_path):
+    rig = ring_rig(8, (512, 612), seed=3)
+    film(tmp_path / "board", rig, BOARD, 80)
+    out = str(tmp_path / "out")
+    assert main(["calibrate", str(tmp_path / "board"), out, "--board", BOARD, "--every", "1"]) == 0
+    off_px = over_the_stage_px(read_calibration(tmp_path / "out").cameras, rig)
+    assert off_px.max() < 0.2
+
+
+WRONG = {
+    "words": (["--board", "8x6"], "COLUMNSxROWS:SQUARE_M:MARKER_M"),
+    "markers": (["--board", "8x6:0.1:0.2"], "markers smaller than squares"),
+    "dictionary": (["--board", BOARD, "--dictionary", "5X5"], "a dictionary of OpenCV"),
+    "another dictionary": (["--board", BOARD, "--dictionary", "DICT_4X4_50"], "in 5 images or more, found it in 0"),
+    "every": (["--board", BOARD, "--every", "0"], "--every and --times of at least 1"),
+    "nothing": ([], "either --board or --silhouettes"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_what_is_wrong_is_one_line(filmed, tmp_path, capsys, what):
+    arguments, words = WRONG[what]
+    few = [] if "--every" in arguments else ["--every", "9"]
+    assert main(["calibrate", str(filmed[0]), str(tmp_path / "out"), *arguments, *few]) == 2
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert words in message and not any(tmp_path.iterdir())
+
+
+def test_a_folder_without_footage_is_said(tmp_path, capsys):
+    assert main(["calibrate", str(tmp_path), str(tmp_path / "out"), "--board", BOARD]) == 2
+    assert "expected two or more videos" in capsys.readouterr().err
+
+
+def test_cameras_that_never_share_a_time_are_named(filmed, tmp_path, capsys):
+    """Each camera's files are there, but of other times than the next one's."""
+    for number, name in enumerate(filmed[1].names[:2]):
+        (tmp_path / "in" / name).mkdir(parents=True)
+        for file in (filmed[0] / name).iterdir():
+            time = int(file.stem) + 100 * number
+            (tmp_path / "in" / name / f"{time:03d}.png").write_bytes(file.read_bytes())
+    arguments = ["calibrate", str(tmp_path / "in"), str(tmp_path / "out"), "--board", SMALL_BOARD, "--every", "1"]
+    assert main(arguments) == 2
+    assert "in another camera at the same time" in capsys.readouterr().err
+
+
+def disturbed(folder, px=1.5):
+    """Turn each camera by about so many pixels, and move it as far."""
+    file = folder / "cameras.json"
+    description, rng = json.loads(file.read_text()), np.random.default_rng(0)
+    for camera in description["cameras"]:
+        focal = camera["K"][0][0]
+        turn = cv2.Rodrigues(rng.normal(0, px / focal, 3))[0]
+        camera["R"] = (turn @ np.array(camera["R"])).tolist()
+        camera["t"] = (turn @ np.array(camera["t"]) + rng.normal(0, px / focal, 3)).tolist()
+    file.write_text(json.dumps(description))
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("studio") / "take"
+    source = Studio(StudioConfig(seed=5, cameras=8, frames=3, fps=2, size_px=160))
+    write_capture(source, folder, images="png")
+    return folder, source.cameras
+
+
+def test_silhouettes_refine_a_disturbed_rig(studio, tmp_path, capsys):
+    folder = shutil.copytree(studio[0], tmp_path / "take")
+    disturbed(folder)
+    off_px = over_the_stage_px(read_calibration(folder).cameras, studio[1]).mean()
+    assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--times", "2", "--json"]) == 0
+    refined = read_calibration(tmp_path / "out")
+    assert over_the_stage_px(refined.cameras, studio[1]).mean() < 0.4 * off_px
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["outlines"]["refined_px"] < 0.3 * figures["outlines"]["missed_px"]
+    assert sum(row["refined"] - row["iou"] for row in list(figures.values())[1:]) > 0.01
+    shutil.copy(tmp_path / "out" / "cameras.json", folder / "cameras.json")
+    assert open_capture(folder).read(1).mask is not None, "it goes where the old one was"
+
+
+def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, capsys, monkeypatch):
+    nothing = Refinement(studio[1], 0.1, 0.1)
+    monkeypatch.setattr(
+        held_out, "refine_by_silhouettes", lambda frames, _: replace(nothing, cameras=frames[0].cameras)
+    )
+    arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--times", "1"]
+    assert main(arguments) == 2
+    assert "keep the calibration" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_three_cameras_are_too_few_for_silhouettes(studio, tmp_path, capsys):
+    folder = shutil.copytree(studio[0], tmp_path / "take")
+    description = json.loads((folder / "cameras.json").read_text())
+    description["cameras"] = description["cameras"][:3]
+    (folder / "cameras.json").write_text(json.dumps(description))
+    assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes"]) == 2
+    assert "expected 4 cameras or more" in capsys.readouterr().err
