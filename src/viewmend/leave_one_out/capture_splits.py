@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +13,8 @@ import torch
 from msgspec import Meta, Struct, structs
 
 from viewmend.capture.formats.recognition import read_any_calibration
-from viewmend.capture.plain import open_capture
+from viewmend.capture.plain import PlainCapture, open_capture
+from viewmend.capture.prepare import open_masked
 from viewmend.geometry.cameras import Cameras
 from viewmend.json_input import read_json, typed
 from viewmend.leave_one_out.capture_scenes import CaptureScene, capture_set
@@ -124,8 +125,34 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
     Raises:
         ValueError: it is none, or a capture is absent or was calibrated anew.
     """
-    splits, found = read_splits(file), []
-    for scene in (scene for scene in splits.scenes if scene.split == "test"):
+    found = []
+    for scene, path in _scenes_of(file, "test"):
+        held = next(one for one in capture_set(path, frames=frames, kind=scene.kind) if one.held == scene.left_out)
+        found.append(replace(held, name=f"{scene.name}-{scene.left_out}", set=file.stem))
+    if not found:
+        raise ValueError(f"{file}: expected a scene for tests, got none; make splits of two subjects or more")
+    return tuple(found)
+
+
+def training_captures(file: Path) -> tuple[tuple[PlainCapture, str], ...]:
+    """The captures of a file that are for training, each with the camera that it leaves out, the truth.
+
+    Raises:
+        ValueError: it is none, or a capture is absent, cannot be used, or was calibrated anew.
+    """
+    found = tuple(
+        (open_masked(path, held=1, kind=scene.kind), scene.left_out) for scene, path in _scenes_of(file, "training")
+    )
+    if not found:
+        raise ValueError(f"{file}: expected a scene for training, got none; make splits of two subjects or more")
+    return found
+
+
+def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple[SplitScene, Path]]:
+    """One part of a file, and where its captures are; ValueError for one that is absent or was calibrated anew."""
+    for scene in read_splits(file).scenes:
+        if scene.split != split:
+            continue
         path = file.parent / scene.path
         if not path.exists():
             raise ValueError(f"{file}: expected the capture {path}, got none; put the file where its paths hold")
@@ -134,11 +161,7 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
                 f"{path}: expected the calibration that {file.name} was made with, {scene.calibration_sha256[:12]}, "
                 f"got another, {now[:12]}; take that version of the data, or make splits of your own"
             )
-        held = next(one for one in capture_set(path, frames=frames, kind=scene.kind) if one.held == scene.left_out)
-        found.append(replace(held, name=f"{scene.name}-{scene.left_out}", set=file.stem))
-    if not found:
-        raise ValueError(f"{file}: expected a scene for tests, got none; make splits of two subjects or more")
-    return tuple(found)
+        yield scene, path
 
 
 _PROTOCOL = (

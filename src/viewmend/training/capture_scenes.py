@@ -17,8 +17,16 @@ from viewmend.training.scenes import SceneSource, rig_samples
 class CaptureScenes:
     """Moments of captures, reduced to the plan's sizes; each is aligned on the cameras that are not left out."""
 
-    def __init__(self, captures: Sequence[CaptureSource], plan: DataPlan, seed: str) -> None:
+    def __init__(
+        self,
+        captures: Sequence[CaptureSource],
+        plan: DataPlan,
+        seed: str,
+        left_out: Sequence[str | None] | None = None,
+    ) -> None:
+        """`left_out` names the one camera of each capture that is left out; None where each is, in turn."""
         self.captures = captures
+        self.left_out = left_out or [None] * len(captures)
         self.plan = plan
         self.seed = seed
         self._prepared: dict[tuple[int, str], PreparedCapture] = {}
@@ -42,7 +50,7 @@ class CaptureScenes:
                 self._prepared[which, held] = prepare(capture, [n for n in capture.cameras.names if n != held])
             return replace(self._prepared[which, held], longest_px=size_px).cameras.to(self.plan.data_device)
 
-        return rig_samples(LeaveOneOut(frames, capture.bounds, cameras), self.plan, random)
+        return rig_samples(LeaveOneOut(frames, capture.bounds, cameras), self.plan, random, self.left_out[which])
 
 
 class MixedScenes:

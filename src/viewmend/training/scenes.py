@@ -115,13 +115,14 @@ def _rougher(it: Imperfections, random: Random) -> Imperfections:
     )
 
 
-def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random) -> list[Sample]:
+def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random, left_out: str | None = None) -> list[Sample]:
     """Some cameras of a rig are left out in turn, each at some of the times.
 
     Args:
         rig: what it saw.
         plan: how many cameras and times, and how views are rendered.
         random: which.
+        left_out: the only camera that is left out, where it is there; None for any.
     """
     dropped = _dropouts(rig.frames, plan.dropped_fraction, random)
     times = sorted(rig.frames)
@@ -138,6 +139,7 @@ def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random) -> list[Sample
             f"captures of {max(plan.times) + 1} frames or more"
         )
     names = [n for n in rig.frames[times[-1]].cameras.names if n not in dropped.get(times[-1], ())]
+    names = names if left_out is None else [name for name in names if name == left_out]
     samples = []
     for held in random.sample(names, min(plan.held_cameras, len(names))):
         others = HeldOutCamera(rig, held, HullConfig(resolution=plan.hull_resolution), dropped)

@@ -1,6 +1,11 @@
 """Where a run's scenes come from, by its plan."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
+from viewmend.capture.plain import PlainCapture
 from viewmend.capture.prepare import open_masked, prepare
+from viewmend.leave_one_out.capture_splits import is_splits, training_captures
 from viewmend.leave_one_out.splits import Split, recordings
 from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
 from viewmend.training.plan import DataPlan, Recipe, WholeViewRecipe
@@ -60,6 +65,13 @@ def _whole_scenes(plan: DataPlan, seed: str, split: Split) -> SceneSource[Sample
     studio = StudioScenes(plan, seed, split)
     if not (folders := recordings(split, plan.captures)):
         return studio
-    opened = [open_masked(folder, held=1) for folder in folders]
-    captures = [prepare(capture, align=False) for capture in opened]  # which refuses the wrong ones
-    return MixedScenes(CaptureScenes(captures, plan, seed), studio, plan.captures_fraction, seed)
+    opened = [own for folder in folders for own in _captures(folder)]
+    captures = [prepare(capture, align=False) for capture, _ in opened]  # which refuses the wrong ones
+    return MixedScenes(
+        CaptureScenes(captures, plan, seed, [held for _, held in opened]), studio, plan.captures_fraction, seed
+    )
+
+
+def _captures(place: Path) -> Sequence[tuple[PlainCapture, str | None]]:
+    """A capture; or those of a file of splits that are for training, each with the camera that it leaves out."""
+    return training_captures(place) if is_splits(place) else [(open_masked(place, held=1), None)]

@@ -33,7 +33,7 @@ DAMPING, MOST_DAMPING = 1e-3, 1e4
 """Levenberg and Marquardt's, at the start, and where no smaller step would help."""
 
 Moves = Float64[np.ndarray, "view parameter"]
-Depths = list[Float64[np.ndarray, "point"]]
+Depths = list[Float64[np.ndarray, "_point"]]
 """The z-depth of each line of sight's place, for each time."""
 
 
@@ -135,7 +135,7 @@ class _Problem:
 
     def cost(self, x: Moves, depths: Depths) -> float:
         """What all places are outside of masks, half of its squares, and what it costs to be moved."""
-        return 0.5 * sum(self._missed(x, depths)) + 0.5 * self.hold * float((x**2).sum())
+        return float(0.5 * sum(self._missed(x, depths)) + 0.5 * self.hold * (x**2).sum())
 
     def missed_px(self, x: Moves, depths: Depths) -> float:
         """Root mean square of what the places are outside of masks."""
