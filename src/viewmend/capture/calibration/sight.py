@@ -77,7 +77,7 @@ class Sight:
 
     @classmethod
     def of(cls, frame: MultiViewFrame, bounds: Bounds) -> "Sight":
-        """Of one frame, whose subject is in this box.
+        """The sight of one frame, whose subject is in this box.
 
         Raises:
             CaptureError: the frame has no masks, or none with an outline.
