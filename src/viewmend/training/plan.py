@@ -72,7 +72,7 @@ class DataPlan:
     cloth_variety: tuple[float, float] = (0.0, 1.0)
     """Least and largest share of these performers' garments that are dyed or made of another cloth."""
     captures: tuple[Path, ...] = ()
-    """Folders of real captures, or files of `viewmend splits`: those for training, without the camera that each names."""
+    """Folders of real captures, or `viewmend splits` files: what they train with, truth being what they leave out."""
     captures_fraction: float = 0.75
     """Share of the scenes that come from them, where they are given."""
     shards: Path | None = None
