@@ -14,7 +14,7 @@ from viewmend.capture.calibration import held_out
 from viewmend.capture.calibration.board import Corners, parse_board
 from viewmend.capture.calibration.bundle import calibrate
 from viewmend.capture.calibration.gauge import brought_to
-from viewmend.capture.calibration.silhouettes import Refinement
+from viewmend.capture.calibration.silhouettes import HOLDS, Refinement
 from viewmend.capture.part import CapturePart
 from viewmend.capture.plain import open_capture, pinholes
 from viewmend.capture.plain_format import read_calibration
@@ -145,7 +145,7 @@ def test_silhouettes_refine_a_disturbed_rig(studio, tmp_path):
     folder = shutil.copytree(studio[0], tmp_path / "take")
     disturbed(folder)
     capture = open_capture(folder)
-    refined = held_out.refined_all([capture.read(0), capture.read(1)], capture.bounds)
+    refined = held_out.refined_all([capture.read(0), capture.read(1)], capture.bounds, HOLDS[0])
     before, after = (over_the_stage_px(c, studio[1]).mean() for c in (capture.cameras, refined.cameras))
     assert after < 0.5 * before and refined.after_px < 0.3 * refined.before_px
     moved_m = (refined.cameras.centers - capture.cameras.centers).norm(dim=1).mean()
@@ -168,7 +168,7 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
         held_out,
         "refine_by_silhouettes",
-        lambda frames, _: Refinement(cameras.select(frames[0].cameras.names), 0.9, 0.1),
+        lambda frames, *_: Refinement(cameras.select(frames[0].cameras.names), 0.9, 0.1),
     )
     assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--times", "1", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
@@ -181,7 +181,7 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
 def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, capsys, monkeypatch):
     nothing = Refinement(studio[1], 0.1, 0.1)
     monkeypatch.setattr(
-        held_out, "refine_by_silhouettes", lambda frames, _: replace(nothing, cameras=frames[0].cameras)
+        held_out, "refine_by_silhouettes", lambda frames, *_: replace(nothing, cameras=frames[0].cameras)
     )
     arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--times", "1"]
     assert main(arguments) == 2

@@ -104,12 +104,16 @@ def _by_board(options: Options, out: Path) -> Figures:
 def _by_silhouettes(options: Options, out: Path) -> Figures:
     from viewmend.capture.calibration.held_out import left_out, refined_all, refined_without
     from viewmend.capture.calibration.report import with_cameras, write_calibration
+    from viewmend.capture.calibration.silhouettes import HOLDS
     from viewmend.capture.formats.recognition import read_any_calibration
     from viewmend.cli.console import busy, say, track
 
     frames, bounds = _frames(options)
     names = frames[0].cameras.names
-    scores = [refined_without(frames, name, bounds) for name in track(left_out(names), "cameras left out in turn")]
+    tried = [(name, hold) for hold in HOLDS for name in left_out(names)]
+    judged = [(hold, refined_without(frames, name, bounds, hold)) for name, hold in track(tried, "cameras left out")]
+    hold = max(HOLDS, key=lambda one: sum(score.after for own, score in judged if own == one))
+    scores = [score for own, score in judged if own == hold]
     for score in scores:
         say(
             f"{score.camera} left out: its mask and the others' hull agree to {score.before:.4f}, "
@@ -122,7 +126,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
             f"of {after:.4f} for {before:.4f}; keep the calibration, use more frames (--times), or better masks"
         )
     with busy("refining all cameras"):
-        refined = refined_all(frames, bounds)
+        refined = refined_all(frames, bounds, hold)
     out.mkdir()
     path = options.source.parent if options.source.is_file() else options.source
     write_calibration(out, with_cameras(read_any_calibration(path, options.kind), refined.cameras))

@@ -27,7 +27,7 @@ class HeldOutIou:
     """With the others refined by their masks alone; the camera itself is as it was."""
 
 
-def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None) -> HeldOutIou:
+def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None, hold: float) -> HeldOutIou:
     """Refine all cameras but one, and look at the hull through that one.
 
     Raises:
@@ -35,20 +35,20 @@ def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds 
         ValueError: the masks agree on no subject.
     """
     others = [frame.without([name]) for frame in frames]
-    refined = refined_all(others, bounds).cameras
+    refined = refined_all(others, bounds, hold).cameras
     held = [frame.select([name]) for frame in frames]
     before, after = (_iou(others, held, cameras, bounds) for cameras in (others[0].cameras, refined))
     return HeldOutIou(name, before, after)
 
 
-def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> Refinement:
-    """Refine all cameras of the frames; `bounds` are the capture's, where it has any.
+def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None, hold: float) -> Refinement:
+    """Refine all cameras of the frames; `bounds` are the capture's, where it has any, `hold` one of `HOLDS`.
 
     Raises:
         CaptureError: the frames have no masks.
         ValueError: the masks agree on no subject.
     """
-    return refine_by_silhouettes(frames, [_around_subject(frame, bounds) for frame in frames])
+    return refine_by_silhouettes(frames, [_around_subject(frame, bounds) for frame in frames], hold)
 
 
 def left_out(names: Sequence[str]) -> list[str]:

@@ -24,8 +24,9 @@ LEAST_CAMERAS = 3
 """Fewer say nothing of each other: wherever two cameras stand, there are places that both see inside of their masks."""
 CAMERA = 7
 """Parameters of a camera: rotation, translation, focal length; each in pixels that it moves what is seen."""
-PRIOR = 1e-3
-"""How strongly cameras are held where they are, beside what the outlines say: these cannot tell all."""
+HOLDS = (1e-3, 0.1)
+"""How strongly cameras are held where they are, beside what the outlines say: these cannot tell all. The second is for
+few times and hard masks; cameras that are left out say which is better."""
 SEARCHES, STEPS, ENOUGH = 6, 6, 0.02
 """So often places are searched anew, with so many steps in between at most; less is enough where one gains less than
 this share of what is missed."""
@@ -48,7 +49,7 @@ class Refinement:
     """The same, refined."""
 
 
-def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds]) -> Refinement:
+def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds], hold: float) -> Refinement:
     """Refine poses and focal lengths of cameras; several times tell more than one.
 
     The rig as a whole stays where it was, and as large.
@@ -56,12 +57,14 @@ def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bou
     Args:
         frames: some times with masks, of the same cameras, `LEAST_CAMERAS` or more.
         bounds: a box around the subject at each time.
+        hold: one of `HOLDS`.
 
     Raises:
         CaptureError: a frame has no masks, or none has any foreground.
     """
     cameras = frames[0].cameras
-    problem = _Problem([Sight.of(frame, box) for frame, box in zip(frames, bounds, strict=True)], Rig.of(cameras))
+    sights = [Sight.of(frame, box) for frame, box in zip(frames, bounds, strict=True)]
+    problem = _Problem(sights, Rig.of(cameras), hold)
     x = np.zeros((len(cameras), CAMERA))
     depths = problem.searched(x)
     before_px = problem.missed_px(x, depths)
@@ -82,7 +85,7 @@ def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bou
 class _Problem:
     """What the outlines of some times say of the cameras, as functions of how far these are moved."""
 
-    def __init__(self, sights: Sequence[Sight], start: Rig):
+    def __init__(self, sights: Sequence[Sight], start: Rig, hold: float):
         self.sights, self.start = sights, start
         middle = np.mean([sight.middle for sight in sights], 0)
         far_m = np.linalg.norm(start.R @ middle + start.t, axis=1)
@@ -92,7 +95,7 @@ class _Problem:
         self.units[:, :3] = (m_per_px / far_m)[:, None]
         self.units[:, 3:6] = m_per_px[:, None]
         self.units[:, 6] = m_per_px / max(sight.radius_m for sight in sights)
-        self.hold = PRIOR * sum(len(sight.view) for sight in sights) / len(start.K)
+        self.hold = hold * sum(len(sight.view) for sight in sights) / len(start.K)
 
     def rig(self, x: Moves) -> Rig:
         """The cameras, moved by `x`."""
