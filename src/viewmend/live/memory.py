@@ -11,10 +11,12 @@ import time
 from functools import cache
 from pathlib import Path
 
-IDLE_S, BUSY_S = 5.0, 60.0
+IDLE_S, BUSY_S = 5.0, 20.0
 """Least seconds from one time to the next: while nobody waits for a view, and while somebody does."""
-SLACK_BYTES = 100e6
-"""Free memory that is kept, since it is used again at once. To hand 100 MB back takes 10 ms, to get them again more."""
+SLACK_BYTES = 10e6
+"""Growth that is not worth looking at. To hand 100 MB back takes 10 ms, to get them again more."""
+TOP_BYTES = 50_000_000
+"""Free memory at the heap's end that glibc keeps by itself, since it is used again at once."""
 ARENAS = 1
 """Heaps of glibc. By default there are eight a core, each with free memory that the others do not use; here one thread
 renders."""
@@ -39,7 +41,7 @@ def _glibc() -> ctypes.CDLL | None:
 def set_up() -> bool:
     """Set the allocator's options, before threads are started; whether it could be done."""
     library = _glibc()
-    options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE_BYTES), (_M_TRIM_THRESHOLD, int(SLACK_BYTES / 2)))
+    options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE_BYTES), (_M_TRIM_THRESHOLD, TOP_BYTES))
     return library is not None and all(library.mallopt(*option) == 1 for option in options)
 
 
