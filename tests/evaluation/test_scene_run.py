@@ -6,6 +6,7 @@ from itertools import pairwise
 import torch
 
 from viewmend.evaluation import scene_run
+from viewmend.evaluation.film import subject_box
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
 
 
@@ -24,3 +25,18 @@ def test_each_time_is_compared_with_the_one_before(small_scenes, monkeypatch):
         assert torch.equal(before.holes, shown.view.holes) and not torch.equal(before.holes, now.view.holes)
         assert torch.equal(before.truth, truth.rgb) and torch.equal(before.completed, shown.rgb)
     assert [completed.view.time for completed, _, _ in asked] == [0, 1, 2]
+
+
+def test_a_film_shows_all_that_is_rendered_and_all_that_is_true(small_scenes, monkeypatch):
+    asked, boxes, score, make = [], [], scene_run.score_frame, scene_run.film
+
+    def listening(completed, truth, before, *how):
+        asked.append((completed.view.mask > 0) | truth.mask)
+        return score(completed, truth, before, *how)
+
+    monkeypatch.setattr(scene_run, "score_frame", listening)
+    monkeypatch.setattr(scene_run, "film", lambda frames, box: (boxes.append(box), make(frames, box))[1])
+    scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=2))
+    evaluate_scene(scene, ("nearest",), RunSettings())
+    expected = subject_box(asked[0]).around(subject_box(asked[1]))
+    assert len(boxes) == 3 and set(boxes) == {expected}

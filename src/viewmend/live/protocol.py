@@ -126,6 +126,11 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
         force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))
 
     @property
+    def pixels(self) -> float:
+        """Of all its pictures."""
+        return len(self.cameras) * self.width * self.height * self.scale**2
+
+    @property
     def cameras(self) -> tuple[Camera, ...]:
         """One for each eye."""
         return self.eyes or (self.camera,)

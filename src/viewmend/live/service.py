@@ -8,6 +8,7 @@ from collections import Counter
 from viewmend.live.clock import Clock, Span, edge_of
 from viewmend.live.frames import FrameSupply
 from viewmend.live.memory import HeapTrimmer
+from viewmend.live.pace import Pace
 from viewmend.live.poses import RigFrame
 from viewmend.live.protocol import FrameTimes
 from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
@@ -38,6 +39,7 @@ class RenderService:
         """The edge of a recording."""
         self.recording.live = False
         self._sessions: list[Session] = []
+        self._pace = Pace()
         self._stopped = False
         self._last = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
@@ -125,6 +127,9 @@ class RenderService:
         try:
             result = self.renderer.render(request, session.viewer)
             times = session.show(request, result)
+            if isinstance(session, ViewerSession):
+                pixels = sum(int(camera.size_px.prod()) for camera in request.cameras)
+                self._pace.record(pixels, session.drawn, time.monotonic() - now)
         except Exception as error:  # one viewer's, who is told; the others go on
             log.exception("while rendering a view")
             self.error = f"{type(error).__name__}: {error}"[:400]
@@ -139,8 +144,9 @@ class RenderService:
     def _next_request(self, now: float, span: Span, rig_frame: RigFrame) -> tuple[Session, RenderRequest] | None:
         """The request of the session that has waited longest, which then is the last in turn."""
         viewers = (session for session in self._sessions if isinstance(session, ViewerSession))
-        active = sum(bool(viewer.recent) and viewer.recent[-1].at > now - 1 for viewer in viewers)
-        playback = Playback(span, self.edge, rig_frame, lambda at: self.supply.read(at) is not None, max(1, active))
+        active = max(1, sum(viewer.is_active(now) for viewer in viewers))
+        has_frame = lambda at: self.supply.read(at) is not None  # noqa: E731
+        playback = Playback(span, self.edge, rig_frame, has_frame, active, self._pace)
         for session in list(self._sessions):
             try:
                 request = session.next_request(now, playback)

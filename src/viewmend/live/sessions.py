@@ -3,13 +3,14 @@
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any, Protocol, runtime_checkable
 
 from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLevel
 from viewmend.live.clock import Clock, Span
+from viewmend.live.pace import Pace
 from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
 from viewmend.live.protocol import MENDED_MODES, ClockChange, FrameTimes, Look
@@ -31,7 +32,9 @@ class Playback:
     has_frame: Callable[[int], bool]
     """Whether a time's frame is at hand. If it is not, asking begins to read it."""
     active_viewers: int
-    """Viewers that a frame was sent to within the last second, this one included."""
+    """Viewers that a frame was sent to within the last second, or who wait for one, this one included."""
+    pace: Pace = field(default_factory=Pace)
+    """How long pictures take."""
 
 
 @runtime_checkable
@@ -99,6 +102,8 @@ class ViewerSession:
         """Look and time of the last request."""
         self._full = False
         self._level, self._wait_ms = FULL, 0.0
+        self.drawn = FULL
+        """What the last view was made with: its level, smaller where many wait."""
         self._encoders, self._wants_key_frame = Encoders(), False
 
     def look(self, look: Look) -> None:
@@ -111,6 +116,11 @@ class ViewerSession:
     def change(self, change: ClockChange, span: Span) -> None:
         """Play, pause, seek, change speed, or follow the edge."""
         self.clock.change(change, span)
+
+    def is_active(self, now: float) -> bool:
+        """Whether a frame was sent within the last second, or the newest look waits for its first one."""
+        waits = self.in_flight is None and self._look is not None and self._look is not self._shown[0]
+        return waits or (bool(self.recent) and self.recent[-1].at > now - 1)
 
     def ack(self, frame: int) -> None:
         """A frame has arrived."""
@@ -140,6 +150,7 @@ class ViewerSession:
         if is_new and not is_new_look and self.clock.playing:
             self.dropped += max(0, at - self._shown[1] - 1)
         self._level, self._full = level, level == FULL
+        self.drawn = playback.pace.bounded(level, look.pixels, playback.active_viewers)
         self._wait_ms = max(0.0, 1000 * (now - self._look_at)) if is_new_look else 0.0
         self._shown = (look, at)
         return self._request(look, at, playback.rig_frame)
@@ -168,7 +179,7 @@ class ViewerSession:
         quality = RenderQuality(
             mend=mend, top_k=top_k, context_times=level.context_times, read_fraction=level.read_fraction
         )
-        scale = look.scale * level.scale
+        scale = look.scale * self.drawn.scale
         cameras = tuple(view_camera(eye, rig_frame, (look.width, look.height), scale) for eye in look.cameras)
         return RenderRequest(at, cameras, quality, look.error_rule)
 
@@ -184,7 +195,7 @@ class ViewerSession:
         now = time.monotonic()
         self.recent.append(SentFrame(now, times, len(message)))
         if self.budget is not None:
-            self.budget.record(self._level, times)
+            self.budget.record(self.drawn, times)
         self.in_flight, self.in_flight_since = info.frame, now
         self._deliver(message)
         return times
