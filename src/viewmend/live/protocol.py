@@ -127,7 +127,7 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
 
     @property
     def pixels(self) -> float:
-        """Of all its pictures."""
+        """How many all of its pictures have."""
         return len(self.cameras) * self.width * self.height * self.scale**2
 
     @property
