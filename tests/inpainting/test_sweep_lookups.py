@@ -48,6 +48,15 @@ def finest(eyes):
     return made
 
 
+def test_lookups_are_as_exact_where_layers_compute_in_bfloat16(scene):
+    _, view, rig = scene
+    _, rays = rays_of(view)
+    found = look_up(rays, rig, view.source_views, 2.0, Scale.of(view))
+    with torch.autocast("cpu", torch.bfloat16):
+        again = look_up(rays, rig, view.source_views, 2.0, Scale.of(view))
+    assert all(torch.equal(one, other) for one, other in zip(found, again, strict=True))
+
+
 @pytest.mark.parametrize("step_px", [1.0, 5.0])
 def test_both_kernels_find_the_same(scene, step_px, monkeypatch):
     _, view, rig = scene

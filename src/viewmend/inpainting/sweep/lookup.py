@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -93,13 +94,14 @@ def look_up(rays: Rays, rig: Rig, source_views: Sequence[str], step_px: float, s
         from viewmend.inpainting.sweep._lookup_numba import look_up_numba as implementation
     else:
         from viewmend.inpainting.sweep._lookup_torch import look_up_torch as implementation
-    step_m = step_px * scale.depth_m / float(rays.camera.K[0, 0, 0])
-    pose = rays.camera.world_from_camera[0]
-    middle = pose[:3, 3] + scale.depth_m * pose[:3, 2]
-    views = _eyes(rig.views.frame.cameras, rig.pyramids, step_m, middle)
-    outlines = _eyes(rig.silhouettes.cameras, rig.silhouette_pyramids, step_m, middle)
-    is_source = [float(name in source_views) for name in views.cameras.names]
-    return implementation(rays, views, rig.views.depth, is_source, outlines, scale.size_m)
+    with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
+        step_m = step_px * scale.depth_m / float(rays.camera.K[0, 0, 0])
+        pose = rays.camera.world_from_camera[0]
+        middle = pose[:3, 3] + scale.depth_m * pose[:3, 2]
+        views = _eyes(rig.views.frame.cameras, rig.pyramids, step_m, middle)
+        outlines = _eyes(rig.silhouettes.cameras, rig.silhouette_pyramids, step_m, middle)
+        is_source = [float(name in source_views) for name in views.cameras.names]
+        return implementation(rays, views, rig.views.depth, is_source, outlines, scale.size_m)
 
 
 def _eyes(cameras: Cameras, pyramids: Sequence[Pyramid], step_m: float, middle: Float[Tensor, "3"]) -> Eyes:
