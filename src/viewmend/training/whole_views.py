@@ -31,7 +31,7 @@ DARKEST = 0.6
 """Least of the gains of augmented colours."""
 LEAST_PX = 200
 """Views of a smaller subject are passed over."""
-FEWEST_CAMERAS = 4
+FEWEST_CAMERAS = 3
 """At least so many cameras are shown, where there are more."""
 BLINDED, SPARSE, RECOLOURED, QUICK = 0.6, 0.3, 0.7, 0.3
 """Fractions: windows with fewer cameras, windows of which only a part is read, views with other colours, views whose
