@@ -44,7 +44,7 @@ COMMANDS = {
         "all",
         *SMALL,
     ],
-    "export-scene": lambda model, capture, out: ["export-scene", capture, out, "--model", model, "--views", "1"],
+    "export-scene": lambda model, capture, out: ["export-scene", capture, out, "--model", model, "--views", "8"],
     "serve": lambda model, capture, out: ["serve", "--port", "0", "--model", model],
     "train": lambda model, capture, out: ["train", "finetune", "--captures", capture, "--from", model, "--out", out],
 }
