@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 
 from starlette.applications import Starlette
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -225,7 +225,7 @@ async def _body(request: Request) -> bytearray | None:
     """The request's body; None where it is too large.
 
     Raises:
-        ProtocolError: it takes too long.
+        ProtocolError: it takes too long, or breaks off.
     """
     body = bytearray()
     try:
@@ -236,6 +236,8 @@ async def _body(request: Request) -> bytearray | None:
                     return None
     except TimeoutError:
         raise ProtocolError(f"expected the whole body within {BODY_S:g} s") from None
+    except ClientDisconnect:
+        raise ProtocolError("expected the whole body, got a part of it") from None
     return body
 
 
