@@ -71,7 +71,7 @@ class StandIn:
         routes = [Route("/", self._file), Route("/page/{name:path}", self._file)]
         routes += [Route("/path.mp4", self._film, methods=["POST"]), WebSocketRoute("/ws", self._viewer)]
         config = uvicorn.Config(
-            Starlette(routes=routes), port=0, log_level="error", ws="websockets-sansio", lifespan="off"
+            Starlette(routes=routes), port=0, log_config=None, log_level="error", ws="websockets-sansio", lifespan="off"
         )
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
