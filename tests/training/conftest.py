@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from training.tiny_runs import RUN
 
 from viewmend.inpainting.config import small as small_model
 from viewmend.training.plan import DataPlan, Recipe
@@ -43,15 +44,7 @@ def tiny(shards) -> Recipe:
         name="tiny",
         model=MODEL,
         data=replace(PLAN, shards=shards, clip_length=2),
-        steps=4,
-        batch=2,
-        new_per_batch=1,
-        replay_size=3,
-        warmup=1,
-        workers=0,
-        ema=0.5,
-        bfloat16=False,
-        checkpoint_every=2,
+        **RUN,
         validate_every=0,
         validation_views=2,
     )

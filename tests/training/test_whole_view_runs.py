@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from training.tiny_runs import RUN, VIEW_MODEL, VIEW_PLAN, VIEW_RULE
 
 from viewmend.cli import main
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
-from viewmend.rendering.view import RenderConfig
 from viewmend.training.loop import train
-from viewmend.training.plan import DataPlan, ViewLossWeights, WholeViewRecipe
+from viewmend.training.plan import ViewLossWeights, WholeViewRecipe
 from viewmend.training.sample_files import ShardError, StoredShards, sample_to_bytes, write_shards
 from viewmend.training.scenes import StudioScenes
 from viewmend.training.stored_scenes import StoredSamples, StudioStore
@@ -24,25 +24,17 @@ from viewmend.training.whole_views import (
     WholeViewScenes,
 )
 
-PLAN = DataPlan(sizes_px=(96,), cameras=(5, 6), times=(0,), held_cameras=2, ray_views=4, hull_resolution=48)
-
-
-MODEL = SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8, error_features=8)
-
-
-RULE = RenderConfig(error_rule="all")
-
 
 @pytest.fixture(scope="module")
 def whole():
-    stored = StudioStore(StudioScenes(PLAN, "tests")).scene(0)[0]
-    return WholeView.of(stored.sample(0, RULE, 4), SweepNet(MODEL))
+    stored = StudioStore(StudioScenes(VIEW_PLAN, "tests")).scene(0)[0]
+    return WholeView.of(stored.sample(0, VIEW_RULE, 4), SweepNet(VIEW_MODEL))
 
 
 @pytest.fixture(scope="session")
 def view_shards(tmp_path_factory):
     folder = tmp_path_factory.mktemp("view-shards")
-    scenes = StudioStore(StudioScenes(PLAN, "tests"))
+    scenes = StudioStore(StudioScenes(VIEW_PLAN, "tests"))
     list(write_shards((scenes.scene(number)[0] for number in range(3)), folder, per_shard=2))
     return folder
 
@@ -54,7 +46,7 @@ def test_each_term_alone_can_be_learned(whole, term):
     """A few steps on one view lower it."""
     torch.manual_seed(0)
     weights = ViewLossWeights(**dict.fromkeys(vars(ViewLossWeights()), 0.0) | {term: 1.0})
-    net = SweepNet(MODEL)
+    net = SweepNet(VIEW_MODEL)
     objective, rate = WholeViewObjective(net, weights), torch.optim.Adam(net.parameters(), 3e-3)
     losses = []
     for _ in range(24):
@@ -69,7 +61,7 @@ def test_each_term_alone_can_be_learned(whole, term):
 
 def test_every_weight_learns(whole):
     torch.manual_seed(0)
-    net = SweepNet(MODEL)
+    net = SweepNet(VIEW_MODEL)
     output = WholeViewObjective(net, ViewLossWeights())([whole, whole])
     output.total.backward()
     still = [name for name, p in net.named_parameters() if p.grad is None or float(p.grad.abs().sum()) == 0]
@@ -80,10 +72,12 @@ def test_every_weight_learns(whole):
 def test_what_is_wrong_can_be_learned_alone(view_shards, tmp_path):
     """The reader stays bit for bit; a model without an `ErrorNet`, or an untrained one, is refused."""
     torch.manual_seed(0)
-    data = replace(PLAN, shards=view_shards)
-    recipe = WholeViewRecipe(name="views", model=MODEL, data=data, steps=3, workers=0, part="errors", bfloat16=False)
+    data = replace(VIEW_PLAN, shards=view_shards)
+    recipe = WholeViewRecipe(
+        name="views", model=VIEW_MODEL, data=data, steps=3, workers=0, part="errors", bfloat16=False
+    )
     recipe = replace(recipe, validate_every=0, batch=1, new_per_batch=1, warmup=1)
-    start = SweepNet(replace(MODEL, error_features=0))
+    start = SweepNet(replace(VIEW_MODEL, error_features=0))
     with pytest.raises(ValueError, match="a trained reader and an ErrorNet"):
         train(recipe, tmp_path / "none", kind=WholeViewRun)
     trained = load_network(train(recipe, tmp_path / "run", start=start, kind=WholeViewRun))
@@ -94,25 +88,19 @@ def test_what_is_wrong_can_be_learned_alone(view_shards, tmp_path):
 
 
 def test_a_reader_of_other_sizes_is_no_beginning(view_shards, tmp_path):
-    recipe = WholeViewRecipe(name="views", model=MODEL, data=replace(PLAN, shards=view_shards), steps=1, workers=0)
+    recipe = WholeViewRecipe(
+        name="views", model=VIEW_MODEL, data=replace(VIEW_PLAN, shards=view_shards), steps=1, workers=0
+    )
     with pytest.raises(ValueError, match="of the recipe's sizes"):
-        train(recipe, tmp_path, start=SweepNet(replace(MODEL, width=12)), kind=WholeViewRun)
+        train(recipe, tmp_path, start=SweepNet(replace(VIEW_MODEL, width=12)), kind=WholeViewRun)
 
 
 def test_a_run_goes_on_where_it_stopped(view_shards, tmp_path):
     recipe = WholeViewRecipe(
         name="views",
-        model=MODEL,
-        data=replace(PLAN, shards=view_shards),
-        steps=4,
-        batch=2,
-        new_per_batch=1,
-        replay_size=3,
-        warmup=1,
-        workers=0,
-        ema=0.5,
-        bfloat16=False,
-        checkpoint_every=2,
+        model=VIEW_MODEL,
+        data=replace(VIEW_PLAN, shards=view_shards),
+        **RUN,
         validate_every=4,
         validation_views=1,
     )
@@ -139,7 +127,7 @@ def test_scenes_are_numbered_through_all_shards(view_shards, tmp_path):
 
 def test_a_number_always_gives_the_same_views(view_shards):
     source, other = (
-        WholeViewScenes(StoredSamples(StoredShards(view_shards, "0"), PLAN, seed), seed, SweepNet(MODEL))
+        WholeViewScenes(StoredSamples(StoredShards(view_shards, "0"), VIEW_PLAN, seed), seed, SweepNet(VIEW_MODEL))
         for seed in ("0", "1")
     )
     first, again, third = source.scene(1), source.scene(1), other.scene(1)
@@ -155,7 +143,7 @@ def test_some_holes_are_guessed_from_their_surroundings_alone(view_shards):
     net = SweepNet(SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8, coarse_fill="rays"))
 
     def guesses(quick):
-        shards = StoredSamples(StoredShards(view_shards, "0"), PLAN, "0")
+        shards = StoredSamples(StoredShards(view_shards, "0"), VIEW_PLAN, "0")
         scenes = WholeViewScenes(shards, "0", net, quick)
         return [own for number in range(1, 4) for own in scenes.scene(number)]
 

@@ -5,17 +5,16 @@ from random import Random
 
 import pytest
 import torch
+from training.tiny_runs import VIEW_MODEL, VIEW_PLAN, VIEW_RULE
 
 from viewmend.geometry.cameras import project, unproject
 from viewmend.inpainting.checkpoint import load_network, save_inpainter
 from viewmend.inpainting.sweep.cells import nearest_depth, rim_depth
-from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.leave_one_out.scenes import LeaveOneOut
-from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.training.plan import DataPlan, WholeViewRecipe
+from viewmend.training.plan import WholeViewRecipe
 from viewmend.training.sample_files import sample_from_bytes, sample_to_bytes
 from viewmend.training.stored_scenes import store
 from viewmend.training.whole_view_objective import _visible
@@ -27,14 +26,6 @@ from viewmend.training.whole_views import (
     recoloured,
     untrained,
 )
-
-PLAN = DataPlan(sizes_px=(96,), cameras=(5, 6), times=(0,), held_cameras=2, ray_views=4, hull_resolution=48)
-
-
-MODEL = SweepConfig(num_views=4, width=8, place_channels=4, features=8, fine_features=8, error_features=8)
-
-
-RULE = RenderConfig(error_rule="all")
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +39,12 @@ def stored(studio):
         return studio.truth(studio.true_cameras.select([held]), time)
 
     rig = LeaveOneOut({0: studio.read(0)}, true_view=truth)
-    return store(rig, 0, replace(PLAN, held_cameras=6), Random(0))
+    return store(rig, 0, replace(VIEW_PLAN, held_cameras=6), Random(0))
 
 
 @pytest.fixture(scope="module")
 def whole(stored):
-    return WholeView.of(stored.sample(0, RULE, 4), SweepNet(MODEL))
+    return WholeView.of(stored.sample(0, VIEW_RULE, 4), SweepNet(VIEW_MODEL))
 
 
 def test_a_stored_scene_is_the_rig_without_a_camera(studio, stored):
@@ -63,10 +54,10 @@ def test_a_stored_scene_is_the_rig_without_a_camera(studio, stored):
     again = sample_from_bytes(sample_to_bytes(stored))
     for number in (0, 3):
         name = stored.held[number].name
-        stream = Stream(SweepNet(MODEL), StreamConfig(render=RULE, memory_mb=None))
+        stream = Stream(SweepNet(VIEW_MODEL), StreamConfig(render=VIEW_RULE, memory_mb=None))
         stream.push(frame.without([name]), None)
         wanted = stream.render(frame.cameras.select([name]))
-        sample = again.sample(number, RULE, 4)
+        sample = again.sample(number, VIEW_RULE, 4)
         view = sample.view
         assert name not in view.candidate_views and view.source_views == wanted.source_views
         # The hull is carved more coarsely, and its vertices are in steps.
@@ -120,7 +111,7 @@ def test_a_part_to_be_read_lies_in_the_subject(whole):
 
 
 def test_other_colours_are_those_of_cameras_view_and_truth_alike(stored):
-    sample = stored.sample(0, RULE, 4)
+    sample = stored.sample(0, VIEW_RULE, 4)
     other = recoloured(sample, Random(2))
     gains = []
     for before, after in (
@@ -138,7 +129,7 @@ def test_other_colours_are_those_of_cameras_view_and_truth_alike(stored):
 def test_who_sees_the_surface_is_known(whole, studio):
     """Points of the true surface project to about their own depth in a camera that sees them."""
     torch.manual_seed(0)
-    net = SweepNet(MODEL)
+    net = SweepNet(VIEW_MODEL)
     with torch.no_grad():
         reading = net(whole.view, whole.rig, whole.scale)
     cells = tuple(reading.swept.cells.T)
@@ -154,12 +145,12 @@ def test_who_sees_the_surface_is_known(whole, studio):
 
 def test_holes_are_guessed_by_the_reader_of_rays_of_another_model(stored, tmp_path):
     """Its weights come from the checkpoint that is named, are not trained, and fill the whole view, not its windows."""
-    recipe = WholeViewRecipe(name="views", model=replace(MODEL, num_views=8, coarse_fill="rays"), steps=1)
+    recipe = WholeViewRecipe(name="views", model=replace(VIEW_MODEL, num_views=8, coarse_fill="rays"), steps=1)
     net, small = untrained(replace(recipe, bfloat16=False)), load_network("small")
     assert torch.equal(net.coarse.choose.weight, small.coarse.choose.weight)
     assert not any(weight.requires_grad for weight in net.coarse.parameters())
     assert all(weight.requires_grad for name, weight in net.named_parameters() if not name.startswith("coarse."))
-    sample = stored.sample(0, RULE, 4)
+    sample = stored.sample(0, VIEW_RULE, 4)
     whole = WholeView.of(sample, net)
     holes = whole.view.holes
     assert int(holes.sum()) > 30 and torch.equal(whole.guess[:, ~holes], whole.view.rgb[:, ~holes])
@@ -170,7 +161,7 @@ def test_holes_are_guessed_by_the_reader_of_rays_of_another_model(stored, tmp_pa
     height, width = window.guess.shape[1:]
     parts = whole.guess.unfold(1, height, 1).unfold(2, width, 1)
     assert bool((parts == window.guess[:, None, None]).all(-1).all(-1).all(0).any())
-    save_inpainter(SweepNet(MODEL), tmp_path, "")
+    save_inpainter(SweepNet(VIEW_MODEL), tmp_path, "")
     with pytest.raises(ValueError, match="with a RayBlendNet"):
         untrained(replace(recipe, coarse_from=str(tmp_path)))
 
@@ -178,7 +169,7 @@ def test_holes_are_guessed_by_the_reader_of_rays_of_another_model(stored, tmp_pa
 def test_stored_hulls_are_as_fine_as_the_plan_says(studio):
     rig = LeaveOneOut({0: studio.read(0)})
     sizes = [
-        sum(len(view.faces) for view in store(rig, 0, replace(PLAN, hull_resolution=n), Random(0)).held)
+        sum(len(view.faces) for view in store(rig, 0, replace(VIEW_PLAN, hull_resolution=n), Random(0)).held)
         for n in (16, 48)
     ]
     assert 4 * sizes[0] < sizes[1]

@@ -182,6 +182,30 @@ def calibration_of(content: dict[str, Any], path: Path) -> PlainCalibration:
     )
 
 
+def write_calibration(folder: Path, calibration: PlainCalibration) -> None:
+    """Write a `cameras.json` that reads as this calibration; files are named as they are in it."""
+    content = {
+        "format": FORMAT,
+        "first_pixel_center": [0.5, 0.5],
+        "metres_per_unit": 1.0,
+        "up": None if calibration.up is None else calibration.up.tolist(),
+        "fps": calibration.fps,
+        "bounds": None if calibration.bounds_m is None else calibration.bounds_m.tolist(),
+        "frames": list(calibration.frames),
+        "cameras": [_entry(camera) for camera in calibration.cameras],
+    }
+    (folder / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _entry(camera: PlainCamera) -> dict[str, Any]:
+    entry: dict[str, Any] = {"name": camera.name, "width": camera.width, "height": camera.height}
+    entry |= {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t_m.tolist(), "dist": camera.dist.tolist()}
+    entry |= {stream: getattr(camera, stream) for stream in camera.streams}
+    if camera.colour is not None:
+        entry["colour"] = camera.colour.tolist()
+    return entry | ({"mask_labels": True} if camera.mask_labels else {})
+
+
 def _spelt(text: bytes) -> dict[str, Any]:
     content = typed(read_json(text), dict[str, Any], "see docs/plain-capture.md")
     version = content.get("format")

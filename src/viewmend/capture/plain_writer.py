@@ -1,6 +1,5 @@
 """Writing any source of frames as a plain capture folder."""
 
-import json
 import os
 import re
 import shutil
@@ -11,12 +10,20 @@ from glob import escape
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 
 from viewmend.atomic_writes import is_running, naming
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import write_depth, write_image
-from viewmend.capture.plain_format import CALIBRATION, FORMAT, stays_inside
+from viewmend.capture.plain_format import (
+    CALIBRATION,
+    PlainCalibration,
+    PlainCamera,
+    Stream,
+    stays_inside,
+    write_calibration,
+)
 from viewmend.capture.prefetch import prefetch
 from viewmend.capture.source import CaptureSource
 from viewmend.capture.video_writer import VideoWriter
@@ -82,7 +89,7 @@ class _Writer:
         self.source = source
         self.folder = folder
         self.suffix = suffix
-        self.streams = {"image"}
+        self.streams: set[Stream] = {"image"}
         names = source.cameras.names
         self.folder_names = {name: _file_name(name, f"camera{index:02d}") for index, name in enumerate(names)}
         if len({name.lower() for name in self.folder_names.values()}) < len(names):
@@ -106,8 +113,7 @@ class _Writer:
         finally:
             for writer in self.videos.values():
                 writer.close()
-        description = json.dumps(self._describe(), indent=1)
-        (self.folder / CALIBRATION).write_text(description, encoding="utf-8")
+        write_calibration(self.folder, self._calibration())
 
     def _check_gaps(self, frame: MultiViewFrame) -> None:
         absent = [name for name in self.videos if name not in frame.cameras.names]
@@ -121,7 +127,7 @@ class _Writer:
         name, frame_id = frame.cameras.names[view], self.source.frame_ids[frame.time]
         width, height = (int(n) for n in frame.cameras.size_px[view])
 
-        def file(stream: str) -> Path:
+        def file(stream: Stream) -> Path:
             self.streams.add(stream)
             return self.folder / self._path(name, stream).replace("{frame}", frame_id)
 
@@ -140,32 +146,39 @@ class _Writer:
             return f"video/{self.folder_names[camera]}.mp4"
         return f"{stream}/{self.folder_names[camera]}/{{frame}}{self.suffix if stream == 'image' else '.png'}"
 
-    def _describe(self) -> dict[str, object]:
+    def _calibration(self) -> PlainCalibration:
         source, cameras = self.source, self.source.cameras.to("cpu")
-        bounds = source.bounds
-        streams = ("video" if self.videos else "image", *sorted(self.streams - {"image"}))
-        return {
-            "format": FORMAT,
-            "first_pixel_center": [0.5, 0.5],
-            "metres_per_unit": 1.0,
-            "up": None if source.up is None else source.up.tolist(),
-            "fps": source.fps,
-            "bounds": None if bounds is None else torch.stack([bounds.low, bounds.high]).tolist(),
-            "frames": list(source.frame_ids),
-            "cameras": [
-                {
-                    "name": name,
-                    "width": int(cameras.size_px[view, 0]),
-                    "height": int(cameras.size_px[view, 1]),
-                    "K": cameras.K[view].tolist(),
-                    "R": cameras.camera_from_world[view, :3, :3].tolist(),
-                    "t": cameras.camera_from_world[view, :3, 3].tolist(),
-                    "dist": [0.0] * 5,
-                    **{stream: self._path(name, stream) for stream in streams},
-                }
+        bounds, poses = source.bounds, cameras.camera_from_world.double().numpy()
+        streams = {"video" if self.videos else "image", *(self.streams - {"image"})}
+
+        def path(name: str, stream: Stream) -> str | None:
+            return self._path(name, stream) if stream in streams else None
+
+        return PlainCalibration(
+            frames=tuple(source.frame_ids),
+            cameras=tuple(
+                PlainCamera(
+                    name=name,
+                    width=int(cameras.size_px[view, 0]),
+                    height=int(cameras.size_px[view, 1]),
+                    K=cameras.K[view].double().numpy(),
+                    R=poses[view, :3, :3],
+                    t_m=poses[view, :3, 3],
+                    dist=np.zeros(5),
+                    image=path(name, "image"),
+                    video=path(name, "video"),
+                    mask=path(name, "mask"),
+                    depth=path(name, "depth"),
+                )
                 for view, name in enumerate(cameras.names)
-            ],
-        }
+            ),
+            up=None if source.up is None else source.up.double().cpu().numpy(),
+            fps=source.fps,
+            bounds_m=None if bounds is None else torch.stack([bounds.low, bounds.high]).double().cpu().numpy(),
+            metres_per_unit=1.0,
+            file=self.folder / CALIBRATION,
+            folder=self.folder,
+        )
 
 
 def _file_name(name: str, otherwise: str) -> str:

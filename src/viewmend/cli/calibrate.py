@@ -74,8 +74,9 @@ def _by_board(options: Options, out: Path) -> Figures:
     from viewmend.capture.calibration.board import parse_board
     from viewmend.capture.calibration.bundle import calibrate
     from viewmend.capture.calibration.footage import look_for, open_footage
-    from viewmend.capture.calibration.report import residual_picture, write_calibration
+    from viewmend.capture.calibration.report import residual_picture
     from viewmend.capture.images import write_image
+    from viewmend.capture.plain_format import write_calibration
     from viewmend.cli.checks import chosen_times
     from viewmend.cli.console import busy, track
 
@@ -103,9 +104,10 @@ def _by_board(options: Options, out: Path) -> Figures:
 
 def _by_silhouettes(options: Options, out: Path) -> Figures:
     from viewmend.capture.calibration.held_out import left_out, refined_all, refined_without
-    from viewmend.capture.calibration.report import with_cameras, write_calibration
+    from viewmend.capture.calibration.report import with_cameras
     from viewmend.capture.calibration.silhouettes import HOLDS
     from viewmend.capture.formats.recognition import read_any_calibration
+    from viewmend.capture.plain_format import write_calibration
     from viewmend.cli.console import busy, say, track
 
     frames, bounds = _frames(options)

@@ -1,16 +1,13 @@
-"""A calibration written down: cameras.json, and a picture of what it misses."""
+"""A calibration with other cameras, and a picture of what it misses."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from viewmend.capture.calibration.bundle import CalibratedCamera
-from viewmend.capture.plain_format import CALIBRATION, FORMAT, PlainCalibration, PlainCamera
+from viewmend.capture.plain_format import PlainCalibration, PlainCamera
 from viewmend.contact_sheet import Tile, contact_sheet, in_rows
 from viewmend.geometry.cameras import Cameras
 
@@ -29,30 +26,6 @@ def with_cameras(calibration: PlainCalibration, cameras: Cameras) -> PlainCalibr
             camera = replace(camera, K=own.K[0].double().cpu().numpy(), R=pose[:3, :3], t_m=pose[:3, 3])
         changed.append(camera)
     return replace(calibration, cameras=tuple(changed))
-
-
-def write_calibration(folder: Path, calibration: PlainCalibration) -> None:
-    """Write the calibration as `cameras.json`, whose files are named as they are in the calibration's own folder."""
-    content: dict[str, Any] = {
-        "format": FORMAT,
-        "first_pixel_center": [0.5, 0.5],
-        "metres_per_unit": 1.0,
-        "up": None if calibration.up is None else calibration.up.tolist(),
-        "fps": calibration.fps,
-        "bounds": None if calibration.bounds_m is None else calibration.bounds_m.tolist(),
-        "frames": list(calibration.frames),
-        "cameras": [_entry(camera) for camera in calibration.cameras],
-    }
-    (folder / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
-
-
-def _entry(camera: PlainCamera) -> dict[str, Any]:
-    entry: dict[str, Any] = {"name": camera.name, "width": camera.width, "height": camera.height}
-    entry |= {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t_m.tolist(), "dist": camera.dist.tolist()}
-    entry |= {stream: getattr(camera, stream) for stream in camera.streams}
-    if camera.colour is not None:
-        entry["colour"] = camera.colour.tolist()
-    return entry | ({"mask_labels": True} if camera.mask_labels else {})
 
 
 def residual_picture(
