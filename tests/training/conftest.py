@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
-from training.tiny_runs import RUN
 
 from viewmend.inpainting.config import small as small_model
 from viewmend.training.plan import DataPlan, Recipe
@@ -22,6 +22,18 @@ PLAN = DataPlan(
     hull_resolution=48,
 )
 MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
+
+RUN: dict[str, Any] = {
+    "steps": 4,
+    "batch": 2,
+    "new_per_batch": 1,
+    "replay_size": 3,
+    "warmup": 1,
+    "workers": 0,
+    "ema": 0.5,
+    "bfloat16": False,
+    "checkpoint_every": 2,
+}
 
 
 @pytest.fixture

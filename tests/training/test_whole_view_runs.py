@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from training.tiny_runs import RUN, VIEW_MODEL, VIEW_PLAN, VIEW_RULE
+from training.conftest import RUN
+from training.tiny_views import VIEW_MODEL, VIEW_PLAN, VIEW_RULE
 
 from viewmend.cli import main
 from viewmend.inpainting.checkpoint import load_network

@@ -5,7 +5,7 @@ from random import Random
 
 import pytest
 import torch
-from training.tiny_runs import VIEW_MODEL, VIEW_PLAN, VIEW_RULE
+from training.tiny_views import VIEW_MODEL, VIEW_PLAN, VIEW_RULE
 
 from viewmend.geometry.cameras import project, unproject
 from viewmend.inpainting.checkpoint import load_network, save_inpainter
