@@ -21,7 +21,7 @@ T = TypeVar("T")
 def to_own_pages(value: T) -> T:
     """The tensor, or the dataclass or tuple of such, with copies of what is large and on the CPU in pages of its own.
 
-    They go back to the system with the copy. LossTerms about a millisecond for 3 MB.
+    They go back to the system with the copy. It costs about a millisecond for 3 MB.
     """
     return _moved(value)
 

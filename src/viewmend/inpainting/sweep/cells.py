@@ -31,7 +31,7 @@ def scattered(
 ) -> Shaped[Tensor, "channel rows columns"]:
     """An image of this shape with the values at rows and columns, zeros elsewhere."""
     image = values.new_zeros(shape[0] * shape[1], values.shape[1])
-    return image.index_copy(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
+    return image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
 
 
 def stacked(*images: Shaped[Tensor, "_channel rows columns"]) -> Shaped[Tensor, "1 channel rows columns"]:

@@ -59,7 +59,8 @@ class PlaceNet(nn.Module):
         from viewmend.inpainting.sweep._weigh_numba import weigh_numba
 
         with torch.autocast("cpu", enabled=False):
-            hidden, shared = self.camera(places.features), self.all_cameras(places.stats)
+            hidden = places.features @ self.camera.weight.T.float()
+            shared = self.all_cameras(places.stats) + self.camera.bias.float()
             weight, bias = self.trust.weight[0].float(), float(self.trust.bias)
             told, trust = weigh_numba(places, prior.contiguous(), hidden, shared, weight, bias)
             out, agreed = self.place(told), told[..., len(weight) :]

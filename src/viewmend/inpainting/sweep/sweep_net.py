@@ -205,7 +205,8 @@ class SweepNet(Network):
         with self.autocast():
             parts = [self.places(look_up(part, rig, view.source_views, float(CELL_PX), scale)) for part in rays]
             weighed = Weighed(*map(torch.cat, zip(*parts, strict=True)))
-            volume = scattered(weighed.features.flatten(1), cells, depth.shape)
+            features = weighed.features.flatten(1).to(self.compute_dtype)
+            volume = scattered(features, cells, depth.shape)
             told = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(volume)
             decided = self.decide(stacked(volume, told))
             logits = self.logits(decided)[0, :, cells[:, 0], cells[:, 1]].T.float() + weighed.score.float()
