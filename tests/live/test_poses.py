@@ -29,6 +29,13 @@ def test_the_first_view_is_between_two_cameras_as_far_as_they_are():
     assert lone.azimuth == pytest.approx(0)
 
 
+@pytest.mark.parametrize("degrees", [(60, 20, 100, 40), (340, 10, 50, 140), (200, 230)])
+def test_the_first_view_is_in_the_middle_of_an_arc(degrees):
+    arc = orbit([math.radians(d) for d in degrees], (64, 64), radius_m=2.0, elevation_rad=0.0, center=CENTER)
+    middle = {(60, 20, 100, 40): 60, (340, 10, 50, 140): 60, (200, 230): -145}[degrees]
+    assert rig_frame(arc, CENTER, torch.tensor([0.0, 1.0, 0.0])).azimuth == pytest.approx(middle, abs=0.02)
+
+
 def test_a_matrix_says_it_all():
     like = camera_at(77, "x")
     R, T = like.camera_from_world[0, :3, :3], like.camera_from_world[0, :3, 3]

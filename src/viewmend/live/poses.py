@@ -14,6 +14,9 @@ from viewmend.geometry.rigid import look_at, rigid
 from viewmend.geometry.upright import horizontal_axes, upright
 from viewmend.live.protocol import Camera
 
+ARC_GAP = 1.5
+"""Cameras stand in an arc where the widest gap between neighbours is so many times the next one."""
+
 
 @dataclass(frozen=True)
 class RigFrame:
@@ -43,8 +46,8 @@ class RigFrame:
 def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> RigFrame:
     """Axes about the subject: as `geometry.orbit` counts azimuths.
 
-    The first view is halfway between the first camera and its neighbour, as far and as high as the cameras on average,
-    and shows as much as they do.
+    The first view is in the middle of the cameras' arc, or halfway between the first camera and its neighbour where
+    they stand all around; as far and as high as the cameras on average, and it shows as much as they do.
 
     Args:
         cameras: the rig.
@@ -58,11 +61,16 @@ def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3
     distance = offsets.norm(dim=-1)
     azimuths = torch.rad2deg(torch.atan2(offsets @ side, offsets @ front))
     after = ((azimuths - azimuths[0]) % 360).sort().values
-    gap = float(after[after > 1][0]) if bool((after > 1).any()) else 0.0
+    gaps = torch.cat([after, after.new_tensor([360.0])]).diff()
+    widest, others = int(gaps.argmax()), gaps.sort().values[:-1]
+    if not len(others) or float(gaps[widest]) >= ARC_GAP * float(others[-1]):
+        ahead = float(after[widest] + gaps[widest] / 2) + 180  # of the first camera: opposite to where none stands
+    else:
+        ahead = float(after[after > 1][0]) / 2
     elevation = float(torch.rad2deg(torch.asin((offsets @ up / distance).clamp(-1, 1))).mean())
     width, height = cameras.size_px[0].tolist()
     fov_y = 2 * math.degrees(math.atan(min(width, height) / 2 / float(cameras.K[0, 1, 1])))
-    azimuth = round(float(azimuths[0]) + min(gap, 90.0) / 2, 2)
+    azimuth = round((float(azimuths[0]) + ahead + 180) % 360 - 180, 2)
     return RigFrame(center, up, front, side, azimuth, max(-80.0, min(80.0, elevation)), float(distance.mean()), fov_y)
 
 

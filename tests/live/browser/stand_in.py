@@ -60,6 +60,7 @@ class StandIn:
     """A code to close new sockets with."""
     broken: bool = False
     """True sends pictures that cannot be decoded."""
+    frames: int = scene.FRAMES
     looks: list[dict] = field(default_factory=list)
     clocks: list[dict] = field(default_factory=list)
     paths: list[dict] = field(default_factory=list)
@@ -168,7 +169,7 @@ class StandIn:
 
     def _state(self, viewer: Seen) -> dict:
         source = {"source": self.source, "error": self.error, "model_error": self.model_error}
-        span = {"first": 0, "end": scene.FRAMES, "total": scene.FRAMES, "loops": True, "kind": "recording"}
+        span = {"first": 0, "end": self.frames, "total": self.frames, "loops": True, "kind": "recording"}
         clock = {"time": int(viewer.time), "playing": viewer.playing, "speed": viewer.speed, "live": viewer.live}
         return {"type": "state", **source, **span, **clock, "behind": 0, "buffering": False}
 

@@ -157,6 +157,15 @@ def test_pause_seek_step_speed_and_live(view):
     view.until(lambda: server.clocks[-1] == {"type": "clock", "playing": False})
 
 
+def test_a_capture_of_one_time_has_no_timeline(browser, desktop):
+    assert desktop.page.locator("#transport").is_visible()
+    with StandIn(frames=1) as server:
+        for view in opened(browser, server, "desktop"):
+            view.settle()
+            view.until(lambda view=view: view.page.locator("#transport").is_hidden())
+            assert view.page.locator("#modes").is_visible()
+
+
 def test_steps_and_clicks_start_from_what_is_shown(desktop):
     page, server = desktop.page, desktop.server
     line = page.locator("#seek")

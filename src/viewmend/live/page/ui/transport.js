@@ -100,6 +100,7 @@ export class Transport {
   #state(state) {
     this.state = state;
     const recording = state.kind === "recording";
+    byId("transport").hidden = recording && state.total === 1; // nothing moves
     const seek = byId("seek");
     seek.min = state.first;
     seek.max = Math.max(state.first, (state.total ?? state.end) - 1);
