@@ -182,3 +182,20 @@ def test_frames_say_what_they_are(ball_view, mode):
     assert desk.session.stats_json(1)["stage_ms"] == stages
     assert header["colours"][0] == [230, 120, 60] and len(header["cameras"][0]["K"]) == 9
     assert desk.session.in_flight == 0 and desk.session.stats_json(1)["viewers"] == 1
+
+
+def test_a_view_at_rest_may_ask_for_more_pixels_and_the_budget_counts_in_those_of_moving_ones():
+    desk = Desk(budget_ms=50.0)
+    desk.pause()
+    desk.look(id=1, moving=True, width=200, height=100)
+    moving = desk.size(desk.due())
+    desk.look(id=2, width=800, height=400)
+    assert desk.size(desk.due()) == moving, "the first answer comes as soon as if nothing had been asked"
+    assert desk.size(desk.due(STILL_S)) == desk.size(desk.due(FULL_S)) == (800, 400)
+    session, learned = desk.session, []
+    session.budget.record = lambda level, times: learned.append(level.scale)
+    view = RenderResult(0, (), State(), StageTimes())
+    session.show(desk.session._request(session._shown[0], 0, FRAME), view)
+    assert learned == [4.0], "sides four times as long"
+    desk.look(id=3, moving=True, width=800, height=400)
+    assert desk.size(desk.due())[0] == 4 * moving[0], "who moves in large pictures has meant it"

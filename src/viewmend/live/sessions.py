@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import count
+from math import sqrt
 from typing import Any, Protocol, runtime_checkable
 
 from viewmend.inpainting.protocol import RenderQuality, State
@@ -104,6 +105,8 @@ class ViewerSession:
         self._level, self._wait_ms = FULL, 0.0
         self.drawn = FULL
         """What the last view was made with: its level, smaller where many wait."""
+        self._moving_px = 0.0
+        """Pixels of the last look that moved or played. The budget counts in them: a view at rest may ask for more."""
         self._encoders, self._wants_key_frame = Encoders(), False
 
     def look(self, look: Look) -> None:
@@ -139,6 +142,7 @@ class ViewerSession:
         is_new = is_new_look or at != self._shown[1]
         at_rest = not look.moving and not (self.clock.playing and playback.span.fps > 0)
         if is_new:
+            self._moving_px = self._moving_px if at_rest and self._moving_px else look.pixels
             level = self._level_for(look, playback.active_viewers)
         else:
             level = self._refinement(now - self._look_at) if at_rest else None
@@ -170,7 +174,13 @@ class ViewerSession:
             level = self.budget.level
         else:
             level = self._ladder.moving if look.moving else FULL
-        return level if look.adaptive else replace(level, scale=1.0)
+        if not look.adaptive:
+            return replace(level, scale=1.0)
+        return level if self.budget is None else replace(level, scale=level.scale * min(1.0, 1 / self._enlarged(look)))
+
+    def _enlarged(self, look: Look) -> float:
+        """How much longer the sides of this look's picture are than those of one that moves."""
+        return sqrt(look.pixels / self._moving_px)
 
     def _request(self, look: Look, at: int, rig_frame: RigFrame) -> RenderRequest:
         level = self._level
@@ -195,7 +205,7 @@ class ViewerSession:
         now = time.monotonic()
         self.recent.append(SentFrame(now, times, len(message)))
         if self.budget is not None:
-            self.budget.record(self.drawn, times)
+            self.budget.record(replace(self.drawn, scale=self.drawn.scale * self._enlarged(look)), times)
         self.in_flight, self.in_flight_since = info.frame, now
         self._deliver(message)
         return times

@@ -157,15 +157,6 @@ def test_pause_seek_step_speed_and_live(view):
     view.until(lambda: server.clocks[-1] == {"type": "clock", "playing": False})
 
 
-def test_a_capture_of_one_time_has_no_timeline(browser, desktop):
-    assert desktop.page.locator("#transport").is_visible()
-    with StandIn(frames=1) as server:
-        for view in opened(browser, server, "desktop"):
-            view.settle()
-            view.until(lambda view=view: view.page.locator("#transport").is_hidden())
-            assert view.page.locator("#modes").is_visible()
-
-
 def test_steps_and_clicks_start_from_what_is_shown(desktop):
     page, server = desktop.page, desktop.server
     line = page.locator("#seek")
@@ -194,7 +185,7 @@ def test_steps_and_clicks_start_from_what_is_shown(desktop):
 
 
 def test_what_the_address_asks_for_must_make_sense(browser, server):
-    for view in opened(browser, server, "desktop", "?mode=foo&left=split&size=big"):
+    for view in opened(browser, server, "desktop", "?sharp=0&mode=foo&left=split&size=big"):
         view.settle()
         assert server.looks[-1]["modes"] == ["mended"]
 

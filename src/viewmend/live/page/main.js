@@ -19,9 +19,10 @@ import { buildTools, screenshot } from "./ui/tools.js";
 import { Transport } from "./ui/transport.js";
 import { listenToGestures } from "./view/gestures.js";
 import { Keys } from "./view/keys.js";
-import { contained, lensOf, resize, sizeFor } from "./view/lens.js";
+import { contained, lensOf, resize, sharpSide, sizeFor } from "./view/lens.js";
 import { degrees } from "./view/matrix.js";
 import { Motion } from "./view/motion.js";
+import { Place, poseOf, poseText, timeOf } from "./view/place.js";
 import { extrinsicsOf } from "./view/pose.js";
 import { Pace, Resolution } from "./draw/resolution.js";
 
@@ -44,7 +45,9 @@ class Page {
     this.link = new ViewerLink(this.connection);
     this.notices = new Notices(() => this.connection.open());
     this.statistics = new Statistics();
-    this.transport = new Transport(this.link);
+    this.transport = new Transport(this.link, timeOf(query.get("time")));
+    this.place = new Place();
+    this.motion.first = poseOf(query.get("pose"));
     this.layout = new Layout(this.settings, () => this.wake());
     this.cameras = new CameraList((camera) => this.snap(camera));
     this.headset = new Headset(this.stage, {
@@ -120,7 +123,10 @@ class Page {
       this.showSources([], undefined);
       this.wake();
     });
-    on(this.link, "state", (state) => this.notices.source(state));
+    on(this.link, "state", (state) => {
+      this.notices.source(state);
+      this.wake();
+    });
     on(this.link, "stats", (stats) => (this.statistics.server = stats));
     on(this.link, "error", ({ message }) => this.notices.toast(message, "error"));
     on(this.link, "picture", (shown) => this.take(shown));
@@ -141,7 +147,7 @@ class Page {
       return;
     }
     this.notices.toast("This browser cannot decode the video; JPEG it is.", "error");
-    this.settings.set("codec", "jpeg");
+    this.settings.set("codec", "jpeg", false);
     byId("codec").value = "jpeg";
   }
 
@@ -151,6 +157,7 @@ class Page {
     this.stage.take(shown);
     this.showSources(header.source_views, this.settings.modes.includes("coverage") ? header.colours : undefined);
     this.transport.picture(header.time);
+    this.controls.size(header);
     this.notices.arrived(this.settings.modes.includes("confidence") && header.confidence === null);
     this.paint();
     const latency = this.statistics.picture(header, shown.bytes);
@@ -199,11 +206,27 @@ class Page {
     if (!this.motion.pose || this.headset.session) return;
     const { R, T, lens, box } = this.viewer();
     const [fixedWidth, fixedHeight] = this.settings.get("size").split("x").map(Number);
-    const size = fixedWidth > 0 ? { width: fixedWidth, height: fixedHeight } : sizeFor(box, this.settings.get("side"), this.limits);
-    this.controls.size(size);
+    const { moving } = this.motion;
+    const atRest = this.settings.get("sharp") && !moving && !this.transport.playing;
+    const side = atRest ? sharpSide(box, Math.min(2, window.devicePixelRatio)) : this.settings.get("side");
+    const size = fixedWidth > 0 ? { width: fixedWidth, height: fixedHeight } : sizeFor(box, side, this.limits);
     const { fx, fy, cx, cy } = resize(lens, size.width, size.height);
-    const look = { camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving: this.motion.moving };
+    const look = { camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving };
     if (this.link.look(look)) this.notices.asked();
+    if (!moving) this.tell();
+  }
+
+  /** Say in the address what is shown. */
+  tell() {
+    const { motion, settings, transport } = this;
+    const split = settings.get("mode") === "split";
+    this.place.tell({
+      pose: motion.atHome || !motion.goal ? null : poseText(motion.goal),
+      time: transport.still < 0 ? null : String(transport.still),
+      mode: settings.get("mode") === "mended" ? null : settings.get("mode"),
+      left: split ? settings.get("left") : null,
+      right: split ? settings.get("right") : null,
+    });
   }
 
   /** @param {number} divider its place as a share of the viewport's width @returns {import("./draw/stage.js").Wish} */

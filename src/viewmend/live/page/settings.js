@@ -8,9 +8,10 @@
  * @property {number} divider where it is, 0 to 1 of the free part's width
  * @property {number | null} topK
  * @property {string} errorRule what is mended; "" for what the server was started with
- * @property {number} side pixels of a square with as many pixels as the picture
+ * @property {number} side pixels of a square with as many pixels as the picture has, at most, while it moves
  * @property {string} size "" for the page's shape, or "WIDTHxHEIGHT"
  * @property {string} codec
+ * @property {boolean} sharp whether a view at rest has as many pixels as the canvas
  * @property {boolean} adaptive whether a moving view may cost resolution
  * @property {boolean} reproject
  * @property {boolean} rig
@@ -27,6 +28,7 @@ const DEFAULTS = {
   side: 384,
   size: "",
   codec: "jpeg",
+  sharp: true,
   adaptive: true,
   reproject: true,
   rig: false,
@@ -42,15 +44,29 @@ const SENSIBLE = {
   size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
 };
 
+/** The name under which a browser keeps choices; those that the address tells are not among them. */
+const KEPT = "viewmend.settings";
+const IN_ADDRESS = ["mode", "left", "right", "size"];
+
+/** What the person chose before, as texts by name. @returns {Record<string, string>} */
+function kept() {
+  try {
+    return JSON.parse(localStorage.getItem(KEPT) ?? "{}") ?? {};
+  } catch {
+    return {}; // a browser that keeps nothing, or something of another page
+  }
+}
+
 export class Settings extends EventTarget {
-  /** @param {URLSearchParams} query choices by name, e.g. `?mode=split&size=320x320&reproject=0` */
+  /** @param {URLSearchParams} query choices by name, e.g. `?mode=split&size=320x320&reproject=0`; they go before kept ones */
   constructor(query) {
     super();
     /** @type {any} */
     this.values = { ...DEFAULTS };
+    const before = kept();
     for (const [name, standard] of Object.entries(DEFAULTS)) {
-      const given = query.get(name);
-      if (given === null || SENSIBLE[name]?.(given) === false) continue;
+      const given = query.get(name) ?? before[name] ?? null;
+      if (typeof given !== "string" || SENSIBLE[name]?.(given) === false) continue;
       if (typeof standard === "boolean") this.values[name] = given !== "0";
       else if (typeof standard === "number" || name === "topK") this.values[name] = Number(given) || standard;
       else this.values[name] = given;
@@ -62,11 +78,22 @@ export class Settings extends EventTarget {
     return this.values[name];
   }
 
-  /** @param {keyof Choices} name @param {any} value */
-  set(name, value) {
+  /** @param {keyof Choices} name @param {any} value @param {boolean} [own] whether the person chose it, for the next time too */
+  set(name, value, own = true) {
     if (this.values[name] === value) return;
     this.values[name] = value;
+    if (own && !IN_ADDRESS.includes(name)) this.#keep(name, value);
     this.dispatchEvent(new CustomEvent("change", { detail: name }));
+  }
+
+  /** @param {string} name @param {any} value */
+  #keep(name, value) {
+    const text = typeof value === "boolean" ? String(Number(value)) : String(value ?? "");
+    try {
+      localStorage.setItem(KEPT, JSON.stringify({ ...kept(), [name]: text }));
+    } catch {
+      // The browser keeps nothing: the choice holds until the page is closed.
+    }
   }
 
   /** The modes that the server must render. @returns {string[]} */

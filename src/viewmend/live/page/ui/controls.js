@@ -18,7 +18,7 @@ export function buildControls(settings, motion, wake) {
     motion.lens(Number(byId("fov").value));
     wake();
   });
-  for (const name of /** @type {("reproject" | "adaptive" | "rig")[]} */ (["reproject", "adaptive", "rig"])) {
+  for (const name of /** @type {("reproject" | "sharp" | "adaptive" | "rig")[]} */ (["reproject", "sharp", "adaptive", "rig"])) {
     const box = byId(name);
     box.addEventListener("change", () => settings.set(name, box.checked));
     settings.watch([name], () => (box.checked = settings.get(name)));
@@ -48,7 +48,7 @@ export function buildControls(settings, motion, wake) {
     rules(rules, standard) {
       const list = byId("error-rule");
       list.replaceChildren(...rules.map((value) => element("option", { value, textContent: /** @type {any} */ (RULES)[value] ?? value })));
-      if (!rules.includes(settings.get("errorRule"))) settings.set("errorRule", standard);
+      if (!rules.includes(settings.get("errorRule"))) settings.set("errorRule", standard, false);
       list.value = settings.get("errorRule");
       list.closest("label").hidden = rules.length < 2;
     },
@@ -56,7 +56,7 @@ export function buildControls(settings, motion, wake) {
     codecs(codecs) {
       const list = byId("codec");
       list.replaceChildren(...codecs.map((value) => element("option", { value, textContent: /** @type {any} */ (CODECS)[value] ?? value })));
-      if (!codecs.includes(settings.get("codec"))) settings.set("codec", "jpeg");
+      if (!codecs.includes(settings.get("codec"))) settings.set("codec", "jpeg", false);
       list.value = settings.get("codec");
       list.closest("label").hidden = codecs.length < 2;
     },
@@ -65,7 +65,7 @@ export function buildControls(settings, motion, wake) {
       setSlider(byId("fov"), Math.round(fov));
       byId("fov-value").textContent = `${Math.round(fov)}°`;
     },
-    /** @param {{width: number, height: number}} size of the picture asked for */
+    /** @param {{width: number, height: number}} size of the picture that is shown */
     size({ width, height }) {
       const text = `${width} × ${height}`;
       if (byId("side-value").textContent !== text) byId("side-value").textContent = text;

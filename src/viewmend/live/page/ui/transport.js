@@ -7,9 +7,10 @@ const SPEEDS = [0.25, 0.5, 1, 2, 4];
 const HEARD_MS = 1000;
 
 export class Transport {
-  /** @param {import("../link/viewer.js").ViewerLink} link */
-  constructor(link) {
+  /** @param {import("../link/viewer.js").ViewerLink} link @param {number} first the frame to begin at, paused; -1 to play */
+  constructor(link, first) {
     this.link = link;
+    this.first = first;
     /** @type {any} */
     this.state = null;
     /** @type {Record<string, {value: any, at: number}>} */
@@ -35,6 +36,16 @@ export class Transport {
     byId("speed").addEventListener("change", () => this.speed(Number(byId("speed").value)));
     link.addEventListener("state", (event) => this.#state(/** @type {CustomEvent} */ (event).detail));
     link.addEventListener("welcome", () => this.#again());
+  }
+
+  /** Whether times follow each other by themselves. */
+  get playing() {
+    return !this.state || (this.state.playing && this.state.total !== 1);
+  }
+
+  /** The frame that the page stands still at, or is to begin at; -1 while it plays. */
+  get still() {
+    return this.first >= 0 ? this.first : this.playing || this.state.total === 1 ? -1 : Math.max(this.sought, this.shown);
   }
 
   toggle() {
@@ -100,6 +111,12 @@ export class Transport {
   #state(state) {
     this.state = state;
     const recording = state.kind === "recording";
+    if (this.first >= 0 && state.end > Math.min(this.first, (state.total ?? Infinity) - 1)) {
+      const seek = this.first;
+      this.first = -1;
+      this.#tell({ playing: false, seek });
+      return;
+    }
     byId("transport").hidden = recording && state.total === 1; // nothing moves
     const seek = byId("seek");
     seek.min = state.first;

@@ -50,6 +50,9 @@ export function sizeFor(box, side, limits) {
   return { width: even(side * shape), height: even(side / shape) };
 }
 
+/** The `side` of a picture that has a pixel for each of the display's. @param {Box} box @param {number} ratio of pixels to CSS pixels */
+export const sharpSide = (box, ratio) => Math.sqrt(box.width * box.height) * ratio;
+
 /** The largest box of a shape within another one. @param {Box} outer @param {number} aspect width by height @returns {Box} */
 export function contained(outer, aspect) {
   const width = Math.min(outer.width, outer.height * aspect);

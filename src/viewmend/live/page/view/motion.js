@@ -22,6 +22,8 @@ export class Motion {
     this.pose = null;
     /** @type {Pose | null} */
     this.goal = null;
+    /** Where the view begins; null for the rig's home. @type {Pose | null} */
+    this.first = null;
     /** @type {any} */
     this.rig = null;
     this.lastChange = -Infinity;
@@ -33,8 +35,13 @@ export class Motion {
   /** Take a rig; the view begins at its home, or stays where it is if there was one. @param {any} rig */
   place(rig) {
     this.rig = rig;
-    this.pose ??= this.home();
-    this.goal ??= this.home();
+    this.pose ??= this.first ?? this.home();
+    this.goal ??= this.pose;
+  }
+
+  /** Whether the view is where it began. */
+  get atHome() {
+    return this.goal !== null && alike(this.goal, this.home());
   }
 
   /** @returns {Pose} */
