@@ -36,14 +36,17 @@ def test_at_rest_each_pixel_of_the_canvas_is_asked_for(browser, server, size):
         assert view.server.looks[-1]["width"] == look["width"]
 
 
+def says(view, resolution: str) -> None:
+    view.until(lambda: view.page.locator("#side-value").inner_text() == resolution)
+
+
 def test_the_slider_tells_the_resolution_that_is_shown(browser, server):
     for view in opened(browser, server, "desktop", "?side=400"):
         view.settle()
         view.page.keyboard.press("Space")
-        view.until(lambda: view.server.looks[-1]["width"] == 504)  # 400 pixels squared in the page's shape
-        view.until(lambda: view.page.locator("#side-value").inner_text() == "504 × 316")
+        says(view, "504 × 316")  # 400 pixels squared in the page's shape
         view.page.keyboard.press("Space")
-        view.until(lambda: view.page.locator("#side-value").inner_text() == "1024 × 640")
+        says(view, "1024 × 640")
 
 
 def test_a_capture_of_one_time_has_no_timeline(browser, desktop):
