@@ -1,11 +1,12 @@
 """A server under a thousand connections of strangers: what a viewer with the token still gets, and what memory does.
 
-Run: `python benchmarks/attack.py [--each] [--write]`. A server in a process of its own; a viewer; kinds of strangers in
-waves of five, 200 of each, opened anew as soon as the server ends them; with `--each` one kind after the other, 1000
-of it. Prints JSON: the viewer's frames a second meanwhile, their share of those before and after, its longest wait, and
-what the server's memory grew by at its highest and 30 seconds after. The strangers' own programs take the same
-processor: on few cores the share says how much of it they leave, too. At last eight viewers ask for all that they may,
-2.1 million pixels each, mended, at once and again and again: the longest that one of them waited.
+Run: `python benchmarks/attack.py [--each] [--rounds 4] [--write]`. A server in a process of its own; a viewer; kinds of
+strangers in waves of five, 200 of each, opened anew as soon as the server ends them; with `--each` one kind after the
+other, 1000 of it; with `--rounds` each wave again and again, and first as often nobody at all. Prints JSON: the
+viewer's frames a second meanwhile, their share of those before and after, its longest wait, and what the server's
+memory grew by at its highest and 30 seconds after. The strangers' own programs take the same processor: on few cores
+the share says how much of it they leave, too. At last eight viewers ask for all that they may, 2.1 million pixels each,
+mended, at once and again and again: the longest that one of them waited.
 """
 
 import argparse
@@ -49,6 +50,8 @@ class Outcome:
     """Of the mean of its frames before and after."""
     highest_mb: float = 0.0
     after_30_s_mb: float = 0.0
+    resident_mb: float = 0.0
+    """Then, in all: of the same wave's rounds the second and on add nothing, or it is a leak."""
 
 
 def look_on(viewer: Client, seconds: float) -> tuple[float, float]:
@@ -62,10 +65,10 @@ def look_on(viewer: Client, seconds: float) -> tuple[float, float]:
 
 
 def attack(viewer: Client, port: int, server: int, kinds: list[str], seconds: float) -> Outcome:
-    """Let strangers of these kinds come, 1000 in all."""
+    """Let strangers of these kinds come, 1000 in all; of no kinds, nobody: what memory does by itself."""
     outcome = Outcome(kinds)
     ended = threading.Event()
-    each = 5 * EACH // len(kinds)
+    each = 5 * EACH // max(1, len(kinds))
     before, memory = look_on(viewer, seconds)[0], megabytes(server)
 
     def watch() -> None:
@@ -74,15 +77,16 @@ def attack(viewer: Client, port: int, server: int, kinds: list[str], seconds: fl
 
     watcher = threading.Thread(target=watch)
     watcher.start()
-    crowd = begin(port, each, seconds + 8, kinds)
+    crowd = begin(port, each, seconds + 8, kinds) if kinds else None
     time.sleep(4)
     outcome.frames_per_s, outcome.slowest_s = look_on(viewer, seconds)
-    outcome.connections = int(crowd.communicate()[0])
+    outcome.connections = int(crowd.communicate()[0]) if crowd is not None else 0
     ended.set()
     watcher.join()
     outcome.share = outcome.frames_per_s / ((before + look_on(viewer, seconds)[0]) / 2)
     look_on(viewer, 30)  # who does not read for so long is put out
-    outcome.after_30_s_mb = megabytes(server) - memory
+    outcome.resident_mb = megabytes(server)
+    outcome.after_30_s_mb = outcome.resident_mb - memory
     return outcome
 
 
@@ -111,6 +115,7 @@ def full_house(url: str, seconds: float, viewers: int = 8) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each look")
+    parser.add_argument("--rounds", type=int, default=1, help="of each wave; with several, as many with nobody first")
     parser.add_argument("--each", action="store_true", help="one kind after the other, instead of five at a time")
     parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
     parser.add_argument(
@@ -133,7 +138,8 @@ def main() -> None:
         with contextlib.ExitStack() as ends, Client(f"ws{address[1]}", TOKEN, timeout_s=120) as viewer:
             ends.callback(server.terminate)  # else who fails here waits for ever
             look_on(viewer, 10)
-            for kinds in waves:
+            nobody: list[list[str]] = [[]] * (given.rounds if given.rounds > 1 else 0)
+            for kinds in nobody + [kinds for kinds in waves for _ in range(given.rounds)]:
                 outcomes.append(attack(viewer, int(address[2]), server.pid, kinds, given.seconds))
                 print(json.dumps(asdict(outcomes[-1])), flush=True)
             viewer.__exit__()

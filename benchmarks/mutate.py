@@ -75,7 +75,7 @@ def main() -> None:
         sys.exit(try_named(copy, options.work) > 0)
     for room in options.rooms:
         state = options.work / f"{room}--{options.seed}.json"
-        bugs = load(state) if state.exists() else draw(room, options.count, options.seed)
+        bugs = drawn_or_known(state, room, options.count, options.seed)
         for bug in bugs:
             bug.outcome = "open" if options.again and bug.outcome == "survived" else bug.outcome
         if any(bug.outcome == "open" for bug in bugs):
@@ -94,6 +94,12 @@ def main() -> None:
         config = {"seed": options.seed, "count": options.count}
         print(write("mutation", "cpu", config, {"rooms": result, "bugs": rows}))
     print(json.dumps(result, indent=1))
+
+
+def drawn_or_known(state: Path, room: str, count: int, seed: int) -> list[Bug]:
+    """The bugs of an earlier run; where more are asked for now, more are drawn."""
+    known = load(state) if state.exists() else []
+    return known + draw(room, count, seed)[len(known) :]
 
 
 def draw(room: str, count: int, seed: int) -> list[Bug]:

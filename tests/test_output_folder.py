@@ -2,11 +2,14 @@
 
 import contextlib
 import shutil
+import signal
 import subprocess
 import sys
 
 import pytest
 
+from viewmend.capture.plain_writer import whole_folder
+from viewmend.cli import signals
 from viewmend.cli.evaluating import report_folder
 from viewmend.output_folder import OutputFolder
 
@@ -32,6 +35,22 @@ def test_what_a_run_made_the_next_one_replaces(tmp_path):
     published(tmp_path / "out")
     assert seen(tmp_path / "out") == ["mine.txt", "pictures/0.png", "pictures/1.png", "sheet.png"]
     assert (tmp_path / "out/sheet.png").read_text() == "sheet of 2"
+
+
+def test_a_signal_waits_until_what_is_unfinished_is_gone(tmp_path, monkeypatch):
+    remove = shutil.rmtree
+
+    def disturbed(path, **how):
+        signal.raise_signal(signal.SIGTERM)
+        remove(path, **how)
+
+    for written in (OutputFolder, whole_folder):
+        out = tmp_path / written.__name__
+        with signals.ended_by_sigterm(), pytest.raises(SystemExit) as ended, written(out) as folder:
+            (folder.draft if isinstance(folder, OutputFolder) else folder).mkdir(exist_ok=True)
+            monkeypatch.setattr(shutil, "rmtree", disturbed)
+        monkeypatch.undo()
+        assert ended.value.code == 143 and not list(tmp_path.rglob("draft")) and not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize("name", ["pictures/000123.png", "pictures/0.png", "pictures/deep/a.txt", "sheet.png"])

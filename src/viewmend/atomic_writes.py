@@ -3,6 +3,8 @@
 import errno
 import os
 import re
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +16,26 @@ from torch import Tensor
 HALF = ".half-"
 """How the name of a file begins that is being written."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """Have Ctrl-C and SIGTERM wait for the end of what must be done as a whole: removing what is unfinished, say."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread is ever interrupted
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handled = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in handled:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handled.items():
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 @contextmanager
@@ -49,7 +71,8 @@ def write_atomically(path: Path, write: Callable[[Path], object], durable: bool 
             if durable and os.name == "posix":  # elsewhere folders cannot be opened
                 _flush_to_disk(path.parent)
     finally:
-        beside.unlink(missing_ok=True)
+        with undisturbed():
+            beside.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 from filelock import FileLock, Timeout
 
-from viewmend.atomic_writes import remove_halves, write_text
+from viewmend.atomic_writes import remove_halves, undisturbed, write_text
 
 HIDDEN = ".viewmend"
 """The folder that holds the lock, the manifest and what is not finished."""
@@ -62,6 +62,10 @@ class OutputFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
+        with undisturbed():
+            self._end()
+
+    def _end(self) -> None:
         shutil.rmtree(self.draft, ignore_errors=True)
         # Before the lock is let go: what the next run makes in there is not this one's to remove.
         if self._new and [entry.name for entry in self.path.iterdir()] == [HIDDEN]:

@@ -54,7 +54,7 @@ def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys)
     with signals.stop_requests() as stopped:
         assert not stopped()
         os.kill(os.getpid(), number)
-        assert stopped() and "with a checkpoint" in capsys.readouterr().err
+        assert stopped() == number and "with a checkpoint" in capsys.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
             sleep(1)

@@ -21,6 +21,18 @@ def test_writes_captures_that_can_be_read(tmp_path, capsys):
     assert "scene_10005" in capsys.readouterr().err
 
 
+def test_who_was_stopped_is_told_how_to_go_on(tmp_path, capsys):
+    small = ["--cameras", "4", "--frames", "1", "--size", "32"]
+    assert main(["studio", str(tmp_path), *small, "--seed", "10005"]) == 0
+    left = tmp_path / f".scene_10006.unfinished-{2**22 + 1}"
+    left.mkdir()
+    assert main(["studio", str(tmp_path), *small, "--seed", "10005", "--scenes", "3"]) == 2
+    assert "go on with --seed 10006 --scenes 2, or choose another folder" in capsys.readouterr().err
+    assert not left.exists()
+    assert main(["studio", str(tmp_path), *small, "--seed", "10004", "--scenes", "2"]) == 2
+    assert "choose another --seed or folder" in capsys.readouterr().err, "it has not begun there"
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -1,6 +1,7 @@
 """Resumable, in processes as serially, and failures are shown."""
 
 import json
+import os
 import pickle
 import shutil
 import signal
@@ -154,6 +155,32 @@ def test_each_method_is_asked_for_what_it_is_made_for(small_scenes, tmp_path, mo
     assert unfilled.psnr_whole == whole[1]["s1", "unfilled"].frames[0].psnr_whole
     assert (black.psnr_whole < unfilled.psnr_whole) == (rule is None), "its own rule asks for what is coloured, too"
     assert (black.hole_px, black.psnr_whole_rendered) == (unfilled.hole_px, unfilled.psnr_whole_rendered)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_workers_leave_when_their_parent_is_killed():
+    script = (
+        "import os, time; from viewmend.evaluation.runner import process_pool; pool = process_pool(1, 1); "
+        "print(pool.submit(os.getpid).result(), flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        parent.kill()
+    end = time.monotonic() + 30
+    while runs(worker) and time.monotonic() < end:
+        time.sleep(0.05)
+    if runs(worker):
+        os.kill(worker, signal.SIGKILL)
+        pytest.fail("it waits for work that nobody will give it")
+
+
+def runs(process):
+    """Whether it is there and no zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_a_scene_that_fails_is_shown_for_every_method(small_scenes, tmp_path):

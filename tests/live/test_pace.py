@@ -1,10 +1,16 @@
 """Several viewers who ask for the largest pictures wait seconds, not minutes."""
 
+import threading
+import time
+from math import sqrt
+
 import pytest
 import torch
+from live_servers import running
 from reference.ball import ring
 
 from viewmend.live.budget import FULL, QualityLevel
+from viewmend.live.client import Client
 from viewmend.live.clock import Span
 from viewmend.live.pace import LONGEST_S, Pace
 from viewmend.live.poses import rig_frame
@@ -48,13 +54,42 @@ def test_what_costs_more_is_smaller_and_the_slowest_of_late_counts():
     assert pace.bounded(MOVING, LARGEST, 8) == MOVING
 
 
-@pytest.mark.parametrize(("waiting", "side"), [(1, 1448), (8, 724)])
+@pytest.mark.parametrize(("waiting", "side"), [(1, 1448), (8, round(1448 * sqrt(LONGEST_S / (8 * 2.0))))])
 def test_a_session_draws_what_all_have_time_for(waiting, side):
     session = ViewerSession(lambda message: None, lambda message: None, None)
     session.look(Look(width=1448, height=1448, adaptive=False))
     frame, pace = rig_frame(ring(4), torch.zeros(3), None), paced(2.0, FULL)
     request = session.next_request(1000.0, Playback(Span(0, 20, 20, 10.0), 0.0, frame, lambda at: True, waiting, pace))
-    assert request is not None and request.cameras[0].size_px[0].tolist() == [side, side]
+    assert request is not None and request.cameras[0].size_px[0].tolist() == pytest.approx([side, side], abs=1)
+
+
+def test_eight_viewers_at_their_limits_wait_for_seconds(monkeypatch):
+    """Of a machine that takes three seconds for the largest picture: 24 s for eight."""
+    waits = []
+
+    def look(url):
+        with Client(url, timeout_s=60) as viewer:
+            barrier.wait(60)
+            for azimuth in (0.0, 90.0):
+                began = time.monotonic()
+                viewer.frame(viewer.look(camera={"azimuth": azimuth}, width=1448, height=1448, adaptive=False))
+                waits.append(time.monotonic() - began)
+
+    with running(limits=Limits(viewers=8)) as server:
+        render = server.service.renderer.render
+
+        def slowly(request, viewer):
+            time.sleep(3.0 * sum(int(camera.size_px.prod()) for camera in request.cameras) / LARGEST)
+            return render(request, viewer)
+
+        monkeypatch.setattr(server.service.renderer, "render", slowly)
+        barrier = threading.Barrier(8)
+        threads = [threading.Thread(target=look, args=(server.ws,)) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(waits) == 16 and max(waits) < 15, sorted(waits)
 
 
 def test_who_waits_for_a_picture_is_counted():

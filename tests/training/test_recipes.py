@@ -1,6 +1,7 @@
 """Recipes state models that exist; what cannot be is refused."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
@@ -33,6 +34,13 @@ def test_recipes_state_models_that_exist_and_losses_that_fit(plan):
     assert RECIPES["paper"](plan).loss == LossWeights(adversarial=0.01, channels="sum", outside="image"), (
         "the paper's objective, exactly"
     )
+
+
+def test_readers_learn_from_subjects_of_every_size(plan):
+    for name in ("small_rays", "views"):
+        sizes = RECIPES[name](plan).data.sizes_px
+        steps = [larger / smaller for smaller, larger in pairwise(sizes)]
+        assert len(sizes) == 4 and all(1 < step < 1.5 for step in steps), f"{name}: {sizes} leaves sizes out"
 
 
 @pytest.mark.parametrize(

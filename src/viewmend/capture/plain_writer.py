@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from viewmend.atomic_writes import is_running, naming
+from viewmend.atomic_writes import is_running, naming, undisturbed
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import write_depth, write_image
 from viewmend.capture.plain_format import (
@@ -69,9 +69,7 @@ def whole_folder(out: Path | str) -> Iterator[Path]:
         )
     out.parent.mkdir(parents=True, exist_ok=True)
     unfinished = out.parent / f".{out.name}.unfinished-{os.getpid()}"
-    for left in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
-        if not is_running(left.name.rpartition("-")[2]):
-            shutil.rmtree(left, ignore_errors=True)
+    remove_unfinished(out)
     try:
         with naming(out):
             yield unfinished
@@ -79,7 +77,15 @@ def whole_folder(out: Path | str) -> Iterator[Path]:
             out.rmdir()
         unfinished.rename(out)
     finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+        with undisturbed():
+            shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def remove_unfinished(out: Path) -> None:
+    """Remove what killed runs have left of this folder beside it."""
+    for left in out.parent.glob(f".{escape(out.name)}.unfinished-*"):
+        if not is_running(left.name.rpartition("-")[2]):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 class _Writer:

@@ -27,18 +27,18 @@ def ended_by_sigterm() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stop_requests() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or SIGTERM asked for the end of what goes on in steps; asked once more, it ends at once."""
-    asked = threading.Event()
+def stop_requests() -> Iterator[Callable[[], int]]:
+    """Which of Ctrl-C and SIGTERM asked for the end of what goes on in steps, 0 for none; once more ends it at once."""
+    asked: list[int] = []
 
     def ask(number: int, _: object) -> None:
-        if asked.is_set():
+        if asked:
             raise KeyboardInterrupt
-        asked.set()
+        asked.append(number)
         say("stopping after this step, with a checkpoint; once more to stop at once, with the last one")
 
     with _handled(ask, signal.SIGINT, signal.SIGTERM):
-        yield asked.is_set
+        yield lambda: sum(asked)
 
 
 @contextlib.contextmanager

@@ -47,16 +47,18 @@ def run(options: Options) -> int:
         name = wrong[0]
         raise ValueError(f"expected --{name} of at least {least[name]}, got {getattr(options, name)}; see --help")
     from viewmend.capture.errors import CaptureError
-    from viewmend.capture.plain_writer import write_capture
+    from viewmend.capture.plain_writer import remove_unfinished, write_capture
     from viewmend.cli.console import print_json, say, track
     from viewmend.studio.imperfections import Imperfections
     from viewmend.studio.stage import Studio, StudioConfig
 
     seeds = range(options.seed, options.seed + options.scenes)
     folders = [options.out / f"scene_{seed:05d}" for seed in seeds]
-    taken = [folder for folder in folders if folder.exists()]
-    if taken:
-        raise CaptureError(f"{taken[0]}: expected no such folder, it exists; choose another --seed or folder")
+    for folder in folders:
+        remove_unfinished(folder)
+    if any(taken := [folder.exists() for folder in folders]):
+        first = folders[taken.index(True)]
+        raise CaptureError(f"{first}: expected no such folder, it exists; {_advice(options, taken)}")
     report = []
     for seed, folder in zip(seeds, folders, strict=True):
         config = StudioConfig(
@@ -77,3 +79,11 @@ def run(options: Options) -> int:
     if options.json:
         print_json({"captures": report})
     return 0
+
+
+def _advice(options: Options, taken: list[bool]) -> str:
+    """What to do where captures exist: whoever was stopped goes on with the first that is not there."""
+    done = taken.index(False) if False in taken else len(taken)
+    if done in (0, len(taken)) or any(taken[done:]):
+        return "choose another --seed or folder"
+    return f"go on with --seed {options.seed + done} --scenes {len(taken) - done}, or choose another folder"

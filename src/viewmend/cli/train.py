@@ -62,12 +62,12 @@ def run(options: Options) -> int:
             say(f"{fitting} of {count} tensors begin as {begun} has them, the others at random")
     with _Reporter(recipe.steps) as reporter, stop_requests() as stopped:
         try:
-            train(recipe, options.out, start, reporter.report, kind, stopped)
+            train(recipe, options.out, start, reporter.report, kind, lambda: stopped() > 0)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
-    if stopped():
+    if number := stopped():
         say(f"{options.out}: stopped after step {reporter.last}, which is kept; the same command goes on from there")
-        return 130
+        return 128 + number
     if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
         say(f"wrote {options.out}" if reporter.steps else f"{options.out}: this run was finished before; nothing to do")
     return 0

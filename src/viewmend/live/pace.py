@@ -6,8 +6,9 @@ from math import sqrt
 
 from viewmend.live.budget import QualityLevel
 
-LONGEST_S = 4.0
-"""All who wait for a picture, one after the other, are served within so many seconds, as far as can be told."""
+LONGEST_S = 2.5
+"""All who wait for a picture, one after the other, are served within so many seconds, as far as can be told: twice as
+long where what is known comes late, or other programs take half of the machine."""
 LEAST_PX = 20_000
 """Smaller pictures say little about large ones: what no resolution changes is most of their time."""
 UNKNOWN_S_PER_PX = 3e-6

@@ -135,8 +135,8 @@ def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random, left_out: str 
         )
     if not ends:
         raise ValueError(
-            f"expected {plan.clip_length} consecutive times for clips, got {times}; leave --clip-length away, or use "
-            f"captures of {max(plan.times) + 1} frames or more"
+            f"expected {plan.clip_length} consecutive times for clips, got {times}; leave --clip-length away, give so "
+            f"many consecutive --times, or use captures of {max(plan.times) + 1} frames or more"
         )
     names = [n for n in rig.frames[times[-1]].cameras.names if n not in dropped.get(times[-1], ())]
     names = names if left_out is None else [name for name in names if name == left_out]
