@@ -68,8 +68,8 @@ def test_eight_viewers_at_their_limits_wait_for_seconds(monkeypatch):
     waits = []
 
     def look(url):
-        with Client(url, timeout_s=60) as viewer:
-            barrier.wait(60)
+        with Client(url, timeout_s=60.0) as viewer:
+            barrier.wait(60.0)
             for azimuth in (0.0, 90.0):
                 began = time.monotonic()
                 viewer.frame(viewer.look(camera={"azimuth": azimuth}, width=1448, height=1448, adaptive=False))
