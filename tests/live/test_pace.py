@@ -12,7 +12,7 @@ from reference.ball import ring
 from viewmend.live.budget import FULL, QualityLevel
 from viewmend.live.client import Client
 from viewmend.live.clock import Span
-from viewmend.live.pace import LONGEST_S, Pace
+from viewmend.live.pace import ALONE_S, LONGEST_S, Pace
 from viewmend.live.poses import rig_frame
 from viewmend.live.protocol import Limits, Look
 from viewmend.live.sessions import Playback, ViewerSession
@@ -40,8 +40,14 @@ def test_eight_who_wait_are_served_within_seconds(seconds):
 def test_one_viewer_and_quick_pictures_are_as_large_as_they_like():
     assert paced(60.0).bounded(FULL, LARGEST, 1) == FULL
     assert paced(0.01).bounded(MOVING, LARGEST, 8) == MOVING
-    assert Pace().bounded(FULL, 320 * 320, 8) == FULL, "of a machine that nothing is known of"
+    assert Pace().bounded(FULL, 320 * 320, 4) == FULL, "of a machine that nothing is known of"
     assert Pace().bounded(MOVING, LARGEST, 8).scale < 1
+
+
+def test_who_looks_on_may_ask_next():
+    alone = paced(3.0).bounded(MOVING, LARGEST, 1, company=True)
+    assert 3.0 * alone.scale**2 == pytest.approx(ALONE_S)
+    assert paced(0.9).bounded(MOVING, LARGEST, 1, company=True) == MOVING
 
 
 def test_what_costs_more_is_smaller_and_the_slowest_of_late_counts():

@@ -143,10 +143,10 @@ class RenderService:
 
     def _next_request(self, now: float, span: Span, rig_frame: RigFrame) -> tuple[Session, RenderRequest] | None:
         """The request of the session that has waited longest, which then is the last in turn."""
-        viewers = (session for session in self._sessions if isinstance(session, ViewerSession))
+        viewers = [session for session in self._sessions if isinstance(session, ViewerSession)]
         active = max(1, sum(viewer.is_active(now) for viewer in viewers))
         has_frame = lambda at: self.supply.read(at) is not None  # noqa: E731
-        playback = Playback(span, self.edge, rig_frame, has_frame, active, self._pace)
+        playback = Playback(span, self.edge, rig_frame, has_frame, active, self._pace, len(viewers) > 1)
         for session in list(self._sessions):
             try:
                 request = session.next_request(now, playback)

@@ -36,6 +36,8 @@ class Playback:
     """Viewers that a frame was sent to within the last second, or who wait for one, this one included."""
     pace: Pace = field(default_factory=Pace)
     """How long pictures take."""
+    company: bool = False
+    """Whether there is more than one viewer, whether they wait for a view or not."""
 
 
 @runtime_checkable
@@ -154,7 +156,7 @@ class ViewerSession:
         if is_new and not is_new_look and self.clock.playing:
             self.dropped += max(0, at - self._shown[1] - 1)
         self._level, self._full = level, level == FULL
-        self.drawn = playback.pace.bounded(level, look.pixels, playback.active_viewers)
+        self.drawn = playback.pace.bounded(level, look.pixels, playback.active_viewers, playback.company)
         self._wait_ms = max(0.0, 1000 * (now - self._look_at)) if is_new_look else 0.0
         self._shown = (look, at)
         return self._request(look, at, playback.rig_frame)
