@@ -2,9 +2,7 @@
 
 import torch
 
-from viewmend import Evidence, RenderConfig, Stream, StreamConfig, make_method
-from viewmend.baselines.classical import Telea
-from viewmend.rendering.error_rules import ERROR_RULES, unseen
+from viewmend import Evidence, RenderConfig, Stream, StreamConfig, error_rule, make_method
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -15,19 +13,7 @@ THRESHOLD = 0.05
 def disagreement(evidence: Evidence) -> torch.Tensor:
     """E (height, width): what no source view colours, and where those that do disagree."""
     wrong = (evidence.blend.disagreement > THRESHOLD) * evidence.mask
-    return torch.maximum(unseen(evidence), wrong)
-
-
-ERROR_RULES["disagreement"] = disagreement
-
-
-class Careful(Telea):
-    """OpenCV's fill wherever the rule asks: commands take it as examples/new_error_rule.py:Careful."""
-
-    error_rule = "disagreement"
-
-    def __init__(self, device: str) -> None:
-        """Methods in a file are made from the device."""
+    return torch.maximum(error_rule("unseen")(evidence), wrong)
 
 
 def missing(rule: str) -> float:
@@ -40,4 +26,4 @@ def missing(rule: str) -> float:
 
 
 if __name__ == "__main__":
-    print({rule: round(missing(rule), 3) for rule in ("unseen", "disagreement")})
+    print({rule: round(missing(rule), 3) for rule in ("unseen", "all", f"{__file__}:disagreement")})

@@ -1,8 +1,7 @@
 """All inpainters by name, for every command: entries of `METHODS`, baselines, classes in files, models' folders."""
 
 import hashlib
-import importlib.util
-import sys
+import importlib
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 
 from viewmend.inpainting.checkpoint import load_inpainter, shipped_models
 from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.python_files import from_file
 
 REFERENCE = "telea"
 """Tables show how much better than this one every other is."""
@@ -82,7 +82,7 @@ def make_method(name: str, device: str = "cpu", precision: str = "auto") -> View
     if name in shipped_models() or Path(name).is_dir():
         return load_inpainter(name, device, precision)
     if ".py:" in name:
-        make = _from_file(name)
+        make = cast(Callable[[str], ViewInpainter], from_file(name))
         try:
             signature(make).bind(device)
         except TypeError as error:
@@ -122,29 +122,6 @@ def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[st
         except MethodMissing as error:
             missing[name] = str(error)
     return tuple(name for name in names if name not in missing), missing
-
-
-def _from_file(name: str) -> Callable[[str], ViewInpainter]:
-    """NAME of FILE.py:NAME; its module's name has the file's hash, so that a changed file is another method."""
-    file, _, wanted = name.rpartition(":")
-    path = Path(file)
-    if not path.is_file():
-        raise ValueError(f"expected FILE.py:NAME, got '{name}', and there is no such file; check the path")
-    module_name = f"{path.stem}_{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
-    if module_name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(module_name, path)
-        assert spec is not None and spec.loader is not None, "the suffix is .py"
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[module_name] = module  # before it runs: dataclasses look their module up
-        try:
-            spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[module_name]
-            raise
-    make = getattr(sys.modules[module_name], wanted, None)
-    if not callable(make):
-        raise ValueError(f"expected '{wanted}' in {path} to be a class or a function, found none; check FILE.py:NAME")
-    return cast(Callable[[str], ViewInpainter], make)
 
 
 def identity(inpainter: object) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 NAMED = re.compile(r"`([\w/]+\.py)(?:: (\w+))?`(?: \| `(.+)` \|$)?", re.MULTILINE)
-"""A file, a name in it, and in the table of equations a line of that."""
+"""A file, a name in it, and in the table of equations a line of that, or two."""
 
 
 def sources_of(path: Path) -> dict[str, str]:
@@ -18,13 +18,21 @@ def sources_of(path: Path) -> dict[str, str]:
     return found
 
 
+def stands(part: str, source: str) -> bool:
+    """Whether it is in a line of the source, and does not break off within a sum."""
+    ends = (line.partition(part)[2].lstrip() for line in source.splitlines() if part in line)
+    return any(not end.startswith(("+", "-")) for end in ends)
+
+
 def wrong(text: str) -> list[str]:
     """What a map names, and is not in src."""
     found = []
     for file, name, line in NAMED.findall(text):
         path = ROOT / "src/viewmend" / file
         sources = sources_of(path) if path.is_file() else {}
-        if not path.is_file() or (name and (name not in sources or line not in sources[name])):
+        lines = line.split("`, `") if line else []
+        there = all(stands(part, sources.get(name, "")) for part in lines)
+        if not path.is_file() or (name and name not in sources) or not there:
             found.append(f"{file}: {name}")
     return found
 
@@ -52,5 +60,9 @@ def test_a_renamed_function_is_seen():
 def test_a_changed_line_is_seen():
     row = "| 2 | 1 | x | `inpainting/decoder.py: blend` | `mended = error` |"
     assert wrong(row) == [] == without_a_line(row)
+    part = (
+        "| 22 | 8 | L | `training/objective.py: Objective` | `total = weights.image * (image.inside + image.outside)` |"
+    )
+    assert wrong(part) == ["training/objective.py: Objective"], "the sum goes on"
     assert wrong(row.replace("mended = error", "mended = E")) == ["inpainting/decoder.py: blend"]
     assert without_a_line("| 2 | 1 | x | `inpainting/decoder.py: blend` |")

@@ -70,6 +70,44 @@ def test_an_unknown_rule_is_named():
         error_rule("unsen")
 
 
+OWN_RULES = """
+from viewmend import error_rule
+unseen = error_rule("unseen")
+soft = lambda evidence: unseen(evidence).clamp_min(0.5)
+thrice = lambda evidence: 3 * unseen(evidence)
+boolean = lambda evidence: unseen(evidence) > 0
+rows = lambda evidence: unseen(evidence)[1:]
+nothing = lambda evidence: 0 * unseen(evidence)
+no_number = lambda evidence: unseen(evidence) / 0
+none = lambda evidence: None
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "got"),
+    [
+        ("soft", None),
+        ("thrice", "values from 0 to 3"),
+        ("boolean", "torch.bool"),
+        ("rows", r"float32 of shape \(95, 96\)"),
+        ("nothing", r"less on \d+ pixels that no source view colours"),
+        ("no_number", "values from nan"),
+        ("none", "NoneType"),
+        ("lost", "to be a class or a function, found none"),
+    ],
+)
+def test_what_a_rule_of_ones_own_gives_is_looked_at(tmp_path, name, got):
+    (tmp_path / "own.py").write_text(OWN_RULES)
+    frame, target = photograph(ring(12)[[0]]), camera_at(45, "t", 96)
+    if got is not None:
+        with pytest.raises(ValueError, match=got):
+            render_view(frame, BALL, target, RenderConfig(cameras=1, error_rule=f"{tmp_path / 'own.py'}:{name}"))
+        return
+    view = render_view(frame, BALL, target, RenderConfig(cameras=1, error_rule=f"{tmp_path / 'own.py'}:{name}"))
+    unseen = render_view(frame, BALL, target, RenderConfig(cameras=1)).error
+    assert torch.equal(view.error, unseen.clamp_min(0.5)) and 0 < float(unseen.mean()) < 1
+
+
 def test_excluded_cameras_leave_no_trace():
     frame, target = photograph(ring(6)), camera_at(60, "t")
     config = RenderConfig()

@@ -32,7 +32,7 @@ class Options:
     """Cameras of the ring."""
     error_rule: str | None = None
     """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject; 'wrong', what a model takes
-    for wrong. By default what the model is made for."""
+    for wrong; or FILE.py:NAME. By default what the model is made for."""
     wrong_fraction: float = 0.15
     """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     model: str | None = None

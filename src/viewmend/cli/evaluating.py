@@ -42,8 +42,8 @@ class RunOptions:
     """How many of these colour a view: the closest to it."""
     error_rule: str | None = None
     """What all methods are asked to mend: 'unseen', the pixels that no camera colours; 'all' of the subject, which is
-    for methods that keep by themselves what is right; 'wrong', what a model takes for wrong. By default each is asked
-    for what it is made for. Scores in the holes are of the same pixels by every rule."""
+    for methods that keep by themselves what is right; 'wrong', what a model takes for wrong; or FILE.py:NAME. By
+    default each is asked for what it is made for. Scores in the holes are of the same pixels by every rule."""
     wrong_fraction: float = 0.15
     """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     frames: int | None = None

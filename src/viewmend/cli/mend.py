@@ -45,7 +45,8 @@ class Options:
     """How many cameras colour a view and are the inpainter's context."""
     error_rule: str | None = None
     """What is mended: 'unseen', the pixels that no camera colours; 'all' of the subject, for models that keep by
-    themselves what is right; 'wrong', what a model takes for wrong. By default what the model is made for."""
+    themselves what is right; 'wrong', what a model takes for wrong; or a rule of your own, FILE.py:NAME. By default
+    what the model is made for."""
     wrong_fraction: float = 0.15
     """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     model: str | None = None
@@ -128,7 +129,8 @@ def _in_words(summary: "MendSummary") -> list[str]:
     iou = [value for values in summary.hull_iou.values() for value in values]
     lines = [
         f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
-        f"of the hull's pixels; hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}",
+        f"of the hull's pixels, {100 * (summary.mended_fraction or 0):.2f} % asked to be mended; "
+        f"hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}",
         "a frame takes " + ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items()),
     ]
     if summary.mean("ours", "psnr_whole") is None:

@@ -169,12 +169,17 @@ class MendSummary:
         """The holes' share of the hull's pixels; None without a hull."""
         return self._holes_px / self._hull_px if self._hull_px else None
 
+    @property
+    def mended_fraction(self) -> float | None:
+        """The share of the hull's pixels with E > 0; None without a hull."""
+        return self._mended_px / self._hull_px if self._hull_px else None
+
     def as_json(self) -> dict[str, object]:
         """The scores; null where there are no such pixels, or no truth. Times are medians, milliseconds."""
         return {
             "frames": self.frames,
             "hole_fraction": self.hole_fraction,
-            "mended_fraction": self._mended_px / self._hull_px if self._hull_px else None,
+            "mended_fraction": self.mended_fraction,
             "psnr_whole": self.mean("ours", "psnr_whole"),
             "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
             "psnr_whole_unseen": self.mean("unseen", "psnr_whole"),

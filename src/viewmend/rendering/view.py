@@ -11,7 +11,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering.blending import BlendConfig, blend
-from viewmend.rendering.error_rules import MIN_WEIGHT, Evidence, error_rule
+from viewmend.rendering.error_rules import MIN_WEIGHT, Evidence, error_map, error_rule
 from viewmend.rendering.selection import select_closest
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
@@ -64,7 +64,7 @@ def render_view(
         source_depth: the proxy's depth in cameras, for callers that remember it; by default it is rendered here.
 
     Raises:
-        ValueError: no camera is left to colour the view.
+        ValueError: no camera is left to colour the view, or an error rule of one's own does not give E.
     """
     usable = _without(frame.cameras, exclude)
     source_depth = source_depth or (lambda names: proxy.depth(frame.cameras.select(names)))
@@ -80,7 +80,7 @@ def render_view(
     bias_m = config.blend.depth_bias * float(proxy.bounds.size_m.norm())
     blended = blend(target, depth, normals, sources, bias_m, config.blend)
 
-    error = error_rule(config.error_rule or "unseen")(Evidence(mask, depth, blended))
+    error = error_map(config.error_rule or "unseen", Evidence(mask, depth, blended))
     coloured = mask * (blended.weights.sum(0) >= MIN_WEIGHT)
     weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
     seen = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)

@@ -1,0 +1,36 @@
+"""Classes and functions of a user's own Python file, named FILE.py:NAME on the command line."""
+
+import hashlib
+import importlib.util
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+def from_file(name: str) -> Callable[..., object]:
+    """NAME of FILE.py:NAME, a class or a function.
+
+    Its module's name has the file's hash, so that a changed file is another module.
+
+    Raises:
+        ValueError: there is no such file, or nothing of that name to call in it.
+    """
+    file, _, wanted = name.rpartition(":")
+    path = Path(file)
+    if not path.is_file():
+        raise ValueError(f"expected FILE.py:NAME, got '{name}', and there is no such file; check the path")
+    module_name = f"{path.stem}_{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+    if module_name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(module_name, path)
+        assert spec is not None and spec.loader is not None, "the suffix is .py"
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[module_name] = module  # before it runs: dataclasses look their module up
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[module_name]
+            raise
+    make = getattr(sys.modules[module_name], wanted, None)
+    if not callable(make):
+        raise ValueError(f"expected '{wanted}' in {path} to be a class or a function, found none; check FILE.py:NAME")
+    return make
