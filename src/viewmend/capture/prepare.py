@@ -1,8 +1,9 @@
 """A capture as everybody looks at it: opened, aligned on its input cameras alone, images no larger than wanted.
 
 `mend`, `serve`, evaluation and training all take their frames from here, so that they see the same pixels. Colours
-stay as the files store them: 8 bit RGB. What is wrong with a capture is refused, or said once through the logger
-`viewmend`; Python prints that to standard error unless a program arranges otherwise.
+are 8 bit RGB, as the files store them or as cameras that disagree were matched. What is wrong with a capture is
+refused, or said once through the logger `viewmend`; Python prints that to standard error unless a program arranges
+otherwise.
 """
 
 import logging
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from viewmend.capture.colour_match import ColourMatch, colour_match
 from viewmend.capture.diagnosis import diagnose, faulty_masks
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.finding import Finding
@@ -35,6 +37,8 @@ class PreparedCapture(OfSource):
     """Cameras that may be looked at; None for all."""
     left_out: tuple[str, ...] = ()
     """Cameras that disagree with all others, and are absent from every frame."""
+    colours: ColourMatch | None = None
+    """How the input cameras' colours are matched; None where they stay as they are."""
     _said: set[str] = field(default_factory=set, compare=False, repr=False)
 
     @property
@@ -61,7 +65,8 @@ class PreparedCapture(OfSource):
                 f"{self.name}: expected one right mask or more, got none at {self.frame_ids[time]}; redo it"
             )
         frame = reduced(frame.without(wrong), self.longest_px)
-        return replace(frame, cameras=self.cameras.select(frame.cameras.names))
+        frame = replace(frame, cameras=self.cameras.select(frame.cameras.names))
+        return frame if self.colours is None else self.colours.matched(frame)
 
 
 def prepare(
@@ -70,6 +75,7 @@ def prepare(
     *,
     longest_px: int | None = None,
     align: bool = True,
+    match_colours: bool = True,
     first: int = 0,
 ) -> PreparedCapture:
     """Align a capture and say how large its images may be.
@@ -82,6 +88,8 @@ def prepare(
         align: look for a shift that all images share, in the masks of the first frame from `first` on that two inputs
             with any foreground are in, and for a camera that is late, in the frames around it. The shift is found at
             full size.
+        match_colours: match the inputs' colours, by the same frame, where they then agree better on surface that
+            nothing was fitted to.
         first: index of the first frame that will be used.
 
     Raises:
@@ -109,7 +117,15 @@ def prepare(
         _refuse_or_warn(source.name, late_camera(*_around(source, frame), source.bounds), said)
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
-    return PreparedCapture(source, alignment, longest_px, named, left_out, said)
+    prepared = PreparedCapture(source, alignment, longest_px, named, left_out, None, said)
+    return _matched(prepared, frame) if match_colours else prepared
+
+
+def _matched(prepared: PreparedCapture, frame: MultiViewFrame) -> PreparedCapture:
+    """With colours matched by this frame of the input cameras, where that helps."""
+    cameras = replace(prepared, longest_px=None).cameras.select(frame.cameras.names)
+    colours = colour_match(replace(frame, cameras=cameras), prepared.bounds)
+    return replace(prepared, colours=colours) if colours is not None and colours.helps else prepared
 
 
 def _refuse_or_warn(where: str, found: Sequence[Finding], said: set[str]) -> None:

@@ -145,7 +145,7 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     capture = open_masked(options.source, kind=options.kind)
     times = chosen_times(options.frames, len(capture.frame_ids))
     count = min(options.times, len(times))
-    prepared = prepare(capture, first=times[0])
+    prepared = prepare(capture, match_colours=False, first=times[0])
     read = [prepared.read(times[len(times) * number // count]) for number in range(count)]
     most = max((frame.cameras.names for frame in read), key=len)
     frames = [frame for frame in read if frame.cameras.names == most]

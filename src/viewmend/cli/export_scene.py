@@ -9,6 +9,8 @@ import tyro
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from viewmend.capture.prepare import PreparedCapture
+    from viewmend.capture.source import CaptureSource
     from viewmend.geometry.cameras import Cameras
     from viewmend.observation import Observation
 
@@ -43,6 +45,8 @@ class Options:
     """Pixels less sure than this are no points, 0 to 1, where the model tells."""
     align: bool = True
     """Take the calibration as it is; by default a shift that all images share is undone."""
+    match_colours: bool = True
+    """Leave the cameras' colours as they are; by default they are matched, as `viewmend mend` does."""
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
 
@@ -55,8 +59,7 @@ def run(options: Options) -> int:
             f"{options.least_confidence}; choose again"
         )
     from viewmend.capture.prefetch import prefetch
-    from viewmend.capture.prepare import open_masked, prepare
-    from viewmend.cli.alignment import say_alignment
+    from viewmend.capture.prepare import open_masked
     from viewmend.cli.checks import chosen_times, load_named
     from viewmend.cli.console import say, track
     from viewmend.export.depth_files import demand_openexr
@@ -70,8 +73,7 @@ def run(options: Options) -> int:
     stream = Stream(load_named(options.model, options.device), bounds=opened.bounds)
     with OutputFolder(options.out) as folder:
         folder.demand_own(*RESULTS)
-        capture = prepare(opened, longest_px=options.longest_px, align=options.align, first=times[0])
-        say_alignment(capture.alignment)
+        capture = _prepared(options, opened, times[0])
         first = stream.push(capture.read(times[0]).to(options.device))
         views = _views(options, first, capture.cameras, capture.up)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))
@@ -92,6 +94,21 @@ def run(options: Options) -> int:
         f"{written.points} points"
     )
     return 0
+
+
+def _prepared(options: Options, opened: "CaptureSource", first: int) -> "PreparedCapture":
+    from viewmend.capture.prepare import prepare
+    from viewmend.cli.prepared import say_prepared
+
+    capture = prepare(
+        opened,
+        longest_px=options.longest_px,
+        align=options.align,
+        match_colours=options.match_colours,
+        first=first,
+    )
+    say_prepared(capture)
+    return capture
 
 
 def _views(options: Options, first: "Observation", rig: "Cameras", up: "Tensor | None") -> "Cameras":

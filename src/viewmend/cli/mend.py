@@ -59,6 +59,9 @@ class Options:
     align: bool = True
     """Take the calibration as it is. By default a shift of all images against it (a wrong convention for pixel
     centres, say) is looked for in the masks of the input cameras' first frame, and undone where they then agree."""
+    match_colours: bool = True
+    """Leave the cameras' colours as they are. By default those of the input cameras are matched to one another, by the
+    first frame, where they then agree better on surface that nothing was fitted to."""
     alpha: bool = False
     """Also cut the subject out: cutout/*.png, RGB and alpha (colours not multiplied by it), and cutout.webm, VP9 with
     alpha, where a film is written. Alpha is the proxy's mask where the model does not tell."""
@@ -86,10 +89,10 @@ def run(options: Options) -> int:
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     from viewmend.capture.prefetch import prefetch
     from viewmend.capture.prepare import prepare
-    from viewmend.cli.alignment import say_alignment
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import MendOutput
+    from viewmend.cli.prepared import say_prepared
     from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.inpainting.protocol import RenderQuality
     from viewmend.rendering.view import RenderConfig
@@ -102,8 +105,8 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; leave it away to keep all")
     inpainter = load_named(options.model, options.device)
     inputs = [name for name in opened.cameras.names if name not in held]
-    capture = prepare(opened, inputs, align=options.align, first=times[0])
-    say_alignment(capture.alignment)
+    capture = prepare(opened, inputs, align=options.align, match_colours=options.match_colours, first=times[0])
+    say_prepared(capture)
     mender = Mender(inpainter, render, capture.bounds, held, RenderQuality(top_k=options.top_k))
     summary = MendSummary()
     plan, frames, frame = _plan(options, capture, times), prefetch(capture, times), None

@@ -52,6 +52,8 @@ class Options:
     """The longest side of the cameras' images: larger ones are made smaller when they are read."""
     align: bool = True
     """Take a capture's calibration as it is. By default it is aligned as `viewmend mend` does."""
+    match_colours: bool = True
+    """Leave the cameras' colours as they are. By default they are matched as `viewmend mend` does."""
     context: int = 3
     """How many cameras colour a view and are the inpainter's context."""
     error_rule: str | None = None
@@ -159,7 +161,9 @@ def _supply(options: Options) -> "FrameSupply":
     if options.source.endswith(".toml"):
         from viewmend.live.rig_frames import RigFrames
 
-        return RigFrames(Path(options.source), options.fps, memory_mb, options.width, options.align)
+        return RigFrames(
+            Path(options.source), options.fps, memory_mb, options.width, options.align, options.match_colours
+        )
     made = options.source == "studio"
     return ReadAhead(_studio(options) if made else _capture(options), options.fps, generated=made, memory_mb=memory_mb)
 
@@ -174,7 +178,7 @@ def _studio(options: Options) -> "Callable[[], CaptureSource]":
         config = StudioConfig(
             seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
         )
-        return prepare(Studio(config), longest_px=options.width, align=False)
+        return prepare(Studio(config), longest_px=options.width, align=False, match_colours=False)
 
     return open_studio
 
@@ -182,8 +186,13 @@ def _studio(options: Options) -> "Callable[[], CaptureSource]":
 def _capture(options: Options) -> "Callable[[], CaptureSource]":
     """Prepares the capture, so that one that cannot be rendered is refused before anybody is told an address."""
     from viewmend.capture.prepare import open_masked, prepare
-    from viewmend.cli.alignment import say_alignment
+    from viewmend.cli.prepared import say_prepared
 
-    prepared = prepare(open_masked(options.source, kind=options.kind), longest_px=options.width, align=options.align)
-    say_alignment(prepared.alignment)
+    prepared = prepare(
+        open_masked(options.source, kind=options.kind),
+        longest_px=options.width,
+        align=options.align,
+        match_colours=options.match_colours,
+    )
+    say_prepared(prepared)
     return lambda: prepared

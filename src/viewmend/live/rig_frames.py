@@ -67,6 +67,7 @@ class RigFrames(LiveFrames):
         memory_mb: float = 500.0,
         longest_px: int | None = None,
         align: bool = True,
+        match_colours: bool = True,
     ) -> None:
         """Read the rig; its cameras are opened by `start`.
 
@@ -75,7 +76,7 @@ class RigFrames(LiveFrames):
         """
         super().__init__(fps, memory_mb)
         self.status = SourceStatus(error="waiting for the cameras")
-        self._path, self._longest_px, self._align = path, longest_px, align
+        self._path, self._longest_px, self._align, self._match = path, longest_px, align, match_colours
         self._lock_cameras = threading.Condition()
         self._playback = Playback()
         self._aligner = Aligner((), 1.0, 1.0, 1.0)
@@ -188,8 +189,8 @@ class RigFrames(LiveFrames):
         assert rig is not None, "the rig has begun"
         source = _OneTime(rig.name, self._cameras, rig.bounds, rig.up, frame)
         if self._prepared is None:
-            self._prepared = prepare(source, align=self._align)
-            self._say_alignment(self._prepared)
+            self._prepared = prepare(source, align=self._align, match_colours=self._match)
+            _say_prepared(self._prepared)
         self.spread_ms = 1000 * together.spread_s
         self.push(replace(self._prepared, source=source).read(0))
 
@@ -251,13 +252,16 @@ class RigFrames(LiveFrames):
         if lines:
             log.warning("in the last %.0f s: %s", REPORT_S, "; ".join(lines))
 
-    def _say_alignment(self, prepared: PreparedCapture) -> None:
-        """Say by how much all images are shifted against the calibration."""
-        found = prepared.alignment
-        if found is not None and found.offset_px != (0.0, 0.0):
-            x, y = found.offset_px
-            what = "all principal points moved by (%+.2f, %+.2f) pixels, IoU %.3f -> %.3f; --no-align leaves them"
-            log.warning(what, x, y, found.iou_before, found.iou_after)
+
+def _say_prepared(prepared: PreparedCapture) -> None:
+    """Say by how much all images are shifted against the calibration, and whether colours are matched."""
+    found = prepared.alignment
+    if found is not None and found.offset_px != (0.0, 0.0):
+        x, y = found.offset_px
+        what = "all principal points moved by (%+.2f, %+.2f) pixels, IoU %.3f -> %.3f; --no-align leaves them"
+        log.warning(what, x, y, found.iou_before, found.iou_after)
+    if prepared.colours is not None:
+        log.warning("%s", prepared.colours.said)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

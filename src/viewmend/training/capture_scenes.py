@@ -47,7 +47,9 @@ class CaptureScenes:
 
         def cameras(held: str) -> Cameras:
             if (which, held) not in self._prepared:  # aligned when this camera is first left out
-                self._prepared[which, held] = prepare(capture, [n for n in capture.cameras.names if n != held])
+                self._prepared[which, held] = prepare(
+                    capture, [n for n in capture.cameras.names if n != held], match_colours=False
+                )
             return replace(self._prepared[which, held], longest_px=size_px).cameras.to(self.plan.data_device)
 
         return rig_samples(LeaveOneOut(frames, capture.bounds, cameras), self.plan, random, self.left_out[which])

@@ -66,7 +66,9 @@ def _whole_scenes(plan: DataPlan, seed: str, split: Split) -> SceneSource[Sample
     if not (folders := recordings(split, plan.captures)):
         return studio
     opened = [own for folder in folders for own in _captures(folder)]
-    captures = [prepare(capture, align=False) for capture, _ in opened]  # which refuses the wrong ones
+    captures = [
+        prepare(capture, align=False, match_colours=False) for capture, _ in opened
+    ]  # which refuses the wrong ones
     return MixedScenes(
         CaptureScenes(captures, plan, seed, [held for _, held in opened]), studio, plan.captures_fraction, seed
     )

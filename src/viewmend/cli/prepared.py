@@ -1,11 +1,19 @@
-"""What is said of a shift that all images of a capture have against its calibration."""
+"""What is said of a capture as it was prepared: a shift of all its images, and matched colours."""
+
+from typing import TYPE_CHECKING
 
 from viewmend.cli.console import say
-from viewmend.geometry.alignment import LEAST_IOU, Alignment
+from viewmend.geometry.alignment import LEAST_IOU
+
+if TYPE_CHECKING:
+    from viewmend.capture.prepare import PreparedCapture
 
 
-def say_alignment(found: Alignment | None) -> None:
-    """Say by how much the images were shifted, and whether hull and masks agree at all."""
+def say_prepared(capture: "PreparedCapture") -> None:
+    """Say by how much the images were shifted, whether hull and masks agree at all, and whether colours are matched."""
+    if capture.colours is not None:
+        say(capture.colours.said)
+    found = capture.alignment
     if found is None:
         return
     if found.offset_px != (0.0, 0.0):

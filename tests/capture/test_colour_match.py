@@ -1,0 +1,102 @@
+"""Cameras of unlike colours are matched to one another; those that agree, and those left out, stay as they are."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+
+from viewmend.capture.colour_match import FEWEST_CAMERAS, colour_match
+from viewmend.capture.plain_writer import write_capture
+from viewmend.capture.prepare import prepare
+from viewmend.capture.source import OfSource
+from viewmend.cli import main
+from viewmend.studio.stage import Studio, StudioConfig
+
+CAMERAS = 8
+PRECISION, WORST = 0.012, 0.04
+"""Of a camera's gain in a channel, mean and worst; highlights and the hull alone are 0.009 and 0.018 of it."""
+
+
+class Tinted(OfSource):
+    """A studio whose cameras have gains of their own; the first shows grey if a test wants."""
+
+    def __init__(self, source, strength=0.2, spoiled=False):
+        self.source, self.spoiled = source, spoiled
+        random = torch.Generator().manual_seed(3)
+        gains = torch.exp(strength * torch.randn(len(source.cameras), 3, generator=random).clamp(-1.5, 1.5))
+        self.gains = gains / gains.mean(0)
+
+    def read(self, time):
+        frame = self.source.read(time)
+        rgb = (0.8 * frame.rgb * self.gains[..., None, None]).round().clamp(0, 255).to(torch.uint8)
+        if self.spoiled:
+            rgb[0] = rgb[0].float().mean(0, keepdim=True).to(torch.uint8)
+        return replace(frame, rgb=rgb)
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Studio(StudioConfig(seed=4, cameras=CAMERAS, frames=1, size_px=192))
+
+
+def gains_left(match, tinted):
+    """The gains of each camera for grey, after the match, beside the mean camera's."""
+    grey = 0.3 * tinted.gains.max()
+    values = torch.cat([grey * tinted.gains, torch.ones(CAMERAS, 1)], 1)
+    left = torch.einsum("vck,vk->vc", match.maps, values) / grey
+    return left / left.mean(0)
+
+
+def test_known_gains_are_recovered(studio):
+    tinted = Tinted(studio)
+    match = colour_match(tinted.read(0), studio.bounds)
+    assert match.helps and match.after < 0.5 * match.before
+    off, given = ((gains - 1).abs() for gains in (gains_left(match, tinted), tinted.gains))
+    assert given.mean() > 0.08 and off.mean() < PRECISION and off.max() < WORST
+
+
+def test_the_mean_camera_stays(studio):
+    match = colour_match(Tinted(studio).read(0), studio.bounds)
+    assert torch.allclose(match.maps.mean(0), torch.eye(3, 4), atol=1e-4)
+
+
+def test_cameras_that_agree_stay_as_they_are(studio):
+    assert not colour_match(studio.read(0), studio.bounds).helps
+    prepared = prepare(studio, align=False)
+    assert prepared.colours is None and torch.equal(prepared.read(0).rgb, studio.read(0).rgb)
+
+
+def test_a_few_cameras_or_none_that_share_surface_are_left_alone(studio):
+    frame = Tinted(studio).read(0)
+    few = frame.select(frame.cameras.names[: FEWEST_CAMERAS - 1])
+    assert colour_match(few, studio.bounds) is None
+    assert colour_match(replace(frame, mask=None), studio.bounds) is None
+
+
+def test_a_camera_that_is_left_out_is_not_looked_at_and_stays(studio):
+    inputs = studio.cameras.names[1:]
+    clean, spoiled = (prepare(Tinted(studio, spoiled=s), inputs, align=False) for s in (False, True))
+    assert clean.colours is not None and torch.equal(clean.colours.maps, spoiled.colours.maps)
+    raw, matched = Tinted(studio).read(0), clean.read(0)
+    assert torch.equal(raw.rgb[0], matched.rgb[0]) and not torch.equal(raw.rgb[1:], matched.rgb[1:])
+    assert torch.equal(raw.mask, matched.mask)
+    assert torch.equal(prepare(Tinted(studio), inputs, align=False, match_colours=False).read(0).rgb, raw.rgb)
+
+
+def test_reduced_images_are_matched_alike(studio):
+    small = prepare(Tinted(studio), longest_px=64, align=False)
+    assert torch.equal(small.colours.maps, prepare(Tinted(studio), align=False).colours.maps)
+    full = torch.nn.functional.avg_pool2d(prepare(Tinted(studio), align=False).read(0).rgb.float(), 3)
+    assert (small.read(0).rgb.float() - full).abs().mean() < 1.0
+
+
+def test_mend_says_that_colours_are_matched(studio, tmp_path, capsys):
+    write_capture(Tinted(studio), tmp_path / "take", images="png")
+    take, out = str(tmp_path / "take"), str(tmp_path / "out")
+    arguments = ["mend", take, "--leave-out", studio.cameras.names[0], "--model", "telea", "--no-align", "--out", out]
+    assert main(arguments) == 0
+    assert "colours of 7 cameras are matched" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "out")
+    assert main([*arguments, "--no-match-colours"]) == 0
+    assert "matched" not in capsys.readouterr().err
