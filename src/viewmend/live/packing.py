@@ -58,7 +58,7 @@ def frame_message(
     parts, data = [], []
     for eye, completed in enumerate(result.completed):
         for mode in look.modes:
-            part, encoded = encoders.encode(picture(completed, mode), eye, mode, look, info.key)
+            part, encoded = encoders.encode(picture(completed, mode, look.background), eye, mode, look, info.key)
             parts.append(part)
             data.append(encoded)
         if look.depth:

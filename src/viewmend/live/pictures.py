@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from viewmend.inpainting.sweep.cells import rim_depth
+from viewmend.live.protocol import MENDED_MODES
 from viewmend.views import FAINT, CompletedView, IncompleteView
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -22,13 +23,22 @@ COARSEST_STRIDE = 4
 """Image pixels a depth pixel in longer pictures."""
 
 
-def picture(completed: CompletedView, mode: str) -> Picture:
-    """One of the protocol's modes as 8-bit RGB, on black.
+def picture(completed: CompletedView, mode: str, background: str = "000000") -> Picture:
+    """One of the protocol's modes as 8-bit RGB, on a background (hexadecimal RGB).
 
     rendered: F. holes: F with the pixels that no camera colours in pink, by any error rule. mended: Fhat. depth: near
     is bright. coverage: which camera coloured what, missing pixels pink. confidence: from violet, a guess, to
     yellow, sure; grey where the inpainter does not tell.
     """
+    shown = _on_black(completed, mode)
+    if background == "000000":
+        return shown
+    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask
+    bare = (1 - opacity.clamp(0, 1)).cpu().numpy()[..., None]
+    return np.minimum(255, np.rint(shown + bare * np.frombuffer(bytes.fromhex(background), np.uint8))).astype(np.uint8)
+
+
+def _on_black(completed: CompletedView, mode: str) -> Picture:
     view = completed.view
     if mode == "mended":
         return _eight_bit(completed.rgb)

@@ -47,6 +47,9 @@ Mode = Annotated[str, one_of(*MODES)]
 Rule = Annotated[str, one_of(*ERROR_RULES)]
 TopK = Annotated[int, Meta(ge=1, le=1_000_000)]
 Quality = Annotated[int, Meta(ge=30, le=95)]
+Colour = Annotated[str, Meta(pattern="^[0-9a-f]{6}\\Z")]
+"""Red, green and blue in hexadecimal."""
+BLACK = "000000"
 ShortText = Annotated[str, Meta(max_length=40)]
 
 
@@ -121,6 +124,8 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     key: bool = False
     """Begin video streams anew: the decoder has lost them."""
     quality: Quality = 85
+    background: Colour = BLACK
+    """What the pictures lie upon."""
 
     def __post_init__(self) -> None:
         force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))

@@ -30,6 +30,7 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
     mode: protocol.Mode = "mended"
     top_k: protocol.TopK | None = None
     error_rule: protocol.Rule | None = None
+    background: protocol.Colour = protocol.BLACK
 
 
 class PictureQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -129,7 +130,7 @@ class PictureJob(RenderJob[tuple[bytes, RenderResult]]):
 
     def encode(self, result: RenderResult) -> None:
         """Encode the picture."""
-        image = picture(result.completed[0], self._asked.mode)
+        image = picture(result.completed[0], self._asked.mode, self._asked.background)
         self.finish((to_jpeg(image, self._asked.quality), result))
 
 
@@ -143,6 +144,11 @@ class PathJob(RenderJob[bytes]):
         self._mp4 = BytesIO()
         self._video = VideoWriter(self._mp4, path.fps, threads=1)  # the render thread's own: none is left behind
 
+    @property
+    def progress(self) -> tuple[int, int]:
+        """How many views are done, and of how many."""
+        return self._count, len(self._path.poses)
+
     def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The next pose, once its frame has been read."""
         if self.done.done() or playback.span.end <= playback.span.first:
@@ -154,7 +160,7 @@ class PathJob(RenderJob[bytes]):
     def encode(self, result: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
         self.viewer: State | None = result.viewer
-        self._video.add(picture(result.completed[0], self._path.mode))
+        self._video.add(picture(result.completed[0], self._path.mode, self._path.background))
         self._count += 1
         if self._count == len(self._path.poses):
             self._video.close()

@@ -18,6 +18,7 @@ from viewmend.live.connection import SessionRegistry, ViewerConnection
 from viewmend.live.door import admit
 from viewmend.live.guard import Guard
 from viewmend.live.metrics_text import metrics_text
+from viewmend.live.originals import original_jpeg, parse_original
 from viewmend.live.page_files import HEADERS, page_files
 from viewmend.live.protocol import HEADER_BYTES, Limits, ProtocolError
 from viewmend.live.push import receive_rig
@@ -27,6 +28,7 @@ from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 
 PICTURE_S = 60.0
+ORIGINAL_S = 5.0
 EXPORT_S = 3600.0
 PICTURES_AT_ONCE = 4
 BODY_BYTES, BODY_S = 1_000_000, 10.0
@@ -56,6 +58,7 @@ class LiveServer:
         self._files = page_files()
         self._pictures = 0
         self._exporting = False
+        self._film: PathJob | None = None
         self._pushing = False
         about = {
             "server": f"viewmend {__version__}",
@@ -75,6 +78,8 @@ class LiveServer:
             Route("/health", self._guarded(self._health)),
             Route("/metrics", self._guarded(self._metrics)),
             Route("/frame.jpg", self._guarded(self._picture)),
+            Route("/camera.jpg", self._guarded(self._original)),
+            Route("/path", self._guarded(self._progress)),
             Route("/path.mp4", self._guarded(self._export), methods=["POST"]),
             WebSocketRoute("/ws", self._viewer),
             WebSocketRoute("/push", self._push),
@@ -151,6 +156,28 @@ class LiveServer:
         headers = {"Server-Timing": timing, "X-Viewmend-Time": str(result.time), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
 
+    async def _original(self, request: Request) -> Response:
+        asked = parse_original(dict(request.query_params))
+        if self._pictures >= PICTURES_AT_ONCE:
+            return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
+        supply, end = self._service.supply, time.monotonic() + ORIGINAL_S
+        at = int(supply.span.clamp(self._service.edge if asked.time == "live" else asked.time))
+        self._pictures += 1
+        try:
+            while (frame := supply.read(at)) is None:
+                if time.monotonic() > end:
+                    return _refusal(503, "the frame did not come in time; see /health")
+                await asyncio.sleep(0.05)
+            image = await asyncio.to_thread(original_jpeg, frame, asked.name)
+        finally:
+            self._pictures -= 1
+        headers = {"X-Viewmend-Time": str(at), "Cache-Control": "no-store"}
+        return Response(image, media_type="image/jpeg", headers=headers)
+
+    async def _progress(self, request: Request) -> Response:
+        done, of = (None, None) if self._film is None else self._film.progress
+        return JSONResponse({"done": done, "of": of}, headers={"Cache-Control": "no-store"})
+
     async def _export(self, request: Request) -> Response:
         if not can_write_mp4():
             return _refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
@@ -163,11 +190,12 @@ class LiveServer:
                 return _refusal(413, f"expected at most {BODY_BYTES} bytes")
             # On a thread: a megabyte of JSON takes its time.
             job = PathJob(await asyncio.to_thread(parse_path, body, self._config.limits))
+            self._film = job
             video = await self._wait(request, job, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
             return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
         finally:
-            self._exporting = False
+            self._exporting, self._film = False, None
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
     async def _wait(self, request: Request, job: RenderJob[Result], limit_s: float) -> Result:

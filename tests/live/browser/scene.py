@@ -85,6 +85,15 @@ def picture(rgb: np.ndarray, z: np.ndarray, points: np.ndarray, mode: str) -> np
     return np.where(hole[..., None], fill, rgb).astype(np.uint8)
 
 
+def original(name: str, time: int) -> np.ndarray:
+    """What a camera of the rig took: the scene before a green wall."""
+    camera = next(one for one in rig()["cameras"] if one["name"] == name)
+    fx, _, cx, _, fy, cy = camera["K"][:6]
+    lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    rgb, z, _ = render({**camera, **lens}, camera["width"], camera["height"], time)
+    return np.where((z > 0)[..., None], rgb, (20, 160, 60)).astype(np.uint8)
+
+
 def hole_share(z: np.ndarray, points: np.ndarray) -> float:
     seen = z > 0
     return float((seen & (np.abs(points[..., 1] - CENTER[1]) < 0.12)).sum() / max(1, seen.sum()))

@@ -61,6 +61,10 @@ class StandIn:
     broken: bool = False
     """True sends pictures that cannot be decoded."""
     frames: int = scene.FRAMES
+    film_hold: bool = False
+    """True lets films end half-way, and stay there."""
+    film: tuple[int | None, int | None] = (None, None)
+    originals: list[dict] = field(default_factory=list)
     looks: list[dict] = field(default_factory=list)
     clocks: list[dict] = field(default_factory=list)
     paths: list[dict] = field(default_factory=list)
@@ -70,6 +74,7 @@ class StandIn:
     def __enter__(self) -> "StandIn":
         self.files = page_files()
         routes = [Route("/", self._file), Route("/page/{name:path}", self._file)]
+        routes += [Route("/path", self._progress), Route("/camera.jpg", self._original)]
         routes += [Route("/path.mp4", self._film, methods=["POST"]), WebSocketRoute("/ws", self._viewer)]
         config = uvicorn.Config(
             Starlette(routes=routes), port=0, log_config=None, log_level="error", ws="websockets-sansio", lifespan="off"
@@ -105,7 +110,22 @@ class StandIn:
     async def _film(self, request: Request) -> Response:
         body = json.loads(await request.body())
         self.paths.append(body)
+        while self.film_hold:
+            self.film = (len(body["poses"]) // 2, len(body["poses"]))
+            await asyncio.sleep(0.05)
+            if await request.is_disconnected():
+                self.film = (None, None)
+                break
         return Response(await asyncio.to_thread(film, body), media_type="video/mp4")
+
+    async def _progress(self, request: Request) -> Response:
+        return JSONResponse(dict(zip(("done", "of"), self.film, strict=True)))
+
+    async def _original(self, request: Request) -> Response:
+        asked = dict(request.query_params)
+        self.originals.append(asked)
+        image = scene.original(asked["name"], int(asked["time"]))
+        return Response(cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg")
 
     async def _viewer(self, socket: WebSocket) -> None:
         await socket.accept()
@@ -188,6 +208,7 @@ class StandIn:
             share = scene.hole_share(z, points)
             for mode in look.get("modes", ["mended"]):
                 image = scene.picture(rgb, z, points, mode)
+                image[z == 0] = tuple(bytes.fromhex(look.get("background", "000000")))
                 about, content = self._encode(viewer, image, look.get("codec", "jpeg"), (eye, mode))
                 parts.append({"kind": "image", "eye": eye, "mode": mode, **about})
                 data.append(content)

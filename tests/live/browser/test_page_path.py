@@ -1,9 +1,14 @@
 """Camera paths: recorded, previewed, and exported as a film that plays."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 from live.browser import scene
+
+from viewmend.capture.camera_path import read_path
+from viewmend.studio.rigs import orbit
 
 pytestmark = pytest.mark.slow
 
@@ -100,3 +105,63 @@ def test_a_film_that_fails_is_said(desktop):
     desktop.until(lambda: "another film is being made" in page.locator("#toasts").inner_text())
     desktop.errors.clear()  # the browser notes the status
     assert page.get_by_role("button", name="Export MP4").is_enabled()
+
+
+def two_views(page) -> None:
+    page.get_by_role("button", name="Add view").click()
+    page.mouse.move(500, 400)
+    page.mouse.wheel(0, -100)
+    page.wait_for_timeout(400)
+    page.get_by_role("button", name="Add view").click()
+
+
+def test_a_film_says_how_far_it_is_and_is_called_off(desktop):
+    page, server = desktop.page, desktop.server
+    two_views(page)
+    page.locator("#path-size").select_option("1920x1080")
+    server.film_hold = True
+    page.get_by_role("button", name="Export MP4").click()
+    desktop.until(lambda: "30 of 61 views, about" in page.locator("#path-text").inner_text())
+    assert 0.4 < page.evaluate("document.querySelector('#path-progress').value") < 0.6
+    assert (server.paths[-1]["width"], server.paths[-1]["height"]) == (1920, 1080)
+    page.get_by_role("button", name="Cancel").click()
+    desktop.until(lambda: "called off" in page.locator("#toasts").inner_text())
+    desktop.until(lambda: server.film == (None, None))  # the server has noticed
+    assert page.locator("#path-film").is_hidden()
+    assert page.get_by_role("button", name="Export MP4").is_enabled()
+
+
+def test_a_path_goes_out_as_json_for_mend_and_comes_back(desktop, tmp_path):
+    page = desktop.page
+    two_views(page)
+    with page.expect_download() as waiting:
+        page.get_by_role("button", name="Save JSON").click()
+    path = tmp_path / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    cameras = read_path(path, orbit([0.0], (32, 32)))
+    assert len(cameras) == 61
+    start = eye(desktop.server.looks[0]["camera"])
+    np.testing.assert_allclose(cameras.centers[0].numpy(), start, atol=1e-4)
+    assert cameras.size_px[0].tolist() == [480, 480]
+    content = json.loads(path.read_text())
+    del content["points"]
+    bare = tmp_path / "bare.json"
+    bare.write_text(json.dumps(content["world_from_camera"]))
+    for file, said in ((path, "2 views, 2 s"), (bare, "2.0 s recorded")):
+        page.get_by_role("button", name="Clear").click()
+        page.locator("#path-file").set_input_files(file)
+        desktop.until(lambda said=said: page.locator("#path-text").inner_text() == said)
+        posted, frames = export(desktop, tmp_path)
+        assert len(frames) == 61
+        np.testing.assert_allclose(eye(posted["poses"][0]), start, atol=1e-3)
+        np.testing.assert_allclose(eye(posted["poses"][-1]), cameras.centers[-1].numpy(), atol=1e-3)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "[[1]]", '{"points": [{"pose": "1,2", "seconds": 0, "time": 0}]}'])
+def test_a_file_that_is_no_path_is_said_and_changes_nothing(desktop, tmp_path, text):
+    two_views(desktop.page)
+    file = tmp_path / "none.json"
+    file.write_text(text)
+    desktop.page.locator("#path-file").set_input_files(file)
+    desktop.until(lambda: "none.json is no camera path" in desktop.page.locator("#toasts").inner_text())
+    assert "2 views" in desktop.page.locator("#path-text").inner_text()

@@ -12,6 +12,7 @@ import { buildControls } from "./ui/controls.js";
 import { byId } from "./ui/dom.js";
 import { Layout } from "./ui/layout.js";
 import { MODES, buildModes, placeDivider } from "./ui/modes.js";
+import { Original } from "./ui/original.js";
 import { Notices } from "./ui/notices.js";
 import { PathPanel } from "./ui/paths.js";
 import { Statistics } from "./ui/statistics.js";
@@ -50,6 +51,9 @@ class Page {
     this.motion.first = poseOf(query.get("pose"));
     this.layout = new Layout(this.settings, () => this.wake());
     this.cameras = new CameraList((camera) => this.snap(camera));
+    this.original = new Original(token);
+    /** The camera that the view was put to, and the pose that it got there. @type {any} */
+    this.snapped = null;
     this.headset = new Headset(this.stage, {
       look: (eyes, side) => this.link.look({ ...this.wanted(), eyes, width: side, height: side, depth: true, moving: false }),
       wish: () => this.wish(0.5),
@@ -101,6 +105,7 @@ class Page {
     const f = Math.min((free.width / camera.width) * camera.K[0], (free.height / camera.height) * camera.K[4]);
     const side = Math.min(free.height, 1.45 * free.width);
     this.motion.snap(camera, degrees(2 * Math.atan(side / 2 / f)));
+    this.snapped = { camera, goal: this.motion.goal };
     this.wake();
   }
 
@@ -196,6 +201,7 @@ class Page {
       top_k: settings.get("topK"),
       error_rule: settings.get("errorRule") || null,
       adaptive: settings.get("adaptive"),
+      background: settings.ground,
       depth: settings.get("reproject") || settings.get("rig"),
       codec: settings.get("codec"),
     };
@@ -250,9 +256,11 @@ class Page {
     const x = placeDivider(this.settings, this.settings.get("size") ? box : this.layout.free);
     const divider = Math.min(1, Math.max(0, (x - box.left) / box.width));
     const viewport = [box.left, height - box.top - box.height, box.width, box.height].map((value) => Math.round(value * ratio));
-    this.stage.clear();
+    this.stage.clear(this.settings.ground);
     this.stage.draw(viewer, viewport, this.wish(divider));
     this.cameras.place(this.settings.get("rig"), viewer, box);
+    const there = this.settings.get("originals") && this.motion.goal === this.snapped?.goal;
+    this.original.show(there ? this.snapped.camera : null, this.transport.shown);
     this.statistics.repaints.mark();
     this.controls.fov(this.motion.pose?.fov ?? 50);
   }

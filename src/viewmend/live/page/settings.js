@@ -14,6 +14,9 @@
  * @property {boolean} sharp whether a view at rest has as many pixels as the canvas
  * @property {boolean} adaptive whether a moving view may cost resolution
  * @property {boolean} reproject
+ * @property {boolean} originals whether what a camera took is shown beside the view from its place
+ * @property {"dark" | "light"} theme
+ * @property {string} background of the pictures, hexadecimal RGB; "" for the theme's
  * @property {boolean} rig
  * @property {boolean} panel
  */
@@ -31,6 +34,9 @@ const DEFAULTS = {
   sharp: true,
   adaptive: true,
   reproject: true,
+  originals: true,
+  theme: "dark",
+  background: "",
   rig: false,
   panel: window.innerHeight > 460,
 };
@@ -41,6 +47,8 @@ const SENSIBLE = {
   mode: (value) => value === "split" || PICTURES.includes(value),
   left: (value) => PICTURES.includes(value),
   right: (value) => PICTURES.includes(value),
+  theme: (value) => value === "dark" || value === "light",
+  background: (value) => /^([0-9a-f]{6})?$/.test(value),
   size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
 };
 
@@ -94,6 +102,11 @@ export class Settings extends EventTarget {
     } catch {
       // The browser keeps nothing: the choice holds until the page is closed.
     }
+  }
+
+  /** What the pictures lie upon. @returns {string} hexadecimal RGB */
+  get ground() {
+    return this.values.background || (this.values.theme === "light" ? "f2f4f6" : "000000");
   }
 
   /** The modes that the server must render. @returns {string[]} */

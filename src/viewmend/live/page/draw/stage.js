@@ -36,13 +36,15 @@ precision highp float;
 uniform sampler2D picture;
 uniform vec2 size;
 uniform float tone;
+uniform vec3 ground;
 in vec3 pixel;
 out vec4 colour;
 void main() {
   vec3 seen = texture(picture, pixel.xy / pixel.z / size).rgb;
-  // The background is black, but compression leaves traces in it.
-  float something = smoothstep(0.015, 0.055, max(seen.r, max(seen.g, seen.b)));
-  colour = vec4(seen * something * tone, 1.0);
+  // The background is of one colour, but compression leaves traces in it.
+  vec3 off = abs(seen - ground);
+  float something = smoothstep(0.015, 0.055, max(off.r, max(off.g, off.b)));
+  colour = vec4(mix(ground, seen * tone, something), 1.0);
 }`;
 /** What was hidden when the picture was taken shows the colours beside it, dimmed. */
 const STRETCHED_TONE = 0.6;
@@ -60,6 +62,7 @@ export class Stage {
     this.header = null;
     /** @type {any[]} */
     this.eyes = [];
+    this.ground = [0, 0, 0];
     this.prepare();
   }
 
@@ -67,7 +70,7 @@ export class Stage {
   prepare() {
     this.header = null;
     this.eyes = [];
-    this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone"]);
+    this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground"]);
     this.lines = new LinePainter(this.gl);
   }
 
@@ -91,11 +94,12 @@ export class Stage {
     this.header = shown.header;
   }
 
-  /** Make the whole canvas black. */
-  clear() {
+  /** Empty the whole canvas. @param {string} ground what the pictures lie upon, hexadecimal RGB */
+  clear(ground) {
     const { gl } = this;
+    this.ground = [0, 2, 4].map((place) => parseInt(ground.slice(place, place + 2), 16) / 255);
     gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(0, 0, 0, 1);
+    gl.clearColor(this.ground[0], this.ground[1], this.ground[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
@@ -134,6 +138,7 @@ export class Stage {
     gl.bindTexture(gl.TEXTURE_2D, picture);
     gl.uniform2f(at.size, header.width, header.height);
     gl.uniform1f(at.tone, 1);
+    gl.uniform3fv(at.ground, this.ground);
     if (still) {
       gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
       gl.bindVertexArray(kept.quad.array);

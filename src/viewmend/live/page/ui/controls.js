@@ -8,6 +8,21 @@ const CODECS = { jpeg: "JPEG", vp9: "VP9 video", h264: "H.264 video" };
 
 /** @typedef {import("../settings.js").Settings} Settings */
 
+/** The page's theme, and what the pictures lie upon: the theme's own until somebody chooses. @param {Settings} settings */
+function buildGround(settings) {
+  byId("theme").addEventListener("change", () => {
+    settings.set("background", "");
+    settings.set("theme", byId("theme").value);
+  });
+  byId("background").addEventListener("input", () => settings.set("background", byId("background").value.slice(1)));
+  settings.watch(["theme", "background"], () => {
+    byId("theme").value = settings.get("theme");
+    byId("background").value = `#${settings.ground}`;
+    document.documentElement.dataset.theme = settings.get("theme");
+    byId("stage").style.background = `#${settings.ground}`;
+  });
+}
+
 /** @param {Settings} settings @param {import("../view/motion.js").Motion} motion @param {() => void} wake */
 export function buildControls(settings, motion, wake) {
   const showMovement = radioGroup(byId("movement"), (value) => {
@@ -18,7 +33,7 @@ export function buildControls(settings, motion, wake) {
     motion.lens(Number(byId("fov").value));
     wake();
   });
-  for (const name of /** @type {("reproject" | "sharp" | "adaptive" | "rig")[]} */ (["reproject", "sharp", "adaptive", "rig"])) {
+  for (const name of /** @type {("reproject" | "sharp" | "adaptive" | "originals" | "rig")[]} */ (["reproject", "sharp", "adaptive", "originals", "rig"])) {
     const box = byId(name);
     box.addEventListener("change", () => settings.set(name, box.checked));
     settings.watch([name], () => (box.checked = settings.get(name)));
@@ -38,6 +53,7 @@ export function buildControls(settings, motion, wake) {
   settings.watch(["side"], () => setSlider(byId("side"), settings.get("side")));
   byId("error-rule").addEventListener("change", () => settings.set("errorRule", byId("error-rule").value));
   byId("codec").addEventListener("change", () => settings.set("codec", byId("codec").value));
+  buildGround(settings);
   return {
     /** @param {string} mode */
     movement(mode) {

@@ -1,10 +1,11 @@
 // The section "Camera path": record, add views, play, and export as MP4 by the server.
 
-import { address } from "../link/connection.js";
 import { lensOf } from "../view/lens.js";
 import { FPS, Track } from "../view/track.js";
 import { extrinsicsOf } from "../view/pose.js";
+import { pathFile, pointsOf } from "../view/track_file.js";
 import { byId, download } from "./dom.js";
+import { Film } from "./film.js";
 
 /**
  * @typedef {object} Surroundings
@@ -24,7 +25,9 @@ export class PathPanel {
     this.recording = false;
     /** @type {{since: number, hands: number} | null} */
     this.playing = null;
-    this.exporting = 0;
+    /** The film that is being rendered. @type {Film | null} */
+    this.film = null;
+    this.told = "";
     this.canExport = true;
     byId("path-record").addEventListener("click", () => this.toggleRecording());
     byId("path-add").addEventListener("click", () => this.#add());
@@ -35,6 +38,10 @@ export class PathPanel {
       this.#show();
     });
     byId("path-export").addEventListener("click", () => this.#export());
+    byId("path-cancel").addEventListener("click", () => this.film?.cancel());
+    byId("path-save").addEventListener("click", () => this.#save());
+    byId("path-open").addEventListener("click", () => byId("path-file").click());
+    byId("path-file").addEventListener("change", () => void this.#open());
     this.#show();
   }
 
@@ -97,12 +104,15 @@ export class PathPanel {
     byId("path-play").textContent = this.playing ? "Stop" : "Preview";
     byId("path-clear").disabled = !points.length || this.recording;
     const button = byId("path-export");
-    button.disabled = !ready || !this.canExport || this.exporting > 0;
-    button.classList.toggle("busy", this.exporting > 0);
-    button.textContent = this.exporting ? "Rendering the film" : "Export MP4";
+    button.disabled = !ready || !this.canExport || this.film !== null;
+    button.classList.toggle("busy", this.film !== null);
+    button.textContent = this.film ? "Rendering the film" : "Export MP4";
+    byId("path-save").disabled = !ready;
+    byId("path-film").hidden = this.film === null;
     let text = "Record your own movement, or add views: the film goes through them.";
     if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s${room ? "" : ": as long as a film can be"}`;
     if (!this.canExport) text = "The server cannot write MP4. There, install viewmend[video].";
+    if (this.film && this.told) text = this.told;
     byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
   }
@@ -125,28 +135,52 @@ export class PathPanel {
     const times = moments.map((seconds) =>
       still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
     );
-    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null };
+    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground };
   }
 
   async #export() {
     const { notices, token } = this.around;
-    this.exporting = performance.now();
+    const film = new Film(token, ({ part, text }) => {
+      byId("path-progress").value = part;
+      this.told = text;
+      this.#show();
+    });
+    this.film = film;
+    this.told = "";
+    byId("path-progress").value = 0;
     this.#show();
     try {
-      const headers = { "content-type": "application/json" };
-      const body = JSON.stringify(this.#request());
-      const answer = await fetch(address("/path.mp4", token), { method: "POST", headers, body });
-      if (!answer.ok) {
-        const said = await answer.json().catch(() => ({}));
-        throw new Error(said.error ?? `the server answered ${answer.status}`);
-      }
-      download(await answer.blob(), "viewmend-path.mp4");
-      notices.toast(`The film is ready (${((performance.now() - this.exporting) / 1000).toFixed(0)} s)`);
+      const made = await film.make(this.#request());
+      if (made) download(made, "viewmend-path.mp4");
+      notices.toast(made ? `The film is ready (${((performance.now() - film.since) / 1000).toFixed(0)} s)` : "No film: it was called off");
     } catch (error) {
       notices.toast(`No film: ${/** @type {Error} */ (error).message}`, "error");
     } finally {
-      this.exporting = 0;
+      this.film = null;
       this.#show();
+    }
+  }
+
+  #save() {
+    const text = JSON.stringify(pathFile(this.track, this.#request()), null, 1);
+    download(new Blob([text], { type: "application/json" }), "viewmend-path.json");
+  }
+
+  async #open() {
+    const { motion, transport, notices } = this.around;
+    const [file] = byId("path-file").files;
+    if (!file || !motion.rig || !motion.goal) return;
+    try {
+      const { points, recorded } = pointsOf(JSON.parse(await file.text()), motion.rig, motion.goal.fov, Math.max(0, transport.shown));
+      this.track.points = points;
+      this.track.recordingSince = recorded ? 0 : -1;
+      this.recording = false;
+      this.playing = null;
+      this.#show();
+    } catch (error) {
+      notices.toast(`${file.name} is no camera path: ${/** @type {Error} */ (error).message}`, "error");
+    } finally {
+      byId("path-file").value = "";
     }
   }
 }

@@ -144,9 +144,9 @@ export class Statistics {
     pen.font = `${10 * ratio}px system-ui, sans-serif`;
     for (let ms = step; ms < top; ms += step) {
       const y = Math.round(height * (1 - ms / top)) + 0.5;
-      pen.fillStyle = "#ffffff26";
+      pen.fillStyle = "#8a929c40";
       pen.fillRect(0, y, width, 1);
-      pen.fillStyle = "#c3cad2";
+      pen.fillStyle = "#8a929c";
       if (y > 14 * ratio) pen.fillText(`${ms} ms`, 5 * ratio, y - 3 * ratio);
     }
   }
