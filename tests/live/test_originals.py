@@ -20,9 +20,9 @@ def served():
 
 def test_a_cameras_image_is_what_it_took(served):
     name = served.service.renderer.rig_json["cameras"][1]["name"]
-    frame = served.service.supply.read(2)
     status, headers, body = get(f"{served.url}/camera.jpg?name={name}&time=2")
     assert status == 200 and headers["content-type"] == "image/jpeg" and headers["x-viewmend-time"] == "2"
+    frame = served.service.supply.read(2)  # it is there now
     taken = frame.select([name]).rgb[0].movedim(0, -1).numpy()
     assert decoded(body).shape == taken.shape and np.abs(decoded(body) - taken.astype(int)).mean() < 4
     assert get(f"{served.url}/camera.jpg?name={name}&time=99999")[0] == 200, "the nearest time that there is"
