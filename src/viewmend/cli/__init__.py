@@ -44,6 +44,7 @@ COMMANDS = (
     Command("evaluate", "viewmend.cli.evaluate", "Compare methods on fixed scenes and captures."),
     Command("evaluate parity", "viewmend.cli.parity", "Compare our baselines with the published networks."),
     Command("evaluate paper-table", "viewmend.cli.paper_table", "The paper's tables on your data, beside its figures."),
+    Command("benchmark", "viewmend.cli.benchmark", "Measure what a view costs here, stage by stage."),
     Command("weights", "viewmend.cli.weights", "List and check weights of others' networks."),
     Command("masks", "viewmend.cli.masks", "Make masks for a capture that has none."),
     Command("calibrate", "viewmend.cli.calibrate", "Find a rig's cameras from a board, or refine them by silhouettes."),
