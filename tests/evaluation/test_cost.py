@@ -98,6 +98,7 @@ def test_mistakes_are_one_line(arguments, said, tmp_path, monkeypatch, capsys):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_command_measures_writes_and_compares(tmp_path, capsys):
     arguments = ["benchmark", "--model", "telea", "--size", "64", "--cameras", "4", "--repeats", "1"]
     out = tmp_path / "report.json"
