@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from viewmend.cli import main
-from viewmend.evaluation.cost import STAGES, Ceilings, CostBench, CostConfig, _counted, ceilings, fitted
+from viewmend.evaluation.cost import STAGES, Ceilings, CostBench, CostScene, _counted, ceilings, fitted
 from viewmend.evaluation.cost_report import CostReport, read_report, versus, write_plots
 from viewmend.evaluation.provenance import provenance
 from viewmend.inpainting.checkpoint import load_inpainter
@@ -37,7 +37,7 @@ def test_exponents_are_those_of_powers(power):
 
 @pytest.fixture(scope="module")
 def report():
-    config = CostConfig(size_px=64, cameras=4, repeats=1, scales=(0.5, 1.0), rigs=(3, 4), viewers=(1, 2))
+    config = CostScene(size_px=64, cameras=4, repeats=1, scales=(0.5, 1.0), rigs=(3, 4), viewers=(1, 2))
     bench = CostBench(load_inpainter("small"), config)
     return CostReport(
         model="small",

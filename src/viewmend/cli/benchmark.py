@@ -44,7 +44,7 @@ def run(options: Options) -> int:
 
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import busy, say, show
-    from viewmend.evaluation.cost import CostBench, CostConfig, ceilings
+    from viewmend.evaluation.cost import CostBench, CostScene, ceilings
     from viewmend.evaluation.cost_report import CostReport, read_report, versus, write_plots
     from viewmend.evaluation.provenance import provenance
     from viewmend.evaluation.report_plot import require_matplotlib
@@ -53,7 +53,7 @@ def run(options: Options) -> int:
     if options.plots is not None:
         require_matplotlib()
     rigs = (max(3, options.cameras // 2), options.cameras, 2 * options.cameras)
-    config = CostConfig(size_px=options.size, cameras=options.cameras, repeats=options.repeats, rigs=rigs)
+    config = CostScene(size_px=options.size, cameras=options.cameras, repeats=options.repeats, rigs=rigs)
     machine = provenance("cpu", torch.get_num_threads(), 1)
     with busy("measuring"):
         bench, top = CostBench(load_named(options.model, "cpu"), config), ceilings()

@@ -33,9 +33,9 @@ class Ceilings:
     """What the machine does at its best, measured."""
 
     flops_per_s: float
-    """Of a product of two square float32 matrices."""
+    """The speed of a product of two square float32 matrices."""
     bytes_per_s: float
-    """Read and written by a copy of a large tensor."""
+    """Bytes that a copy of a large tensor reads and writes."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class StageCost:
     ms: float
     """Median."""
     flops: int
-    """Of products and convolutions that torch dispatches; those of numba's kernels are not seen."""
+    """Operations of products and convolutions that torch dispatches. Those of numba's kernels are not seen."""
     bytes: int
-    """Read and written by the operations that torch dispatches; what a cache keeps counts, too."""
+    """Bytes that the operations torch dispatches read and write. What a cache keeps counts, too."""
     floor_ms: float
     """Least time for these at the ceilings."""
     ratio: float | None
-    """Measured by least time; None where nothing was counted."""
+    """How many times the least time it took. None where nothing was counted."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,13 @@ class Growth:
     sizes: tuple[float, ...]
     ms: tuple[float, ...]
     exponent: float
-    """Of the power of the size that fits best."""
+    """The power of the size that fits best."""
     asked: float
     """The exponent is to be at most this."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CostConfig:
+class CostScene:
     """The scene and the sizes that are measured."""
 
     size_px: int = 256
@@ -78,7 +78,7 @@ class CostConfig:
     """Times that each figure is the median of."""
     seed: int = 10000
     scales: Sequence[float] = (0.5, 0.71, 1.0, 1.41)
-    """Of the size."""
+    """Parts of `size_px` at which views are measured."""
     rigs: Sequence[int] = (4, 8, 16)
     viewers: Sequence[int] = (1, 2, 4, 8)
     fractions: Sequence[float] = (0.125, 0.25, 0.5, 1.0)
@@ -139,7 +139,7 @@ def _counted(work: Callable[[], object]) -> tuple[int, int]:
 class CostBench:
     """Measures one model on a studio's scene."""
 
-    def __init__(self, inpainter: ViewInpainter, config: CostConfig) -> None:
+    def __init__(self, inpainter: ViewInpainter, config: CostScene) -> None:
         self.inpainter, self.config = inpainter, config
         self.studio = self._studio(config.cameras)
 
