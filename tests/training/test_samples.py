@@ -29,7 +29,7 @@ from viewmend.training.sample_files import (
     write_shards,
 )
 from viewmend.training.samples import HeldOutCamera, Sample, widened
-from viewmend.training.scenes import StudioScenes, random_stage
+from viewmend.training.scenes import StudioScenes, random_stage, rig_samples
 from viewmend.training.sources import scene_source
 
 
@@ -40,6 +40,14 @@ def studio() -> Studio:
 
 def same(a, b):
     return sample_to_bytes(a) == sample_to_bytes(b)
+
+
+def test_the_last_of_just_enough_times_is_a_target(studio, plan):
+    rig, plan = LeaveOneOut({time: studio.read(time) for time in (0, 1)}), replace(plan, times=(0, 1), held_cameras=1)
+    samples = rig_samples(rig, replace(plan, least_past=1, min_hole_px=0), Random(0))
+    assert samples and {sample.view.time for sample in samples} == {1}
+    with pytest.raises(ValueError, match="more than 2 times"):
+        rig_samples(rig, replace(plan, least_past=2), Random(0))
 
 
 def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
