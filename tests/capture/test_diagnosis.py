@@ -239,6 +239,7 @@ ODD = {
     "negative": (spoilt_images(lambda image: 255 - image), "do not show what the others see"),
     "upside down": (spoilt_images(lambda image: image[::-1]), "do not show what the others see"),
     "blurred": (spoilt_images(lambda image: cv2.GaussianBlur(image, (0, 0), 4)), "'{}'"),
+    "grey": (spoilt_images(lambda image: image.mean(-1, keepdims=True).repeat(3, -1).astype(np.uint8)), "are grey"),
     "exchanged images": (exchanged_images, "do not show what the others see"),
 }
 

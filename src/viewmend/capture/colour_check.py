@@ -17,6 +17,8 @@ FAR = 2.5
 """A camera shows something else if its colours are so many times as far from all others' as is usual."""
 FARTHER, LESS_ALIKE = 1.55, 0.72
 """So many times as far is enough where the correlation with any other is lower than usual by this factor."""
+PALE, COLOURFUL = 0.4, 0.05
+"""An image is grey whose saturation is lower than the usual one by this factor, where that is so much at least."""
 BLURRED, NOISY = 0.45, 2.0
 """Differences of neighbouring pixels, beside the usual ones, below which an image is blurred, above which noisy."""
 
@@ -34,9 +36,14 @@ def odd_colours(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, 
     distance, correlation = nearest_agreement(colours, colours)
     typical, alike = distance.nanmedian(), correlation.nanmedian()
     detail = _detail(small)
-    usual = detail.nanmedian()
+    usual, saturation = detail.nanmedian(), _saturation(small)
+    grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
     for view, name in enumerate(small.cameras.names):
-        if bool(distance[view] > FAR * typical) or (
+        if bool(grey[view]):
+            found.append(
+                Finding(f"camera '{name}': its images are grey, the others' are not; check what it was set to")
+            )
+        elif bool(distance[view] > FAR * typical) or (
             bool(distance[view] > FARTHER * typical) and bool(correlation[view] < LESS_ALIKE * alike)
         ):
             text = (
@@ -57,3 +64,11 @@ def _detail(frame: MultiViewFrame) -> Float[Tensor, "view"]:
     grey, inside = frame.rgb.float().mean(1), frame.mask > FOREGROUND
     both = inside[:, :, 1:] & inside[:, :, :-1]
     return ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))
+
+
+def _saturation(frame: MultiViewFrame) -> Float[Tensor, "view"]:
+    """How far the subject's channels are apart, relative to its brightness, in each camera; NaN without foreground."""
+    assert frame.mask is not None
+    rgb, inside = frame.rgb.float(), frame.mask > FOREGROUND
+    apart = ((rgb.amax(1) - rgb.amin(1)) * inside).sum((1, 2))
+    return apart / (rgb.mean(1) * inside).sum((1, 2))
