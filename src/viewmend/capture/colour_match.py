@@ -37,6 +37,8 @@ SLABS = 4
 """Points lie in order of space; each of so many parts of the surface is judged by maps fitted to the others."""
 WORTH = 0.9
 """Colours that were not fitted to must differ by less than this share of what they did before."""
+NOTICED = 0.012
+"""Cameras whose colours differ by less are left as they are: what maps cannot tell from the hull's error is as much."""
 
 Maps = Float[Tensor, "view 3 4"]
 
@@ -57,7 +59,7 @@ class ColourMatch:
     @property
     def helps(self) -> bool:
         """Whether cameras agree better on surface that nothing was fitted to."""
-        return self.after < WORTH * self.before
+        return self.before > NOTICED and self.after < WORTH * self.before
 
     @property
     def said(self) -> str:
