@@ -4,13 +4,15 @@ import hashlib
 import importlib.util
 import sys
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 
 def from_file(name: str) -> Callable[..., object]:
     """NAME of FILE.py:NAME, a class or a function.
 
-    Its module's name has the file's hash, so that a changed file is another module.
+    Its module's name has the file's hash, so that a changed file is another module. A file that did not change since
+    the last call is not read again.
 
     Raises:
         ValueError: there is no such file, or nothing of that name to call in it.
@@ -19,7 +21,8 @@ def from_file(name: str) -> Callable[..., object]:
     path = Path(file)
     if not path.is_file():
         raise ValueError(f"expected FILE.py:NAME, got '{name}', and there is no such file; check the path")
-    module_name = f"{path.stem}_{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
+    stat = path.stat()
+    module_name = _module_name(path.resolve(), stat.st_mtime_ns, stat.st_size)
     if module_name not in sys.modules:
         spec = importlib.util.spec_from_file_location(module_name, path)
         assert spec is not None and spec.loader is not None, "the suffix is .py"
@@ -34,3 +37,8 @@ def from_file(name: str) -> Callable[..., object]:
     if not callable(make):
         raise ValueError(f"expected '{wanted}' in {path} to be a class or a function, found none; check FILE.py:NAME")
     return make
+
+
+@lru_cache(maxsize=16)
+def _module_name(path: Path, changed_ns: int, size: int) -> str:
+    return f"{path.stem}_{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"

@@ -205,6 +205,24 @@ def test_other_rules_are_other_cells(small_scenes, tmp_path):
     assert cell_keys(replace(small_scenes[0], held="cam03"), {"telea": "x"}, RunSettings()) != usual
 
 
+def test_a_rule_of_ones_own_that_was_edited_is_another_cell(small_scenes, tmp_path, monkeypatch):
+    from viewmend.evaluation.cells import cell_keys
+
+    file, read = tmp_path / "own.py", []
+    settings = RunSettings(stream=StreamConfig(render=RenderConfig(error_rule=f"{write_rule(file, 1)}:rule")))
+    before = cell_keys(small_scenes[0], {"telea": "x"}, settings)
+    as_ever = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: (read.append(path), as_ever(path))[1])
+    assert cell_keys(small_scenes[0], {"telea": "x"}, settings) == before and read == [], "it is not read for each view"
+    write_rule(file, 11)
+    assert cell_keys(small_scenes[0], {"telea": "x"}, settings) != before and read == [file]
+
+
+def write_rule(file, number):
+    file.write_text(f"def rule(evidence):\n    return {number}\n")
+    return file
+
+
 @pytest.mark.slow
 def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
     pytest.importorskip("ray", reason="Ray is not installed")

@@ -42,6 +42,19 @@ class PreparedCapture(OfSource):
     _said: set[str] = field(default_factory=set, compare=False, repr=False)
 
     @property
+    def changes(self) -> tuple[str, ...]:
+        """What is no longer as it was taken, in words."""
+        told = [] if self.colours is None else [self.colours.said]
+        if self.alignment is not None and self.alignment.offset_px != (0.0, 0.0):
+            x, y = self.alignment.offset_px
+            told.append(
+                f"all principal points moved by ({x:+.2f}, {y:+.2f}) pixels: hull and masks then agree better, IoU "
+                f"{self.alignment.iou_before:.3f} -> {self.alignment.iou_after:.3f}; check first_pixel_center, or use "
+                "--no-align"
+            )
+        return tuple(told)
+
+    @property
     def cameras(self) -> Cameras:
         """All cameras, those that are no inputs too, moved by the shift and resized with their images."""
         x_px, y_px = self.alignment.offset_px if self.alignment else (0.0, 0.0)

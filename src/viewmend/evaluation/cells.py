@@ -24,8 +24,9 @@ from viewmend.evaluation.scorers import FEATURES, KINDS, Features
 from viewmend.json_input import typed
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import identity, make_method
+from viewmend.rendering.error_rules import error_rule
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
 DAMAGED += (RuntimeError, MemoryError, SyntaxError, OverflowError)  # NotImplementedError is a RuntimeError
@@ -177,6 +178,7 @@ def cell_keys(scene: LeaveOneOutScene, identities: dict[str, str], settings: Run
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
     rules += [] if settings.background == "black" else [settings.background]
+    rules += [error_rule(settings.stream.render.error_rule or "unseen").__module__]  # has the hash of one's own file
     scene_digest = _digest([*rules, *settings.networks])
     return tuple(
         CellKey(scene.name, name, _digest([scene_digest, own, settings.precision]), scene_digest)

@@ -136,6 +136,11 @@ def _counted(work: Callable[[], object]) -> tuple[int, int]:
     return flops.get_total_flops(), traffic.bytes
 
 
+def _less(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
+    """What `a` has beyond `b`, of each."""
+    return max(0, a[0] - b[0]), max(0, a[1] - b[1])
+
+
 class CostBench:
     """Measures one model on a studio's scene."""
 
@@ -183,12 +188,11 @@ class CostBench:
         first = _counted(lambda: stream.view(target, time=1))
         second = _counted(lambda: stream.view(target, time=1))
         rendered = _counted(lambda: stream.view(target, time=1, quality=RenderQuality(mend=False)))
-        less = lambda a, b: (max(0, a[0] - b[0]), max(0, a[1] - b[1]))  # noqa: E731
         return {
             "geometry": pushed,
-            "context": less(first, second),
+            "context": _less(first, second),
             "rendering": rendered,
-            "inpainting": less(second, rendered),
+            "inpainting": _less(second, rendered),
         }
 
     def _time_ms(self, studio: Studio, work: Callable[[Stream, int], object]) -> float:

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from viewmend.inpainting.sweep.cells import rim_depth
-from viewmend.live.protocol import MENDED_MODES
+from viewmend.live.protocol import BLACK, MENDED_MODES
 from viewmend.views import FAINT, CompletedView, IncompleteView
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -23,7 +23,7 @@ COARSEST_STRIDE = 4
 """Image pixels a depth pixel in longer pictures."""
 
 
-def picture(completed: CompletedView, mode: str, background: str = "000000") -> Picture:
+def picture(completed: CompletedView, mode: str, background: str = BLACK) -> Picture:
     """One of the protocol's modes as 8-bit RGB, on a background (hexadecimal RGB).
 
     rendered: F. holes: F with the pixels that no camera colours in pink, by any error rule. mended: Fhat. depth: near
@@ -31,7 +31,7 @@ def picture(completed: CompletedView, mode: str, background: str = "000000") -> 
     yellow, sure; grey where the inpainter does not tell.
     """
     shown = _on_black(completed, mode)
-    if background == "000000":
+    if background == BLACK:
         return shown
     opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask
     bare = (1 - opacity.clamp(0, 1)).cpu().numpy()[..., None]

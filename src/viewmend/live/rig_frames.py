@@ -190,7 +190,8 @@ class RigFrames(LiveFrames):
         source = _OneTime(rig.name, self._cameras, rig.bounds, rig.up, frame)
         if self._prepared is None:
             self._prepared = prepare(source, align=self._align, match_colours=self._match)
-            _say_prepared(self._prepared)
+            for text in self._prepared.changes:
+                log.warning("%s", text)
         self.spread_ms = 1000 * together.spread_s
         self.push(replace(self._prepared, source=source).read(0))
 
@@ -251,17 +252,6 @@ class RigFrames(LiveFrames):
         self._said = counted
         if lines:
             log.warning("in the last %.0f s: %s", REPORT_S, "; ".join(lines))
-
-
-def _say_prepared(prepared: PreparedCapture) -> None:
-    """Say by how much all images are shifted against the calibration, and whether colours are matched."""
-    found = prepared.alignment
-    if found is not None and found.offset_px != (0.0, 0.0):
-        x, y = found.offset_px
-        what = "all principal points moved by (%+.2f, %+.2f) pixels, IoU %.3f -> %.3f; --no-align leaves them"
-        log.warning(what, x, y, found.iou_before, found.iou_after)
-    if prepared.colours is not None:
-        log.warning("%s", prepared.colours.said)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:

@@ -66,9 +66,8 @@ def _whole_scenes(plan: DataPlan, seed: str, split: Split) -> SceneSource[Sample
     if not (folders := recordings(split, plan.captures)):
         return studio
     opened = [own for folder in folders for own in _captures(folder)]
-    captures = [
-        prepare(capture, align=False, match_colours=False) for capture, _ in opened
-    ]  # which refuses the wrong ones
+    # Here for what is refused alone: each view prepares its inputs itself.
+    captures = [prepare(capture, align=False, match_colours=False) for capture, _ in opened]
     return MixedScenes(
         CaptureScenes(captures, plan, seed, [held for _, held in opened]), studio, plan.captures_fraction, seed
     )
