@@ -99,15 +99,36 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     Raises:
         ValueError: a file holds something else, or images are stored bottom-up.
     """
-    folder = root(path, file)
-    metas = [file] if path.is_file() else sorted(json for json in folder.glob("*.json") if _is_meta(json))
-    meta = _meta(metas[0]) if metas else None
+    folder, meta = root(path, file), _meta_of(path, file)
     place = meta.dataset.camera_path if meta and stays_inside(meta.dataset.camera_path) else CALIBRATION
     cameras = typed(read_json(bounded_bytes(folder / place)), CalibrationFile).cameras
     frames = _frames(folder, meta)
     told: dict[str, Any] = {"first_pixel_center": [0.5, 0.5], "frames": frames}
     told["cameras"] = [_camera(folder, camera, frames) for camera in cameras]
     return told | (_told_by(meta) if meta else {})
+
+
+def stored_from_program(path: Path) -> np.ndarray:
+    """From the frame that the program works in, y up, to the one of `calibration.json`, 4 x 4 (data set or meta file).
+
+    Raises:
+        ValueError: this is no data set, or its meta file holds something else.
+    """
+    if (file := find(path)) is None:
+        raise ValueError(f"expected a data set of RIFTCast or its meta file, got {path}")
+    return _stored_from_program(_meta_of(path, file))
+
+
+def _stored_from_program(meta: MetaFile | None) -> np.ndarray:
+    if meta is None or meta.dataset.to_world is None:
+        return FLIP
+    return FLIP @ np.array(meta.dataset.to_world).reshape(4, 4)
+
+
+def _meta_of(path: Path, file: Path) -> MetaFile | None:
+    """The meta file that this path is, or the first in the folder; None where there is none."""
+    metas = [file] if path.is_file() else sorted(json for json in root(path, file).glob("*.json") if _is_meta(json))
+    return _meta(metas[0]) if metas else None
 
 
 def _frames(folder: Path, meta: MetaFile | None) -> list[str]:
@@ -144,12 +165,11 @@ def _is_file(path: Path) -> bool:
 def _told_by(meta: MetaFile) -> dict[str, Any]:
     if not (meta.dataset.flip_images and meta.dataset.flip_masks):
         raise ValueError("expected flip_images and flip_masks, got files that are bottom-up; flip them and these two")
-    to_world = meta.dataset.to_world
-    stored_from_program = FLIP if to_world is None else FLIP @ np.array(to_world).reshape(4, 4)
-    told: dict[str, Any] = {"up": stored_from_program[:3, 1].tolist()}
+    stored = _stored_from_program(meta)
+    told: dict[str, Any] = {"up": stored[:3, 1].tolist()}
     if meta.volume is not None:
         half = meta.volume.scale * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        corners = np.c_[np.array(meta.volume.position) + half, np.ones(8)] @ stored_from_program.T
+        corners = np.c_[np.array(meta.volume.position) + half, np.ones(8)] @ stored.T
         told["bounds"] = [corners[:, :3].min(0).tolist(), corners[:, :3].max(0).tolist()]
     return told
 
