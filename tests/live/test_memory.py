@@ -1,7 +1,9 @@
 """Memory that lies free goes back to the system."""
 
+import gc
 import re
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -39,3 +41,29 @@ def test_a_little_is_kept_and_busy_times_are_left_alone(monkeypatch):
     assert not tidying.when_due(idle=True), "nothing has come since"
     grown = bytearray(b"x") * 100_000_000
     assert tidying.when_due(idle=True) and len(grown) == 100_000_000
+
+
+def test_cycles_go_before_memory_is_handed_back(monkeypatch):
+    monkeypatch.setattr(memory, "IDLE_S", 0.0)
+
+    class Connection:
+        def __init__(self):
+            self.scope = {"visitor": self}
+
+    gc.disable()
+    try:
+        gone = weakref.ref(Connection())
+        assert isinstance(gone(), Connection)
+        grown = bytearray(b"x") * 50_000_000
+        assert memory.HeapTrimmer().when_due(idle=True) and grown
+        assert gone() is None
+    finally:
+        gc.enable()
+
+
+def test_what_is_loaded_is_not_looked_at_again():
+    try:
+        memory.loaded()
+        assert gc.get_freeze_count() > 1000
+    finally:
+        gc.unfreeze()

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 import json
 import threading
 import time
@@ -16,7 +17,7 @@ from test_faults import exchange, still_serves
 from viewmend.live import server as live_server
 from viewmend.live import turns
 from viewmend.live.client import Client
-from viewmend.live.door import SocketDoor
+from viewmend.live.door import HttpDoor, SocketDoor
 from viewmend.live.protocol import Limits, ProtocolError, read_message
 from viewmend.live.render_jobs import parse_path
 from viewmend.live.turns import Turns
@@ -34,6 +35,11 @@ def test_turns_are_given_one_after_the_other_and_newcomers_first(monkeypatch):
         gate.ask(lambda: (given.append((0, time.monotonic())), time.sleep(0.03)), True)
         for number, first in ((1, False), (2, False), (3, True)):
             gate.ask(lambda number=number: given.append((number, time.monotonic())), first)
+        gone = [lambda number=number: given.append((number, time.monotonic())) for number in (5, 6)]
+        for turn in gone:
+            gate.ask(turn, False)
+        for turn in (*gone, gone[0]):
+            gate.withdraw(turn)
         with pytest.raises(ZeroDivisionError):
             Turns().ask(lambda: 1 / 0, True)
         await asyncio.sleep(0.5)
@@ -44,6 +50,19 @@ def test_turns_are_given_one_after_the_other_and_newcomers_first(monkeypatch):
     assert [number for number, _ in given] == [0, 3, 1, 2, 4]
     at = [when for _, when in given]
     assert at[1] - at[0] > 0.03 + 4 * 0.03 - 0.001 and at[2] - at[1] > 0.019 and at[3] - at[2] > 0.019
+
+
+def test_who_is_gone_waits_for_no_turn_and_leaves_nothing(monkeypatch):
+    monkeypatch.setattr(turns, "PAUSE_S", 1.0)
+    with running(token=TOKEN) as server:
+        assert still_serves(server)
+        for _ in range(30):
+            with opened(server) as raw:
+                raw.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 40_000)
+        state = server.server.server_state
+        wait_until(lambda: not state.connections)
+        assert not state.turns._waiting, "they would have had half a minute of turns"
+        wait_until(lambda: gc.collect() is not None and not any(type(o) is HttpDoor for o in gc.get_objects()))
 
 
 @pytest.mark.parametrize(

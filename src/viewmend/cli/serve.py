@@ -92,7 +92,7 @@ def run(options: Options) -> int:
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import say
     from viewmend.live.listener import Server
-    from viewmend.live.memory import set_up
+    from viewmend.live.memory import loaded, set_up
     from viewmend.live.protocol import Limits, token_query
     from viewmend.live.renderer import Renderer
     from viewmend.live.server import LiveServer, ServerConfig
@@ -118,6 +118,7 @@ def run(options: Options) -> int:
     renderer = Renderer(supply, inpainter, stream, options.device)
     server = Server(LiveServer(RenderService(renderer, supply), config), config)
     with server.bound() as address:
+        loaded()
         say(f"open {address}/{token_query(token)}   (Ctrl-C stops it)")
         server.run_bound()
     return 0

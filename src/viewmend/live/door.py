@@ -123,6 +123,12 @@ class HttpDoor(H11Protocol, Visitor):
         super().connection_made(transport)
         self.make_room(self.connections)
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Whoever it was has gone."""
+        super().connection_lost(exc)
+        self._turns.withdraw(self._take_turn)
+        self._unheard = b""
+
     def resume_writing(self) -> None:
         """What was sent is nearly read."""
         self.drained()

@@ -30,6 +30,11 @@ class Turns:
         (self._waiting.appendleft if first else self._waiting.append)(turn)
         self._plan()
 
+    def withdraw(self, turn: Callable[[], None]) -> None:
+        """Forget about `turn`, if it waits: who asked is gone, and would take the time of others and hold memory."""
+        if turn in self._waiting:
+            self._waiting.remove(turn)
+
     def _plan(self) -> None:
         if self._waiting and self._planned is None and not self._given:
             wait_s = max(0.0, self._free_at - time.monotonic())
@@ -37,7 +42,8 @@ class Turns:
 
     def _next(self) -> None:
         self._planned = None
-        self._give(self._waiting.popleft())
+        if self._waiting:
+            self._give(self._waiting.popleft())
 
     def _give(self, turn: Callable[[], None]) -> None:
         begun, self._given = time.monotonic(), True
