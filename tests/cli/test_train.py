@@ -47,9 +47,11 @@ def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
     shards = tmp_path / "shards"
     command = ["samples", "finetune", "--captures", str(capture), "--out", str(shards)]
     assert main([*command, "--clip-length", "2", "--count", "3", "--workers", "0"]) == 0
-    assert [path.name for path in shards.glob("*.*") if path.is_file()] == ["shard-00000.tar"]
+    assert sorted(p.name for p in shards.glob("*.*") if p.suffix) == ["next.json", "plan.txt", "shard-00000.tar"]
     assert [len(sample.clip) for sample in read_shard(shards / "shard-00000.tar")] == [2, 2, 2]
-    assert main([*command, "--count", "1", "--workers", "0"]) == 2, "shards are never replaced"
+    before = (shards / "shard-00000.tar").read_bytes()
+    assert main([*command, "--clip-length", "2", "--count", "1", "--workers", "0"]) == 0
+    assert (shards / "shard-00000.tar").read_bytes() == before, "shards are never replaced"
     trained = ["train", "finetune", "--shards", str(shards), "--from", str(model), "--out", str(tmp_path / "out")]
     assert main([*trained, "--clip-length", "3", *BRIEF]) == 2, "clips are too short"
     assert main([*trained, "--no-bfloat16", *BRIEF]) == 0

@@ -1,11 +1,11 @@
 """`viewmend samples`: make training samples ahead of a run."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from viewmend.cli import recipe_options
 from viewmend.training.plan import FLAT, Recipe, WholeViewRecipe
@@ -13,6 +13,9 @@ from viewmend.training.plan import FLAT, Recipe, WholeViewRecipe
 SAMPLES_A_SHARD, SCENES_A_SHARD = 48, 16
 PLAN = "plan.txt"
 """What the scenes of a folder are made by."""
+POSITION = "next.json"
+"""Where samples of scenes that have several go on."""
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +24,7 @@ class Options:
 
     They are the recipe's own kind of samples (small by default), made once for many runs of `viewmend train --shards`.
     Of a recipe that trains rays alone, some pixels' rays are written, looked up: thousands of scenes fit in memory.
-    Of one that trains whole views (views), scenes are written, compressed, and a run that was stopped goes on.
+    Of one that trains whole views (views), scenes are written, compressed. A run that was stopped goes on.
     Every value of the recipe is an option, as in `viewmend train`.
     """
 
@@ -45,13 +48,15 @@ def run(options: Options) -> int:
         raise ValueError(f"expected a count of at least 1, got {options.count}")
     with OutputFolder(options.out) as folder:
         code = _make(options)
-        folder.made("shard-*.tar", PLAN)
+        folder.made("shard-*.tar", PLAN, POSITION)
     return code
 
 
 def _make(options: Options) -> int:
+    import json
     import time
 
+    from viewmend.atomic_writes import write_text
     from viewmend.cli.console import say, track
     from viewmend.training.replay import samples_in_order
     from viewmend.training.sample_files import write_shards
@@ -59,26 +64,73 @@ def _make(options: Options) -> int:
 
     recipe = options.recipe
     whole = isinstance(recipe, WholeViewRecipe)
-    there = _count_there(options.out)
-    if there and not whole:
-        raise ValueError(f"{options.out}: expected no samples yet, found shards; choose another --out, or remove them")
-    if whole:
-        _demand_same(options.out, recipe)
     per_shard = SCENES_A_SHARD if whole else SAMPLES_A_SHARD
-    first = there * per_shard
-    count = options.count - first
+    at = _position(options.out, per_shard if whole else None)
+    _demand_same(options.out, recipe)
+    count = options.count - at.samples
     if count <= 0:
-        say(f"{options.out}: {first} samples are there already")
+        say(f"{options.out}: {at.samples} samples are there already")
         return 0
     seed = f"{recipe.seed}/0"
     source = stored_source(recipe, seed) if whole else training_source(recipe, seed)
     began = time.monotonic()
-    samples = islice((s for _, _, s in samples_in_order(source, first, recipe.workers)), count)
-    shards = list(write_shards(track(samples, "samples", count), options.out, per_shard, there))
+    samples = islice(_from(at, samples_in_order(source, at.scene, recipe.workers)), count)
+    shards = []
+    for shard in write_shards(track(samples, "samples", count), options.out, per_shard, at.shards):
+        shards.append(shard)
+        at.shards += 1
+        if not whole:
+            write_text(options.out / POSITION, json.dumps(asdict(at)))
     rate = count / (time.monotonic() - began)
     size_mb = sum(path.stat().st_size for path in shards) / 1e6
     say(f"wrote {count} samples, {len(shards)} shards, {size_mb:.0f} MB to {options.out}: {rate:.1f} samples/s")
     return 0
+
+
+@dataclass(kw_only=True)
+class Position:
+    """Where a folder's samples end."""
+
+    shards: int = 0
+    samples: int = 0
+    scene: int = 0
+    """The scene to go on with."""
+    sample: int = 0
+    """How many of its samples are there."""
+
+
+def _from(at: Position, numbered: Iterator[tuple[int, int, Item]]) -> Iterator[Item]:
+    """The samples that are not there yet; `at` moves on with them."""
+    skipped = at.sample
+    for scene, number, sample in numbered:
+        if scene > at.scene:
+            at.scene, at.sample, skipped = scene, 0, 0
+        if number >= skipped:
+            at.sample, at.samples = number + 1, at.samples + 1
+            yield sample
+
+
+def _position(out: Path, per_shard: int | None) -> Position:
+    """Where the folder's samples end: a scene each, so many a shard; or by what was written down, for None.
+
+    A shard beyond what was written down is made again.
+
+    Raises:
+        ValueError: there are shards of which nothing was written down, or fewer; or one is missing between others.
+    """
+    from viewmend.json_input import read_json, typed
+
+    there, file = _count_there(out), out / POSITION
+    if per_shard is not None:
+        return Position(shards=there, samples=there * per_shard, scene=there * per_shard)
+    if not there:
+        return Position()
+    if not file.exists():
+        raise ValueError(f"{out}: expected no samples yet, found shards; choose another --out, or remove them")
+    at = typed(read_json(file.read_bytes()), Position, f"remove {out}")
+    if not (0 <= at.shards <= there and min(at.samples, at.scene, at.sample) >= 0):
+        raise ValueError(f"{file}: expected {at.shards} shards, found {there}; choose another --out, or remove them")
+    return at
 
 
 def _count_there(out: Path) -> int:
