@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from viewmend.geometry.rigid import look_at
     from viewmend.inpainting.checkpoint import load_inpainter
     from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
+    from viewmend.leave_one_out.riftcast_views import RiftcastViews
     from viewmend.live.client import Client
     from viewmend.live.publisher import Publisher
     from viewmend.methods import make_method
@@ -46,6 +47,7 @@ __all__ = [
     "Publisher",
     "RenderConfig",
     "RenderQuality",
+    "RiftcastViews",
     "Silhouettes",
     "StageTimes",
     "State",
@@ -80,6 +82,7 @@ _ROOM = {
     "Publisher": "live.publisher",
     "RenderConfig": "rendering.view",
     "RenderQuality": "inpainting.protocol",
+    "RiftcastViews": "leave_one_out.riftcast_views",
     "Silhouettes": "views",
     "StageTimes": "timing",
     "State": "inpainting.protocol",

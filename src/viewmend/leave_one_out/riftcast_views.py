@@ -39,11 +39,19 @@ class RiftcastViews:
     """The folder of an export as incomplete views, its geometry and the camera images beside them.
 
     `capture.read(time)` has the camera that a view stands for as well: leave it out of what is looked at, and its
-    image is the truth. Whether the exporter's hull saw that camera's mask its options say (`--exclude_nearest`
-    leaves out its colours alone).
+    image is the truth. The exporter's hull has seen that camera's mask: `--exclude_nearest` leaves out its colours
+    alone.
+
+    Examples:
+        >>> from viewmend import CaptureError, RiftcastViews
+        >>> try:
+        ...     RiftcastViews("export", capture="nowhere")
+        ... except CaptureError as error:
+        ...     print("nowhere" in str(error))
+        True
     """
 
-    def __init__(self, folder: Path, capture: Path) -> None:
+    def __init__(self, folder: str | Path, capture: str | Path) -> None:
         """Open an export and the data set that it was made of.
 
         Args:
@@ -54,7 +62,7 @@ class RiftcastViews:
             CaptureError: there is no such export, or the data set cannot be read.
         """
         self.folder = Path(folder)
-        self.capture = open_capture(capture, kind="riftcast")
+        self.capture = open_capture(Path(capture), kind="riftcast")
         self._world = riftcast.stored_from_program(Path(capture))
         if not any(self.folder.glob("frame_*/error")):
             raise CaptureError(
