@@ -1,6 +1,8 @@
 """Runs, logs and cells of strangers are read or refused like any other file: in one line, soon, in little memory."""
 
 import json
+import struct
+import zipfile
 from dataclasses import asdict
 
 import numpy as np
@@ -77,6 +79,16 @@ def cell() -> Cell:
     names = FrameScores.__dataclass_fields__
     frame = FrameScores(**{n: 1 if n in ("time", "width_px", "height_px") or n.endswith("_px") else 0.5 for n in names})
     return Cell(CellKey("s", "m", "d", "e"), "P", "ring", "calm", "x", (frame,), None, ORIGIN)
+
+
+def test_features_whose_head_is_not_closed_are_damaged(tmp_path):
+    store = CellStore(tmp_path)
+    store.save(cell(), MethodRun("m", cell().frames, None))
+    head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1, 1024, \n"
+    with zipfile.ZipFile(tmp_path / f"{cell().key.stem}.npz", "w") as packed:
+        for kind in scorers.KINDS:
+            packed.writestr(f"{kind}.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(4096))
+    assert store.load(cell().key).features is None
 
 
 def test_cells(tmp_path):

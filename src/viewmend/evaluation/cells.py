@@ -8,6 +8,7 @@ import struct
 import zlib
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 from zipfile import BadZipFile
 
@@ -29,7 +30,7 @@ from viewmend.rendering.error_rules import error_rule
 PROTOCOL = 3
 """Grows when studio, renderer or scores change so that old cells no longer stand beside new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
-DAMAGED += (RuntimeError, MemoryError, SyntaxError, OverflowError)  # NotImplementedError is a RuntimeError
+DAMAGED += (RuntimeError, MemoryError, SyntaxError, TokenError, OverflowError)  # NotImplementedError is a RuntimeError
 """What an .npz file that is not whole raises."""
 
 
