@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
-from viewmend.json_input import Number, Triple, read_json, shown, typed
+from viewmend.json_input import Number, Triple, bounded_bytes, read_json, shown, typed
 
 Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
@@ -49,7 +49,7 @@ def read_path(file: Path, like: Cameras) -> Cameras:
         ValueError: the file does not hold that; says what and where.
     """
     try:
-        content = read_json(file.read_bytes())
+        content = read_json(bounded_bytes(file))
         given: PathFile = typed(content if isinstance(content, dict) else {"world_from_camera": content}, PathFile)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None

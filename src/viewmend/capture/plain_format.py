@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from viewmend.capture.errors import CaptureError
 from viewmend.geometry.cameras import is_intrinsics
 from viewmend.geometry.rigid import is_rotation
-from viewmend.json_input import Number, Triple, read_json, shown, typed
+from viewmend.json_input import Number, Triple, bounded_bytes, read_json, shown, typed
 
 FORMAT = "plain-capture/1"
 CALIBRATION = "cameras.json"
@@ -156,7 +156,7 @@ def read_calibration(folder: Path) -> PlainCalibration:
         there = "the folder has none" if folder.is_dir() else "there is no such folder"
         raise CaptureError(f"expected a capture folder with {path}, but {there}; check the path")
     try:
-        return calibration_of(_spelt(path.read_bytes()), path)
+        return calibration_of(_spelt(bounded_bytes(path)), path)
     except ValueError as error:
         raise CaptureError(f"{path}: {error}") from None
 

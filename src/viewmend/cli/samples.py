@@ -118,7 +118,7 @@ def _position(out: Path, per_shard: int | None) -> Position:
     Raises:
         ValueError: there are shards of which nothing was written down, or fewer; or one is missing between others.
     """
-    from viewmend.json_input import read_json, typed
+    from viewmend.json_input import bounded_bytes, read_json, typed
 
     there, file = _count_there(out), out / POSITION
     if per_shard is not None:
@@ -127,7 +127,7 @@ def _position(out: Path, per_shard: int | None) -> Position:
         return Position()
     if not file.exists():
         raise ValueError(f"{out}: expected no samples yet, found shards; choose another --out, or remove them")
-    at = typed(read_json(file.read_bytes()), Position, f"remove {out}")
+    at = typed(read_json(bounded_bytes(file)), Position, f"remove {out}")
     if not (0 <= at.shards <= there and min(at.samples, at.scene, at.sample) >= 0):
         raise ValueError(f"{file}: expected {at.shards} shards, found {there}; choose another --out, or remove them")
     return at

@@ -11,7 +11,7 @@ from viewmend.atomic_writes import write_atomically, write_text
 from viewmend.evaluation.cost import Ceilings, Growth, StageCost
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.report_plot import STYLE, require_matplotlib
-from viewmend.json_input import read_json, typed
+from viewmend.json_input import bounded_bytes, read_json, typed
 
 SLOWER = 1.2
 """A stage that takes so many times as long as before is called slower."""
@@ -78,7 +78,7 @@ def read_report(path: Path) -> EarlierReport:
         ValueError: the file holds none; says what and where.
     """
     try:
-        return typed(read_json(path.read_bytes()), EarlierReport, "give a file of viewmend benchmark --out")
+        return typed(read_json(bounded_bytes(path)), EarlierReport, "give a file of viewmend benchmark --out")
     except OSError as error:
         raise ValueError(f"{path}: expected a report, got: {error.strerror}; check --versus") from error
     except ValueError as error:

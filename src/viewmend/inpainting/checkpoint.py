@@ -13,7 +13,7 @@ from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
-from viewmend.json_input import read_json
+from viewmend.json_input import bounded_bytes, read_json
 from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError, load_weights, read_weights
 
 FORMAT = 2
@@ -128,7 +128,7 @@ def _folder(name_or_path: str | Path) -> Path:
 
 def _read_config(path: Path) -> tuple[int, InpainterConfig | SweepConfig]:
     try:
-        values = read_json(path.read_bytes())
+        values = read_json(bounded_bytes(path))
     except (OSError, ValueError) as error:
         raise DamagedWeightsError(f"{path}: expected JSON, got {error}; copy the file again") from error
     version = values.pop("viewmend_format", None) if isinstance(values, dict) else None

@@ -16,7 +16,7 @@ from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain import PlainCapture, open_capture
 from viewmend.capture.prepare import open_masked
 from viewmend.geometry.cameras import Cameras
-from viewmend.json_input import read_json, typed
+from viewmend.json_input import bounded_bytes, read_json, typed
 from viewmend.leave_one_out.capture_scenes import CaptureScene, capture_set
 from viewmend.rendering.selection import select_closest
 
@@ -114,7 +114,7 @@ def read_splits(file: Path) -> SplitFile:
     if file.stat().st_size > MOST_BYTES:
         raise ValueError(f"{file}: expected splits, got {file.stat().st_size} bytes; is it the right file?")
     try:
-        return typed(read_json(file.read_bytes()), SplitFile, "see viewmend splits --help")
+        return typed(read_json(bounded_bytes(file)), SplitFile, "see viewmend splits --help")
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
 

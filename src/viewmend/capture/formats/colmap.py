@@ -6,8 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viewmend.capture.formats.files import bounded_bytes, camera_names, mask_beside
+from viewmend.capture.formats.files import camera_names, mask_beside
+from viewmend.json_input import bounded_bytes
 
+MOST_BYTES = 2**29
+"""The largest of these files that is read; a model of a thousand images has about 100 MB."""
 MODELS = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),
     "PINHOLE": (1, "fx fy cx cy"),
@@ -45,7 +48,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     Raises:
         ValueError: a file ends too early or holds what cannot be, or a lens is none of `MODELS`.
     """
-    cameras, images = bounded_bytes(file), bounded_bytes(file.with_name(f"images{file.suffix}"))
+    cameras, images = (bounded_bytes(path, MOST_BYTES) for path in (file, file.with_name(f"images{file.suffix}")))
     try:
         if file.suffix == ".bin":
             lenses, views = _binary_lenses(cameras), _binary_images(images)

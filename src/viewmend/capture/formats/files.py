@@ -1,4 +1,4 @@
-"""What readers of formats ask of files: bounded bytes, the size of an image, names of cameras."""
+"""What readers of formats ask of files: the size of an image, names of cameras."""
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -10,24 +10,8 @@ from viewmend.capture.containers import read_bytes
 from viewmend.capture.images import told_size
 from viewmend.capture.plain_format import stays_inside
 
-MOST_BYTES = 2**29
-"""The largest calibration file that is read; a COLMAP model of a thousand images has about 100 MB."""
 HEAD_BYTES = 2**20
 """How much of an image is read to learn its size."""
-
-
-def bounded_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """All bytes of a file.
-
-    Raises:
-        ValueError: the file is larger than `most`.
-        OSError: it cannot be read.
-    """
-    with path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f"expected {path.name} to have at most {most} bytes, got more; is it the right file?")
-    return data
 
 
 def places_named(folder: Path, part: str) -> list[Path]:

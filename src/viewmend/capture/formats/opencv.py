@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from viewmend.capture.formats.files import bounded_bytes, five_coefficients, places_named, rotation_of
+from viewmend.capture.formats.files import five_coefficients, places_named, rotation_of
 from viewmend.capture.formats.footage import find_footage
 from viewmend.capture.formats.opencv_storage import MOST_BYTES, read_storage
+from viewmend.json_input import bounded_bytes
 
 SUFFIXES = (".xml", ".yml", ".yaml")
 KEYS = {
