@@ -55,7 +55,7 @@ def read_json(text: str | bytes) -> Any:
         ValueError: the text is not JSON; says where.
     """
     try:
-        return _without_nulls(json.loads(text))
+        return json.loads(text, object_hook=_without_nulls, parse_float=_number)
     except (ValueError, RecursionError) as error:  # of syntax, of bytes, of numbers with thousands of digits
         raise ValueError(f"expected JSON, got something else: {str(error)[:80]}; correct it there") from None
 
@@ -84,15 +84,15 @@ def shown(value: object, most: int = 200) -> str:
     return text if len(text) <= most else text[: most - 3] + "..."
 
 
-def _without_nulls(value: Any) -> Any:
-    """The value without the keys that are null; whole numbers that were written with a point as integers."""
-    if isinstance(value, dict):
-        return {key: _without_nulls(item) for key, item in value.items() if item is not None}
-    if isinstance(value, list):
-        return [_without_nulls(item) for item in value]
-    if isinstance(value, float) and abs(value) <= LARGEST_INTEGER and value.is_integer():
-        return int(value)
-    return value
+def _without_nulls(value: dict[str, Any]) -> dict[str, Any]:
+    """The object without the keys that are null."""
+    return {key: item for key, item in value.items() if item is not None}
+
+
+def _number(text: str) -> float | int:
+    """A number with a point or an exponent; a whole one as an integer."""
+    value = float(text)
+    return int(value) if abs(value) <= LARGEST_INTEGER and value.is_integer() else value
 
 
 def _explained(error: str, value: Any, kind: Any, next_step: str) -> str:

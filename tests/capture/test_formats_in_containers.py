@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from reference.foreign_studios import write_dna, write_riftcast
 from reference.random_rigs import COUNTS, SEEDS, TAKES, assert_same, assert_take, named, opencv, random_rig, random_take
 
+from viewmend.capture.containers import names_in
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.plain import open_capture
 from viewmend.capture.run_lengths import read_runs, run_lengths
@@ -74,6 +75,12 @@ def test_a_container_leads_nowhere_else(tmp_path):
                 color.create_dataset("1", (600,), np.uint8, external=[(str(tmp_path / "secret"), 0, 600)])
         with pytest.raises(CaptureError, match=r"expected a readable file, got: (no|its data lie in another file)"):
             open_capture(tmp_path).read(1)
+
+
+def test_members_whose_names_are_no_text_are_left_out(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file[b"\x82"], file["7"] = np.zeros(3, np.uint8), np.zeros(3, np.uint8)
+    assert names_in(tmp_path / "a.h5") == {"7"}
 
 
 def test_images_of_plain_captures_may_lie_in_hdf5_files(tmp_path):

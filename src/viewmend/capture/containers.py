@@ -36,7 +36,8 @@ def names_in(folder: Path) -> frozenset[str]:
     try:
         with opened(file) as root:
             group = member(root, folder.relative_to(file).parts)
-            return frozenset(group) if hasattr(group, "keys") else frozenset()
+            members = group if hasattr(group, "keys") else ()
+            return frozenset(name for name in members if isinstance(name, str))  # bytes that are no text stay bytes
     except OSError:
         return frozenset()
 

@@ -13,7 +13,7 @@ import numpy as np
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.images import told_size
 from viewmend.capture.plain_format import stays_inside
-from viewmend.json_input import read_json
+from viewmend.json_input import read_json, shown
 
 MAX_BYTES = 2 * 10**9
 """The largest file that is read."""
@@ -132,10 +132,10 @@ def read_document(path: Path) -> Document:
         raise CaptureError(f"{path}: expected JSON keys, got a {type(document).__name__}; export it again")
     version = str(document.get("asset", {}).get("version", "none"))
     if not version.startswith("2"):
-        raise CaptureError(f"{path}: expected glTF version 2.0, got {version}; export it as glTF 2.0")
+        raise CaptureError(f"{path}: expected glTF version 2.0, got {version[:40]}; export it as glTF 2.0")
     needed = [e for e in document.get("extensionsRequired", []) if not e.startswith(("KHR_materials", "KHR_mesh_q"))]
     if needed:
-        raise CaptureError(f"{path}: needs extensions {needed}, which are not supported; export without compression")
+        raise CaptureError(f"{path}: needs extensions {shown(needed)}, got no reader; export without compression")
     buffers = tuple(_resource(path, b["uri"]) if "uri" in b else binary for b in document.get("buffers", []))
     return Document(path, document, buffers)
 
