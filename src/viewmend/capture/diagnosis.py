@@ -13,6 +13,7 @@ from torch import Tensor
 
 from viewmend.capture.colour_check import odd_colours
 from viewmend.capture.finding import Finding
+from viewmend.capture.outline_check import odd_outline
 from viewmend.capture.peers import odd_camera
 from viewmend.capture.reduction import reduced
 from viewmend.geometry.alignment import LEAST_IOU, silhouette_iou
@@ -62,8 +63,17 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Findi
     if not SMALLEST_M <= size_m <= LARGEST_M:
         text = f"expected a subject of about {SMALLEST_M} to {LARGEST_M:g} m, got {size_m:.3g} m; check metres_per_unit"
         found = (*found, Finding(text))
-    found = (*found, *odd_camera(left, bounds))
+    found = (*found, *_odd(left, bounds))
     return (*found, *odd_colours(left.without([finding.camera for finding in found if finding.camera]), bounds))
+
+
+def _odd(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, ...]:
+    """The camera that does not go with its peers: as the hull says it, unless the outlines name another one."""
+    by_hull, by_outlines = odd_camera(frame, bounds), odd_outline(frame, bounds)
+    if by_outlines is None or (by_hull and f"'{by_outlines[0]}'" in by_hull[0].text):
+        return by_hull
+    text = "without camera '{}' the outlines of all others fit together {:.0f} times better".format(*by_outlines)
+    return (Finding(f"{text}; check its calibration, its mask and whether it is in time"),)
 
 
 def faulty_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds | None) -> tuple[Finding, ...]:

@@ -76,8 +76,8 @@ class Sight:
     radius_m: float
 
     @classmethod
-    def of(cls, frame: MultiViewFrame, bounds: Bounds) -> "Sight":
-        """The sight of one frame, whose subject is in this box.
+    def of(cls, frame: MultiViewFrame, bounds: Bounds, points: int = POINTS) -> "Sight":
+        """The sight of one frame, whose subject is in this box, with about so many points of each outline.
 
         Raises:
             CaptureError: the frame has no masks, or none with an outline.
@@ -86,18 +86,18 @@ class Sight:
             raise CaptureError("expected frames with masks, got none; make them with viewmend masks")
         width, height = frame.cameras.max_size_px
         distances = np.full((len(frame.cameras), height, width), -1.0, np.float32)
-        views, points = [], []
+        views, found = [], []
         for view, (w, h) in enumerate(frame.cameras.size_px.tolist()):
-            outline = find_outline(frame.mask[view, :h, :w].contiguous().cpu().numpy(), POINTS)
+            outline = find_outline(frame.mask[view, :h, :w].contiguous().cpu().numpy(), points)
             if outline is not None:
                 distances[view, :h, :w] = outline.outside_px
                 views.append(np.full(len(outline.points), view))
-                points.append(outline.points)
-        if not points:
+                found.append(outline.points)
+        if not found:
             raise CaptureError("expected a subject's outline in the masks, got none; choose other frames")
         return cls(
             np.concatenate(views),
-            np.concatenate(points),
+            np.concatenate(found),
             distances.ravel(),
             (width, height),
             frame.cameras.size_px.cpu().numpy(),
