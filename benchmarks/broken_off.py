@@ -12,6 +12,7 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -174,11 +175,22 @@ def disk(folder: Path, free_bytes: int) -> Iterator[Path]:
         place.rmdir()
 
 
+@contextlib.contextmanager
+def fresh(folder: Path) -> Iterator[Path]:
+    """An empty folder, of the same name each time: files may be named after what they were made from."""
+    place = folder / "area"
+    place.mkdir()
+    try:
+        yield place
+    finally:
+        shutil.rmtree(place)
+
+
 def broken_off(command: str, points: int, folder: Path) -> Outcome:
     """Everything that is done to one command."""
     outcome = Outcome()
-    with tempfile.TemporaryDirectory(dir=folder) as place:
-        area = Area(Path(place), command)
+    with fresh(folder) as place:
+        area = Area(place, command)
         code, said, log = area.run()
         lines, whole = log.splitlines(), area.files()
         outcome.points, room = len(lines), sum(whole.values())
@@ -191,8 +203,8 @@ def broken_off(command: str, points: int, folder: Path) -> Outcome:
     for n in range(points):
         number = 1 + round(n * (len(lines) - 1) / max(1, points - 1))
         for sent in (signal.SIGKILL, signal.SIGTERM):
-            with tempfile.TemporaryDirectory(dir=folder) as place:
-                faults = _struck(Area(Path(place), command), number, sent, set(whole))
+            with fresh(folder) as place:
+                faults = _struck(Area(place, command), number, sent, set(whole))
             outcome.killed += sent == signal.SIGKILL
             outcome.ended += sent == signal.SIGTERM
             outcome.faults += [f"{sent.name} at {number} ({lines[number - 1][-80:]}): {fault}" for fault in faults]

@@ -8,6 +8,8 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from viewmend.input_errors import InputError
+
 WRAPPER = "netG"
 """Checkpoints of a GAN's generator may be {"netG": weights}; all others are the weights themselves."""
 COUNTER = "num_batches_tracked"
@@ -19,7 +21,7 @@ FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 Network = TypeVar("Network", bound=nn.Module)
 
 
-class WeightsError(ValueError):
+class WeightsError(InputError):
     """Weights that cannot be loaded: which file, what was expected, what came, the next step."""
 
 

@@ -1,7 +1,9 @@
 """What can be wrong with a capture."""
 
+from viewmend.input_errors import InputError
 
-class CaptureError(ValueError):
+
+class CaptureError(InputError):
     """A capture that cannot be used.
 
     The message names the file, the camera and the frame, what was expected, what came, and the next step.

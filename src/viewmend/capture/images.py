@@ -2,6 +2,7 @@
 
 import functools
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ DEPTH_UNITS_PER_M = 1000
 MAX_DEPTH_M = 65.535
 MAX_PIXELS = 2**27
 """The most pixels of one image; its head is asked, before anything is decoded."""
+PNG, PART = b"\x89PNG\r\n\x1a\n", 12
+"""How a PNG begins, and the bytes that each of its parts has beside its own: length, kind, check."""
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits, and would be read as black."""
 
@@ -124,7 +127,6 @@ def told_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _decode(path: Path, where: str, flags: int) -> np.ndarray:
-    import cv2
 
     try:
         data = read_bytes(path)
@@ -135,20 +137,41 @@ def _decode(path: Path, where: str, flags: int) -> np.ndarray:
             f"{where}: expected an image of at most {MAX_PIXELS / 1e6:.0f} million pixels, got {told[0]} x {told[1]}; "
             "make it smaller"
         )
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and _is_complete(data) else None
-    except cv2.error:  # it claims more pixels than OpenCV takes
-        image = None
-    if image is None:
+    if (image := decoded(data, flags)) is None:
         got = f"{len(data)} bytes that are none, or cut short"
         raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")
     return image
 
 
+def decoded(data: bytes, flags: int, most_pixels: int = MAX_PIXELS) -> np.ndarray | None:
+    """Image data of others as OpenCV decodes them with these flags; None for what is none, cut short or too large.
+
+    Its head and, of a PNG, the lengths of its parts are looked at before anything is made for them.
+    """
+    import cv2
+
+    told = told_size(data) or (0, 0)
+    if not data or told[0] * told[1] > most_pixels or not _is_complete(data):
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # it claims more pixels than OpenCV takes
+        return None
+
+
 def _is_complete(data: bytes) -> bool:
-    """Whether PNG and JPEG data have their end: some decoders fill up what is missing with grey."""
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" in data[-1024:]
+    """Whether PNG and JPEG data have their end: some decoders fill up what is missing with grey.
+
+    Nor may a part of a PNG be longer than the data: OpenCV makes room for it first.
+    """
+    if data.startswith(PNG):
+        at = len(PNG)
+        while at + 8 <= len(data):
+            length, kind = struct.unpack_from(">I4s", data, at)
+            at += PART + length
+            if at > len(data) or kind == b"IEND":
+                return kind == b"IEND"
+        return False
     if data.startswith(b"\xff\xd8"):
         return b"\xff\xd9" in data[len(data) // 2 :]
     return True

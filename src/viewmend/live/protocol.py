@@ -12,6 +12,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
 from viewmend.geometry.rigid import is_rotation
+from viewmend.input_errors import InputError
 from viewmend.json_input import LARGEST_INTEGER, one_of, read_json, typed
 from viewmend.rendering.error_rules import ERROR_RULES
 from viewmend.timing import StageTimes
@@ -53,7 +54,7 @@ BLACK = "000000"
 ShortText = Annotated[str, Meta(max_length=40)]
 
 
-class ProtocolError(ValueError):
+class ProtocolError(InputError):
     """A message that is not of the protocol. It says what was expected, what came, and the next step."""
 
 

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from msgspec import Meta, Struct
 from starlette.websockets import WebSocket
 
-from viewmend.capture.images import told_size
+from viewmend.capture.images import decoded, told_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import rigid
@@ -190,10 +190,7 @@ def _decoded(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.nd
     if (told := told_size(data)) is not None and told != (width, height):
         raise ProtocolError(f"camera '{name}': expected {kind} of {width} x {height} pixels, got {told[0]} x {told[1]}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:  # it claims more pixels than OpenCV takes
-        image = None
+    image = decoded(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.shape[:2] != (height, width):
         got = "no image" if image is None else f"{image.shape[1]} x {image.shape[0]}"
         raise ProtocolError(f"camera '{name}': expected {kind} of {width} x {height} pixels, got {got}")

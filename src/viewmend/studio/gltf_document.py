@@ -11,7 +11,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.images import told_size
+from viewmend.capture.images import decoded, told_size
 from viewmend.capture.plain_format import stays_inside
 from viewmend.json_input import read_json, shown
 
@@ -103,7 +103,7 @@ class Document:
             raise CaptureError(
                 f"{self.path}: expected images of at most {MAX_TEXELS} pixels, got {size[0]} x {size[1]}; shrink it"
             )
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+        image = decoded(data, cv2.IMREAD_COLOR)
         if image is None:
             raise CaptureError(
                 f"{self.path}: image {entry.get('name', index)} is no readable JPEG or PNG; export it again"

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from viewmend.atomic_writes import HALF, write_tensors
+from viewmend.input_errors import InputError
 from viewmend.training.plan import Recipe
 from viewmend.training.replay import ReplayPosition
 
@@ -20,7 +21,7 @@ MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_every", "validate_every
 """Parts of a recipe that a run may go on with another value of."""
 
 
-class RunError(ValueError):
+class RunError(InputError):
     """A run that cannot go on: which file, what was expected, what came, the next step."""
 
 

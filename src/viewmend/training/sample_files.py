@@ -22,6 +22,7 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.sweep.lookup import Scale
 from viewmend.inpainting.sweep.pyramids import Pyramid, Rig
+from viewmend.input_errors import InputError
 from viewmend.training.ray_batches import RayBatch
 from viewmend.training.samples import Sample
 from viewmend.training.stored_scenes import StoredScene, StoredView
@@ -42,7 +43,7 @@ STRUCTURE = "structure"
 """Name of the tensor that holds the sample without its tensors, as JSON."""
 
 
-class ShardError(ValueError):
+class ShardError(InputError):
     """Samples that cannot be read: which file, what was expected, what came, the next step."""
 
 

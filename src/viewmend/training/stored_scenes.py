@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.baselines.classical import Unfilled
-from viewmend.capture.images import MAX_PIXELS, told_size
+from viewmend.capture.images import MAX_PIXELS, decoded
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
@@ -154,6 +154,8 @@ def _frame(
     width, height = cameras.max_size_px
     images = torch.zeros(len(rgba), 4, height, width, dtype=torch.uint8)
     depth = torch.zeros(len(rgba), height, width) if depths else None
+    if len(rgba) != len(cameras) or len(depths) not in (0, len(cameras)):
+        raise ValueError(f"expected an image and a depth of {len(cameras)} cameras, got {len(rgba)}; {AGAIN}")
     for view, image in enumerate(rgba):
         if [image.shape[2], image.shape[1]] != cameras.size_px[view].tolist():
             raise ValueError(f"expected a stored image of the camera's size, got {tuple(image.shape[1:])}; {AGAIN}")
@@ -181,8 +183,7 @@ def _opened(png: UInt8[Tensor, "_byte"], kind: type, dimensions: int) -> np.ndar
     """A stored PNG of this kind; ValueError for anything else."""
     import cv2
 
-    told = told_size(png.numpy().tobytes())
-    image = None if told is None or told[0] * told[1] > MAX_PIXELS else cv2.imdecode(png.numpy(), cv2.IMREAD_UNCHANGED)
+    image = decoded(png.numpy().tobytes(), cv2.IMREAD_UNCHANGED, MAX_PIXELS)
     if image is None or image.dtype != kind or image.ndim != dimensions or image.shape[2:] not in ((), (4,)):
         raise ValueError(f"expected a stored PNG of {kind.__name__}, got {len(png)} bytes of something else; {AGAIN}")
     return image

@@ -16,6 +16,7 @@ NAMES = ("transforms.json", "transforms_train.json")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 Row = tuple[Number, Number, Number, Number]
 Angle = Annotated[float, Meta(gt=0, lt=3.14)]
+Side = Annotated[int, Meta(ge=1, le=2**16)]
 
 
 class Lens(Struct, kw_only=True):
@@ -28,8 +29,8 @@ class Lens(Struct, kw_only=True):
     fl_y: Number | None = None
     cx: Number | None = None
     cy: Number | None = None
-    w: int | None = None
-    h: int | None = None
+    w: Side | None = None
+    h: Side | None = None
     k1: Number | None = None
     k2: Number | None = None
     k3: Number | None = None
