@@ -237,10 +237,11 @@ ODD = {
     "half a mask": (half_a_mask, "'{}'"),
     "a wide mask": (lambda f: change_masks(f, lambda m: cv2.dilate(m, np.ones((13, 13))), names_of(f)[3]), "'{}'"),
     "negative": (spoilt_images(lambda image: 255 - image), "do not show what the others see"),
-    "upside down": (spoilt_images(lambda image: image[::-1]), "do not show what the others see"),
+    "upside down": (spoilt_images(lambda image: image[::-1]), "fit much better upside down"),
     "blurred": (spoilt_images(lambda image: cv2.GaussianBlur(image, (0, 0), 4)), "'{}'"),
     "grey": (spoilt_images(lambda image: image.mean(-1, keepdims=True).repeat(3, -1).astype(np.uint8)), "are grey"),
     "exchanged images": (exchanged_images, "do not show what the others see"),
+    "mirrored": (spoilt_images(lambda image: image[:, ::-1]), "fit much better mirrored"),
 }
 
 

@@ -27,7 +27,7 @@ def displaced(frame, name, step_m):
 @pytest.mark.parametrize("step_m", [(0.06, 0.0, 0.0), (0.0, -0.05, 0.0), (-0.04, 0.04, 0.0)])
 def test_a_displaced_camera_is_the_one_without_which_outlines_fit(studio, name, step_m):
     found = odd_outline(displaced(studio.read(0), name, step_m), studio.bounds)
-    assert found is not None and found[0] == name and found[1] > 4
+    assert found is not None and found[0] == (name,) and found[1] > 4
 
 
 def test_a_good_rig_has_no_odd_outline(studio):

@@ -1,11 +1,14 @@
 """Whether the cameras' images show the same surface: one that shows another picture, or another sharpness, is named."""
 
+from collections.abc import Sequence
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.capture.finding import Finding
 from viewmend.capture.reduction import reduced
-from viewmend.capture.surface_colours import nearest_agreement, surface_colours
+from viewmend.capture.surface_colours import Surface, SurfaceColours, nearest_agreement, surface_of
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
@@ -17,6 +20,8 @@ FAR = 2.5
 """A camera shows something else if its colours are so many times as far from all others' as is usual."""
 FARTHER, LESS_ALIKE = 1.55, 0.72
 """So many times as far is enough where the correlation with any other is lower than usual by this factor."""
+SUSPECT, FITS = 1.25, 0.65
+"""Who is so many times as far as is usual may have another image, and has if with it the distance is so much less."""
 PALE, COLOURFUL = 0.4, 0.05
 """An image is grey whose saturation is lower than the usual one by this factor, where that is so much at least."""
 BLURRED, NOISY = 0.45, 2.0
@@ -29,12 +34,14 @@ def odd_colours(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, 
     if small.mask is None or len(small.cameras) < 3:
         return ()
     try:
-        colours = surface_colours(small, reconstruct(small.mask, small.cameras, bounds, HULL))
+        surface = surface_of(small, reconstruct(small.mask, small.cameras, bounds, HULL))
     except ValueError:
         return ()
-    found = []
+    found, colours = [], surface.colours(small.rgb)
     distance, correlation = nearest_agreement(colours, colours)
     typical, alike = distance.nanmedian(), correlation.nanmedian()
+    suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
+    others = _fitting_better(small, surface, colours, distance, suspects)
     detail = _detail(small)
     usual, saturation = detail.nanmedian(), _saturation(small)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
@@ -43,6 +50,9 @@ def odd_colours(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, 
             found.append(
                 Finding(f"camera '{name}': its images are grey, the others' are not; check what it was set to")
             )
+        elif view in others:
+            text = f"camera '{name}': its images do not show what the others see, and fit much better {others[view]}"
+            found.append(Finding(f"{text}; exchange or turn its files"))
         elif bool(distance[view] > FAR * typical) or (
             bool(distance[view] > FARTHER * typical) and bool(correlation[view] < LESS_ALIKE * alike)
         ):
@@ -56,6 +66,35 @@ def odd_colours(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, 
             what = "blurred" if bool(detail[view] < usual) else "noisy"
             found.append(Finding(f"camera '{name}': its images are {what} beside the others'; check focus and gain"))
     return tuple(found)
+
+
+def _fitting_better(
+    frame: MultiViewFrame,
+    surface: Surface,
+    colours: SurfaceColours,
+    distance: Float[Tensor, "view"],
+    suspects: Sequence[int],
+) -> dict[int, str]:
+    """The cameras whose images fit the others' much better mirrored, turned or as another camera's; and how."""
+    found, names = {}, frame.cameras.names
+    for view in suspects:
+        width, height = (int(side) for side in frame.cameras.size_px[view])
+        own = frame.rgb[view, :, :height, :width]
+        tried = {"mirrored": own.flip(2), "upside down": own.flip(1), "turned by 180 degrees": own.flip(1, 2)}
+        tried |= {
+            f"as that of '{names[other]}'": frame.rgb[other, :, :height, :width]
+            for other, size in enumerate(frame.cameras.size_px.tolist())
+            if other != view and size == [width, height]
+        }
+        nearest = {}
+        for what, image in tried.items():
+            rgb = frame.rgb.clone()
+            rgb[view, :, :height, :width] = image
+            nearest[what] = float(nearest_agreement(surface.colours(rgb), colours)[0].nan_to_num(torch.inf)[view])
+        what = min(nearest, key=nearest.__getitem__)
+        if nearest[what] < FITS * float(distance[view]):
+            found[view] = what
+    return found
 
 
 def _detail(frame: MultiViewFrame) -> Float[Tensor, "view"]:

@@ -70,9 +70,10 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Findi
 def _odd(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, ...]:
     """The camera that does not go with its peers: as the hull says it, unless the outlines name another one."""
     by_hull, by_outlines = odd_camera(frame, bounds), odd_outline(frame, bounds)
-    if by_outlines is None or (by_hull and f"'{by_outlines[0]}'" in by_hull[0].text):
+    if by_outlines is None or (by_hull and any(f"'{name}'" in by_hull[0].text for name in by_outlines[0])):
         return by_hull
-    text = "without camera '{}' the outlines of all others fit together {:.0f} times better".format(*by_outlines)
+    names, times = " or ".join(f"'{name}'" for name in by_outlines[0]), by_outlines[1]
+    text = f"without camera {names} the outlines of all others fit together {times:.0f} times better"
     return (Finding(f"{text}; check its calibration, its mask and whether it is in time"),)
 
 

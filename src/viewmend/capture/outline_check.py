@@ -28,14 +28,15 @@ SUSPECTS = 3
 LEFT = 0.5
 """A suspect is the one if so little, or less, of what was missed is left without it."""
 ALONE = 0.7
-"""The next suspect must leave more than the best one divided by this."""
+"""It may be the next suspect as well, unless that leaves more than the best one divided by this."""
 
 
-def odd_outline(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[str, float] | None:
+def odd_outline(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[tuple[str, ...], float] | None:
     """The camera that keeps all outlines from fitting together, and how many times better they do without it.
 
     The line of sight through a point of an outline touches the subject, so somewhere along it is a place that lies
-    inside of all other masks. How far outside the best place is, is what is missed. None where no camera is odd.
+    inside of all other masks. How far outside the best place is, is what is missed. Two
+    cameras are named where it may be either. None where no camera is odd.
     """
     names = frame.cameras.names
     small = reduced(frame, LONGEST_PX)
@@ -53,9 +54,10 @@ def odd_outline(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[str, floa
         return None
     order = np.argsort(left)
     best = left[order[0]]
-    if best > LEFT * missed or (len(left) > 1 and best > ALONE * left[order[1]]):
+    if best > LEFT * missed:
         return None
-    return names[suspects[order[0]]], missed / max(best, LEAST_LEFT_PX)
+    either = [view for view in order[:2] if best > ALONE * left[view] or view == order[0]]
+    return tuple(names[suspects[view]] for view in either), missed / max(best, LEAST_LEFT_PX)
 
 
 def _missed_px(frame: MultiViewFrame, box: Bounds) -> tuple[float, np.ndarray]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from viewmend.capture.finding import Finding
 from viewmend.capture.reduction import reduced
-from viewmend.capture.surface_colours import nearest_agreement, surface_colours
+from viewmend.capture.surface_colours import nearest_agreement, surface_of
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
@@ -175,8 +175,8 @@ def late_images(frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | 
         proxy = reconstruct(frame.mask, frame.cameras, bounds, HULL)
     except ValueError:
         return ()
-    now = surface_colours(frame, proxy)
-    then = [surface_colours(replace(frame, rgb=other.rgb), proxy) for other in frames]
+    surface = surface_of(frame, proxy)
+    now, then = surface.colours(frame.rgb), [surface.colours(other.rgb) for other in frames]
     distances = torch.stack([nearest_agreement(colours, now)[0] for colours in then]).nan_to_num(torch.inf)
     ratio = (distances.amin(0) / distances[middle]).nan_to_num(1.0)  # of cameras that share nothing: inf / inf
     view = int(ratio.argmin())

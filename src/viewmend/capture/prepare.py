@@ -70,7 +70,10 @@ class PreparedCapture(OfSource):
         """
         frame = self.source.read(time).without(self.left_out)
         named = self.cameras.names if self.inputs is None else self.inputs
-        found = faulty_masks(frame, named, self.bounds)
+        absent = [name for name in named if name not in frame.cameras.names and name not in self.left_out]
+        text = "camera '{}' has no image or no mask, and is absent; check its files"
+        found = tuple(Finding(text.format(name)) for name in absent)
+        found += faulty_masks(frame, named, self.bounds)
         _refuse_or_warn(f"{self.name}: frame '{self.frame_ids[time]}'", found, self._said)
         wrong = [finding.camera for finding in found if finding.camera]
         if len(wrong) == len(frame.cameras):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.geometry.cameras import project
@@ -33,8 +33,26 @@ class SurfaceColours:
     """Where a camera sees the point well."""
 
 
+@dataclass(frozen=True)
+class Surface:
+    """Surface points in every camera."""
+
+    uv_px: Float[Tensor, "view point 2"]
+    seen: Bool[Tensor, "view point"]
+    """Where a camera sees the point well, whatever its image shows."""
+
+    def colours(self, rgb: UInt8[Tensor, "view 3 height width"]) -> SurfaceColours:
+        """What images of these cameras show of the points."""
+        return SurfaceColours(sample_bilinear(rgb.float() / 255, self.uv_px, "border"), self.seen)
+
+
 def surface_colours(frame: MultiViewFrame, proxy: GeometryProxy) -> SurfaceColours:
     """Sample the proxy's surface in all cameras; the frame has masks."""
+    return surface_of(frame, proxy).colours(frame.rgb)
+
+
+def surface_of(frame: MultiViewFrame, proxy: GeometryProxy) -> Surface:
+    """Where the proxy's surface is in all cameras; the frame has masks."""
     assert frame.mask is not None, "there is no proxy without masks"
     step = max(1, len(proxy.mesh.vertices) // POINTS)
     points, normals = proxy.mesh.vertices[::step], proxy.normals[::step]
@@ -44,12 +62,11 @@ def surface_colours(frame: MultiViewFrame, proxy: GeometryProxy) -> SurfaceColou
     column, row = uv.floor().long().unbind(-1)
     view = torch.arange(len(uv), device=uv.device)[:, None]
     nearest = depth[view, row.clamp(0, height - 1), column.clamp(0, width - 1)]
-    layers = torch.cat([frame.rgb, frame.mask[:, None]], 1).float() / 255
-    sampled = sample_bilinear(layers, uv, "border")
+    opaque = sample_bilinear(frame.mask[:, None].float() / 255, uv, "border")[..., 0]
     away = torch.nn.functional.normalize(frame.cameras.centers[:, None] - points, dim=-1)
     seen = in_view(uv, z, frame.cameras) & (nearest > 0) & (z <= nearest + BIAS * float(proxy.bounds.size_m.norm()))
-    seen &= ((normals * away).sum(-1) > LEAST_COSINE) & (sampled[..., 3] > LEAST_MASK)
-    return SurfaceColours(sampled[..., :3], seen)
+    seen &= ((normals * away).sum(-1) > LEAST_COSINE) & (opaque > LEAST_MASK)
+    return Surface(uv, seen)
 
 
 def nearest_agreement(
