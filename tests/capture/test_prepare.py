@@ -65,3 +65,24 @@ def test_a_reduced_capture_states_the_cameras_of_its_frames():
     frame = prepared.read(0)
     assert frame.rgb.shape == (6, 3, 32, 32) and prepared.cameras.max_size_px == (32, 32)
     assert torch.equal(frame.cameras.K, prepared.cameras.K)
+
+
+class Absent(BallCapture):
+    """A rig of which camera `c1` has nothing at time 1."""
+
+    def read(self, time):
+        frame = super().read(time)
+        return frame.without(["c1"]) if time == 1 else frame
+
+
+def test_a_camera_without_a_file_is_said_once_and_is_absent_there(caplog):
+    prepared = prepare(Absent(ring(6)), align=False)
+    assert [len(prepared.read(time).cameras) for time in (0, 1, 1)] == [6, 5, 5]
+    said = [record.getMessage() for record in caplog.records if "'c1'" in record.getMessage()]
+    assert len(said) == 1 and "has no image or no mask, and is absent; check its files" in said[0]
+
+
+def test_a_camera_that_is_no_input_may_be_absent(caplog):
+    names = [name for name in ring(6).names if name != "c1"]
+    assert len(prepare(Absent(ring(6)), names, align=False).read(1).cameras) == 5
+    assert not [record for record in caplog.records if "'c1'" in record.getMessage()]

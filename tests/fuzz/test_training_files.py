@@ -172,6 +172,9 @@ def test_stored_scenes_say_no_more_than_they_hold(stored):
     small = tensor(cv2.imencode(".png", np.zeros((8, 8, 4), np.uint8))[1].tobytes())
     with pytest.raises(ValueError, match="of the camera's size"):
         replace(stored, images=(small, *stored.images[1:])).sample(0, render, 2)
+    for changes in ({"images": stored.images * 2}, {"images": stored.images[:3]}, {"depths": stored.depths[:3]}):
+        with pytest.raises(ValueError, match="expected an image and a depth of 4 cameras"):
+            replace(stored, **changes).sample(0, render, 2)
 
 
 def test_tars(sample, tmp_path):
