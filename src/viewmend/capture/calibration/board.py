@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
+from viewmend.capture.calibration.corners import refined
+
 LEAST_CORNERS = 8
 """Fewer corners in an image say too little of where the board is."""
 
@@ -65,7 +67,8 @@ class Board:
         on_board = self.corners_m[ids]
         if np.linalg.matrix_rank(on_board - on_board[0], tol=self.square_m / 2) < 2:
             return None
-        return Corners(ids, np.asarray(pixels, np.float64).reshape(-1, 2) + 0.5)
+        found = np.asarray(pixels, np.float64).reshape(-1, 2) + 0.5
+        return Corners(ids, refined(grey, found, on_board[:, :2], self.square_m, self.marker_m))
 
 
 def parse_board(text: str, dictionary: str) -> Board:
