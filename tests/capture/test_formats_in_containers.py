@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from reference.foreign_studios import write_dna, write_riftcast
 from reference.random_rigs import COUNTS, SEEDS, TAKES, assert_same, assert_take, named, opencv, random_rig, random_take
 
-from viewmend.capture.containers import names_in
+from viewmend.capture.containers import names_in, read_bytes
 from viewmend.capture.errors import CaptureError
 from viewmend.capture.plain import open_capture
 from viewmend.capture.run_lengths import read_runs, run_lengths
@@ -81,6 +81,13 @@ def test_members_whose_names_are_no_text_are_left_out(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file[b"\x82"], file["7"] = np.zeros(3, np.uint8), np.zeros(3, np.uint8)
     assert names_in(tmp_path / "a.h5") == {"7"}
+
+
+def test_a_named_type_is_no_image(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["a.png"] = np.dtype("uint8")
+    with pytest.raises(ValueError, match="expected the bytes of an image"):
+        read_bytes(tmp_path / "a.h5" / "a.png")
 
 
 def test_images_of_plain_captures_may_lie_in_hdf5_files(tmp_path):

@@ -96,3 +96,8 @@ def test_arrays_of_other_things_are_refused(tmp_path):
     (tmp_path / "a.npy").write_bytes(stream.getvalue()[:9])
     with pytest.raises(ValueError, match=r"in a\.npy"):
         read_objects(tmp_path / "a.npy")
+
+
+def test_a_text_with_an_escape_that_is_none_is_read_without_a_warning(tmp_path):
+    (tmp_path / "a.pkl").write_bytes(b"S'a\\c'\n.")
+    assert read_objects(tmp_path / "a.pkl") == "a\\c"

@@ -55,7 +55,8 @@ def read_bytes(path: Path, most: int | None = None) -> bytes:
             return stream.read(-1 if most is None else most)
     with opened(file) as root:
         data = member(root, path.relative_to(file).parts)
-        if getattr(data, "dtype", None) not in (np.uint8, np.int8) or data.size > MOST_BYTES:
+        size = getattr(data, "size", None)  # groups and named types have none
+        if size is None or size > MOST_BYTES or data.dtype not in (np.uint8, np.int8):
             raise ValueError(f"{path}: expected the bytes of an image, got something else; copy the file again")
         return np.asarray(data[()] if most is None or data.ndim != 1 else data[:most]).tobytes()
 

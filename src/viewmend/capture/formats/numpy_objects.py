@@ -6,6 +6,7 @@ values: nothing is imported or called, and whatever else a pickle asks for is re
 
 import pickletools
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,7 +95,13 @@ def numbers(value: Any, *shape: int) -> np.ndarray:
 
 
 def _followed(data: bytes) -> Any:
-    """What the pickle's instructions leave."""
+    """What the pickle's instructions leave; Python warns of texts in it whose escapes are none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return _run(data)
+
+
+def _run(data: bytes) -> Any:
     machine = _Machine()
     for opcode, argument, _ in pickletools.genops(data):
         name = opcode.name
