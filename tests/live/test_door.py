@@ -1,5 +1,6 @@
 """What strangers may cost: connections, messages, time."""
 
+import asyncio
 import contextlib
 import socket
 import struct
@@ -155,6 +156,14 @@ def test_who_reads_slowly_is_waited_for(left, reads):
     sizes = iter(left)
     visitor.transport = SimpleNamespace(get_write_buffer_size=lambda: next(sizes))
     assert all(visitor.reads(visitor.since + second) for second in range(len(left))) == reads
+
+
+def test_who_is_gone_gets_no_refusal():
+    """Its connection may have ended while the question waited for its turn."""
+    gone = door.SocketDoor.__new__(door.SocketDoor)
+    gone.conn = SimpleNamespace(eof_sent=True)  # all else would be an AttributeError
+    for kind in ("start", "body"):
+        asyncio.run(gone.send({"type": f"websocket.http.response.{kind}", "status": 401, "headers": [], "body": b"no"}))
 
 
 def test_what_is_nearly_read_counts_as_read():

@@ -238,7 +238,9 @@ class SocketDoor(WebSocketsSansIOProtocol, Visitor):
             self.transport.pause_reading()
 
     async def send(self, message: Any) -> None:
-        """Send what the application says; a refusal completes the handshake, too."""
+        """Send what the application says; a refusal completes the handshake, too, and who is gone gets none."""
+        if self.conn.eof_sent and message["type"].startswith("websocket.http.response"):
+            return
         await super().send(message)
         self.handshake_complete = self.handshake_complete or self.close_sent
 
