@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import pytest
 from msgspec import Meta, Struct
 
-from viewmend.json_input import Number, bounded_bytes, one_of, read_json, typed
+from viewmend.json_input import Number, one_of, read_json, typed
 
 
 class Wheel(Struct, frozen=True):
@@ -35,13 +35,6 @@ def test_nulls_in_objects_are_absent_and_whole_numbers_are_integers_at_any_depth
     assert found == [None, {"b": [{"d": 2, "e": -1000}, None], "f": 1e308, "g": 0.5}]
     assert [type(value) for value in found[1]["b"][0].values()] == [int, int]
     assert type(found[1]["f"]) is float
-
-
-def test_a_file_is_read_up_to_its_bound(tmp_path):
-    (tmp_path / "a.json").write_bytes(b"12345")
-    assert bounded_bytes(tmp_path / "a.json", 5) == b"12345"
-    with pytest.raises(ValueError, match=r"expected a\.json to have at most 4 bytes, got more"):
-        bounded_bytes(tmp_path / "a.json", 4)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,7 @@
-"""JSON from outside as typed values (msgspec); what is too large or does not fit is refused with one clear line."""
+"""JSON from outside as typed values (msgspec); what does not fit is refused with one clear line."""
 
 import json
 import re
-from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 import msgspec
@@ -16,8 +15,6 @@ Number = Annotated[float, Meta(ge=-FINITE, le=FINITE)]
 Triple = tuple[Number, Number, Number]
 LARGEST_INTEGER = 2**53
 """The largest whole number up to which JavaScript counts exactly."""
-MOST_BYTES = 2**24
-"""The largest file of JSON that is read; the calibration of a thousand images has a megabyte."""
 PLAIN_NAMES = {
     "int": "a whole number",
     "float": "a number",
@@ -32,20 +29,6 @@ PLAIN_NAMES = {
 def one_of(*words: str) -> Meta:
     """A text that is one of these words."""
     return Meta(pattern=f"^({'|'.join(words)})\\Z")
-
-
-def bounded_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
-    """All bytes of a file.
-
-    Raises:
-        ValueError: the file is larger than `most`.
-        OSError: it cannot be read.
-    """
-    with path.open("rb") as file:
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f"expected {path.name} to have at most {most} bytes, got more; is it the right file?")
-    return data
 
 
 def read_json(text: str | bytes) -> Any:

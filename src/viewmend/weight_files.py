@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from viewmend.input_errors import InputError
+from viewmend.foreign_input import InputError
 
 WRAPPER = "netG"
 """Checkpoints of a GAN's generator may be {"netG": weights}; all others are the weights themselves."""

@@ -15,7 +15,7 @@ from viewmend.baselines.dstt import DSTT
 from viewmend.baselines.e2fgvi import E2FGVI, E2FGVIHQ
 from viewmend.baselines.fuseformer import FuseFormer
 from viewmend.baselines.token_transformer import NATIVE_PX, MemorySlot, TokenTransformer
-from viewmend.input_errors import InputError
+from viewmend.foreign_input import InputError
 
 TOLERANCE = 1e-3
 """Largest absolute difference, in a range of [-1, 1], of two float32 networks that are the same."""

@@ -7,9 +7,10 @@ from typing import Annotated
 import torch
 from msgspec import Meta, Struct
 
+from viewmend.foreign_input import bounded_bytes
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
-from viewmend.json_input import Number, Triple, bounded_bytes, read_json, shown, typed
+from viewmend.json_input import Number, Triple, read_json, shown, typed
 
 Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from viewmend.capture.finding import Finding
 from viewmend.capture.reduction import reduced
-from viewmend.capture.surface_colours import Surface, SurfaceColours, nearest_agreement, surface_of
+from viewmend.capture.surface_colours import Surface, SurfaceColours, agreement, nearest_agreement, surface_of
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
+from viewmend.geometry.sampling import sample_bilinear
 from viewmend.views import MultiViewFrame
 
 LONGEST_PX = 256
@@ -86,11 +87,11 @@ def _fitting_better(
             for other, size in enumerate(frame.cameras.size_px.tolist())
             if other != view and size == [width, height]
         }
-        nearest = {}
-        for what, image in tried.items():
-            rgb = frame.rgb.clone()
-            rgb[view, :, :height, :width] = image
-            nearest[what] = float(nearest_agreement(surface.colours(rgb), colours)[0].nan_to_num(torch.inf)[view])
+        shown = sample_bilinear(
+            torch.stack(list(tried.values())).float() / 255, surface.uv_px[view].expand(len(tried), -1, -1), "border"
+        )
+        shared = surface.seen[view] & surface.seen
+        nearest = {what: agreement(rgb, shared, colours, view)[0] for what, rgb in zip(tried, shown, strict=True)}
         what = min(nearest, key=nearest.__getitem__)
         if nearest[what] < FITS * float(distance[view]):
             found[view] = what

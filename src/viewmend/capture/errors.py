@@ -1,6 +1,6 @@
 """What can be wrong with a capture."""
 
-from viewmend.input_errors import InputError
+from viewmend.foreign_input import InputError
 
 
 class CaptureError(InputError):

@@ -127,7 +127,6 @@ def told_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _decode(path: Path, where: str, flags: int) -> np.ndarray:
-
     try:
         data = read_bytes(path)
     except OSError as error:

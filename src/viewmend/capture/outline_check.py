@@ -11,7 +11,9 @@ from viewmend.geometry.proxy import reconstruct
 from viewmend.views import MultiViewFrame
 
 LONGEST_PX = 384
+"""Larger images are reduced first."""
 HULL = HullConfig(resolution=64)
+"""For the box around the subject alone."""
 POINTS, MOST_POINTS = 40, 400
 """Points of each outline at most, and of all outlines together."""
 AROUND = 1.5
@@ -21,6 +23,7 @@ LEAST_CAMERAS = 5
 LEAST_PX = 0.1
 """Outlines that miss each other by less fit together."""
 LEAST_LEFT_PX = 0.01
+"""Less than this is not told apart."""
 STANDS_OUT = 1.6
 """A camera is suspected if its own outline is missed by so many times the median's."""
 SUSPECTS = 3
@@ -35,8 +38,8 @@ def odd_outline(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[tuple[str
     """The camera that keeps all outlines from fitting together, and how many times better they do without it.
 
     The line of sight through a point of an outline touches the subject, so somewhere along it is a place that lies
-    inside of all other masks. How far outside the best place is, is what is missed. Two
-    cameras are named where it may be either. None where no camera is odd.
+    inside of all other masks. How far outside the best place is, is what is missed. Two cameras are
+    named where it may be either. None where no camera is odd.
     """
     names = frame.cameras.names
     small = reduced(frame, LONGEST_PX)
@@ -64,7 +67,7 @@ def _missed_px(frame: MultiViewFrame, box: Bounds) -> tuple[float, np.ndarray]:
     """What all outlines miss, pixels, root mean square, and what each camera's own outline misses, `(view,)`."""
     points = min(POINTS, MOST_POINTS // len(frame.cameras))
     sight, rig = Sight.of(frame, box, max(1, points)), Rig.of(frame.cameras)
-    squared = sight.look(rig, sight.searched(rig)[:, None]).missed[:, 0]
+    squared = sight.least_missed(rig)
     count = np.bincount(sight.view, minlength=len(frame.cameras))
     own = np.bincount(sight.view, squared, minlength=len(frame.cameras)) / np.maximum(count, 1)
     return float(np.sqrt(squared.mean())), np.sqrt(own)

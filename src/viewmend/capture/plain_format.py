@@ -14,9 +14,10 @@ from jaxtyping import Float64
 from msgspec import Meta, Struct
 
 from viewmend.capture.errors import CaptureError
+from viewmend.foreign_input import bounded_bytes
 from viewmend.geometry.cameras import is_intrinsics
 from viewmend.geometry.rigid import is_rotation
-from viewmend.json_input import Number, Triple, bounded_bytes, read_json, shown, typed
+from viewmend.json_input import Number, Triple, read_json, shown, typed
 
 FORMAT = "plain-capture/1"
 CALIBRATION = "cameras.json"

@@ -77,20 +77,27 @@ def nearest_agreement(
     The least root mean square distance of RGB, and the highest correlation, over the points that two cameras see; NaN
     where no other shares enough of them. One camera that is wrong is far from all others, and none of these is.
     """
-    nearest = []
-    for view, (own, seen) in enumerate(zip(colours.rgb, colours.seen, strict=True)):
-        both = (seen & others.seen).float()
-        both[view] = 0
-        count = both.sum(1)
-        enough = count >= LEAST_SHARED
-        if not bool(enough.any()):
-            nearest.append(own.new_full((2,), torch.nan))
-            continue
-        both, count, rgb = both[enough, :, None], count[enough, None, None], others.rgb[enough]
-        a, b = (x - (x * both).sum(1, keepdim=True) / count for x in (own.expand_as(rgb), rgb))
-        products = [(x * y * both).sum((1, 2)) for x, y in ((a, b), (a, a), (b, b))]
-        correlation = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-6)
-        squares = ((own - rgb).square() * both).sum((1, 2)) / (3 * count[:, 0, 0])
-        nearest.append(torch.stack([squares.amin().sqrt(), correlation.amax()]))
-    distance, correlation = torch.stack(nearest).unbind(1)
+    nearest = [
+        agreement(own, both, others, view)
+        for view, (own, both) in enumerate(zip(colours.rgb, colours.seen[:, None] & others.seen, strict=True))
+    ]
+    distance, correlation = torch.tensor(nearest, device=colours.rgb.device).unbind(1)
     return distance, correlation
+
+
+def agreement(
+    own: Float[Tensor, "point 3"], shared: Bool[Tensor, "view point"], others: SurfaceColours, view: int
+) -> tuple[float, float]:
+    """`nearest_agreement` of one camera, `view`, over the points that it shares with each of the others."""
+    both = shared.float()
+    both[view] = 0
+    count = both.sum(1)
+    enough = count >= LEAST_SHARED
+    if not bool(enough.any()):
+        return torch.nan, torch.nan
+    both, count, rgb = both[enough, :, None], count[enough, None, None], others.rgb[enough]
+    a, b = (x - (x * both).sum(1, keepdim=True) / count for x in (own.expand_as(rgb), rgb))
+    products = [(x * y * both).sum((1, 2)) for x, y in ((a, b), (a, a), (b, b))]
+    correlation = products[0] / (products[1] * products[2]).sqrt().clamp(min=1e-6)
+    squares = ((own - rgb).square() * both).sum((1, 2)) / (3 * count[:, 0, 0])
+    return float(squares.amin().sqrt()), float(correlation.amax())

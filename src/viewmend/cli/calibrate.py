@@ -103,19 +103,17 @@ def _by_board(options: Options, out: Path) -> Figures:
 
 
 def _by_silhouettes(options: Options, out: Path) -> Figures:
-    from viewmend.capture.calibration.held_out import left_out, refined_all, refined_without
+    from viewmend.capture.calibration.held_out import best_hold, left_out, refined_all, refined_without
     from viewmend.capture.calibration.report import with_cameras
-    from viewmend.capture.calibration.silhouettes import HOLDS
     from viewmend.capture.formats.recognition import read_any_calibration
     from viewmend.capture.plain_format import write_calibration
     from viewmend.cli.console import busy, say, track
 
     frames, bounds = _frames(options)
     names = frames[0].cameras.names
-    tried = [(name, hold) for hold in HOLDS for name in left_out(names)]
-    judged = [(hold, refined_without(frames, name, bounds, hold)) for name, hold in track(tried, "cameras left out")]
-    hold = max(HOLDS, key=lambda one: sum(score.after for own, score in judged if own == one))
-    scores = [score for own, score in judged if own == hold]
+    with busy("how strongly cameras are held"):
+        hold = best_hold(frames, bounds)
+    scores = [refined_without(frames, name, bounds, hold) for name in track(left_out(names), "cameras left out")]
     for score in scores:
         say(
             f"{score.camera} left out: its mask and the others' hull agree to {score.before:.4f}, "

@@ -118,7 +118,8 @@ def _position(out: Path, per_shard: int | None) -> Position:
     Raises:
         ValueError: there are shards of which nothing was written down, or fewer; or one is missing between others.
     """
-    from viewmend.json_input import bounded_bytes, read_json, typed
+    from viewmend.foreign_input import bounded_bytes
+    from viewmend.json_input import read_json, typed
 
     there, file = _count_there(out), out / POSITION
     if per_shard is not None:

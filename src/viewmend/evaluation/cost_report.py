@@ -11,7 +11,8 @@ from viewmend.atomic_writes import write_atomically, write_text
 from viewmend.evaluation.cost import Ceilings, Growth, StageCost
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.report_plot import STYLE, require_matplotlib
-from viewmend.json_input import bounded_bytes, read_json, typed
+from viewmend.foreign_input import bounded_bytes
+from viewmend.json_input import read_json, typed
 
 SLOWER = 1.2
 """A stage that takes so many times as long as before is called slower."""

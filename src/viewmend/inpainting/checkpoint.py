@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 
 from viewmend.atomic_writes import write_tensors, write_text
+from viewmend.foreign_input import bounded_bytes
 from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.network import auto_dtype, set_compute_dtype
@@ -13,7 +14,7 @@ from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.inpainting.temporal_accumulation import TemporalAccumulation
-from viewmend.json_input import bounded_bytes, read_json
+from viewmend.json_input import read_json
 from viewmend.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError, load_weights, read_weights
 
 FORMAT = 2

@@ -15,8 +15,9 @@ from msgspec import Meta, Struct, structs
 from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain import PlainCapture, open_capture
 from viewmend.capture.prepare import open_masked
+from viewmend.foreign_input import bounded_bytes
 from viewmend.geometry.cameras import Cameras
-from viewmend.json_input import bounded_bytes, read_json, typed
+from viewmend.json_input import read_json, typed
 from viewmend.leave_one_out.capture_scenes import CaptureScene, capture_set
 from viewmend.rendering.selection import select_closest
 

@@ -11,8 +11,8 @@ import torch
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
+from viewmend.foreign_input import InputError
 from viewmend.geometry.rigid import is_rotation
-from viewmend.input_errors import InputError
 from viewmend.json_input import LARGEST_INTEGER, one_of, read_json, typed
 from viewmend.rendering.error_rules import ERROR_RULES
 from viewmend.timing import StageTimes

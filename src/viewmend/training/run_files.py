@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from viewmend.atomic_writes import HALF, write_tensors
-from viewmend.input_errors import InputError
+from viewmend.foreign_input import InputError
 from viewmend.training.plan import Recipe
 from viewmend.training.replay import ReplayPosition
 

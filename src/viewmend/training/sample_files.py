@@ -18,11 +18,11 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from viewmend.atomic_writes import HALF, write_atomically
+from viewmend.foreign_input import InputError
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.sweep.lookup import Scale
 from viewmend.inpainting.sweep.pyramids import Pyramid, Rig
-from viewmend.input_errors import InputError
 from viewmend.training.ray_batches import RayBatch
 from viewmend.training.samples import Sample
 from viewmend.training.stored_scenes import StoredScene, StoredView

@@ -1,9 +1,12 @@
-"""Whether refined cameras are better: judged by cameras that the refinement has not seen."""
+"""Whether refined cameras are better: judged by cameras, or times, that the refinement has not seen."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from viewmend.capture.calibration.silhouettes import Refinement, refine_by_silhouettes
+import numpy as np
+
+from viewmend.capture.calibration.sight import Rig, Sight
+from viewmend.capture.calibration.silhouettes import HOLDS, Refinement, refine_by_silhouettes
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -12,6 +15,8 @@ from viewmend.views import MultiViewFrame
 
 LEFT_OUT = 3
 """So many cameras are left out in turn, as far apart in the rig's order as can be."""
+LEFT_OUT_TIMES = 2
+"""So many times are left out in turn, where there are several."""
 MARGIN = 0.1
 """How much larger than the hull the box is that may hold the subject, to each side."""
 
@@ -41,6 +46,18 @@ def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds 
     return HeldOutIou(name, before, after)
 
 
+def missed_px(frames: Sequence[MultiViewFrame], left: int, bounds: Bounds | None, hold: float) -> float:
+    """What outlines miss at the time `frames[left]`, pixels, root mean square, with all cameras refined by the others.
+
+    Raises:
+        CaptureError: the frames have no masks.
+        ValueError: the masks agree on no subject.
+    """
+    refined = refined_all([frame for time, frame in enumerate(frames) if time != left], bounds, hold).cameras
+    sight = Sight.of(frames[left], _around_subject(frames[left], bounds))
+    return float(np.sqrt(sight.least_missed(Rig.of(refined)).mean()))
+
+
 def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None, hold: float) -> Refinement:
     """Refine all cameras of the frames; `bounds` are the capture's, where it has any, `hold` one of `HOLDS`.
 
@@ -49,6 +66,20 @@ def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None, hold: f
         ValueError: the masks agree on no subject.
     """
     return refine_by_silhouettes(frames, [_around_subject(frame, bounds) for frame in frames], hold)
+
+
+def best_hold(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> float:
+    """Which of `HOLDS` serves times best that the refinement has not seen, or of a single time, cameras.
+
+    Raises:
+        CaptureError: the frames have no masks.
+        ValueError: the masks agree on no subject.
+    """
+    if len(frames) > 1:
+        times = range(min(LEFT_OUT_TIMES, len(frames)))
+        return min(HOLDS, key=lambda hold: sum(missed_px(frames, time, bounds, hold) for time in times))
+    names = left_out(frames[0].cameras.names)
+    return max(HOLDS, key=lambda hold: sum(refined_without(frames, name, bounds, hold).after for name in names))
 
 
 def left_out(names: Sequence[str]) -> list[str]:

@@ -133,6 +133,10 @@ class Sight:
         best = depth[np.arange(len(far)), self.look(rig, depth).missed.argmin(1)]
         return self.refined(rig, best, halvings=2 + HALVINGS)
 
+    def least_missed(self, rig: Rig) -> Float64[np.ndarray, "point"]:
+        """What the best place of each line of sight is outside of all masks, as `Seen.missed`."""
+        return self.look(rig, self.searched(rig)[:, None]).missed[:, 0]
+
     def refined(
         self, rig: Rig, depth: Float64[np.ndarray, "point"], halvings: int = HALVINGS
     ) -> Float64[np.ndarray, "point"]:

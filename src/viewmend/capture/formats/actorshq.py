@@ -8,7 +8,7 @@ import numpy as np
 
 from viewmend.capture.formats.files import inverted, rotation_of
 from viewmend.capture.formats.footage import footage_of
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 HEADER = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
 CORNERS = ("aabb_min_x", "aabb_min_y", "aabb_min_z", "aabb_max_x", "aabb_max_y", "aabb_max_z")

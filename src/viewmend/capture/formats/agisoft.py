@@ -8,7 +8,7 @@ import numpy as np
 
 from viewmend.capture.formats.files import camera_names, mask_beside
 from viewmend.capture.formats.xml import attributes, number, read_xml
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**24
 """The largest of these files that is read; a hundred cameras have 200 kB."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from viewmend.capture.formats.files import camera_names, mask_beside
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**29
 """The largest of these files that is read; a model of a thousand images has about 100 MB."""

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from viewmend.capture.formats.files import camera_names, image_size_px, mask_beside
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**22
 """The largest of these files that is read; the largest of the sets has 363 cameras in 130 kB."""

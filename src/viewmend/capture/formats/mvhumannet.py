@@ -8,7 +8,8 @@ from msgspec import Meta, Struct
 from viewmend.capture.formats.files import five_coefficients
 from viewmend.capture.formats.footage import footage_of
 from viewmend.capture.formats.numpy_objects import numbers, read_objects
-from viewmend.json_input import Number, Triple, bounded_bytes, read_json, typed
+from viewmend.foreign_input import bounded_bytes
+from viewmend.json_input import Number, Triple, read_json, typed
 
 PLACES = ("images", "images_lr")
 RIGS = {120 / 65: (4096, 3000)}

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**28
 """The largest of these files that is read; ZJU-MoCap's annotations have some megabytes."""

@@ -9,7 +9,7 @@ import numpy as np
 from viewmend.capture.formats.files import five_coefficients, places_named, rotation_of
 from viewmend.capture.formats.footage import find_footage
 from viewmend.capture.formats.opencv_storage import MOST_BYTES, read_storage
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 SUFFIXES = (".xml", ".yml", ".yaml")
 KEYS = {

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from viewmend.capture.formats.xml import read_xml
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**20
 """The largest of these files that is read; sixty cameras have 50 kB."""

@@ -8,7 +8,8 @@ from msgspec import Meta, Struct
 
 from viewmend.capture.formats.files import five_coefficients
 from viewmend.capture.formats.footage import footage_of
-from viewmend.json_input import Number, Triple, bounded_bytes, read_json, typed
+from viewmend.foreign_input import bounded_bytes
+from viewmend.json_input import Number, Triple, read_json, typed
 
 CENTIMETRES = 0.01
 FPS = {"hd": 29.97, "vga": 25.0}

@@ -7,7 +7,7 @@ from typing import Any
 
 from viewmend.capture.formats.files import five_coefficients, places_named, rotation_of
 from viewmend.capture.formats.footage import find_footage
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**21
 """The largest of these files that is read; twelve cameras have 5 kB."""

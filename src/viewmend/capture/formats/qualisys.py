@@ -9,7 +9,7 @@ import numpy as np
 from viewmend.capture.formats.files import places_named
 from viewmend.capture.formats.footage import find_footage
 from viewmend.capture.formats.xml import attributes, read_xml
-from viewmend.json_input import bounded_bytes
+from viewmend.foreign_input import bounded_bytes
 
 MOST_BYTES = 2**20
 """The largest of these files that is read; four cameras have 5 kB."""

@@ -10,7 +10,8 @@ from msgspec import Meta, Struct
 from viewmend.capture.formats.files import five_coefficients
 from viewmend.capture.plain_format import stays_inside
 from viewmend.capture.run_lengths import RUN_LENGTHS
-from viewmend.json_input import Number, Triple, bounded_bytes, read_json, typed
+from viewmend.foreign_input import bounded_bytes
+from viewmend.json_input import Number, Triple, read_json, typed
 
 CALIBRATION = "calibration.json"
 TYPES = ("VCI", "VCI_REAL")

@@ -10,7 +10,8 @@ from msgspec import Meta, Struct
 from viewmend.capture.formats.files import camera_names, image_size_px
 from viewmend.capture.images import read_rgba
 from viewmend.capture.plain_format import stays_inside
-from viewmend.json_input import Number, bounded_bytes, read_json, typed
+from viewmend.foreign_input import bounded_bytes
+from viewmend.json_input import Number, read_json, typed
 
 NAMES = ("transforms.json", "transforms_train.json")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")

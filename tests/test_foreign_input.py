@@ -6,7 +6,7 @@ import pytest
 
 from viewmend.baselines.parity import ParityFileError
 from viewmend.capture.errors import CaptureError
-from viewmend.input_errors import MOST_CHARACTERS, InputError
+from viewmend.foreign_input import MOST_CHARACTERS, InputError, bounded_bytes
 from viewmend.live.protocol import ProtocolError
 from viewmend.training.run_files import RunError
 from viewmend.training.sample_files import ShardError
@@ -30,3 +30,10 @@ def test_a_message_of_the_largest_length_stays():
 def test_errors_go_from_process_to_process():
     error = pickle.loads(pickle.dumps(CaptureError("z" * 2000)))
     assert type(error) is CaptureError and len(str(error)) == MOST_CHARACTERS
+
+
+def test_a_file_is_read_up_to_its_bound(tmp_path):
+    (tmp_path / "a.json").write_bytes(b"12345")
+    assert bounded_bytes(tmp_path / "a.json", 5) == b"12345"
+    with pytest.raises(ValueError, match=r"expected a\.json to have at most 4 bytes, got more"):
+        bounded_bytes(tmp_path / "a.json", 4)
