@@ -19,6 +19,8 @@ MANY_ARGUMENTS: set[str] = {
     "viewmend/geometry/_hull_numba.py:judge",
     "viewmend/geometry/_hull_numba.py:occupied_blocks",
     "viewmend/geometry/_rasterize_numba.py:draw_band",
+    "viewmend/inpainting/_ray_sampling_numba.py:compare_silhouette",
+    "viewmend/inpainting/_ray_sampling_numba.py:follow",
     "viewmend/inpainting/sweep/_lookup_numba.py:_sample",
     "viewmend/inpainting/sweep/_lookup_numba.py:look_up_camera",
     "viewmend/inpainting/sweep/_lookup_numba.py:look_up_silhouette",

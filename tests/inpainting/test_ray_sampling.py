@@ -8,6 +8,8 @@ from inpainting.plates import Rig, camera, context, look, tiny, view
 from reference.rays_twin import far_twin, rays_twin
 
 from viewmend.geometry.cameras import Cameras
+from viewmend.inpainting._ray_sampling_numba import sample_numba
+from viewmend.inpainting._ray_sampling_torch import sample_torch
 from viewmend.inpainting.coarse_fill import fill
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.ray_blend_net import PIXELS_STEP, RADIUS_PX, look_around
@@ -35,14 +37,17 @@ def turned(cameras: Cameras, angle: float) -> Cameras:
     return replace(cameras, camera_from_world=turn @ cameras.camera_from_world)
 
 
-def test_following_equals_its_twin(rng):
+@pytest.mark.parametrize("implementation", [sample_numba, sample_torch])
+def test_following_equals_its_twin(rng, implementation, monkeypatch):
+    monkeypatch.setattr("viewmend.inpainting._ray_sampling_numba.sample_numba", implementation)
     incomplete = view(5)
     ray_views = context(5, ("left", "third", "right"))
     depth = ray_views.depth + 0.2 * torch.rand(ray_views.depth.shape, generator=rng) * (ray_views.depth > 0)
-    frame = replace(ray_views.frame, cameras=turned(ray_views.frame.cameras, 0.55))
+    own = (torch.rand(depth.shape, generator=rng) * 256).byte()  # not what the proxy covers
+    frame = replace(ray_views.frame, cameras=turned(ray_views.frame.cameras, 0.55), mask=own)
     ray_views = replace(ray_views, frame=frame, depth=depth)
     rig = context(5, ("left", "third", "right", "novel")).frame
-    masks = (torch.rand(rig.rgb[:, 0].shape, generator=rng) * 256).byte()
+    masks = (torch.rand(rig.rgb[:, 0].shape, generator=rng) * 64).byte()
     incomplete = replace(incomplete, silhouettes=Silhouettes(masks, turned(rig.cameras, 0.55)))
     pixels = torch.nonzero(incomplete.error > 0)
     pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
@@ -51,7 +56,7 @@ def test_following_equals_its_twin(rng):
     assert 0 < samples.features.in_view.mean() < 1, "some points are out of view"
     assert torch.allclose(samples.features.stack().double(), torch.from_numpy(features), atol=2e-3)
     assert torch.allclose(samples.consistency.stack().double(), torch.from_numpy(occupancy), atol=2e-3)
-    assert 0.05 < (samples.consistency.second < 0.9).float().mean() < 0.95
+    assert 0.05 < (samples.consistency.second < 0.5).float().mean() < 0.95
     again = RayFeatures.unstack(samples.features.stack())
     assert all(torch.equal(a, b) for a, b in zip(again, samples.features, strict=True))
     alone = samples.features.stack()[:, OFFSETS.index(0.09)]

@@ -9,14 +9,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.geometry.cameras import project, unproject
-from viewmend.geometry.sampling import bilinear_taps, in_view, sample_bilinear
 from viewmend.inpainting.coarse_fill import pull_push
-from viewmend.views import ContextViews, IncompleteView, Silhouettes
+from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Where a ray is looked at: z-depth behind the proxy, in subject sizes."""
@@ -26,6 +24,8 @@ OUTLINE = 0.06
 """Side, in subject sizes, of the squares over which masks are averaged: this tells how near their outline is."""
 PATCH = 0.08
 """Side, in subject sizes, of the squares over which colours are averaged: single pixels agree by chance more easily."""
+COVERED = 0.3
+"""Beside the proxy's edge, depths count from so much of it in view."""
 CELLS = (0.03, 0.06)
 """Sides, in subject sizes, of the squares by which `multi_scale_context` shows a pixel its farther surroundings."""
 CELL_CHANNELS = 6
@@ -104,6 +104,19 @@ class RaySamples(NamedTuple):
     """What all silhouettes of the rig say of the points."""
 
 
+class Seen(NamedTuple):
+    """What is looked up."""
+
+    frame: MultiViewFrame
+    """The cameras near the view."""
+    mask: UInt8[Tensor, "view height width"]
+    """The foreground in each, 0 to 255."""
+    depth: Float[Tensor, "view height width"]
+    """The proxy's z-depth in each, metres; 0 where there is none."""
+    silhouettes: Silhouettes
+    """The masks of all cameras of the rig."""
+
+
 def subject_size_m(view: IncompleteView) -> Float[Tensor, ""]:
     """Root of the subject's area at its median depth, metres: the unit along rays, so that any rig fits.
 
@@ -121,43 +134,22 @@ def sample_along_rays(
     The view needs a depth somewhere; a pixel without takes it from around. `offsets` are z-depths behind the proxy, in
     subject sizes.
     """
-    cameras, shape = ray_views.frame.cameras, (len(pixels), len(offsets))
+    if view.depth.device.type == "cpu":
+        from viewmend.inpainting._ray_sampling_numba import sample_numba as implementation
+    else:
+        from viewmend.inpainting._ray_sampling_torch import sample_torch as implementation
     size_m = subject_size_m(view)
     index = tuple(pixels.unbind(1))
     depth = view.depth[index]
     if not bool((depth > 0).all()):
         depth = pull_push(view.depth[None], view.depth > 0)[0][index]
-    z = depth[:, None] + size_m * depth.new_tensor(offsets)
-    uv = (pixels.flip(1) + 0.5).to(z)[:, None].expand(-1, len(offsets), -1)
-    points = unproject(uv.reshape(1, -1, 2), z.reshape(1, -1), view.camera)[0]
-
-    at, z = project(points, cameras)
-    inside = in_view(at, z, cameras)[..., None].to(z)
-    to_viewer = F.normalize(view.camera.centers[0] - points, dim=-1)
-    cosine = (F.normalize(cameras.centers[:, None] - points, dim=-1) * to_viewer).sum(-1, keepdim=True)
-    is_source = z.new_tensor([name in view.source_views for name in cameras.names])[:, None, None].expand_as(cosine)
-    mask = ray_views.frame.mask if ray_views.frame.mask is not None else 255 * (ray_views.depth > 0).to(torch.uint8)
-
-    colour, own_mask, coverage, depth = _at_points(ray_views, at).split((3, 1, 1, 1), -1)
-    behind = torch.where(coverage > 0.3, (z[..., None] - depth / coverage.clamp_min(0.05)) / size_m, 0.0)
-    mean_mask, mean_colour, mean_coverage = _means_at_points(ray_views.frame.rgb, mask, ray_views.depth > 0, at)
-    features = RayFeatures(
-        colour=colour,
-        mask=own_mask,
-        depth_difference=(behind / NEAR).tanh(),
-        coarse_depth_difference=(behind / FAR).tanh(),
-        viewing_cosine=cosine,
-        is_source=is_source,
-        in_view=inside,
-        mean_mask=mean_mask,
-        mean_colour=mean_colour,
-        mean_coverage=mean_coverage,
-    )
-    consistency = _silhouette_consistency(points, view.silhouettes or Silhouettes(mask, cameras))
-    return RaySamples(
-        RayFeatures(*((values * inside).movedim(0, 1).unflatten(0, shape) for values in features)),
-        SilhouetteConsistency(*consistency.unflatten(0, shape).split(1, -1)),
-    )
+    mask = ray_views.frame.mask
+    if mask is None:
+        mask = 255 * (ray_views.depth > 0).to(torch.uint8)
+    seen = Seen(ray_views.frame, mask, ray_views.depth, view.silhouettes or Silhouettes(mask, ray_views.frame.cameras))
+    is_source = [float(name in view.source_views) for name in ray_views.frame.cameras.names]
+    z_m = depth[:, None] + size_m * depth.new_tensor(offsets)
+    return implementation(view.camera, pixels.flip(1) + 0.5, z_m, seen, is_source, float(size_m))
 
 
 def multi_scale_context(
@@ -182,7 +174,7 @@ def multi_scale_context(
     cells, place = torch.unique(torch.cat(shifted, 1), dim=0, return_inverse=True)
     told = []
     for side, (above, left), at in zip(sides, before, cells.split(2, 1), strict=True):
-        means = F.avg_pool2d(_padded(F.pad(shown, (left, 0, above, 0)), side), side)[0]
+        means = F.avg_pool2d(padded(F.pad(shown, (left, 0, above, 0)), side), side)[0]
         told.append(windows(means, at, CELLS_AROUND))
     return torch.cat(told, 1), place
 
@@ -197,64 +189,12 @@ def windows(
     return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
 
 
-def _at_points(ray_views: ContextViews, at: Float[Tensor, "view point 2"]) -> Float[Tensor, "view point 6"]:
-    """RGB before black, mask, whether the proxy is there and its depth, bilinearly; zeros beyond the image."""
-    frame, (height, width) = ray_views.frame, ray_views.depth.shape[1:]
-    view = torch.arange(len(frame.cameras), device=at.device)[:, None]
-    total = at.new_zeros(*at.shape[:2], 6)
-    for tap in bilinear_taps(at, width, height):
-        depth = ray_views.depth[view, tap.row, tap.column]
-        covered = (depth > 0).to(at)
-        mask = covered if frame.mask is None else frame.mask[view, tap.row, tap.column].to(at) / 255
-        rgb = frame.rgb[view, :, tap.row, tap.column].to(at) / 255 * mask[..., None]
-        values = torch.cat([rgb, torch.stack([mask, covered, depth], -1)], -1)
-        total += (tap.weight * tap.inside)[..., None] * values
-    return total
+def side_px(size: float, masks: UInt8[Tensor, "view height width"]) -> int:
+    """A length in subject sizes, of these images: pixels, 1 at least. The subject is the root of its mean area."""
+    return max(1, round(size * float((masks.sum((1, 2)) / 255).mean().sqrt())))
 
 
-def _silhouette_consistency(points: Float[Tensor, "point 3"], silhouettes: Silhouettes) -> Float[Tensor, "point 4"]:
-    """The two smallest mask values at each point, and means around; a camera that has it not in view says 1."""
-    cameras, mask = silhouettes.cameras, silhouettes.mask
-    at, z = project(points, cameras)
-    view = torch.arange(len(cameras), device=mask.device)[:, None]
-    value = torch.zeros_like(z)
-    for tap in bilinear_taps(at, mask.shape[2], mask.shape[1]):
-        value += tap.weight * tap.inside * mask[view, tap.row, tap.column]
-    side = max(1, round(OUTLINE * _subject_px(mask)))
-    mean = sample_bilinear(_means(mask[:, None], side), at / side)[..., 0]
-    values = torch.where(in_view(at, z, cameras), torch.stack([value / 255, mean]), 1.0)
-    values = F.pad(values, (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
-    return values.topk(2, dim=1, largest=False).values.flatten(0, 1).T
-
-
-def _means_at_points(
-    rgb: UInt8[Tensor, "view 3 height width"],
-    mask: UInt8[Tensor, "view height width"],
-    covered: Bool[Tensor, "view height width"],
-    at: Float[Tensor, "view point 2"],
-) -> tuple[Float[Tensor, "view point 1"], Float[Tensor, "view point 3"], Float[Tensor, "view point 1"]]:
-    """Means around each point of the mask, of RGB before black, and of what the proxy covers."""
-    subject_px = _subject_px(mask)
-    side, half = (max(1, round(size * subject_px)) for size in (OUTLINE, PATCH / 2))
-    shapes = _means(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
-    # Of colours every other row and column will do.
-    colours = F.avg_pool2d(_padded(rgb[..., ::2, ::2].to(at) * mask[:, None, ::2, ::2], half), half) / 255**2
-    mean_mask, mean_coverage = sample_bilinear(shapes, at / side).split(1, -1)
-    return mean_mask, sample_bilinear(colours, at / (2 * half)), mean_coverage
-
-
-def _subject_px(mask: UInt8[Tensor, "view height width"]) -> float:
-    """Root of the subject's area, a mean over cameras."""
-    return float((mask.sum((1, 2)) / 255).mean().sqrt())
-
-
-def _means(shapes: UInt8[Tensor, "view shape height width"], side: int) -> Float[Tensor, "view shape rows columns"]:
-    """Means of squares of this side, 255 as 1. Whole numbers: pooling is slower."""
-    squares = _padded(shapes, side).unflatten(3, (-1, side)).unflatten(2, (-1, side))
-    return squares.sum(3, dtype=torch.int32).sum(4).float() / (255 * side**2)
-
-
-def _padded(
+def padded(
     images: Shaped[Tensor, "view channel height width"], side: int
 ) -> Shaped[Tensor, "view channel whole_height whole_width"]:
     """The images with zeros right and below, so that squares of this side cover them."""
