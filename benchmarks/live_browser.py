@@ -122,6 +122,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=SIZES)
     parser.add_argument("--codecs", nargs="+", default=CODECS)
     parser.add_argument("--mode", default="mended")
+    parser.add_argument("--model", default="views")
     parser.add_argument("--budget-ms", type=float, default=100, help="of the server; 0 for full quality always")
     parser.add_argument("--full-size", action="store_true", help="the full resolution while moving, too")
     parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
@@ -129,7 +130,8 @@ def main() -> None:
     chromium = os.environ.get("VIEWMEND_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)))
     results: dict[str, object] = {}
     since = time.monotonic()
-    with served(["--budget-ms", str(options.budget_ms)]) as address, sync_playwright() as control:
+    served_with = ["--model", options.model, "--budget-ms", str(options.budget_ms)]
+    with served(served_with) as address, sync_playwright() as control:
         browser = control.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         results["start"] = start(page, address, since)
