@@ -6,7 +6,7 @@ import threading
 import pytest
 import torch
 
-from viewmend.geometry.threads import parallel_for
+from viewmend.geometry.threads import heavy_operations, light_operations, parallel_for
 
 
 @pytest.fixture
@@ -65,3 +65,51 @@ def test_a_forked_child_has_threads_of_its_own(two_threads):
         parallel_for(work, 4)
         os._exit(0 if done == [1] * 4 else 1)
     assert os.waitpid(child, 0)[1] == 0
+
+
+@pytest.fixture
+def three_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
+def workers(count: int) -> int:
+    """On how many threads work is done that all of them wait for together."""
+    seen, together = set(), threading.Barrier(count, timeout=20)
+
+    def work(_: int) -> None:
+        seen.add(threading.get_ident())
+        together.wait()
+
+    parallel_for(work, count)
+    return len(seen)
+
+
+def test_light_operations_stay_on_one_thread_and_heavy_ones_do_not(three_threads):
+    assert torch.get_num_threads() == 3
+    with light_operations():
+        assert torch.get_num_threads() == 1
+        assert workers(3) == 3, "our own loops are shared as ever"
+        with heavy_operations():
+            assert torch.get_num_threads() == 3
+            with light_operations():
+                assert torch.get_num_threads() == 1
+            assert torch.get_num_threads() == 3
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 3 and workers(3) == 3
+
+
+def test_threads_are_as_before_after_an_error_and_as_asked_later(three_threads):
+    @light_operations()
+    def fails() -> None:
+        assert torch.get_num_threads() == 1
+        raise ValueError
+
+    with pytest.raises(ValueError):
+        fails()
+    assert torch.get_num_threads() == 3
+    torch.set_num_threads(2)
+    with light_operations(), heavy_operations():
+        assert torch.get_num_threads() == 2, "nothing is remembered from before"

@@ -19,6 +19,7 @@ from viewmend.geometry.hull import (
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface, occupied_box
+from viewmend.geometry.threads import light_operations
 
 WORTH_RECARVING = 0.85
 """A subject smaller than this fraction of the carved box is carved again in its own box."""
@@ -50,6 +51,7 @@ class GeometryProxy:
         return GeometryProxy(self.mesh.to(device), self.normals.to(device), self.bounds.to(device))
 
 
+@light_operations()
 def reconstruct(
     mask: UInt8[Tensor, "view height width"],
     cameras: Cameras,

@@ -10,7 +10,7 @@ from torch import Tensor
 from viewmend.geometry._rasterize_torch import edge_functions, homogeneous, rasterize_torch
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import Mesh
-from viewmend.geometry.threads import parallel_for
+from viewmend.geometry.threads import light_operations, parallel_for
 
 NEAR_M = 1e-6
 """Surface nearer than this is not drawn."""
@@ -29,6 +29,7 @@ class Raster:
     """Index into the mesh's faces (int32), -1 where there is no surface."""
 
 
+@light_operations()
 def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front"] = "none") -> Raster:
     """Draw `mesh` into every camera, images of `cameras.max_size_px`; nothing is drawn beyond a view's own size.
 

@@ -1,16 +1,18 @@
-"""Sharing work among threads on the CPU."""
+"""Sharing work among threads on the CPU, where that is worth it."""
 
 import itertools
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 
 import torch
 
 
 def parallel_for(work: Callable[[int], object], count: int) -> None:
-    """Call `work(0)` to `work(count - 1)` on as many threads as torch uses; `work` must release the GIL to gain.
+    """Call `work(0)` to `work(count - 1)` on as many threads as torch may use; `work` must release the GIL to gain.
 
     Plain threads and not numba's own: those abort the process when two of our callers run at once, and may not be
     forked. The caller works, too, and waits for none of them to begin: started anew each time, threads cost a
@@ -22,7 +24,7 @@ def parallel_for(work: Callable[[int], object], count: int) -> None:
         while (item := next(items)) < count:
             work(item)
 
-    threads = torch.get_num_threads()
+    threads = _most_threads()
     others = [_pool(threads).submit(run) for _ in range(min(threads, count) - 1)]
     try:
         run()
@@ -30,6 +32,44 @@ def parallel_for(work: Callable[[int], object], count: int) -> None:
         for other in others:
             if not other.cancel():
                 other.result()
+
+
+_torch = threading.local()
+
+
+@contextmanager
+def light_operations() -> Iterator[None]:
+    """Within, torch's operations stay on the calling thread, but for `heavy_operations`; `parallel_for` shares as ever.
+
+    An operation on the pixels of one view takes less time than to wake another thread for it. For with, or to decorate
+    a function.
+    """
+    with _torch_threads(1):
+        yield
+
+
+@contextmanager
+def heavy_operations() -> Iterator[None]:
+    """Within, torch's operations share their work as they do outside of `light_operations`: convolutions, networks."""
+    with _torch_threads(_most_threads()):
+        yield
+
+
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    before, most = torch.get_num_threads(), getattr(_torch, "most", None)
+    _torch.most = _most_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+        _torch.most = most
+
+
+def _most_threads() -> int:
+    """How many threads torch uses outside of `light_operations`."""
+    return getattr(_torch, "most", None) or torch.get_num_threads()
 
 
 @cache

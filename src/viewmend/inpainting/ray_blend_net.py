@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.inpainting.coarse_fill import CoarseFill, fill
 from viewmend.inpainting.ray_sampling import (
     CELL_CHANNELS,
@@ -105,6 +106,7 @@ class RayBlendNet(CoarseFill):
         )
         self.choose = nn.Linear(20 * width, points + 2)
 
+    @light_operations()
     def forward(
         self,
         views: Sequence[IncompleteView],
@@ -128,6 +130,7 @@ class RayBlendNet(CoarseFill):
             for guess, at, rgb in zip(guesses, pixels, read, strict=True)
         ]
 
+    @heavy_operations()
     def mix(self, told: RayInputs) -> Float[Tensor, "pixel 3"]:
         """The mixed colour of each pixel."""
         size = max(1, len(told.place)) if torch.is_grad_enabled() else PIXELS_AT_ONCE

@@ -10,6 +10,7 @@ from torch import Tensor
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
+from viewmend.geometry.threads import light_operations
 from viewmend.rendering.blending import BlendConfig, blend
 from viewmend.rendering.error_rules import MIN_WEIGHT, Evidence, error_map, error_rule
 from viewmend.rendering.selection import select_closest
@@ -45,6 +46,7 @@ class RenderConfig:
             raise ValueError(f"expected a wrong_fraction above 0 and up to 1, got {self.wrong_fraction}")
 
 
+@light_operations()
 def render_view(
     frame: MultiViewFrame,
     proxy: GeometryProxy,

@@ -12,7 +12,7 @@ from torch import Tensor
 from viewmend.geometry.threads import parallel_for
 from viewmend.inpainting.sweep.lookup import CONTRAST, FAR, FEATURES, NEAR, STATS, Eyes, Places, Rays
 
-BAND = 64
+BAND = 128
 """Rays that a thread takes at a time."""
 
 

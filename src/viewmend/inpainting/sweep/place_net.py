@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.geometry.threads import heavy_operations
 from viewmend.inpainting.sweep.lookup import COLOUR, CONTRAST, FEATURES, IN_VIEW, MASK, STATS, Places
 
 
@@ -58,7 +59,7 @@ class PlaceNet(nn.Module):
         """The same in float32 by a compiled loop, since sums over so few cameras are slow in torch."""
         from viewmend.inpainting.sweep._weigh_numba import weigh_numba
 
-        with torch.autocast("cpu", enabled=False):
+        with torch.autocast("cpu", enabled=False), heavy_operations():
             hidden = places.features @ self.camera.weight.T.float()
             shared = self.all_cameras(places.stats) + self.camera.bias.float()
             weight, bias = self.trust.weight[0].float(), float(self.trust.bias)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
@@ -112,6 +113,7 @@ class SweepNet(Network):
         return fill([replace(view, error=view.holes.to(view.error))], [seen])[0].float()
 
     @torch.no_grad()
+    @light_operations()
     def error_map(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
         """How wrong each pixel seems to be, for the rule `wrong`; None where no camera may be looked at.
 
@@ -150,6 +152,7 @@ class SweepNet(Network):
         return max(MARGIN_PX, self.coarse.crop_margin_px(quality))
 
     @torch.no_grad()
+    @light_operations()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The view with all of E read, on the proxy and its rim, or faded; a view without E comes back at once.
 
@@ -271,7 +274,7 @@ class SweepNet(Network):
         decided: Float[Tensor, "1 feature rows columns"],
     ) -> Float[Tensor, "pixel output"]:
         """What convolutions over the view make of its pixels."""
-        with self.autocast():
+        with self.autocast(), heavy_operations():
             near = F.interpolate(decided, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
             near = near[0, :, : shape[0], : shape[1]]
             out = self.finish(stacked(near, scattered(told.to(near), pixels, shape)))
