@@ -64,6 +64,8 @@ class Observation:
     """What was encoded of the images, as a context provider remembers it."""
     depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False)
     """The proxy's depth in the cameras that were asked for, by name."""
+    _counted: tuple[tuple[int, int], int] = field(default=((-1, -1), 0), repr=False)
+    """How many depths and encoded entries there were when bytes were counted, and the bytes."""
 
     def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
         """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered once only."""
@@ -89,7 +91,13 @@ class Observation:
 
     @property
     def size(self) -> int:
-        """Bytes, without what is too small to count."""
+        """Bytes, without what is too small to count; they are counted anew where something was added."""
+        entries = len(self.depths), len(self.encoded)
+        if self._counted[0] != entries:
+            self._counted = (entries, self._count())
+        return self._counted[1]
+
+    def _count(self) -> int:
         made = [self.frame.rgb, self.frame.mask, *self.depths.values(), *self.encoded.values()]
         if isinstance(self.proxy, GeometryProxy):
             made += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
