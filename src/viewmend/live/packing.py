@@ -4,6 +4,7 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from viewmend.geometry.threads import light_operations
 from viewmend.live.pictures import (
     COLOURS,
     Picture,
@@ -50,6 +51,7 @@ class Encoders:
         return part | {"bytes": len(data)}, data
 
 
+@light_operations()
 def frame_message(
     look: Look, request: RenderRequest, result: RenderResult, info: FrameInfo, encoders: Encoders
 ) -> tuple[bytes, FrameTimes]:

@@ -211,7 +211,8 @@ class SweepNet(Network):
             features = weighed.features.flatten(1).to(self.compute_dtype)
             volume = scattered(features, cells, depth.shape)
             told = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(volume)
-            decided = self.decide(stacked(volume, told))
+            with heavy_operations():
+                decided = self.decide(stacked(volume, told))
             logits = self.logits(decided)[0, :, cells[:, 0], cells[:, 1]].T.float() + weighed.score.float()
         return Swept(cells, depth, logits, weighed, decided)
 

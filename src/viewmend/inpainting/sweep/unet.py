@@ -7,8 +7,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.geometry.threads import heavy_operations
-
 WIDER = 16
 """More channels at each coarser scale."""
 
@@ -27,7 +25,6 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
         self.join = nn.ModuleList(nn.Conv2d(fine, fine, 3, padding=1) for fine in widths[:-1])
 
-    @heavy_operations()
     def forward(self, image: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 feature height width"]:
         """Features of the same resolution."""
         x = F.relu(self.enter(image.contiguous(memory_format=torch.channels_last)))
