@@ -1,6 +1,7 @@
 """Inputs that strangers might give, and the bounds that whoever reads them keeps."""
 
 import copy
+import gc
 import json
 import os
 import resource
@@ -14,6 +15,8 @@ from hypothesis import strategies as st
 
 INPUTS = int(os.environ.get("VIEWMEND_FUZZ", "60"))
 MOST_S, MOST_MB = 5.0, 600
+COLLECT_EVERY = 64
+"""After so many inputs of a parser, garbage is looked for: 5,000 networks would take all memory before Python does."""
 FUZZED = settings(
     max_examples=INPUTS,
     deadline=None,
@@ -123,6 +126,8 @@ def reworded(draw, text: str):
 def held(read: Callable[[], object], refusals: tuple[type[Exception], ...] = (ValueError,)) -> None:
     """Read or refuse, in one line, within the bounds."""
     tried = TRIED.setdefault(os.environ["PYTEST_CURRENT_TEST"].split(" ")[0].split("::")[1], Tried())
+    if tried.inputs % COLLECT_EVERY == 0:
+        gc.collect()  # networks are cycles, which Python counts as few small things
     began, before = time.process_time(), peak_mb()
     tried.inputs, tried.failures = tried.inputs + 1, tried.failures + 1
     try:
