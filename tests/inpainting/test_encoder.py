@@ -76,3 +76,27 @@ def test_background_patches_are_discarded_and_nothing_else():
             for col in range(images.kept.shape[2]):
                 patch = images.foreground[view, row * 16 : row * 16 + 28, col * 16 : col * 16 + 28]
                 assert bool(images.kept[view, row, col]) == bool(patch.any())
+
+
+def test_gradients_of_some_images_count_for_all(rng):
+    tokeniser = Tokeniser(TINY)
+    stacks = [context_images(context(t, width=66, height=60), TINY) for t in range(3)]
+    towards = torch.randn(len(tokeniser(stacks)), TINY.dim, generator=rng)
+
+    def gradients(share: float) -> list[torch.Tensor]:
+        tokeniser.zero_grad()
+        tokens = tokeniser(stacks, share)
+        assert torch.equal(tokens, whole)
+        (tokens * towards).sum().backward()
+        parameters = (tokeniser.encoder.layers[2].weight, tokeniser.linear.weight)
+        return [torch.zeros_like(p) if p.grad is None else p.grad.clone() for p in parameters]
+
+    with torch.no_grad():
+        whole = tokeniser(stacks, 0.5)
+    encoder, linear = gradients(1.0)
+    torch.manual_seed(0)
+    some = [gradients(0.5) for _ in range(400)]
+    assert all(torch.allclose(own, linear, atol=1e-5) for _, own in some), "only the encoding is learned from in part"
+    drawn = torch.stack([own for own, _ in some])
+    away = (drawn.mean(0) - encoder).norm() / encoder.norm()
+    assert float(away) < 0.15 < float((drawn[0] - encoder).norm() / encoder.norm())

@@ -116,6 +116,7 @@ def test_a_window_is_small_has_its_past_and_counts_its_own_holes_alone(whole, cu
     assert int((cut.view.error * inner).sum()) > 0 and 0.8 * SIDE_PX**2 < int(inner.sum()) <= SIDE_PX**2
     recipe = replace(RECIPES["windows"](PLAN), model=replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, blocks=1))
     net = build(recipe.model)
+    assert Objective(net, recipe).model.context_gradients == recipe.context_gradients == 0.2
     before = Objective(net, recipe)([cut]).image
     beyond = torch.where(inner, cut.truth, cut.truth ^ 255)
     after = Objective(net, recipe)([replace(cut, truth=beyond)]).image

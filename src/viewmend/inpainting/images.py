@@ -21,6 +21,9 @@ from viewmend.inpainting.patches import (
 )
 from viewmend.views import ContextViews, IncompleteView, WindowPart
 
+Shown = tuple[Float[Tensor, "channel _h _w"], Bool[Tensor, "_rows _cols"]]
+"""What the encoder is shown of one image, and the patches that are kept."""
+
 
 @dataclass(frozen=True)
 class Images:
@@ -96,21 +99,42 @@ class Tokeniser(nn.Module):
         self.colour_skip = config.colour_skip
         self.norm = nn.LayerNorm(config.dim) if config.token_norms else nn.Identity()
 
-    def forward(self, stacks: Sequence[Images]) -> Float[Tensor, "patch dim"]:
+    def forward(self, stacks: Sequence[Images], gradients: float = 1.0) -> Float[Tensor, "patch dim"]:
         """Tokens of all kept patches of all stacks, in order.
+
+        With `gradients` below 1, where any are computed, they flow through the encoding of this share of the images,
+        which chance takes and which count for the others: the mean of the encoder's gradient stays. Most of a training
+        step is that encoding, of 22 images for one.
 
         Only a crop around each image's kept patches is encoded, with the encoder's receptive radius in zeros
         beyond the image: so nothing depends on the size of the crop, nor on what else is in the batch.
         """
         images = [pair for stack in stacks for pair in zip(stack.channels, stack.kept, strict=True)]
-        # A batch pads all crops to the largest: worth it on a device that wants large batches, not on a CPU.
-        batches = [[pair] for pair in images] if images[0][0].device.type == "cpu" else [images]
-        patches = torch.cat([self._patches(batch) for batch in batches])
+        if gradients < 1 and torch.is_grad_enabled():
+            patches = self._learned_in_part(images, gradients)
+        else:
+            patches = torch.cat(self._patches(images))
         return self.norm(self.linear(patches.flatten(1)))
 
-    def _patches(
-        self, images: Sequence[tuple[Float[Tensor, "channel _h _w"], Bool[Tensor, "_rows _cols"]]]
-    ) -> Float[Tensor, "patch feature 7 7"]:
+    def _learned_in_part(self, images: Sequence[Shown], share: float) -> Float[Tensor, "patch feature 7 7"]:
+        """The patches of all images, with gradients of this share of them, each so many times as large."""
+        chosen = (torch.rand(len(images)) < share).tolist()
+        with torch.no_grad():
+            others = iter(self._patches([own for own, taken in zip(images, chosen, strict=True) if not taken]))
+        taught = self._patches([own for own, taken in zip(images, chosen, strict=True) if taken])
+        learned = iter(own.detach() + (own - own.detach()) / share for own in taught)
+        return torch.cat([next(learned if taken else others) for taken in chosen])
+
+    def _patches(self, images: Sequence[Shown]) -> list[Float[Tensor, "_patch feature 7 7"]]:
+        """The kept patches of each image."""
+        if not images:
+            return []
+        # A batch pads all crops to the largest: worth it on a device that wants large batches, not on a CPU.
+        batches = [[pair] for pair in images] if images[0][0].device.type == "cpu" else [images]
+        counts = [int(kept.sum()) for _, kept in images]
+        return list(torch.cat([self._encoded(batch) for batch in batches]).split(counts))
+
+    def _encoded(self, images: Sequence[Shown]) -> Float[Tensor, "patch feature 7 7"]:
         """The kept patches of these images' features, encoded in one batch."""
         crops = [crop_windows(kept[None]) for _, kept in images]
         size = (max(s[0] for _, s in crops), max(s[1] for _, s in crops))

@@ -57,6 +57,9 @@ class Prediction:
 class PatchTransformer(Network):
     """T(F[t] | G[t], I[i, tau]) of section 1. Its state is empty: what it encodes, the context provider remembers."""
 
+    context_gradients = 1.0
+    """Share of the context images through whose encoding gradients flow, in training."""
+
     def __init__(self, config: InpainterConfig) -> None:
         super().__init__()
         self.config = config
@@ -81,7 +84,7 @@ class PatchTransformer(Network):
             return []
         stacks = [context_images(views, self.config) for views in many]
         with self.autocast():
-            tokens = self.tokeniser(stacks)
+            tokens = self.tokeniser(stacks, self.context_gradients)
             keys_values = self.transformer.project_context(tokens)
         counts = [len(stack.places) for stack in stacks]
         parts = zip(many, stacks, tokens.split(counts), keys_values.split(counts, 2), strict=True)

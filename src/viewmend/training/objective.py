@@ -33,6 +33,8 @@ class Objective(nn.Module):
         super().__init__()
         self.model = model
         self.recipe = recipe
+        patches = model.patches if isinstance(model, Chain) else model
+        patches.context_gradients = recipe.context_gradients
 
     def forward(self, batch: list[Sample]) -> StepOutput:
         """All terms of `batch`."""

@@ -165,6 +165,8 @@ class Recipe:
     """For the rays alone: what was looked up is augmented each time it is seen, so that few samples last longer."""
     bfloat16: bool = True
     """Run the networks under autocast."""
+    context_gradients: float = 1.0
+    """Share of the context images through whose encoding gradients flow; chance takes them, and they count for all."""
     checkpoint_every: int = 100
     """Steps after which the run is written down, to go on from there."""
     validate_every: int = 500
@@ -178,6 +180,7 @@ class Recipe:
         least |= {"new_per_batch": 1}
         wrong = [f"{name} of {getattr(self, name)}" for name, low in least.items() if getattr(self, name) < low]
         wrong += [f"minutes of {self.minutes}"] if self.minutes is not None and not self.minutes > 0 else []
+        wrong += [] if 0 < self.context_gradients <= 1 else [f"context_gradients of {self.context_gradients} (up to 1)"]
         wrong += [] if 0 < self.learning_rate < math.inf else [f"learning_rate of {self.learning_rate}"]
         wrong += [] if self.data.clip_length > 0 else [f"clip_length of {self.data.clip_length}"]
         if wrong:

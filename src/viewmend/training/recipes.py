@@ -116,7 +116,7 @@ def windows(data: DataPlan) -> Recipe:
     """`paper_small` on windows around what is missing, eight of each view."""
     recipe = paper_small(data)
     plan = replace(recipe.data, windows=8, held_cameras=2, imperfect_fraction=0.3, sizes_px=(320, 512))
-    return replace(recipe, name="windows", data=plan, new_per_batch=4, replay_size=600)
+    return replace(recipe, name="windows", data=plan, new_per_batch=4, replay_size=300, context_gradients=0.2)
 
 
 def base(data: DataPlan) -> Recipe:
