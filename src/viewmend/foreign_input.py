@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-MOST_BYTES = 2**24
+MOST_BYTES = 2**23
 """The largest file that is read unless its reader knows better; the calibration of a thousand images has a megabyte."""
 MOST_CHARACTERS = 1000
 """A message may be so long: what it quotes from files of others has any length."""
