@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import pytest
 from msgspec import Meta, Struct
 
-from viewmend.json_input import Number, one_of, read_json, typed
+from viewmend.json_input import MOST_PARTS, Number, one_of, read_json, typed
 
 
 class Wheel(Struct, frozen=True):
@@ -76,3 +76,12 @@ def test_numbers_of_any_size_fit_or_are_refused():
     big: Any = read_json(f'{{"radius": {"9" * 400}}}')
     with pytest.raises(ValueError, match="radius: expected another value"):
         typed(big, Wheel)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" + "[]," * MOST_PARTS + "0]", b"[" + b'{"a":[]},' * (MOST_PARTS // 2) + b"0]"], ids=["text", "bytes"]
+)
+def test_more_lists_and_objects_than_anything_has_are_refused_unread(text):
+    with pytest.raises(ValueError, match=f"at most {MOST_PARTS} lists and objects, got {MOST_PARTS + 1}; is it"):
+        read_json(text)
+    assert len(read_json("[" + "[]," * 1000 + "0]")) == 1001

@@ -13,6 +13,8 @@ FINITE = 1e300
 Number = Annotated[float, Meta(ge=-FINITE, le=FINITE)]
 """A finite number."""
 Triple = tuple[Number, Number, Number]
+MOST_PARTS = 2**20
+"""The most lists and objects of a text, brackets within its words among them; ten thousand cameras have a twentieth."""
 LARGEST_INTEGER = 2**53
 """The largest whole number up to which JavaScript counts exactly."""
 PLAIN_NAMES = {
@@ -35,8 +37,12 @@ def read_json(text: str | bytes) -> Any:
     """Parse JSON.
 
     Raises:
-        ValueError: the text is not JSON; says where.
+        ValueError: the text is not JSON; says where. Or it holds more lists and objects than anything that is read here
+            has: millions of them take many seconds, and a hundred times their own size.
     """
+    opening = (b"[", b"{") if isinstance(text, bytes) else ("[", "{")
+    if (parts := sum(map(text.count, opening))) > MOST_PARTS:  # pyright: ignore[reportArgumentType]
+        raise ValueError(f"expected JSON of at most {MOST_PARTS} lists and objects, got {parts}; is it the right file?")
     try:
         return json.loads(text, object_hook=_without_nulls, parse_float=_number)
     except (ValueError, RecursionError) as error:  # of syntax, of bytes, of numbers with thousands of digits
