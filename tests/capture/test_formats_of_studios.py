@@ -179,6 +179,13 @@ def test_genebodys_real_rig(shared, tmp_path):
         ("actorshq", "4x/calibration.csv", b",fx,", b",gx,", "expected columns name,w,h,rx"),
         ("actorshq", "4x/calibration.csv", b"Cam", b"../Cam", "expected rows of cameras or times"),
         ("panoptic", "calibration_160422_ultimatum1.json", b'"hd"', b'"dome"', "type: expected another value"),
+        (
+            "panoptic",
+            "calibration_160422_ultimatum1.json",
+            b'"t": [[',
+            b'"t": [[{}], [',
+            "t.0..0.: expected a finite number",
+        ),
         ("easyvolcap", "intri.yml", b"K_", b"L_", "expected cameras with names"),
     ],
 )

@@ -50,7 +50,7 @@ TRIED: dict[str, Tried] = {}
 @st.composite
 def changed(draw, value):
     """JSON with one to three of its values replaced, removed, doubled or put where another was."""
-    value = copy.deepcopy(value)
+    value, many = copy.deepcopy(value), 3000
     for _ in range(draw(st.integers(1, 3))):
         at, key = value, None
         while isinstance(at, dict | list) and at and (key is None or draw(st.integers(0, 3))):
@@ -62,7 +62,9 @@ def changed(draw, value):
         if kind == "remove":
             del parent[key]
         elif kind == "double" and isinstance(parent, list):
-            parent.extend([at] * draw(st.sampled_from([1, 3000])))
+            copies = draw(st.sampled_from([1, many]))
+            parent.extend([at] * copies)
+            many = 1 if copies > 1 else many  # lists within so many lists would take all memory before they are read
         else:
             parent[key] = (
                 copy.deepcopy(draw(NASTY)) if kind != "deep" else nested(draw(st.sampled_from([3, 900, 5000])))

@@ -169,6 +169,8 @@ def test_stored_scenes_say_no_more_than_they_hold(stored):
     ):
         with pytest.raises(ValueError, match=message):
             replace(stored, held=(replace(view, **changes),)).sample(0, render, 2)
+    with pytest.raises(ValueError, match="expected a scene of 1 views or more, got 0"):
+        replace(stored, held=()).sample(0, render, 2)
     small = tensor(cv2.imencode(".png", np.zeros((8, 8, 4), np.uint8))[1].tobytes())
     with pytest.raises(ValueError, match="of the camera's size"):
         replace(stored, images=(small, *stored.images[1:])).sample(0, render, 2)

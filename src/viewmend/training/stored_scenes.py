@@ -73,6 +73,8 @@ class StoredScene:
         Raises:
             ValueError: what was stored is damaged.
         """
+        if number >= len(self.held):
+            raise ValueError(f"expected a scene of {number + 1} views or more, got {len(self.held)}; {AGAIN}")
         view = self.held[number]
         rig = view.cameras
         rgba = [_decoded(png) for png in self.images]

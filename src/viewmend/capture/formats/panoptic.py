@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from msgspec import Meta, Struct
 
 from viewmend.capture.formats.files import five_coefficients
@@ -14,6 +13,8 @@ from viewmend.json_input import Number, Triple, read_json, typed
 CENTIMETRES = 0.01
 FPS = {"hd": 29.97, "vga": 25.0}
 SIDE = Annotated[int, Meta(ge=1)]
+Row = Annotated[list[Number], Meta(min_length=1, max_length=1)] | Number
+"""The file has t as a column, or as a row."""
 
 
 class CameraEntry(Struct, kw_only=True):
@@ -25,7 +26,7 @@ class CameraEntry(Struct, kw_only=True):
     K: tuple[Triple, Triple, Triple]
     distCoef: list[Number]  # noqa: N815 (the file's own name)
     R: tuple[Triple, Triple, Triple]
-    t: list[Any]
+    t: tuple[Row, Row, Row]
 
 
 class CalibrationFile(Struct, kw_only=True):
@@ -56,7 +57,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         for name in chosen:
             camera = own[name]
             lens = {"K": camera.K, "dist": five_coefficients(name, camera.distCoef), "R": camera.R}
-            t = np.asarray(camera.t, float).ravel().tolist()
+            t = [row[0] if isinstance(row, list) else row for row in camera.t]
             entries.append(footage.of(name, camera.resolution) | lens | {"t": t})
         told = {"metres_per_unit": CENTIMETRES, "up": [0.0, -1.0, 0.0], "fps": footage.fps or fps}
         return told | {"frames": footage.frames, "cameras": entries}
