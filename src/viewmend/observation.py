@@ -64,7 +64,7 @@ class Observation:
     """What was encoded of the images, as a context provider remembers it."""
     depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False)
     """The proxy's depth in the cameras that were asked for, by name."""
-    _counted: tuple[tuple[int, int], int] = field(default=((-1, -1), 0), repr=False)
+    _counted: tuple[tuple[int, int], int] = field(default=((-1, -1), 0), repr=False, init=False)
     """How many depths and encoded entries there were when bytes were counted, and the bytes."""
 
     def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:

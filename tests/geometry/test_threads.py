@@ -2,6 +2,7 @@
 
 import os
 import threading
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -9,12 +10,21 @@ import torch
 from viewmend.geometry.threads import heavy_operations, light_operations, parallel_for
 
 
-@pytest.fixture
-def two_threads():
+def threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(2)
+    torch.set_num_threads(count)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def two_threads():
+    yield from threads(2)
+
+
+@pytest.fixture
+def three_threads():
+    yield from threads(3)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 37])
@@ -65,14 +75,6 @@ def test_a_forked_child_has_threads_of_its_own(two_threads):
         parallel_for(work, 4)
         os._exit(0 if done == [1] * 4 else 1)
     assert os.waitpid(child, 0)[1] == 0
-
-
-@pytest.fixture
-def three_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
 
 
 def workers(count: int) -> int:

@@ -24,6 +24,7 @@ from viewmend.inpainting.ray_sampling import (
     Seen,
     SilhouetteConsistency,
     side_px,
+    subject_px,
 )
 
 BAND = 32
@@ -45,8 +46,9 @@ def sample_numba(
     pose = camera.world_from_camera[0].double()
     through = torch.cat([pose[None, :3, 3], pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())]).numpy()
     uv, z = uv_px.double().numpy(), z_m.double().numpy()
-    side, half = side_px(OUTLINE, seen.mask), side_px(PATCH / 2, seen.mask)
-    wide = side_px(OUTLINE, seen.silhouettes.mask)
+    subject = subject_px(seen.mask)
+    side, half = side_px(OUTLINE, subject), side_px(PATCH / 2, subject)
+    wide = side_px(OUTLINE, subject_px(seen.silhouettes.mask))
     eyes, outlines = _unpacked(seen.frame.cameras), _unpacked(seen.silhouettes.cameras)
     rgb, mask, depth = seen.frame.rgb.numpy(), seen.mask.numpy(), seen.depth.numpy()
     all_masks = seen.silhouettes.mask.numpy()
@@ -56,7 +58,8 @@ def sample_numba(
 
     def average(view: int) -> None:
         if view < len(eyes):
-            average_shapes(mask[view], depth[view], side, shapes[view])
+            average_mask(mask[view], side, shapes[view, 0])
+            average_coverage(depth[view], side, shapes[view, 1])
             average_colours(rgb[view], mask[view], half, colours[view])
         else:
             average_mask(all_masks[view - len(eyes)], wide, around[view - len(eyes)])
@@ -95,17 +98,14 @@ def _squares(images: np.ndarray, side: int) -> tuple[int, int]:
 
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def average_shapes(mask, depth, side, out):
-    """Means, over squares, of a mask and of what the proxy covers, 255 as 1."""
-    height, width = mask.shape
+def average_coverage(depth, side, out):
+    """Shares of squares that the proxy covers."""
+    height, width = depth.shape
     for row in range(height):
         for column in range(width):
-            m = mask[row, column]
-            if m > 0:
-                out[0, row // side, column // side] += m
             if depth[row, column] > 0:
-                out[1, row // side, column // side] += 255
-    out /= 255 * side**2
+                out[row // side, column // side] += 1
+    out /= side**2
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -154,6 +154,29 @@ def _bilinear(image, x, y):
     return value
 
 
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@no_type_check
+def _point(rays, uv, t):
+    """The point at z-depth t along the ray of a pixel."""
+    u, v = uv[0], uv[1]
+    x = rays[0, 0] + t * (rays[1, 0] * u + rays[1, 1] * v + rays[1, 2])
+    y = rays[0, 1] + t * (rays[2, 0] * u + rays[2, 1] * v + rays[2, 2])
+    z = rays[0, 2] + t * (rays[3, 0] * u + rays[3, 1] * v + rays[3, 2])
+    return x, y, z
+
+
+@njit(nogil=True, cache=True, error_model="numpy", inline="always")
+@no_type_check
+def _project(P, size, x, y, z):
+    """Where a camera of this size sees a point, and its z-depth, which is 0 where it has the point not in view."""
+    w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
+    safe = max(w, 1e-9)
+    u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / safe
+    v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / safe
+    inside = w > 0 and u >= 0 and v >= 0 and u < size[0] and v < size[1]
+    return u, v, w if inside else 0.0
+
+
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
 def follow(
@@ -162,20 +185,12 @@ def follow(
 ):  # fmt: skip
     """What one camera shows at the points of rays first to end - 1; nothing is written of those out of its view."""
     height, width = mask.shape
-    viewer, world_from_pixel = rays[0], rays[1:]
+    viewer = rays[0]
     for pixel in range(first, end):
         for point in range(z.shape[1]):
-            t = z[pixel, point]
-            px = viewer[0] + t * _row(world_from_pixel[0], uv[pixel])
-            py = viewer[1] + t * _row(world_from_pixel[1], uv[pixel])
-            pz = viewer[2] + t * _row(world_from_pixel[2], uv[pixel])
-            w = P[2, 0] * px + P[2, 1] * py + P[2, 2] * pz + P[2, 3]
+            px, py, pz = _point(rays, uv[pixel], z[pixel, point])
+            u, v, w = _project(P, size, px, py, pz)
             if w <= 0:
-                continue
-            safe = max(w, 1e-9)
-            u = (P[0, 0] * px + P[0, 1] * py + P[0, 2] * pz + P[0, 3]) / safe
-            v = (P[1, 0] * px + P[1, 1] * py + P[1, 2] * pz + P[1, 3]) / safe
-            if not (u >= 0 and v >= 0 and u < size[0] and v < size[1]):
                 continue
             own = out[pixel, point, view]
             left, top = floor(u - 0.5), floor(v - 0.5)
@@ -209,14 +224,8 @@ def follow(
 
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
-def _row(row, uv):
-    return row[0] * uv[0] + row[1] * uv[1] + row[2]
-
-
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-@no_type_check
 def _lower(least, pixel, point, first, value):
-    """A value among the two smallest of a point, if it is."""
+    """A value among the two smallest of a point, if it is. A copy: numba keeps what it compiled when other files change."""
     if value < least[pixel, point, first]:
         least[pixel, point, first + 1], least[pixel, point, first] = least[pixel, point, first], value
     elif value < least[pixel, point, first + 1]:
@@ -227,20 +236,11 @@ def _lower(least, pixel, point, first, value):
 @no_type_check
 def compare_silhouette(first, end, uv, z, rays, P, size, mask, around, per_side, least):
     """Lowers the two smallest masks, and the two smallest means around, at every point that this camera has in view."""
-    viewer, world_from_pixel = rays[0], rays[1:]
     for pixel in range(first, end):
         for point in range(z.shape[1]):
-            t = z[pixel, point]
-            px = viewer[0] + t * _row(world_from_pixel[0], uv[pixel])
-            py = viewer[1] + t * _row(world_from_pixel[1], uv[pixel])
-            pz = viewer[2] + t * _row(world_from_pixel[2], uv[pixel])
-            w = P[2, 0] * px + P[2, 1] * py + P[2, 2] * pz + P[2, 3]
+            px, py, pz = _point(rays, uv[pixel], z[pixel, point])
+            u, v, w = _project(P, size, px, py, pz)
             if w <= 0:
-                continue
-            safe = max(w, 1e-9)
-            u = (P[0, 0] * px + P[0, 1] * py + P[0, 2] * pz + P[0, 3]) / safe
-            v = (P[1, 0] * px + P[1, 1] * py + P[1, 2] * pz + P[1, 3]) / safe
-            if not (u >= 0 and v >= 0 and u < size[0] and v < size[1]):
                 continue
             _lower(least, pixel, point, 0, (1 / 255) * _bilinear(mask, u, v))
             _lower(least, pixel, point, 2, _bilinear(around, u * per_side, v * per_side))

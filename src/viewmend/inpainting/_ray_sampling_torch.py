@@ -21,6 +21,7 @@ from viewmend.inpainting.ray_sampling import (
     SilhouetteConsistency,
     padded,
     side_px,
+    subject_px,
 )
 from viewmend.views import Silhouettes
 
@@ -88,7 +89,7 @@ def _silhouette_consistency(points: Float[Tensor, "point 3"], silhouettes: Silho
     value = torch.zeros_like(z)
     for tap in bilinear_taps(at, mask.shape[2], mask.shape[1]):
         value += tap.weight * tap.inside * mask[view, tap.row, tap.column]
-    side = side_px(OUTLINE, mask)
+    side = side_px(OUTLINE, subject_px(mask))
     mean = sample_bilinear(_means(mask[:, None], side), at / side)[..., 0]
     values = torch.where(in_view(at, z, cameras), torch.stack([value / 255, mean]), 1.0)
     values = F.pad(values, (0, 0, 0, 2), value=1.0)  # two cameras more, that see nothing
@@ -102,7 +103,8 @@ def _means_at_points(
     at: Float[Tensor, "view point 2"],
 ) -> tuple[Float[Tensor, "view point 1"], Float[Tensor, "view point 3"], Float[Tensor, "view point 1"]]:
     """Means around each point of the mask, of RGB before black, and of what the proxy covers."""
-    side, half = side_px(OUTLINE, mask), side_px(PATCH / 2, mask)
+    subject = subject_px(mask)
+    side, half = side_px(OUTLINE, subject), side_px(PATCH / 2, subject)
     shapes = _means(torch.stack([mask, covered.to(torch.uint8) * 255], 1), side)
     # Of colours every other row and column will do.
     colours = F.avg_pool2d(padded(rgb[..., ::2, ::2].to(at) * mask[:, None, ::2, ::2], half), half) / 255**2

@@ -183,15 +183,20 @@ def windows(
     image: Float[Tensor, "channel height width"], pixels: Int[Tensor, "pixel 2"], radius: int
 ) -> Float[Tensor, "pixel channel window window"]:
     """The square around each pixel, zeros beyond the image."""
-    padded = F.pad(image, (radius,) * 4)
+    framed = F.pad(image, (radius,) * 4)
     reach = torch.arange(2 * radius + 1, device=image.device)
     rows, cols = (pixels[:, i, None] + reach for i in (0, 1))
-    return padded[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
+    return framed[:, rows[:, :, None], cols[:, None, :]].movedim(0, 1)
 
 
-def side_px(size: float, masks: UInt8[Tensor, "view height width"]) -> int:
-    """A length in subject sizes, of these images: pixels, 1 at least. The subject is the root of its mean area."""
-    return max(1, round(size * float((masks.sum((1, 2)) / 255).mean().sqrt())))
+def subject_px(masks: UInt8[Tensor, "view height width"]) -> float:
+    """Root of the subject's area, a mean over cameras."""
+    return float((masks.sum((1, 2)) / 255).mean().sqrt())
+
+
+def side_px(size: float, subject: float) -> int:
+    """A length in sizes of a subject of `subject_px`: whole pixels, 1 at least."""
+    return max(1, round(size * subject))
 
 
 def padded(
