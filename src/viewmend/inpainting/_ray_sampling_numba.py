@@ -225,7 +225,7 @@ def follow(
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
 def _lower(least, pixel, point, first, value):
-    """A value among the two smallest of a point, if it is. A copy: numba keeps what it compiled when other files change."""
+    """A value among the two smallest of a point, if it is. A copy: numba does not notice when other files change."""
     if value < least[pixel, point, first]:
         least[pixel, point, first + 1], least[pixel, point, first] = least[pixel, point, first], value
     elif value < least[pixel, point, first + 1]:
