@@ -240,6 +240,7 @@ class SocketDoor(WebSocketsSansIOProtocol, Visitor):
     async def send(self, message: Any) -> None:
         """Send what the application says; a refusal completes the handshake, too, and who is gone gets none."""
         if self.conn.eof_sent and message["type"].startswith("websocket.http.response"):
+            self.handshake_complete = True
             return
         await super().send(message)
         self.handshake_complete = self.handshake_complete or self.close_sent
