@@ -56,6 +56,8 @@ def start(page: Page, address: str, since: float) -> dict[str, float]:
     taken = {"page_s": time.monotonic() - since}
     page.wait_for_selector("#picture[data-frame]", timeout=120_000)
     taken["first_picture_s"] = time.monotonic() - since
+    if page.locator("#seek").get_attribute("max") == "0":  # nothing moves
+        return {name: round(seconds, 1) for name, seconds in taken.items()}
     first = page.locator("#picture").get_attribute("data-time")
     page.wait_for_selector(f"#picture[data-time]:not([data-time='{first}'])", timeout=120_000)
     taken["moving_s"] = time.monotonic() - since
@@ -63,7 +65,7 @@ def start(page: Page, address: str, since: float) -> dict[str, float]:
 
 
 def wait_until_made(page: Page, address: str) -> None:
-    """Until the studio has made all of its frames."""
+    """Until the source has made all of its frames."""
     count = page.evaluate("+document.querySelector('#seek').max + 1")
     made = 0
     while made < count:
@@ -98,6 +100,7 @@ def figures(seen: list[dict], repaints: list[float]) -> dict[str, object]:
         "repaints_per_s": mean(repaints),
         "kb_per_frame": mean([frame["bytes"] / 1000 for frame in seen]),
         "width_mean": mean([frame["width"] for frame in seen]),
+        "height_mean": mean([frame["height"] for frame in seen]),
         "holes_mean": round(sum(frame["holes"] for frame in seen) / len(seen), 4),
         "stage_ms": {name: mean([frame["stages"][name] for frame in seen]) for name in stages},
     }
@@ -118,6 +121,7 @@ def measure(page: Page, address: str, query: dict[str, object], seconds: float) 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--source", help="a capture instead of the studio")
     parser.add_argument("--seconds", type=float, default=20, help="of orbiting, each size and codec")
     parser.add_argument("--sizes", nargs="+", default=SIZES)
     parser.add_argument("--codecs", nargs="+", default=CODECS)
@@ -130,7 +134,7 @@ def main() -> None:
     chromium = os.environ.get("VIEWMEND_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)))
     results: dict[str, object] = {}
     since = time.monotonic()
-    served_with = ["--model", options.model, "--budget-ms", str(options.budget_ms)]
+    served_with = [*filter(None, [options.source]), "--model", options.model, "--budget-ms", str(options.budget_ms)]
     with served(served_with) as address, sync_playwright() as control:
         browser = control.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 800})

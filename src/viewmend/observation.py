@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.chosen_views import ChosenViews
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
@@ -69,6 +70,12 @@ class Observation:
 
     def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
         """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered once only."""
+        self._render(names)
+        width, height = self.frame.cameras.select(names).max_size_px
+        return torch.stack([self.depths[name][:height, :width] for name in names])  # as `frame.select` cuts images
+
+    def _render(self, names: Sequence[str]) -> None:
+        """See to it that the proxy's depth in these cameras is known."""
         new = [name for name in names if name not in self.depths]
         if new:
             rendered = self.proxy.depth(self.frame.cameras.select(new))
@@ -76,13 +83,12 @@ class Observation:
             if right or below:
                 rendered = F.pad(rendered, (0, right, 0, below))  # padded as the images are
             self.depths.update(zip(new, to_own_pages(rendered), strict=True))
-        width, height = self.frame.cameras.select(names).max_size_px
-        return torch.stack([self.depths[name][:height, :width] for name in names])  # as `frame.select` cuts images
 
     def context(self, names: Sequence[str]) -> ContextViews | None:
         """What an inpainter may see of these cameras; those without a frame are left out, None if all are."""
         there = [name for name in names if name in self.frame.cameras.names]
-        return ContextViews(self.frame.select(there), self.depth(there)) if there else None
+        self._render(there)
+        return ChosenViews.of(self.frame, there, self.depths) if there else None
 
     def pay_geometry(self) -> float:
         """The milliseconds of the proxy, for the first who asks; 0 afterwards."""

@@ -1,5 +1,6 @@
 """Lookups of places along rays in numba, for the CPU; `_lookup_torch` is the twin for any device."""
 
+from collections.abc import Iterable
 from math import exp, floor, sqrt
 from typing import no_type_check
 
@@ -19,12 +20,12 @@ BAND = 128
 def look_up_numba(
     rays: Rays,
     views: Eyes,
-    depth: Float[Tensor, "view height width"],
+    depths: Iterable[Float[Tensor, "height width"]],
     is_source: list[float],
     outlines: Eyes,
     size_m: float,
 ) -> Places:
-    """`lookup.look_up`; `depth` is the proxy's in each of `views`, metres."""
+    """`lookup.look_up`; `depths` are the proxy's in each of `views`, metres."""
     count, places = rays.z_m.shape
     found = np.empty((count, places, len(is_source), FEATURES), np.float32)
     prior = np.empty(found.shape[:3], np.float32)
@@ -32,7 +33,7 @@ def look_up_numba(
     pose = rays.camera.world_from_camera[0].double()
     world_from_pixel = pose[:3, :3] @ torch.linalg.inv(rays.camera.K[0].double())
     through = torch.cat([pose[None, :3, 3], world_from_pixel]).numpy()
-    uv, z, depths = rays.uv_px.double().numpy(), rays.z_m.float().numpy(), depth.numpy()
+    uv, z, known = rays.uv_px.double().numpy(), rays.z_m.float().numpy(), [depth.numpy() for depth in depths]
     units, least = (1 / (NEAR * size_m), 1 / (FAR * size_m)), stats[..., 6:]
     eyes, silhouettes = _unpacked(views), _unpacked(outlines)
 
@@ -41,7 +42,7 @@ def look_up_numba(
         for view, (P, center, size, fine, wide, scales) in enumerate(eyes):
             look_up_camera(
                 *(first, end, view, uv, z, through, P, center, size, fine, wide, scales),
-                *(depths[view], units, is_source[view], found, prior),
+                *(known[view], units, is_source[view], found, prior),
             )
         compare_cameras(first, end, found, prior, stats)
         for P, _, size, fine, wide, scales in silhouettes:

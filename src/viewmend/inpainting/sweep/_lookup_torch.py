@@ -1,5 +1,7 @@
 """Lookups of places along rays in torch, for any device; `_lookup_numba` is the twin for the CPU."""
 
+from collections.abc import Iterable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,13 +15,14 @@ from viewmend.inpainting.sweep.lookup import CONTRAST, FAR, NEAR, Eyes, Level, P
 def look_up_torch(
     rays: Rays,
     views: Eyes,
-    depth: Float[Tensor, "view height width"],
+    depths: Iterable[Float[Tensor, "height width"]],
     is_source: list[float],
     outlines: Eyes,
     size_m: float,
 ) -> Places:
-    """`lookup.look_up`; `depth` is the proxy's in each of `views`, metres."""
+    """`lookup.look_up`; `depths` are the proxy's in each of `views`, metres."""
     shape, cameras = rays.z_m.shape, views.cameras
+    depth = torch.stack(tuple(depths))
     there = (rays.z_m > 0).flatten()
     uv = rays.uv_px.to(rays.z_m)[:, None].expand(-1, shape[1], -1).reshape(1, -1, 2)
     points = unproject(uv, rays.z_m.reshape(1, -1), rays.camera)[0]

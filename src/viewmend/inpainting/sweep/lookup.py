@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from viewmend.chosen_views import each
 from viewmend.geometry.cameras import Cameras
 from viewmend.inpainting.ray_sampling import subject_size_m
 from viewmend.inpainting.sweep.pyramids import Pyramid, Rig
@@ -101,7 +102,7 @@ def look_up(rays: Rays, rig: Rig, source_views: Sequence[str], step_px: float, s
         views = _eyes(rig.views.frame.cameras, rig.pyramids, step_m, middle)
         outlines = _eyes(rig.silhouettes.cameras, rig.silhouette_pyramids, step_m, middle)
         is_source = [float(name in source_views) for name in views.cameras.names]
-        return implementation(rays, views, rig.views.depth, is_source, outlines, scale.size_m)
+        return implementation(rays, views, each(rig.views, "depth"), is_source, outlines, scale.size_m)
 
 
 def _eyes(cameras: Cameras, pyramids: Sequence[Pyramid], step_m: float, middle: Float[Tensor, "3"]) -> Eyes:

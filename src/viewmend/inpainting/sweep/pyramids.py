@@ -9,6 +9,7 @@ from jaxtyping import Int, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.chosen_views import each
 from viewmend.geometry.threads import parallel_for
 from viewmend.inpainting.protocol import ContextProvider
 from viewmend.views import ContextViews, Silhouettes
@@ -69,11 +70,12 @@ class Rig:
 
 def view_pyramids(views: ContextViews) -> tuple[Pyramid, ...]:
     """RGB upon black, mask and coverage by the proxy, of every camera."""
-    rgb, mask, depth = views.frame.rgb, _masks(views), views.depth
+    rgb, depth = each(views.frame, "rgb"), each(views, "depth")
+    mask = each(views.frame, "mask") or _masks(views)
 
     def whole(view: int, width: int, height: int) -> UInt8[Tensor, "rows columns 5"]:
         own = slice(height), slice(width)
-        if rgb.device.type == "cpu":
+        if rgb[0].device.type == "cpu":
             from viewmend.inpainting.sweep._lookup_numba import premultiplied
 
             image = torch.zeros(height + 2, width + 2, 5, dtype=torch.uint8)
