@@ -1,8 +1,9 @@
 """How good whole views are: python benchmarks/whole_views.py [--models NAME ...] [--sets SET ...] [--sheets DIR].
 
 One time of scenes in which a camera is left out. Each model is asked for what it is made for; NAME@0.15 is the model
-asked by the rule `wrong` for at most that part of the proxy, NAME! the model that is not fitted to the rig. SET is P,
-Q:PERFORMERS, or CAPTURE:INPUTS, e.g. ../shared/captures/wd2:8.
+asked by the rule `wrong` for at most that part of the proxy, NAME@0 the model as it moves live, when nothing is read,
+and NAME! the model that is not fitted to the rig. SET is P, Q:PERFORMERS, or CAPTURE:INPUTS, e.g.
+../shared/captures/wd2:8.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from viewmend.contact_sheet import Tile, contact_sheet, picture
 from viewmend.evaluation.frame_scores import FrameScores, TrueView, score_frame, true_view
+from viewmend.inpainting.protocol import RenderQuality
 from viewmend.leave_one_out.capture_scenes import capture_set
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.leave_one_out.studio_scenes import performer_set, procedural_set
@@ -85,12 +87,14 @@ def mended(scene: LeaveOneOutScene, models: Sequence[str]) -> Iterator[tuple[str
     truth = true_view(frame.truth, None)
     for model in models:
         name, _, fraction = model.rstrip("!").partition("@")
-        rule = RenderConfig(error_rule="wrong", wrong_fraction=float(fraction)) if fraction else RenderConfig()
+        part = float(fraction or 0)
+        rule = RenderConfig(error_rule="wrong", wrong_fraction=part) if part else RenderConfig()
         stream = Stream(
             make_method(name), StreamConfig(memory_mb=None, render=rule, fit_rig=model[-1] != "!"), frame.bounds
         )
         stream.push(frame.inputs)
-        yield model, stream.view(frame.truth.cameras).completed, truth
+        quality = RenderQuality(read_fraction=0.0 if fraction and not part else None)
+        yield model, stream.view(frame.truth.cameras, quality=quality).completed, truth
 
 
 def mean_scores(scores: Sequence[FrameScores]) -> dict[str, float | None]:

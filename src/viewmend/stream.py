@@ -249,7 +249,7 @@ class Stream:
 
     def _narrowed(self, view: IncompleteView, fraction: float | None, exclude: Sequence[str]) -> IncompleteView:
         """The view with E where most is to be gained."""
-        context = ContextProvider(self._context, None, exclude, self._memory)
+        context = ContextProvider(self._context, RenderQuality(read_fraction=fraction), exclude, self._memory)
         return view if fraction is None else narrowed(view, self.inpainter, context, fraction)
 
     def _render(

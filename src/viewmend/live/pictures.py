@@ -33,9 +33,12 @@ def picture(completed: CompletedView, mode: str, background: str = BLACK) -> Pic
     shown = _on_black(completed, mode)
     if background == BLACK:
         return shown
+    import cv2
+
     opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask
-    bare = (1 - opacity.clamp(0, 1)).cpu().numpy()[..., None]
-    return np.minimum(255, np.rint(shown + bare * np.frombuffer(bytes.fromhex(background), np.uint8))).astype(np.uint8)
+    bare = (1 - opacity.clamp(0, 1)).cpu().numpy()
+    colour = bytes.fromhex(background)
+    return cv2.add(shown, cv2.merge([np.rint(bare * level).astype(np.uint8) for level in colour]))
 
 
 def _on_black(completed: CompletedView, mode: str) -> Picture:

@@ -1,11 +1,14 @@
 """Images in cells of a few pixels, with a rim about the proxy; and values at points as images. Ours."""
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.views import RIM_PX
+from viewmend.views import RIM_PX, IncompleteView
 
 CELL_PX = 2
 """Side of the cells in which places are judged."""
@@ -14,8 +17,54 @@ CELL_PX = 2
 def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """The depth, metres, with a rim of `RIM_PX` about the proxy that has the smallest depth near it; 0 elsewhere."""
     far = torch.where(depth > 0, depth, torch.inf)
-    near = -F.max_pool2d(-far[None], 2 * RIM_PX + 1, 1, RIM_PX)[0]
-    return torch.where(depth > 0, depth, torch.where(near.isfinite(), near, 0.0))
+    side = 2 * RIM_PX + 1
+    if depth.device.type == "cpu" and depth.dtype == torch.float32:  # in a tenth of the time that torch takes
+        import cv2
+
+        window, border = np.ones((side, side), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": np.inf}
+        near = torch.from_numpy(cv2.erode(far.numpy(), window, **border))
+    else:
+        near = -F.max_pool2d(-far[None], side, 1, RIM_PX)[0]
+    return torch.where(near.isfinite(), torch.where(depth > 0, depth, near), 0.0)
+
+
+def halved(view: IncompleteView) -> IncompleteView:
+    """The view in half its resolution: what covered pixels of each cell show in the mean, at the nearest depth.
+
+    E is not brought along.
+    """
+    height, width = view.mask.shape
+    right, below = width % 2, height % 2
+    camera = view.camera.cropped(0, 0, width + right, height + below)
+    covered = F.pad(view.mask, (0, right, 0, below))[None]
+    share = F.avg_pool2d(covered, 2).clamp(min=1e-6)
+
+    def mean(images: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
+        return F.avg_pool2d(F.pad(images, (0, right, 0, below)) * covered, 2) / share
+
+    mask = (share[0] > 1e-6).to(covered)
+    return IncompleteView(
+        camera.resized((width + right) // 2, (height + below) // 2),
+        mean(view.rgb),
+        mask,
+        mask,
+        nearest_depth(view.depth),
+        view.source_views,
+        mean(view.weights),
+        view.time,
+        view.candidate_views,
+        view.silhouettes,
+    )
+
+
+def doubled(
+    image: Float[Tensor, "channel rows columns"], inside: Bool[Tensor, "rows columns"], shape: Sequence[int]
+) -> Float[Tensor, "channel height width"]:
+    """An image in twice its resolution, cut to this height and width, between its values inside alone."""
+    known = inside.to(image)[None]
+    large = F.interpolate(torch.cat([image * known, known])[None], scale_factor=2, mode="bilinear")[0]
+    large = large[:, : shape[0], : shape[1]]
+    return large[:-1] / large[-1:].clamp(min=1e-6)
 
 
 def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:

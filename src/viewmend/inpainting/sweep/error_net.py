@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
-from viewmend.inpainting.sweep.cells import CELL_PX, nearest_depth, rim_depth, scattered, stacked
+from viewmend.inpainting.sweep.cells import CELL_PX, doubled, halved, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.lookup import STATS, Rays, Scale, look_up
 from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.unet import UNet
@@ -27,6 +27,8 @@ BEHIND_CHANNELS = 24
 """What is kept of all places behind the proxy."""
 LEAST_GAIN = 0.01**2
 """Pixels that are expected to change less are never chosen."""
+LARGE_PX = 128
+"""Root of the area of a subject that half the resolution is enough for, where nothing is read."""
 LEAST_FADE = 0.02
 """Pixels that are expected to be background by less are left."""
 
@@ -119,6 +121,14 @@ class ErrorNet(Network):
             found = self.tell(self.decide(stacked(*told)))
         found = F.pixel_shuffle(found.float().sigmoid(), CELL_PX)[0, :, :height, :width]
         return ErrorMap(*torch.where(depth[:height, :width] > 0, found, 0.0))
+
+    def expected(self, view: IncompleteView, rig: Rig, quick: bool) -> ErrorMap:
+        """What is expected of a whole view's pixels; `quick` judges a large subject in half its resolution."""
+        if not quick or int((view.mask > 0).sum()) < LARGE_PX**2:
+            return self(view, rig)
+        rim, small = rim_depth(view.depth) > 0, halved(view)
+        found = torch.stack(self(small, rig, Scale.of(view)))
+        return ErrorMap(*torch.where(rim, doubled(found, rim_depth(small.depth) > 0, view.mask.shape), 0.0))
 
     @staticmethod
     def _stats(

@@ -127,7 +127,8 @@ class SweepNet(Network):
             )
         names = view.closest_views(self.config.num_views)
         seen = context(view.time, names) if names else None
-        return None if seen is None else self.errors(view, Rig.of(seen, view.silhouettes, context))
+        quick = context.quality.read_fraction == 0
+        return None if seen is None else self.errors.expected(view, Rig.of(seen, view.silhouettes, context), quick)
 
     @property
     def tells_errors(self) -> bool:
