@@ -88,6 +88,27 @@ def swing(page: Page, seconds: float) -> tuple[list[dict], list[float]]:
     return page.evaluate("document.querySelector('#picture').seen"), repaints[1:] or repaints
 
 
+def rest(page: Page) -> dict[str, object]:
+    """How soon a view that comes to rest has a pixel for each of the page's, or as many as it ever gets."""
+    page.locator("#picture").focus()
+    page.keyboard.press("Space")  # the clock stops
+    page.keyboard.down("ArrowRight")
+    page.wait_for_timeout(SWING_MS)
+    page.evaluate(COLLECT)
+    page.keyboard.up("ArrowRight")
+    still = page.evaluate("performance.now()")
+    page.wait_for_timeout(6000)
+    seen = page.evaluate("document.querySelector('#picture').seen")
+    page.keyboard.press("Space")
+    most = max(frame["height"] for frame in seen)
+    return {
+        "canvas": page.evaluate("(c => [c.width, c.height])(document.querySelector('#picture'))"),
+        "largest": next([frame["width"], frame["height"]] for frame in seen if frame["height"] == most),
+        "largest_after_s": round(next(f["now"] - still for f in seen if f["height"] == most) / 1000, 2),
+        "last_after_s": round((seen[-1]["now"] - still) / 1000, 2),
+    }
+
+
 def figures(seen: list[dict], repaints: list[float]) -> dict[str, object]:
     latencies = [frame["latency"] for frame in seen if frame["latency"] is not None]
     seconds = (seen[-1]["now"] - seen[0]["now"]) / 1000
@@ -123,7 +144,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", help="a capture instead of the studio")
     parser.add_argument("--seconds", type=float, default=20, help="of orbiting, each size and codec")
-    parser.add_argument("--sizes", nargs="+", default=SIZES)
+    parser.add_argument("--sizes", nargs="+", default=SIZES, help="WIDTHxHEIGHT, or 'page' for what the page asks")
+    parser.add_argument("--page", default="1280x800", help="size of the page, WIDTHxHEIGHT")
     parser.add_argument("--codecs", nargs="+", default=CODECS)
     parser.add_argument("--mode", default="mended")
     parser.add_argument("--model", default="views")
@@ -137,14 +159,18 @@ def main() -> None:
     served_with = [*filter(None, [options.source]), "--model", options.model, "--budget-ms", str(options.budget_ms)]
     with served(served_with) as address, sync_playwright() as control:
         browser = control.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        width, height = map(int, options.page.split("x"))
+        page = browser.new_page(viewport={"width": width, "height": height})
         results["start"] = start(page, address, since)
         print("start", json.dumps(results["start"]), flush=True)
         cases = [(f"{size} {codec}", size, codec) for size in options.sizes for codec in options.codecs]
         first = (f"{cases[0][0]}, first seconds", *cases[0][1:])
         for label, size, codec in (first, *cases):
-            query = {"size": size, "codec": codec, "mode": options.mode, "adaptive": int(not options.full_size)}
+            query = {"codec": codec, "mode": options.mode, "adaptive": int(not options.full_size)}
+            query |= {} if size == "page" else {"size": size}
             results[label] = measure(page, address, query, options.seconds)
+            if size == "page":
+                results[label]["rest"] = rest(page)
             print(label, json.dumps(results[label]), flush=True)
             wait_until_made(page, address)
         browser.close()

@@ -98,7 +98,7 @@ READING_LADDER = Ladder(
         FULL,
     ),
     moving=QualityLevel(1.0, 7, None, 0.0),
-    still=QualityLevel(1.0, 7, None, 0.1),
+    still=QualityLevel(1.0, 7, None, 0.0),
 )
 
 

@@ -32,7 +32,7 @@ def test_at_rest_each_pixel_of_the_canvas_is_asked_for(browser, server, size):
         view.settle()
         moving = [look for look in view.server.looks[start:] if look["moving"]]
         assert moving
-        assert all(look["width"] * look["height"] <= 1.02 * 384**2 for look in moving)
+        assert all(look["width"] * look["height"] <= 1.02 * 640**2 for look in moving)
         assert view.server.looks[-1]["width"] == look["width"]
 
 

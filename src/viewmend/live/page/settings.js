@@ -28,7 +28,7 @@ const DEFAULTS = {
   divider: 0.5,
   topK: null,
   errorRule: "",
-  side: 384,
+  side: 640,
   size: "",
   codec: "jpeg",
   sharp: true,
