@@ -181,7 +181,7 @@ def test_the_page_shows_the_same_pixels(shifted, tmp_path, mend):
     pose = camera.world_from_camera[0].tolist()
     file.write_text(json.dumps({"world_from_camera": [pose], "K": camera.K[0].tolist(), "width": 48, "height": 48}))
     assert mend(shifted, tmp_path / "out", "--path", file, "--frames", "0:1")[0] == 0
-    supply = serve._supply(serve.Options(source=str(shifted)))
+    supply = serve.open_supply(serve.Options(source=str(shifted)))
     supply.start()
     try:
         while supply.read(0) is None:

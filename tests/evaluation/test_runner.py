@@ -241,6 +241,6 @@ def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
 
 def test_a_cluster_that_is_not_there_is_one_clear_error(small_scenes, tmp_path, monkeypatch):
     ray = SimpleNamespace(is_initialized=lambda: False)
-    monkeypatch.setattr(ray_cluster, "_ray", lambda: ray)
+    monkeypatch.setattr(ray_cluster, "find_ray", lambda address: ray)
     with pytest.raises(ValueError, match=r"expected a Ray cluster at '127.0.0.1:1', got none .* --ray local"):
         run(small_scenes[:1], tmp_path, ray="127.0.0.1:1")

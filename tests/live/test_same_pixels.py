@@ -22,7 +22,7 @@ SIZE_PX = (480, 360)
 
 def served(capture, model, **options):
     """What `viewmend serve` renders of the first frame, from where its page begins; and the camera."""
-    supply = serve._supply(serve.Options(source=str(capture), **options))
+    supply = serve.open_supply(serve.Options(source=str(capture), **options))
     supply.start()
     try:
         renderer, end = Renderer(supply, make_method(model)), time.monotonic() + 60

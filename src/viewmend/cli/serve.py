@@ -11,7 +11,10 @@ from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS
 
 if TYPE_CHECKING:
     from viewmend.capture.source import CaptureSource
+    from viewmend.inpainting.protocol import ViewInpainter
     from viewmend.live.frames import FrameSupply
+    from viewmend.live.server import ServerConfig
+    from viewmend.stream import StreamConfig
 
 TOKEN_VARIABLE = "VIEWMEND_TOKEN"
 
@@ -61,7 +64,13 @@ class Options:
     wrong_fraction: float = 0.15
     """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     viewers: int = 8
-    """How many may watch at once."""
+    """How many may watch at once; with --ray, at each replica."""
+    ray: str | None = None
+    """Address of a Ray cluster whose machines render: HOST:PORT, auto, or local (needs viewmend[ray])."""
+    replicas: int = 2
+    """With --ray: how many processes render, at least."""
+    most_replicas: int | None = None
+    """With --ray: how many render when there are many viewers; by default as many as always."""
     cameras: int = 8
     """Cameras of the studio's ring."""
     frames: int = 60
@@ -73,7 +82,7 @@ class Options:
     device: str = "cpu"
     """Where to compute: cpu, or cuda."""
     memory_mb: float = 3000.0
-    """Memory for frames at hand and what was computed of them."""
+    """Memory for frames at hand and what was computed of them; with --ray, half of it is what processes share."""
 
 
 def run(options: Options) -> int:
@@ -89,39 +98,60 @@ def run(options: Options) -> int:
     # Before torch is loaded. Its threads would spin between two pieces of work, on cores that a browser may need.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
-    from viewmend.cli.checks import load_named
+    if options.ray is not None:
+        from viewmend.cli.serving_many import serve_many
+
+        return serve_many(options)
     from viewmend.cli.console import say
     from viewmend.live.listener import Server
     from viewmend.live.memory import loaded, set_up
-    from viewmend.live.protocol import Limits, token_query
+    from viewmend.live.protocol import token_query
     from viewmend.live.renderer import Renderer
-    from viewmend.live.server import LiveServer, ServerConfig
+    from viewmend.live.server import LiveServer
     from viewmend.live.service import RenderService
-    from viewmend.methods import default_method
-    from viewmend.rendering.view import RenderConfig
-    from viewmend.stream import StreamConfig
 
     set_up()
-    token = _token(options)
-    config = ServerConfig(
+    config = server_config(options)
+    supply = open_supply(options)
+    renderer = Renderer(supply, load_inpainter(options), stream_config(options), options.device)
+    server = Server(LiveServer(RenderService(renderer, supply), config), config)
+    with server.bound() as address:
+        loaded()
+        say(f"open {address}/{token_query(config.token)}   (Ctrl-C stops it)")
+        server.run_bound()
+    return 0
+
+
+def server_config(options: Options) -> "ServerConfig":
+    """Where and for whom is served."""
+    from viewmend.live.protocol import Limits
+    from viewmend.live.server import ServerConfig
+    from viewmend.methods import default_method
+
+    return ServerConfig(
         host=options.host,
         port=options.port,
-        token=token,
+        token=_token(options),
         budget_ms=options.budget_ms or None,
         model=options.model or default_method(),
         limits=Limits(viewers=options.viewers),
     )
-    supply = _supply(options)
-    inpainter = load_named(options.model, options.device)
+
+
+def stream_config(options: Options) -> "StreamConfig":
+    """How frames become views."""
+    from viewmend.rendering.view import RenderConfig
+    from viewmend.stream import StreamConfig
+
     render = RenderConfig(cameras=options.context, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
-    stream = StreamConfig(render=render, memory_mb=options.memory_mb / 2)
-    renderer = Renderer(supply, inpainter, stream, options.device)
-    server = Server(LiveServer(RenderService(renderer, supply), config), config)
-    with server.bound() as address:
-        loaded()
-        say(f"open {address}/{token_query(token)}   (Ctrl-C stops it)")
-        server.run_bound()
-    return 0
+    return StreamConfig(render=render, memory_mb=options.memory_mb / 2)
+
+
+def load_inpainter(options: Options) -> "ViewInpainter":
+    """The model, where it renders."""
+    from viewmend.cli.checks import load_named
+
+    return load_named(options.model, options.device)
 
 
 def _token(options: Options) -> str | None:
@@ -141,10 +171,11 @@ def _token(options: Options) -> str | None:
 
 def _check(options: Options) -> None:
     """What can be said before anything heavy is imported."""
-    positive = ("width", "context", "viewers", "cameras", "frames", "size", "memory_mb")
+    positive = ("width", "context", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
     wrong = [name for name in positive if not getattr(options, name) > 0]
     wrong += [name for name in ("budget_ms", "port") if not getattr(options, name) >= 0]
     wrong += ["cameras"] if options.source == "studio" and options.cameras < 4 else []
+    wrong += ["most_replicas"] if (options.most_replicas or options.replicas) < options.replicas else []
     if options.fps is not None and not 0 < options.fps <= 240:
         wrong.append("fps")
     if wrong or options.port > 65535:
@@ -152,7 +183,8 @@ def _check(options: Options) -> None:
         raise ValueError(f"expected a sensible --{name.replace('_', '-')}, got {getattr(options, name)}; see --help")
 
 
-def _supply(options: Options) -> "FrameSupply":
+def open_supply(options: Options) -> "FrameSupply":
+    """Where frames come from; ValueError or OSError for a source that cannot be read."""
     from viewmend.live.frames import ReadAhead
     from viewmend.live.pushed import PushedFrames
 

@@ -54,6 +54,10 @@ class Chain(Network):
         """The patch transformer's."""
         self.patches.encode_past(view, context)
 
+    def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
+        """The patch transformer's."""
+        self.patches.encode_cameras(views, context)
+
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view; the coarse fill alone where the quality allows no context times."""

@@ -153,6 +153,11 @@ class PatchTransformer(Network):
             times = window_times(view.time, self.config)[1:]
             context.encoded(times, self.context_names(view), self.encode_contexts)
 
+    @torch.no_grad()
+    def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
+        """Encodes all of these cameras at their time."""
+        context.encoded((views.frame.time,), views.frame.cameras.names, self.encode_contexts)
+
     def context_names(self, view: IncompleteView) -> tuple[str, ...]:
         """The cameras that are context."""
         count = self.config.context_cameras

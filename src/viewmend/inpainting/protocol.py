@@ -214,6 +214,16 @@ def encode_past(inpainter: ViewInpainter, view: IncompleteView, context: Context
         own(view, context)
 
 
+def encode_cameras(inpainter: ViewInpainter, views: ContextViews, context: ContextProvider) -> None:
+    """All that an inpainter encodes of these cameras at their time, whatever the view, for `context` to remember.
+
+    Nothing for an inpainter that has no `encode_cameras`: it encodes nothing of cameras, or for each view anew.
+    """
+    own = getattr(inpainter, "encode_cameras", None)
+    if own is not None:
+        own(views, context)
+
+
 def crop_margin_px(inpainter: ViewInpainter, quality: RenderQuality) -> int | None:
     """How far around the subject a view matters to what fills it, pixels; None where the whole view does.
 

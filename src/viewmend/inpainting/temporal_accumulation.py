@@ -18,10 +18,11 @@ from viewmend.inpainting.protocol import (
     State,
     ViewInpainter,
     crop_margin_px,
+    encode_cameras,
     encode_past,
     own_background,
 )
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 STALE = 3
 """Views of more than so many frames ago are not looked at."""
@@ -78,6 +79,10 @@ class TemporalAccumulation(nn.Module):
     def encode_past(self, view: IncompleteView, context: ContextProvider) -> None:
         """The inner inpainter's."""
         encode_past(self.inner, view, context)
+
+    def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
+        """The inner inpainter's."""
+        encode_cameras(self.inner, views, context)
 
     def initial_state(self) -> AccumulationState:
         """The state before the first view of a stream."""

@@ -15,6 +15,12 @@ from viewmend.live.protocol import VERSION, token_query, unpack
 
 PACE = 0.9
 """Part of the messages a second that the server takes."""
+AGAIN_S = 0.1
+"""Seconds between two tries to connect anew."""
+
+
+class ConnectionLostError(ConnectionError):
+    """The connection has ended and nobody said why; another may be had."""
 
 
 class ServerSocket:
@@ -22,7 +28,7 @@ class ServerSocket:
 
     def __init__(self, url: str, token: str | None) -> None:
         try:  # an extra: without it, the names of this module are there all the same
-            from websockets.exceptions import ConnectionClosed, InvalidStatus
+            from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
             from websockets.sync.client import connect
         except ImportError:
             raise ImportError("a connection needs websockets: pip install 'viewmend[live]'") from None
@@ -32,8 +38,11 @@ class ServerSocket:
         try:
             self._socket = self._open.enter_context(connect(address, max_size=None, compression=None))
         except InvalidStatus as refused:
-            said = bytes(refused.response.body or b"").decode(errors="replace")
-            raise ConnectionError(f"the server refuses ({refused.response.status_code}): {said[:400]}") from None
+            said, status = bytes(refused.response.body or b"").decode(errors="replace"), refused.response.status_code
+            kind = ConnectionLostError if status >= 500 else ConnectionError
+            raise kind(f"the server refuses ({status}): {said[:400]}") from None
+        except (OSError, InvalidHandshake) as error:
+            raise ConnectionLostError(f"{url}: expected a server, got none ({error}); is it running?") from None
 
     def send(self, message: str | bytes) -> None:
         """Send a message. If the connection is closed already, `receive` says why."""
@@ -44,13 +53,14 @@ class ServerSocket:
         """The next message: JSON, or a binary one.
 
         Raises:
-            ConnectionError: the server refuses, or the connection is closed; says why.
+            ConnectionError: the server refuses, and says why.
+            ConnectionLostError: the connection is closed.
             TimeoutError: none came in time.
         """
         try:
             message = self._socket.recv(timeout=max(0.0, timeout_s))
         except self._closed as closed:
-            raise ConnectionError(f"the server has closed the connection: {closed}") from None
+            raise ConnectionLostError(f"the server has closed the connection: {closed}") from None
         if isinstance(message, bytes):
             return message
         content = json.loads(message)
@@ -87,16 +97,50 @@ class Client:
     url: str = "ws://127.0.0.1:8008"
     token: str | None = None
     timeout_s: float = 30.0
+    again_s: float = 0.0
+    """For so long a connection that is lost is tried to be had again; then what was looked at is asked for anew, at the
+    time that was shown last. 0: it is an error."""
     messages: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The last message of each type."""
+    connections: int = field(default=0, init=False)
+    """How often it was connected."""
 
     def __enter__(self) -> "Client":
-        self._socket = ServerSocket(f"{self.url}/ws", self.token)
-        self._looks, self._at_most_per_s = 0, math.inf
-        self._may_send, self._since_s = 1.0, time.monotonic()
-        self.send("hello", version=VERSION, codecs=["jpeg"])
-        self._at_most_per_s = PACE * self.wait_for("welcome")["limits"]["messages_per_s"]
+        self._looks, self._shown = 0, -1
+        self._look: dict[str, Any] = {}
+        self._clock: dict[str, Any] = {}
+        """What parts the clock from the edge; with a seek until that is shown."""
+        self._connect()
         return self
+
+    def _connect(self) -> None:
+        """Connect, and say hello."""
+        self._socket = ServerSocket(f"{self.url}/ws", self.token)
+        self.connections += 1
+        self._at_most_per_s, self._may_send, self._since_s = math.inf, 1.0, time.monotonic()
+        self.send("hello", version=VERSION, codecs=["jpeg"])
+        self.messages.pop("welcome", None)
+        end = time.monotonic() + self.timeout_s
+        while "welcome" not in self.messages:
+            self._take(end)
+        self._at_most_per_s = PACE * self.messages["welcome"]["limits"]["messages_per_s"]
+
+    def _connect_again(self) -> None:
+        """A new connection, where the look and the clock are as they were."""
+        end = time.monotonic() + self.again_s
+        self._socket.close()
+        while True:
+            try:
+                self._connect()
+                break
+            except ConnectionLostError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(AGAIN_S)
+        if self._clock:
+            self.send("clock", **({"seek": self._shown} if self._shown >= 0 else {}) | self._clock)
+        if self._look:
+            self.send("look", **self._look)
 
     def __exit__(self, *exception: object) -> None:
         self._socket.close()
@@ -109,6 +153,10 @@ class Client:
             self._since_s = now
             if self._may_send < 0:
                 time.sleep(-self._may_send / most)
+        if kind == "look":
+            self._look = values
+        elif kind == "clock":
+            self._clock = {} if values.get("live") else self._clock | values
         self._socket.send(json.dumps({"type": kind, **values}))
 
     def look(self, **values: object) -> int:
@@ -134,12 +182,24 @@ class Client:
                 return frame
 
     def _receive(self, end: float) -> Frame | None:
+        try:
+            return self._take(end)
+        except ConnectionLostError:
+            if self.again_s <= 0:
+                raise
+        self._connect_again()
+        return None
+
+    def _take(self, end: float) -> Frame | None:
         message = self._socket.receive(end - time.monotonic())
         if isinstance(message, dict):
             self.messages[message["type"]] = message
             return None
         header, parts = unpack(message)
         self.send("ack", frame=header["frame"])
+        self._shown = header["time"]
+        if self._clock.get("playing", True) or self._clock.get("seek") == self._shown:
+            self._clock.pop("seek", None)
         frame = Frame(header, {}, {}, 1000 * time.perf_counter() - header["sent_ms"], len(message))
         for part, data in zip(header["parts"], parts, strict=True):
             if part["kind"] == "image":

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from viewmend.capture.source import CaptureSource
 from viewmend.geometry.bounds import Bounds
-from viewmend.live.clock import Span
+from viewmend.live.clock import Clock, Span
+from viewmend.observation import Observation
 from viewmend.own_pages import to_own_pages
 from viewmend.views import MultiViewFrame
 
@@ -60,6 +61,9 @@ class FrameSupply(ABC):
         """The times that can be asked for."""
         self.spread_ms: float | None = None
         """How far apart the newest frame's pictures were taken, where this machine reads the cameras itself."""
+        self.recording = Clock()
+        """The edge of a recording: one position for all who follow it."""
+        self.recording.live = False
 
     def camera_counts(self) -> dict[str, dict[str, int]]:
         """What was counted of each camera, where this machine reads them itself; "up" is 1 while it is there."""
@@ -68,6 +72,10 @@ class FrameSupply(ABC):
     @abstractmethod
     def read(self, time: int) -> MultiViewFrame | None:
         """The frame; None while it is not there. It never waits."""
+
+    def made(self, time: int) -> Observation | None:
+        """What another process has made of a frame that `read` gives; None where nobody has."""
+        return None
 
     def start(self) -> None:  # noqa: B027
         """Begin to read; nothing to do where frames come by themselves."""

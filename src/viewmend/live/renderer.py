@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter, own_error_rule
@@ -10,6 +11,8 @@ from viewmend.live.budget import ladder_for
 from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
+from viewmend.observation import Observation
+from viewmend.rig_fit import fitted_to_rig
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.timing import StageTimes
 from viewmend.views import CompletedView, MultiViewFrame
@@ -91,8 +94,8 @@ class Renderer:
         if rig is None or self.is_of(rig):
             return False
         bounds = rig.bounds
-        stream = Stream(self._inpainter, self._config, bounds)
-        observation = stream.push(self._read(time))
+        stream = Stream(self._fitted(self._read(time), bounds), replace(self._config, fit_rig=False), bounds)
+        observation = self._observed(stream, time)
         proxy = observation.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
@@ -114,7 +117,7 @@ class Renderer:
         """
         if self._stream is None:
             raise FrameNotReadyError
-        self._stream.push(self._read(request.time))
+        self._observed(self._stream, request.time)
         before = viewer or self._stream.viewer()
         stream = self._stream
         if request.error_rule is not None:
@@ -128,6 +131,26 @@ class Renderer:
         if frame is None:
             raise FrameNotReadyError
         return frame.to(self._device)
+
+    def _fitted(self, frame: MultiViewFrame, bounds: Bounds | None) -> ViewInpainter:
+        """The inpainter, fitted to the rig by its first frame."""
+        if not self._config.fit_rig:
+            return self._inpainter
+        return fitted_to_rig(self._inpainter, frame, bounds, self._config.hull, self._config.render)
+
+    def _observed(self, stream: Stream, at: int) -> Observation:
+        """The time, taken in by the stream, with all that the supply has made of it already."""
+        made = self._supply.made(at)
+        if made is None:
+            return stream.push(self._read(at))
+        assert isinstance(made.proxy, GeometryProxy), "supplies carve hulls"
+        observation = stream.push(made.frame.to(self._device), made.proxy.to(self._device))
+        if self._device == "cpu":  # elsewhere cameras are encoded as they are looked at
+            observation.depths, observation.encoded = (
+                made.depths | observation.depths,
+                made.encoded | observation.encoded,
+            )
+        return observation
 
     def _view(self, stream: Stream, camera: Cameras, viewer: State, at: int, quality: RenderQuality) -> StreamView:
         """The view; with its holes where the model fails."""

@@ -5,7 +5,7 @@ import threading
 import time
 from collections import Counter
 
-from viewmend.live.clock import Clock, Span, edge_of
+from viewmend.live.clock import Span, edge_of
 from viewmend.live.frames import FrameSupply
 from viewmend.live.memory import HeapTrimmer
 from viewmend.live.pace import Pace
@@ -35,9 +35,6 @@ class RenderService:
         """Counts for /metrics."""
         self.times = FrameTimes()
         """Times of all frames together, for /metrics."""
-        self.recording = Clock()
-        """The edge of a recording."""
-        self.recording.live = False
         self._sessions: list[Session] = []
         self._pace = Pace()
         self._stopped = False
@@ -79,7 +76,7 @@ class RenderService:
     @property
     def edge(self) -> float:
         """The position of the viewers who follow the edge."""
-        return edge_of(self.supply.span, self.recording)
+        return edge_of(self.supply.span, self.supply.recording)
 
     @property
     def ready(self) -> bool:
@@ -115,7 +112,7 @@ class RenderService:
     def _serve_next(self) -> bool:
         """Render and show one view, if any session wants one."""
         now, span = time.monotonic(), self.supply.span
-        self.recording.advance(now - self._last, span)
+        self.supply.recording.advance(now - self._last, span)
         self._last = now
         if not self.ready or self.renderer.frame is None:
             return False

@@ -68,6 +68,11 @@ class Rig:
         return replace(self, views=self.views.select(names), pyramids=self.pyramids[: len(names)])
 
 
+def keep_pyramids(views: ContextViews, context: ContextProvider) -> None:
+    """The pyramids of all cameras of a time, for `context` to remember."""
+    Rig.of(views, None, context)
+
+
 def view_pyramids(views: ContextViews) -> tuple[Pyramid, ...]:
     """RGB upon black, mask and coverage by the proxy, of every camera."""
     rgb, depth = each(views.frame, "rgb"), each(views, "depth")

@@ -26,7 +26,7 @@ from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet, unread
 from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
-from viewmend.inpainting.sweep.pyramids import Rig
+from viewmend.inpainting.sweep.pyramids import Rig, keep_pyramids
 from viewmend.inpainting.sweep.reading import Reading, Swept
 from viewmend.inpainting.sweep.unet import UNet
 from viewmend.views import CompletedView, ContextViews, IncompleteView
@@ -134,6 +134,8 @@ class SweepNet(Network):
     def tells_errors(self) -> bool:
         """Whether it can say where most is to be gained."""
         return self.errors is not None
+
+    encode_cameras = staticmethod(keep_pyramids)
 
     @torch.no_grad()
     def fitted_to_rig(self, held: Sequence[HeldOut]) -> "SweepNet":

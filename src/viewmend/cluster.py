@@ -1,0 +1,66 @@
+"""Ray, an extra: whether it is there, and the way into a cluster."""
+
+import os
+import secrets
+import socket
+from typing import Any
+
+ANSWER_S = 5.0
+"""A cluster answers within this time."""
+LOCAL = "local"
+"""Instead of an address: a cluster of this machine alone, for as long as the run lasts."""
+QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}
+"""Nobody is told that Ray is used."""
+ON_LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+"""How Ray calls it that a cluster's own sockets are bound to 127.0.0.1, as on systems where it has no others."""
+
+
+def find_ray(address: str) -> Any:
+    """The module ray, told before it is imported what it may do: no reports, and a local cluster on loopback alone.
+
+    A local cluster has a token of its own, made at random, without which nobody on this machine can use it.
+
+    Raises:
+        ValueError: Ray is not installed.
+    """
+    wanted = QUIET
+    if address == LOCAL:
+        wanted = wanted | ON_LOOPBACK | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    for name, value in wanted.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ValueError(
+            "expected Ray for --ray, got none; install viewmend's extra 'ray', or leave --ray away"
+        ) from error
+    return ray
+
+
+def connect(ray: Any, address: str, **own: object) -> None:
+    """Connect to a running cluster, or start one of this machine alone.
+
+    Args:
+        ray: what `find_ray` gave.
+        address: of a running cluster (HOST:PORT, ray://HOST:PORT, auto), or `LOCAL`.
+        own: options of `ray.init` for a cluster that is started.
+
+    Raises:
+        ValueError: there is no cluster at the address.
+    """
+    local = address == LOCAL
+    try:
+        _knock(address)
+        ray.init(None if local else address, include_dashboard=False, log_to_driver=False, **(own if local else {}))
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"expected a Ray cluster at '{address}', got none ({' '.join(str(error).split())[:200]}); check --ray, or "
+            f"use --ray {LOCAL}"
+        ) from error
+
+
+def _knock(address: str) -> None:
+    """OSError where nobody listens at HOST:PORT; Ray itself would wait for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()

@@ -1,0 +1,229 @@
+"""Many viewers, on Ray Serve: one actor reads the rig, replicas render for the viewers that its proxy gives them."""
+
+import asyncio
+import contextlib
+import logging
+import math
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from viewmend.cluster import LOCAL, connect, find_ray
+from viewmend.inpainting.protocol import ViewInpainter
+from viewmend.live.behind_proxy import BehindProxy
+from viewmend.live.frames import FrameSupply
+from viewmend.live.ingest import Ingest, SourceState
+from viewmend.live.memory import loaded, set_up
+from viewmend.live.renderer import Renderer
+from viewmend.live.server import LiveServer, ServerConfig
+from viewmend.live.service import RenderService
+from viewmend.live.shared_frames import SharedFrames
+from viewmend.live.shared_time import SharedTime
+from viewmend.stream import StreamConfig
+
+NAME = "viewmend"
+"""Serve's name for the application."""
+ANSWER_S = 30.0
+"""So much longer than it was asked to wait an ingest may take for an answer: it may be carving."""
+READY_S = 120.0
+"""A replica takes viewers when it has rendered its first view, or after this long."""
+SPARE_REQUESTS = 8
+"""Requests of a replica besides its viewers: pictures, paths, /health."""
+WELL_FILLED = 0.75
+"""Replicas are added where more than this part of all places is taken."""
+STOPPING_S = 5.0
+INGEST_SHARE, REPLICAS_SHARE = 0.4, 0.4
+"""Parts of the store: what the ingest keeps, and what all replicas of one machine may still use of what it dropped."""
+REPLICAS_A_MACHINE = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManyViewers:
+    """What is served, and how many replicas render it."""
+
+    open_supply: Callable[[], FrameSupply]
+    """Called where the cameras are read; ValueError or OSError for a source that cannot be."""
+    load_inpainter: Callable[[], ViewInpainter]
+    server: ServerConfig
+    stream: StreamConfig
+    device: str
+    replicas: tuple[int, int]
+    """How many at least, and at most."""
+    store_mb: float
+    """A machine's shared memory."""
+
+    @property
+    def replica_mb(self) -> float:
+        """What one replica may use of it."""
+        return REPLICAS_SHARE * self.store_mb / min(self.replicas[1], REPLICAS_A_MACHINE)
+
+
+class IngestActor:
+    """The ingest as an actor. The source is opened by the first call, so that what is wrong with it is an answer."""
+
+    def __init__(self, served: ManyViewers, put: Callable[[SharedTime], Any]) -> None:
+        set_up()
+        self._served, self._put = served, put
+        self._opening = threading.Lock()
+        self._ingest: Ingest | None = None
+
+    def state(self, known: int, wait_s: float) -> SourceState:
+        """As `Ingest.state`."""
+        return self._opened().state(known, wait_s)
+
+    def time(self, at: int, wait_s: float) -> tuple[str, Any] | None:
+        """As `Ingest.time`."""
+        return self._opened().time(at, wait_s)
+
+    def _opened(self) -> Ingest:
+        with self._opening:
+            if self._ingest is None:
+                served, kept_mb = self._served, INGEST_SHARE * self._served.store_mb
+                supply, inpainter = served.open_supply(), served.load_inpainter()
+                self._ingest = Ingest(supply, inpainter, served.stream.hull, kept_mb, self._put)
+                loaded()
+            return self._ingest
+
+
+class RayIngest:
+    """The way to the ingest's actor. What it gives is read from this machine's object store, where it lies."""
+
+    def __init__(self, actor: Any) -> None:
+        self._actor = actor
+
+    def state(self, known: int, wait_s: float) -> SourceState:
+        """As `IngestLink.state`."""
+        return self._answer(self._actor.state.remote(known, wait_s), wait_s)
+
+    def time(self, at: int, wait_s: float) -> tuple[str, SharedTime] | None:
+        """As `IngestLink.time`."""
+        found = self._answer(self._actor.time.remote(at, wait_s), wait_s)
+        return None if found is None else (found[0], self._answer(found[1][0], wait_s))
+
+    def _answer(self, reference: Any, wait_s: float) -> Any:
+        import ray  # pyright: ignore[reportMissingImports]
+
+        try:
+            return ray.get(reference, timeout=wait_s + ANSWER_S)
+        except ray.exceptions.RayError as error:
+            raise ConnectionError(" ".join(str(error).split())[:200]) from error
+
+
+@contextlib.contextmanager
+def serving(served: ManyViewers, address: str) -> Iterator[str]:
+    """Serve on a cluster until the context ends; the address for viewers, once replicas are ready for them.
+
+    Args:
+        served: what, and how.
+        address: of a running cluster, or `cluster.LOCAL`.
+
+    Raises:
+        ValueError: Ray is not installed, there is no cluster, or the source cannot be read.
+        OSError: somebody else has the port.
+    """
+    host, port = served.server.host, _free_port(served.server.host, served.server.port)
+    ray = find_ray(address)
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    cpus = served.replicas[1] + 1
+    connect(ray, address, num_cpus=cpus, object_store_memory=int(1e6 * served.store_mb), configure_logging=False)
+    from ray import serve  # pyright: ignore[reportMissingImports]
+
+    logging.getLogger("ray.serve").setLevel(logging.ERROR)
+
+    try:
+        calls = 4 * served.replicas[1] + 8  # two questions a replica, and as many of those that it replaces
+        actor = ray.remote(num_cpus=1, max_restarts=-1, max_concurrency=calls)(IngestActor)
+        ingest = actor.remote(served, _put)
+        opened = ingest.state.remote(-1, 0.0)
+        quiet = {"enable_access_log": False, "log_level": "ERROR"}
+        serve.start(http_options={"host": host, "port": port}, logging_config=quiet)
+        _demand(ray, opened)
+        serve.run(_application(serve, served, ingest), name=NAME, route_prefix="/", logging_config=quiet)
+        try:
+            yield f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        finally:
+            if address != LOCAL:  # which ends as a whole
+                serve.delete(NAME)
+                ray.kill(ingest)
+    finally:
+        ray.shutdown()
+
+
+def _application(serve: Any, served: ManyViewers, ingest: Any) -> Any:
+    """What Serve runs: replicas of the live server's application."""
+
+    def build() -> BehindProxy:
+        return _replica(served, RayIngest(ingest))
+
+    viewers, (fewest, most) = served.server.limits.viewers, served.replicas
+    scaling = {
+        "min_replicas": fewest,
+        "initial_replicas": fewest,
+        "max_replicas": most,
+        "target_ongoing_requests": max(1, math.floor(WELL_FILLED * viewers)),
+    }
+    deployment = serve.deployment(
+        name="replica",
+        ray_actor_options={"num_cpus": 1, "num_gpus": 1 if served.device.startswith("cuda") else 0},
+        max_ongoing_requests=viewers + SPARE_REQUESTS,
+        autoscaling_config=scaling,
+        graceful_shutdown_timeout_s=STOPPING_S,
+        health_check_period_s=1.0,
+    )
+    return deployment(serve.ingress(build)(_Replica)).bind()
+
+
+class _Replica:
+    """Holds the application; Serve's ingress adds what it is called by."""
+
+
+def _replica(served: ManyViewers, ingest: RayIngest) -> BehindProxy:
+    """The application of one replica: its own renderer, upon times that the ingest has made."""
+    set_up()
+    supply = SharedFrames(ingest, served.replica_mb / 2)
+    stream = replace(served.stream, memory_mb=min(served.stream.memory_mb or math.inf, served.replica_mb / 2))
+    renderer = Renderer(supply, served.load_inpainter(), stream, served.device)
+    service = RenderService(renderer, supply)
+
+    async def ready() -> None:
+        end = time.monotonic() + READY_S
+        while not service.ready and time.monotonic() < end and not (supply.status.error or service.error):
+            await asyncio.sleep(0.05)
+        loaded()
+
+    return BehindProxy(LiveServer(service, served.server).app(), ready)
+
+
+def _put(shared: SharedTime) -> list[Any]:
+    """The time, in the object store; its reference in a list, so that who is handed it fetches it himself."""
+    import ray  # pyright: ignore[reportMissingImports]
+
+    return [ray.put(shared)]
+
+
+def _demand(ray: Any, opened: Any) -> None:
+    """See that the source is open; what is wrong with it is said in its own words."""
+    try:
+        ray.get(opened)
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, ValueError | OSError):
+            raise error.cause from None
+        raise
+
+
+def _free_port(host: str, port: int) -> int:
+    """The port, or a free one for 0: what Ray says of one that is taken is long, and comes late.
+
+    Raises:
+        OSError: somebody else has it.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host, port), family=family) as listener:
+            return int(listener.getsockname()[1])
+    except OSError as error:
+        what = error.strerror or str(error)
+        raise OSError(f"port {port} of {host}: {what}; choose another --port or --host") from None
