@@ -41,7 +41,7 @@ class ServerSocket:
             said, status = bytes(refused.response.body or b"").decode(errors="replace"), refused.response.status_code
             kind = ConnectionLostError if status >= 500 else ConnectionError
             raise kind(f"the server refuses ({status}): {said[:400]}") from None
-        except (OSError, InvalidHandshake) as error:
+        except (OSError, InvalidHandshake, ConnectionClosed) as error:
             raise ConnectionLostError(f"{url}: expected a server, got none ({error}); is it running?") from None
 
     def send(self, message: str | bytes) -> None:

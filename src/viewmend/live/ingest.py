@@ -6,7 +6,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.protocol import ViewInpainter
@@ -33,6 +33,7 @@ class SourceState:
     camera_counts: dict[str, dict[str, int]]
 
 
+@runtime_checkable
 class IngestLink(Protocol):
     """The way from a process that renders to the one that reads. Both calls wait, and are made by threads.
 

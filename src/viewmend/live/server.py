@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
@@ -134,6 +135,7 @@ class LiveServer:
             "error": error,
             "viewers": len(self.registry.sessions),
             "version": __version__,
+            "process": os.getpid(),
         }
         return JSONResponse(health, 503 if failing else 200)
 
