@@ -14,6 +14,9 @@ QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}
 ON_LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 """How Ray calls it that a cluster's own sockets are bound to 127.0.0.1, as on systems where it has no others."""
 
+AS_URGENT = {"RAY_worker_niceness": "0"}
+"""Work has the priority of the command that asks for it; by itself Ray gives it less than anything else has."""
+
 
 def find_ray(address: str) -> Any:
     """The module ray, told before it is imported what it may do: no reports, and a local cluster on loopback alone.
@@ -25,7 +28,7 @@ def find_ray(address: str) -> Any:
     """
     wanted = QUIET
     if address == LOCAL:
-        wanted = wanted | ON_LOOPBACK | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+        wanted = wanted | ON_LOOPBACK | AS_URGENT | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     for name, value in wanted.items():
         os.environ.setdefault(name, value)
     try:

@@ -55,7 +55,7 @@ def test_a_local_cluster_has_a_token_and_reports_to_nobody(monkeypatch):
     assert "RAY_AUTH_TOKEN" not in os.environ and os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
     assert cluster.find_ray(cluster.LOCAL) is ray
     assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) >= 32
-    assert os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] == "0"
+    assert os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] == "0" and cluster.AS_URGENT.items() <= os.environ.items()
 
 
 def test_a_port_that_is_taken_is_said_before_a_cluster_is_started():

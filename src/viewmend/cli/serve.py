@@ -101,7 +101,7 @@ def run(options: Options) -> int:
     if options.ray is not None:
         from viewmend.cli.serving_many import serve_many
 
-        return serve_many(options)
+        serve_many(options)
     from viewmend.cli.console import say
     from viewmend.live.listener import Server
     from viewmend.live.memory import loaded, set_up

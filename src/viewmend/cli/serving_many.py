@@ -1,16 +1,17 @@
 """`viewmend serve --ray`: one process reads the rig, many render."""
 
-import threading
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 from viewmend.cli.console import say
 from viewmend.cli.serve import Options, load_inpainter, open_supply, server_config, stream_config
 from viewmend.cli.signals import ended_by_sigterm
 
 
-def serve_many(options: Options) -> int:
+def serve_many(options: Options) -> NoReturn:
     """Serve on a Ray cluster until interrupted.
 
     Raises:
@@ -47,8 +48,8 @@ def serve_many(options: Options) -> int:
     )
     with serving(served, options.ray) as address, ended_by_sigterm():  # Ray has a handler of its own
         say(f"open {address}/{token_query(config.token)}   (Ctrl-C stops it)")
-        threading.Event().wait()
-    return 0
+        while True:  # the system may give a signal to any thread, and this one must see it
+            time.sleep(0.5)
 
 
 def _absolute(name: str) -> str:
