@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
+from viewmend.inpainting.protocol import RenderQuality
 from viewmend.inpainting.sweep.cells import CELL_PX, doubled, halved, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.lookup import STATS, Rays, Scale, look_up
 from viewmend.inpainting.sweep.pyramids import Rig
@@ -122,9 +123,9 @@ class ErrorNet(Network):
         found = F.pixel_shuffle(found.float().sigmoid(), CELL_PX)[0, :, :height, :width]
         return ErrorMap(*torch.where(depth[:height, :width] > 0, found, 0.0))
 
-    def expected(self, view: IncompleteView, rig: Rig, quick: bool) -> ErrorMap:
-        """What is expected of a whole view's pixels; `quick` judges a large subject in half its resolution."""
-        if not quick or int((view.mask > 0).sum()) < LARGE_PX**2:
+    def expected(self, view: IncompleteView, rig: Rig, quality: RenderQuality) -> ErrorMap:
+        """What is expected of a whole view's pixels; a large subject's in half its resolution if nothing is read."""
+        if quality.read_fraction != 0 or int((view.mask > 0).sum()) < LARGE_PX**2:
             return self(view, rig)
         rim, small = rim_depth(view.depth) > 0, halved(view)
         found = torch.stack(self(small, rig, Scale.of(view)))

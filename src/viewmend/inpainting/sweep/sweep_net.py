@@ -127,8 +127,7 @@ class SweepNet(Network):
             )
         names = view.closest_views(self.config.num_views)
         seen = context(view.time, names) if names else None
-        quick = context.quality.read_fraction == 0
-        return None if seen is None else self.errors.expected(view, Rig.of(seen, view.silhouettes, context), quick)
+        return seen and self.errors.expected(view, Rig.of(seen, view.silhouettes, context), context.quality)
 
     @property
     def tells_errors(self) -> bool:
