@@ -82,7 +82,7 @@ class Asked:
         self._ingest = Ingest(Still(), make_method("views"), HullConfig(), 500.0, lambda shared: [ray.put(shared)])
 
     def state(self, known: int, wait_s: float):
-        return self._ingest.state(known, wait_s)
+        return self._ingest.state(known, wait_s, False)
 
     def time(self, at: int, wait_s: float):
         return self._ingest.time(at, wait_s)

@@ -29,9 +29,9 @@ class Link:
     def __init__(self, ingest):
         self.ingest, self.asked = ingest, []
 
-    def state(self, known, wait_s):
+    def state(self, known, wait_s, watched):
         self._demand()
-        return self.ingest.state(known, min(wait_s, 0.2))
+        return self.ingest.state(known, min(wait_s, 0.2), watched)
 
     def time(self, at, wait_s):
         self._demand()
@@ -54,7 +54,9 @@ def ingest_of(supply, memory_mb=50.0):
 
 @pytest.fixture
 def link():
+    """To a recording whose edge stands still at 0."""
     supply = recording()
+    supply.recording.playing = False
     yield Link(ingest_of(supply))
     supply.stop()
 
@@ -163,13 +165,58 @@ def test_a_new_rig_is_another(follow):
     assert frames.rig is same, "nobody prepares anew for a frame"
 
 
-def test_the_edge_is_one_for_all(link, follow):
-    one = follow(link)
-    link.ingest._supply.recording.position = 3.0
-    link.ingest._last = time.monotonic() + 60  # stands still
-    wait_until(lambda: abs(one.recording.position - 3.0) < 1.0)
-    other = follow(link)
-    wait_until(lambda: abs(other.recording.position - one.recording.position) < 1.0)
+def test_all_who_follow_the_edge_see_the_same_times_however_slow_the_hull(follow, monkeypatch):
+    carved = []
+    observe = shared_time.observe
+
+    def slowly(*given):
+        time.sleep(0.2)  # six frames
+        carved.append(given[0].time)
+        return observe(*given)
+
+    monkeypatch.setattr(shared_time, "observe", slowly)
+    supply = ReadAhead(lambda: BallCapture(CAMERAS, 1000), fps=30.0)
+    link = Link(ingest_of(supply))
+    seen = [set(), set()]
+    followers = [follow(link), follow(link)]
+    end = time.monotonic() + 4
+    while time.monotonic() < end:
+        for frames, times in zip(followers, seen, strict=True):
+            at = int(frames.recording.position)
+            if frames.read(at) is not None:
+                times.add(at)
+        time.sleep(0.004)
+    supply.stop()
+    assert len(seen[0] & seen[1]) >= 6, "times come, though each is late"
+    assert len(seen[0] ^ seen[1]) <= 2 and len(carved) <= len(seen[0] | seen[1]) + 3
+    assert max(seen[0]) - min(seen[0]) > 45, "and the edge goes on as fast as ever"
+
+
+def test_while_nobody_watches_nothing_is_made(link, follow):
+    link.ingest._supply.recording.playing = True
+    frames = follow(link)
+    wait_until(lambda: frames.recording.position > 0, 5)  # the edge goes on
+    time.sleep(0.3)
+    assert link.asked == [] and not link.ingest._kept
+
+
+def test_of_a_live_rig_nobody_sees_what_is_not_made(follow, monkeypatch):
+    pushed = PushedFrames()
+    link = Link(ingest_of(pushed))
+    pushed.begin("one", 15.0, None, None)
+    frame = BallCapture(CAMERAS, 1).read(0)
+    pushed.push(frame)
+    frames = follow(link)
+    fetched(frames, 0)
+    wait_until(lambda: link.ingest._led == 0)
+    may_carve, observe = threading.Event(), shared_time.observe
+    monkeypatch.setattr(shared_time, "observe", lambda *given: may_carve.wait(20) and observe(*given))
+    pushed.push(frame)
+    for _ in range(20):
+        assert frames.read(0) is not None and frames.span.newest == 0
+        time.sleep(0.02)
+    may_carve.set()
+    wait_until(lambda: frames.read(frames.span.newest) is not None and frames.span.newest == 1)
 
 
 def test_what_is_kept_is_bounded(follow):

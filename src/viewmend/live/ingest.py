@@ -1,5 +1,7 @@
 """The one process that reads a rig: every time is read, carved and encoded once, for all who render."""
 
+import logging
+import math
 import secrets
 import threading
 import time
@@ -12,8 +14,15 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.live.clock import Span, edge_of
 from viewmend.live.frames import FrameSupply, Rig, SourceStatus
+from viewmend.live.memory import HeapTrimmer
 from viewmend.live.shared_time import SharedTime
 from viewmend.views import MultiViewFrame
+
+WATCHED_S = 2.0
+"""The edge's times are made for so long after somebody said that they are watched."""
+LEAD_TICK_S = 0.005
+
+log = logging.getLogger("viewmend.live")
 
 
 @dataclass(frozen=True)
@@ -28,7 +37,7 @@ class SourceState:
     span: Span
     rig: Rig | None
     edge: float
-    """The position of those who follow the edge."""
+    """The position of those who follow the edge: while they watch, the last time that was made for them."""
     spread_ms: float | None
     camera_counts: dict[str, dict[str, int]]
 
@@ -40,8 +49,11 @@ class IngestLink(Protocol):
     ConnectionError says that the other process is away; it may come back.
     """
 
-    def state(self, known: int, wait_s: float) -> SourceState:
-        """The state as soon as its version is not the `known` one; after `wait_s` in any case."""
+    def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
+        """The state as soon as its version is not the `known` one; after `wait_s` in any case.
+
+        While somebody says that the edge is `watched`, its times are made without being asked for.
+        """
         ...
 
     def time(self, at: int, wait_s: float) -> tuple[str, SharedTime] | None:
@@ -50,7 +62,10 @@ class IngestLink(Protocol):
 
 
 class Ingest:
-    """Reads a supply for others. Any number of threads may call it."""
+    """Reads a supply for others. Any number of threads may call it.
+
+    All who follow the edge see the same times: a thread makes them, one after the other, each of what is the edge then.
+    """
 
     def __init__(
         self,
@@ -74,30 +89,30 @@ class Ingest:
         self._process = secrets.token_hex(8)
         self._changed = threading.Condition()
         self._version = 0
-        self._last = time.monotonic()
+        self._last, self._watched = time.monotonic(), -math.inf
+        self._led = -1
+        """The edge's time that was made last."""
         self._kept: OrderedDict[int, tuple[str, Any, int]] = OrderedDict()
         """Each time with its source, what it is found by, and its bytes; the one asked for longest ago first."""
         self._making = threading.Lock()
         supply.changed = self._tell
         supply.start()
+        threading.Thread(target=self._lead, name="edge", daemon=True).start()
 
-    def state(self, known: int, wait_s: float) -> SourceState:
+    def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
         """As `IngestLink.state`."""
         supply = self._supply
         with self._changed:
+            if watched:
+                self._watched = time.monotonic()
+                self._changed.notify_all()
             self._changed.wait_for(lambda: self._version != known, wait_s)
-            now, span = time.monotonic(), supply.span
-            supply.recording.advance(now - self._last, span)
-            self._last = now
+            span, edge = supply.span, self._edge()
+            if self._is_watched and span.first <= self._led < span.end:
+                edge = float(self._led)
+            counts = supply.camera_counts()
             return SourceState(
-                self._version,
-                self._source,
-                supply.status,
-                span,
-                supply.rig,
-                edge_of(span, supply.recording),
-                supply.spread_ms,
-                supply.camera_counts(),
+                self._version, self._source, supply.status, span, supply.rig, edge, supply.spread_ms, counts
             )
 
     def time(self, at: int, wait_s: float) -> tuple[str, Any] | None:
@@ -107,6 +122,37 @@ class Ingest:
             with self._making:  # one after the other: each uses what the processor has
                 kept = self._at_hand(at) or self._made(frame)
         return kept
+
+    def _edge(self) -> float:
+        """Where the edge is now, whether that time is made or not."""
+        now, supply = time.monotonic(), self._supply
+        supply.recording.advance(now - self._last, supply.span)
+        self._last = now
+        return edge_of(supply.span, supply.recording)
+
+    @property
+    def _is_watched(self) -> bool:
+        return time.monotonic() - self._watched < WATCHED_S
+
+    def _lead(self) -> None:
+        """Make the edge's times while somebody watches; how many of them is how fast this machine is."""
+        trimmer = HeapTrimmer()
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_watched, WATCHED_S)
+                at = int(self._edge())
+                if not self._is_watched or at == self._led or at < 0:
+                    self._changed.wait(LEAD_TICK_S)
+                    continue
+            try:
+                made = self.time(at, WATCHED_S)
+            except Exception as error:  # nothing may end the thread; who asks for the time is told
+                log.warning("while making time %d: %s", at, error)
+                made = None
+            trimmer.when_due(idle=False)
+            if made is not None:
+                self._led = at
+                self._tell()
 
     @property
     def _source(self) -> str:

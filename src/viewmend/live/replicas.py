@@ -70,9 +70,9 @@ class IngestActor:
         self._opening = threading.Lock()
         self._ingest: Ingest | None = None
 
-    def state(self, known: int, wait_s: float) -> SourceState:
+    def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
         """As `Ingest.state`."""
-        return self._opened().state(known, wait_s)
+        return self._opened().state(known, wait_s, watched)
 
     def time(self, at: int, wait_s: float) -> tuple[str, Any] | None:
         """As `Ingest.time`."""
@@ -94,9 +94,9 @@ class RayIngest:
     def __init__(self, actor: Any) -> None:
         self._actor = actor
 
-    def state(self, known: int, wait_s: float) -> SourceState:
+    def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
         """As `IngestLink.state`."""
-        return self._answer(self._actor.state.remote(known, wait_s), wait_s)
+        return self._answer(self._actor.state.remote(known, wait_s, watched), wait_s)
 
     def time(self, at: int, wait_s: float) -> tuple[str, SharedTime] | None:
         """As `IngestLink.time`."""
@@ -137,7 +137,7 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
         calls = 4 * served.replicas[1] + 8  # two questions a replica, and as many of those that it replaces
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_concurrency=calls)(IngestActor)
         ingest = actor.remote(served, _put)
-        opened = ingest.state.remote(-1, 0.0)
+        opened = ingest.state.remote(-1, 0.0, False)
         quiet = {"enable_access_log": False, "log_level": "ERROR"}
         serve.start(http_options={"host": host, "port": port}, logging_config=quiet)
         _demand(ray, opened)

@@ -21,6 +21,9 @@ STILL_S, FULL_S = 0.25, 0.8
 """Seconds that a view has been still when it is rendered again. The sharp picture comes first, since whoever moves on
 waits for it; then all that the model can do."""
 
+AWAITED_S = 10.0
+"""So long a time is waited for that the clock has passed."""
+
 
 @dataclass(frozen=True)
 class Playback:
@@ -104,6 +107,8 @@ class ViewerSession:
         self._shown: tuple[Look | None, int] = (None, -1)
         """Look and time of the last request."""
         self._full = False
+        self._awaited = (-1, 0.0)
+        """The time that is on its way, and since when; -1 for none."""
         self._level, self._wait_ms = FULL, 0.0
         self.drawn = FULL
         """What the last view was made with: its level, smaller where many wait."""
@@ -150,7 +155,7 @@ class ViewerSession:
             level = self._refinement(now - self._look_at) if at_rest else None
         if level is None:
             return None
-        if not playback.has_frame(at):
+        if (at := self._at_hand(at, now, playback)) is None:
             self.buffering = True
             return None
         if is_new and not is_new_look and self.clock.playing:
@@ -160,6 +165,18 @@ class ViewerSession:
         self._wait_ms = max(0.0, 1000 * (now - self._look_at)) if is_new_look else 0.0
         self._shown = (look, at)
         return self._request(look, at, playback.rig_frame)
+
+    def _at_hand(self, at: int, now: float, playback: Playback) -> int | None:
+        """The time to show: the clock's, or where that runs ahead of what comes, the one that was waited for."""
+        awaited, since = self._awaited
+        if self.clock.playing and playback.span.first <= awaited < at and now - since < AWAITED_S:
+            at = awaited
+        if playback.has_frame(at):
+            self._awaited = (-1, now)
+            return at
+        if at != awaited:
+            self._awaited = (at, now)
+        return None
 
     def _refinement(self, still_s: float) -> QualityLevel | None:
         """The level for a view that has been still so long; None where it was rendered as well already."""

@@ -1,12 +1,13 @@
 """Frames that another process reads: they come with their hulls, and lie in memory that processes share."""
 
 import logging
+import math
 import threading
 import time
 from collections import OrderedDict
 from dataclasses import replace
 
-from viewmend.live.clock import Span
+from viewmend.live.clock import Span, edge_of
 from viewmend.live.frames import FrameSupply
 from viewmend.live.ingest import IngestLink, SourceState
 from viewmend.live.shared_time import SharedTime
@@ -17,6 +18,8 @@ WAIT_S = 1.0
 """How long one question waits for its answer."""
 RETRY_S = 0.2
 """A process that is away is asked again after this long."""
+WATCHED_S = 1.0
+"""For so long the edge counts as watched."""
 FRESH_S = 0.5
 """What nobody asked for again within this time is not fetched any more."""
 AWAY = "the process that reads the cameras has ended; it is started again"
@@ -42,6 +45,9 @@ class SharedFrames(FrameSupply):
         """Times that are not here, and when each was asked for last; the first has waited longest."""
         self._ahead: int | None = None
         """What is fetched while nothing is wanted."""
+        self._watched = -math.inf
+        """When the edge's time was asked for last."""
+        self.recording.playing = False  # it is where the ingest says
         self._stopped = False
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._follow, self._fetch)]
 
@@ -75,6 +81,8 @@ class SharedFrames(FrameSupply):
 
     def _find(self, at: int) -> SharedTime | None:
         with self._lock:
+            if at == int(edge_of(self.span, self.recording)):
+                self._watched = time.monotonic()
             if at in self._kept:
                 self._kept.move_to_end(at)
             elif self.span.first <= at < self.span.end:
@@ -86,7 +94,7 @@ class SharedFrames(FrameSupply):
         known = -1
         while not self._stopped:
             try:
-                state = self._ingest.state(known, WAIT_S)
+                state = self._ingest.state(known, WAIT_S, self._is_edge_watched)
             except ConnectionError:
                 self._lose()
                 time.sleep(RETRY_S)
@@ -96,7 +104,8 @@ class SharedFrames(FrameSupply):
                 known = state.version
                 self._take(state)
                 self.changed()
-            self._set_edge(state)
+            else:
+                self.recording.position = state.edge
 
     def _lose(self) -> None:
         if self.status.error != AWAY:
@@ -110,13 +119,17 @@ class SharedFrames(FrameSupply):
                 self._source, self.rig = state.source, state.rig
                 self._kept.clear()
                 self._wanted, self._ahead = {}, None
-            self.span, self.status = state.span, state.status
+            span, self.status, self.recording.position = state.span, state.status, state.edge
+            # What has happened and is not made yet is nobody's to see.
+            self.span = replace(span, end=int(state.edge) + 1) if span.live and state.edge >= span.first else span
+            if self._is_edge_watched and int(state.edge) not in self._kept:
+                self._ahead = int(state.edge)
+                self._lock.notify_all()
             self.spread_ms, self._counts = state.spread_ms, state.camera_counts
 
-    def _set_edge(self, state: SourceState) -> None:
-        """All processes show a recording's edge at one position; what a message takes is less than a frame."""
-        if not state.span.live and abs(self.recording.position - state.edge) > 1:
-            self.recording.position = state.edge
+    @property
+    def _is_edge_watched(self) -> bool:
+        return time.monotonic() - self._watched < WATCHED_S
 
     def _fetch(self) -> None:
         while not self._stopped:
@@ -148,5 +161,6 @@ class SharedFrames(FrameSupply):
         while len(self._kept) > 2 and sum(shared.bytes for shared in self._kept.values()) > self._limit:
             self._kept.popitem(last=False)
         soon = at + 1 if at + 1 < self.span.end or not self.span.complete else self.span.first
-        if was_asked_for and soon not in self._kept and soon < self.span.end:
+        is_edge = at == int(edge_of(self.span, self.recording))  # whose next time the ingest leads to
+        if was_asked_for and not is_edge and soon not in self._kept and soon < self.span.end:
             self._ahead = soon
