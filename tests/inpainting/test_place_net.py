@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from viewmend.inpainting.sweep import sweep_net
 from viewmend.inpainting.sweep.cells import scattered, stacked
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.lookup import FEATURES, IN_VIEW, STATS, Places
 from viewmend.inpainting.sweep.place_net import PlaceNet
+from viewmend.inpainting.sweep.pyramids import Rig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.stage import Studio, StudioConfig
@@ -54,7 +54,7 @@ def test_a_view_is_read_alike_however_many_rays_are_weighed_at_once(monkeypatch)
     stream.push(frame.without(frame.cameras.names[1:2]))
     camera = frame.cameras.select(frame.cameras.names[1:2])
     whole = stream.view(camera).completed
-    monkeypatch.setattr(sweep_net, "RAYS_AT_ONCE", 29)
+    monkeypatch.setattr(Rig, "rays_at_once", 29)
     parts = stream.view(camera).completed
     assert (whole.rgb - whole.view.rgb).abs().max() > 0.05
     torch.testing.assert_close(parts.rgb, whole.rgb, atol=1e-5, rtol=0)

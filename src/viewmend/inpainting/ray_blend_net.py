@@ -147,14 +147,23 @@ class RayBlendNet(CoarseFill):
         window: Float[Tensor, "pixel 8 11 11"],
         far: Float[Tensor, "pixel feature"],
     ) -> Float[Tensor, "pixel 3"]:
-        pixels = len(features)
-        features, consistency, window, far = map(_rounded_up, (features, consistency, window, far))
+        parts = map(_rounded_up, (features, consistency, window, far))
+        return self.mixed(*parts)[: len(features)]
+
+    def mixed(
+        self,
+        features: Float[Tensor, "pixel point view 14"],
+        consistency: Float[Tensor, "pixel point 4"],
+        window: Float[Tensor, "pixel 8 11 11"],
+        far: Float[Tensor, "pixel feature"],
+    ) -> Float[Tensor, "pixel 3"]:
+        """The mixed colour of each pixel, all at once; `far` is what `self.far` made of its surroundings."""
         colours, points = self._points(features, consistency)
         hidden = self.head(torch.cat([points.flatten(1), self.around(window).flatten(1), far], 1))
         candidate = F.pad(RayFeatures.unstack(features).in_view.amax((2, 3)) > 0, (0, 2), value=True)
         weights = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
         coarse_fill = window[:, None, -3:, RADIUS_PX, RADIUS_PX]
-        return (weights[..., None] * torch.cat([colours, coarse_fill, 0 * coarse_fill], 1)).sum(1)[:pixels]
+        return (weights[..., None] * torch.cat([colours, coarse_fill, 0 * coarse_fill], 1)).sum(1)
 
     def _points(
         self, features: Float[Tensor, "pixel point view 14"], consistency: Float[Tensor, "pixel point 4"]

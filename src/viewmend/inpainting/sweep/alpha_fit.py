@@ -17,7 +17,7 @@ FAINTEST = 1e-4
 """Alpha is no closer to 0 or 1 before it is changed."""
 
 
-def with_slope(alpha: Float[Tensor, "*pixel"], slope: float) -> Float[Tensor, "*pixel"]:
+def with_slope(alpha: Float[Tensor, "*pixel"], slope: float | Float[Tensor, ""]) -> Float[Tensor, "*pixel"]:
     """Alpha with its logits multiplied by `slope`; what is 0 stays 0."""
     changed = (slope * alpha.clamp(FAINTEST, 1 - FAINTEST).logit()).sigmoid()
     return torch.where(alpha > 0, changed, 0.0)

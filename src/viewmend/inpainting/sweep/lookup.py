@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, UInt8
@@ -79,6 +79,27 @@ class Rays(NamedTuple):
     camera: Cameras
     uv_px: Float[Tensor, "ray 2"]
     z_m: Float[Tensor, "ray place"]
+
+    def split(self, size: int | None) -> "list[Rays]":
+        """Parts of so many rays; all in one where None."""
+        if size is None:
+            return [self]
+        parts = zip(self.uv_px.split(size), self.z_m.split(size), strict=True)
+        return [Rays(self.camera, *part) for part in parts]
+
+
+@runtime_checkable
+class Sight(Protocol):
+    """What `SweepNet` looks places up in: a `Rig`, or what an export packs of one."""
+
+    @property
+    def rays_at_once(self) -> int | None:
+        """So many are weighed together; None for all."""
+        ...
+
+    def look_up(self, rays: Rays, source_views: Sequence[str], step_px: float, scale: Scale) -> Places:
+        """As the function `look_up`."""
+        ...
 
 
 def look_up(rays: Rays, rig: Rig, source_views: Sequence[str], step_px: float, scale: Scale) -> Places:

@@ -1,8 +1,9 @@
 """Cameras' images in all scales: what is looked up in them has the size of what it is for. Ours."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from jaxtyping import Int, UInt8
@@ -13,6 +14,9 @@ from viewmend.chosen_views import each
 from viewmend.geometry.threads import parallel_for
 from viewmend.inpainting.protocol import ContextProvider
 from viewmend.views import ContextViews, Silhouettes
+
+if TYPE_CHECKING:
+    from viewmend.inpainting.sweep.lookup import Places, Rays, Scale
 
 SMALLEST_PX = 4
 """Levels are halved until a side is no longer than this."""
@@ -41,6 +45,8 @@ class Rig:
     silhouettes: Silhouettes
     """The masks of all cameras."""
     silhouette_pyramids: tuple[Pyramid, ...]
+    rays_at_once: ClassVar[int] = 1024
+    """So many are weighed together: what is looked up along more does not fit a cache."""
 
     @classmethod
     def of(cls, views: ContextViews, silhouettes: Silhouettes | None, context: ContextProvider | None = None) -> "Rig":
@@ -61,6 +67,12 @@ class Rig:
             time, "silhouettes", all_names, lambda new: silhouette_pyramids(silhouettes.select(new))
         )
         return cls(views, tuple(pyramids), silhouettes, tuple(masks))
+
+    def look_up(self, rays: "Rays", source_views: Sequence[str], step_px: float, scale: "Scale") -> "Places":
+        """What every camera shows at places along rays, as `lookup.look_up`."""
+        from viewmend.inpainting.sweep.lookup import look_up
+
+        return look_up(rays, self, source_views, step_px, scale)
 
     def first(self, count: int) -> "Rig":
         """With so many of the cameras; all silhouettes stay."""

@@ -16,18 +16,17 @@ from torch.nn import functional as F
 
 from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.inpainting.coarse_fill import SmoothFill
-from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.network import Network
 from viewmend.inpainting.protocol import ContextProvider, HeldOut, RenderQuality, State
 from viewmend.inpainting.ray_blend_net import RayBlendNet
-from viewmend.inpainting.sweep.alpha_fit import fitted_slope, recomposed, with_slope
+from viewmend.inpainting.sweep.alpha_fit import fitted_slope
 from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered, stacked
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet, unread
-from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, look_up
+from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, Sight
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig, keep_pyramids
-from viewmend.inpainting.sweep.reading import Reading, Swept
+from viewmend.inpainting.sweep.reading import Reading, Swept, finer, uncovered
 from viewmend.inpainting.sweep.unet import UNet
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
@@ -40,12 +39,7 @@ TOLD_CHANNELS = 27
 of the place, and how sure its depth is."""
 JOINT = 0.03
 """Pixels whose depth differs from their cell's by less than so many subject sizes are of its surface."""
-LEAST_MASK = 0.1
-RAYS_AT_ONCE = 1024
-"""So many are weighed together: what is looked up along more does not fit a cache."""
 MARGIN_PX = 16
-HOLE_GUESS = 0.7
-"""Weight of what `RayBlendNet` reads in holes; the rest is this reader's, which saw few holes in training."""
 
 
 class SweepNet(Network):
@@ -91,15 +85,26 @@ class SweepNet(Network):
             read: which pixels of the proxy and of the rim about it; None for all.
             guess: its part of the `coarse_guess` of the whole view.
         """
-        scale = scale or Scale.of(view)
-        depth, coloured = rim_depth(view.depth), view.weights.sum(0) > 0
-        read = depth > 0 if read is None else read & (depth > 0)
         guess = self.coarse_guess(view, rig.views) if guess is None else guess
+        read = torch.ones_like(view.mask, dtype=torch.bool) if read is None else read
+        return self.read(view, rig, scale or Scale.of(view), read, guess)
+
+    def read(
+        self,
+        view: IncompleteView,
+        sight: Sight,
+        scale: Scale,
+        read: Bool[Tensor, "height width"],
+        guess: Float[Tensor, "3 height width"],
+    ) -> Reading:
+        """What these pixels show, as far as they are of the proxy or of its rim, by what is looked up in `sight`."""
+        depth, coloured = rim_depth(view.depth), view.weights.sum(0) > 0
+        read = read & (depth > 0)
         flags = torch.stack([view.mask, coloured.float(), view.weights.amax(0), read.float()])
         shown = torch.cat([guess, flags])
         view = replace(view, depth=depth)
-        swept = self._sweep(view, rig, scale, read, shown)
-        return self._blend(view, rig, scale, torch.nonzero(read), shown, swept)
+        swept = self._sweep(view, sight, scale, read, shown)
+        return self._blend(view, sight, scale, torch.nonzero(read), shown, swept)
 
     @torch.no_grad()
     def coarse_guess(
@@ -170,27 +175,14 @@ class SweepNet(Network):
             return (CompletedView(view, view.rgb) if view.fade is None else unread(view, fades)), state
         quick = context.quality.read_fraction is not None
         guess = self.coarse_guess(view, seen, quick)
-        found, E = self(view, Rig.of(seen, view.silhouettes, context), read=read, guess=guess), view.error
-        rgb, alpha, confidence, depth = (
-            scattered(values, found.pixels, view.mask.shape)
-            for values in (found.rgb, found.alpha[:, None], found.confidence[:, None], found.depth[:, None])
-        )
-        soft = with_slope(alpha, self.alpha_slope)
-        rgb, alpha = recomposed(rgb, alpha[0], soft[0]), soft
-        if not quick and isinstance(self.coarse, RayBlendNet):
-            rgb = torch.where(read & view.holes, HOLE_GUESS * guess + (1 - HOLE_GUESS) * rgb, rgb)
-        return CompletedView(
-            view,
-            blend(view.rgb, E, rgb, (read | fades).to(E)),
-            torch.where(read | fades, E * alpha[0] + (1 - E) * view.mask, view.mask),
-            torch.where(read, E * confidence[0] + (1 - E), view.mask),
-            torch.where(read, depth[0] * (alpha[0] > 0.5), view.depth),
-        ), state
+        found = self(view, Rig.of(seen, view.silhouettes, context), read=read, guess=guess)
+        in_holes = guess if not quick and isinstance(self.coarse, RayBlendNet) else None
+        return found.laid_into(view, read, fades, self.alpha_slope, in_holes), state
 
     def _sweep(
         self,
         view: IncompleteView,
-        rig: Rig,
+        sight: Sight,
         scale: Scale,
         read: Bool[Tensor, "height width"],
         shown: Float[Tensor, "7 height width"],
@@ -200,15 +192,12 @@ class SweepNet(Network):
         cells = torch.nonzero(depth > 0)
         along = depth[tuple(cells.T)][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
         middles = CELL_PX * (cells.flip(1).double() + 0.5)
-        rays = [
-            Rays(view.camera, *part)
-            for part in zip(middles.split(RAYS_AT_ONCE), along.split(RAYS_AT_ONCE), strict=True)
-        ]
+        rays = Rays(view.camera, middles, along).split(sight.rays_at_once)
         front = nearest_depth(view.depth)
         beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = F.avg_pool2d(shown[None], CELL_PX, ceil_mode=True)[0]
         with self.autocast():
-            parts = [self.places(look_up(part, rig, view.source_views, float(CELL_PX), scale)) for part in rays]
+            parts = [self.places(sight.look_up(part, view.source_views, float(CELL_PX), scale)) for part in rays]
             weighed = Weighed(*map(torch.cat, zip(*parts, strict=True)))
             features = weighed.features.flatten(1).to(self.compute_dtype)
             volume = scattered(features, cells, depth.shape)
@@ -221,7 +210,7 @@ class SweepNet(Network):
     def _blend(
         self,
         view: IncompleteView,
-        rig: Rig,
+        sight: Sight,
         scale: Scale,
         pixels: Int[Tensor, "pixel 2"],
         shown: Float[Tensor, "7 height width"],
@@ -234,18 +223,18 @@ class SweepNet(Network):
         front = torch.where((own - front).abs() < JOINT * scale.size_m, own, front)
         depth = front + scale.size_m * offset
         uv, at = pixels.flip(1).double() + 0.5, depth.detach()[:, None]
-        found = look_up(Rays(view.camera, uv, at), rig, view.source_views, 1.0, scale)
+        found = sight.look_up(Rays(view.camera, uv, at), view.source_views, 1.0, scale)
         before = swept.weighed.trust[cell, place]
         with self.autocast():
             weighed = self.pixels(found, before[:, None])
-        sharp = _straight(weighed.colour[:, 0], weighed.mask[:, 0])
+        sharp = uncovered(weighed.colour[:, 0], weighed.mask[:, 0])
         best = weighed.trust[:, 0].argmax(1)
-        best = found.features[torch.arange(len(best)), 0, best] if len(best) else found.features.sum((1, 2))
-        single = _straight(best[:, COLOUR], best[:, MASK])
+        best = found.features[:, 0].take_along_dim(best[:, None, None], 1)[:, 0]
+        single = uncovered(best[:, COLOUR], best[:, MASK])
         shares = swept.logits.softmax(1)[..., None]
         means = torch.cat([(shares * part).sum(1) for part in (swept.weighed.colour, swept.weighed.mask)], 1)
-        means = _finer(means, swept, pixels)
-        soft = _straight(means[:, :3], means[:, 3:])
+        means = finer(means, swept, pixels)
+        soft = uncovered(means[:, :3], means[:, 3:])
         here = shown[:, pixels[:, 0], pixels[:, 1]].T
         guess = here[:, :3]
         told = [sharp, single, soft, guess, sharp - guess, weighed.mask[:, 0], means[:, 3:], here[:, 4:6]]
@@ -262,7 +251,7 @@ class SweepNet(Network):
         self, pixels: Int[Tensor, "pixel 2"], swept: Swept
     ) -> tuple[Int[Tensor, "pixel"], Float[Tensor, "pixel"], Float[Tensor, "pixel"]]:
         """The most probable place of each pixel, the mean offset about it in subject sizes, and its probability."""
-        shares = _finer(swept.logits.softmax(1), swept, pixels)
+        shares = finer(swept.logits.softmax(1), swept, pixels)
         place = shares.argmax(1)
         around = torch.stack([place - 1, place, place + 1], 1).clamp(0, len(OFFSETS) - 1)
         weight = shares.gather(1, around) + 1e-6
@@ -282,19 +271,3 @@ class SweepNet(Network):
             near = near[0, :, : shape[0], : shape[1]]
             out = self.finish(stacked(near, scattered(told.to(near), pixels, shape)))
         return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
-
-
-def _finer(
-    values: Float[Tensor, "cell channel"], swept: Swept, pixels: Int[Tensor, "pixel 2"]
-) -> Float[Tensor, "pixel channel"]:
-    """The cells' values at pixels, bilinearly; nothing comes from cells that were not read."""
-    whole = F.pad(values, (0, 1), value=1.0)
-    image = scattered(whole, swept.cells, swept.depth.shape)[None]
-    fine = F.interpolate(image, scale_factor=CELL_PX, mode="bilinear", align_corners=False)[0]
-    at = fine[:, pixels[:, 0], pixels[:, 1]].T
-    return at[:, :-1] / at[:, -1:].clamp_min(1e-6)
-
-
-def _straight(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
-    """Colours upon black as they are without it."""
-    return (colour / mask.clamp_min(LEAST_MASK)).clamp(0, 1)

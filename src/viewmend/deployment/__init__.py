@@ -1,0 +1,1 @@
+"""A model outside of Python: `SweepNet` as an AOTInductor package or as ONNX, with sizes that may differ."""
