@@ -55,6 +55,7 @@ COMMANDS = (
     Command(
         "export-scene", "viewmend.cli.export_scene", "Write a capture as a scene for engines: hull, points, depth."
     ),
+    Command("export", "viewmend.cli.export", "Write a model for C++ and other runtimes: AOTInductor or ONNX."),
     Command("info", "viewmend.cli.info", "Say what a capture or a model is, and check a calibration."),
 )
 

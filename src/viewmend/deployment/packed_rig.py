@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.deployment.halvings import CONSTANT, halvings
 from viewmend.deployment.rig_cameras import RigCameras, Seen, Viewer, cosines, seen_by
 from viewmend.deployment.view_inputs import ViewInputs
 from viewmend.inpainting.sweep.lookup import AROUND, CONTRAST, FAR, NEAR, Places, Rays, Scale
@@ -19,6 +20,8 @@ from viewmend.inpainting.sweep.pyramids import SMALLEST_PX
 
 LEVELS = 11
 """Scales of an image, each half of the one before: enough for a shorter side of 4096 pixels."""
+SPARE = 16
+"""Rows that a sheet of levels has beyond the finest: halves of a length add up to no more than it, but for borders."""
 MEASURED = 2
 """Scale at which the subject's area is measured."""
 
@@ -39,30 +42,21 @@ class PackedLevels(NamedTuple):
 
     @classmethod
     def of(
-        cls, images: Float[Tensor, "camera rows columns channel"], sizes_px: Int[Tensor, "camera 2"], mask: int
+        cls, images: Float[Tensor, "camera channel rows columns"], sizes_px: Int[Tensor, "camera 2"], mask: int
     ) -> "PackedLevels":
         """All scales of images from 0 to 255, whose channel `mask` shows the subject."""
-        height, width = images.shape[1:3]
-        levels = [F.pad(images, (0, 0, 1, 2, 1, 2))]
-        for level in range(1, LEVELS):
-            rows = _halved(levels[-1], 1, height // 2**level + 3)
-            levels.append(((_halved(rows, 2, width // 2**level + 3) + 2) / 4).floor())
+        levels = halvings(images, LEVELS - 1, lambda means: (means + 0.5).floor())
+        area = levels[MEASURED][:, mask].double().sum((1, 2)) / 255 * 4**MEASURED
         sides = 2 ** torch.arange(LEVELS)
-        rows, columns = (torch.full((LEVELS,), size, dtype=torch.long) // sides + 3 for size in (height, width))
         shortest = (sizes_px.amin(1)[:, None] + sides - 1) // sides
         last = (shortest > SMALLEST_PX).sum(1).clamp_max(LEVELS - 1)
-        area = levels[MEASURED][..., mask].double().sum((1, 2)) / 255 * 4**MEASURED
-        first = (rows * columns).cumsum(0) - rows * columns
-        values = torch.cat([level.flatten(1, 2) for level in levels], 1)
-        return cls(values, first, columns, last, area.sqrt().clamp_min(1))
+        return cls(*_laid_out(levels), last, area.sqrt().clamp_min(1))
 
     def level(self, footprint_px: Float[Tensor, "camera"]) -> Int[Tensor, "camera"]:
         """Each camera's level whose pixels are about as large as so many of the image's."""
         return torch.minimum(footprint_px.clamp_min(1).log2().round().long(), self.last)
 
-    def at(
-        self, seen: Seen, level: Int[Tensor, "camera"], channels: int
-    ) -> Float[Tensor, "ray place camera channel"]:
+    def at(self, seen: Seen, level: Int[Tensor, "camera"], channels: int) -> Float[Tensor, "ray place camera channel"]:
         """The first channels of each camera's level, bilinearly, in [0, 1]; meaningless where nothing is in view."""
         scale = 0.5 ** level.double()
         x, y = seen.u * scale + 0.5, seen.v * scale + 0.5
@@ -76,11 +70,25 @@ class PackedLevels(NamedTuple):
         return ((1 - below) * upper + below * lower) / 255
 
 
-def _halved(image: Tensor, axis: int, length: int) -> Tensor:
-    """Sums of two pixels along an axis, so many; the first is border, and so is what is beyond the image."""
-    place, last = 2 * torch.arange(length), image.shape[axis] - 1
-    before, after = (place - 1).clamp(0, last), place.clamp_max(last)
-    return image.index_select(axis, before) + image.index_select(axis, after)
+def _laid_out(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """All levels as one row of pixels, channels last; where each begins, and how long its rows are.
+
+    The finest lies on the left of a sheet, those below `CONSTANT` under each other on the right; then come the others.
+    """
+    whole, right, others = levels[0], levels[1:CONSTANT], levels[CONSTANT:]
+    height, width, half = whole.shape[2] + SPARE, whole.shape[3] + 1, right[0].shape[3] + 1
+    left = F.pad(whole, (1, 0, 1, SPARE - 1))
+    strips = [F.pad(level, (1, half - 1 - level.shape[3], 1, 0)) for level in right]
+    below = height - sum(level.shape[2] for level in strips)
+    sheet = torch.cat([left, F.pad(torch.cat(strips, 2), (0, 0, 0, below))], 3)
+    rows = [F.pad(level, (1, 0, 1, 0)) for level in others]
+    values = torch.cat([image.flatten(2) for image in (sheet, *rows)], 2).movedim(1, 2)
+    tops = torch.cat([torch.full((1,), size, dtype=torch.long) for size in (0, *(s.shape[2] for s in strips[:-1]))])
+    tops, rows_px = tops.cumsum(0), sheet.shape[3]
+    sizes = torch.tensor([0, *(level.shape[2] * level.shape[3] for level in rows)]).cumsum(0)[:-1]
+    first = [torch.zeros(1, dtype=torch.long), tops * rows_px + width, sizes + sheet.shape[2] * rows_px]
+    columns = [torch.full((CONSTANT,), rows_px, dtype=torch.long), torch.tensor([level.shape[3] for level in rows])]
+    return values, torch.cat(first), torch.cat(columns)
 
 
 @dataclass(frozen=True)
@@ -93,7 +101,7 @@ class PackedRig:
     is_source: Bool[Tensor, "camera"]
     all_cameras: RigCameras
     outlines: PackedLevels
-    rays_at_once: ClassVar[None] = None
+    rays_at_once: ClassVar[int | None] = None
 
     @classmethod
     def of(cls, given: ViewInputs) -> "PackedRig":
@@ -103,9 +111,9 @@ class PackedRig:
         rgb, mask = given.images[given.chosen].float(), given.masks[given.chosen].float()
         depth = given.proxy_depths[given.chosen]
         black = ((rgb * mask[:, None] + 127) / 255).floor()
-        shown = torch.cat([black, mask[:, None], 255 * (depth > 0).float()[:, None]], 1).movedim(1, 3)
+        shown = torch.cat([black, mask[:, None], 255 * (depth > 0).float()[:, None]], 1)
         levels = PackedLevels.of(shown, cameras.sizes_px, 3)
-        outlines = PackedLevels.of(given.masks.float()[..., None], given.image_sizes_px, 0)
+        outlines = PackedLevels.of(given.masks.float()[:, None], given.image_sizes_px, 0)
         return cls(cameras, levels, depth, given.is_source, everyone, outlines)
 
     def look_up(self, rays: Rays, source_views: Sequence[str], step_px: float, scale: Scale) -> Places:

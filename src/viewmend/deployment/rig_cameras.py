@@ -77,7 +77,8 @@ def seen_by(
     u, v = x / safe, y / safe
     width, height = cameras.sizes_px.double().unbind(1)
     inside = front & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    return Seen(*(torch.where(inside, values, 0.0) for values in (u, v, w)), inside)
+    u, v, w = (torch.where(inside, values, 0.0) for values in (u, v, w))
+    return Seen(u, v, w, inside)
 
 
 def cosines(

@@ -41,7 +41,7 @@ class ViewInputs(NamedTuple):
     """The subject in all cameras, 0 to 255."""
     proxy_depths: Float[Tensor, "camera rows columns"]
     """z-depth of the proxy in all cameras, metres, 0 where there is none; of those not chosen it does not matter."""
-    rig_K: Float[Tensor, "camera 3 3"]
+    rig_K: Float[Tensor, "camera 3 3"]  # noqa: N815
     """The cameras' intrinsics, pixels."""
     rig_camera_from_world: Float[Tensor, "camera 4 4"]
     """The cameras' poses."""
@@ -104,11 +104,11 @@ class ViewInputs(NamedTuple):
 class ViewOutputs(NamedTuple):
     """The mended view; the exported model's outputs, in this order. Where E is 0, the view is as it was."""
 
-    rgb: Float[Tensor, "3 height width"]
+    mended_rgb: Float[Tensor, "3 height width"]
     """Fhat, in [0, 1], upon black."""
     alpha: Float[Tensor, "height width"]
     """How much of each pixel the subject covers, in [0, 1]."""
     confidence: Float[Tensor, "height width"]
     """How sure the model is of each pixel, in [0, 1]."""
-    depth: Float[Tensor, "height width"]
+    mended_depth: Float[Tensor, "height width"]
     """z-depth of the subject, metres; 0 where there is none."""

@@ -76,18 +76,18 @@ def fill(
     background. Where holes are wide, only the `subject` counts. What is farther than `REACH_PX` from anything known is
     `pull_push`ed from the subject's pixels.
     """
-    near, _ = _from_near(rgb, ~missing, missing)
-    wide = missing & _spread(~_spread(~missing))
+    near, _ = from_near(rgb, ~missing, missing)
+    wide = missing & spread(~spread(~missing))
     if not bool(wide.any()):
         return near  # nor is anything out of reach: around what is, a square of THIN_PX is missing
-    filled, reached = _from_near(rgb, ~missing & subject, missing)
+    filled, reached = from_near(rgb, ~missing & subject, missing)
     deep = missing & ~reached
     if bool(deep.any()):
         filled = torch.where(deep, pull_push(filled, ~deep & subject), filled)
     return torch.where(wide, filled, near)
 
 
-def _from_near(
+def from_near(
     rgb: Float[Tensor, "channel height width"],
     known: Bool[Tensor, "height width"],
     missing: Bool[Tensor, "height width"],
@@ -114,7 +114,7 @@ def _sum_around(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "
     return image
 
 
-def _spread(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def spread(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """Where a square of `THIN_PX`, around a pixel, holds any of them; there are none beyond the image."""
     for axis, pad in ((0, (0, 0, REACH_PX, REACH_PX)), (1, (REACH_PX, REACH_PX))):
         around, length = F.pad(pixels, pad), pixels.shape[axis]

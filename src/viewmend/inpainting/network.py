@@ -1,5 +1,6 @@
 """What our networks have in common."""
 
+from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 
 import torch
@@ -32,8 +33,10 @@ class Network(nn.Module):
         """The state before the first view of a stream."""
         return State()
 
-    def autocast(self) -> torch.autocast:
-        """The context in which the layers compute in `compute_dtype`."""
+    def autocast(self) -> AbstractContextManager[object]:
+        """The context in which the layers compute in `compute_dtype`; none in what `torch.export` traces."""
+        if torch.compiler.is_exporting():
+            return nullcontext()
         device = next(self.parameters()).device
         return torch.autocast(device.type, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 

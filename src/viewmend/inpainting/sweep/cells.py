@@ -18,7 +18,8 @@ def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height wid
     """The depth, metres, with a rim of `RIM_PX` about the proxy that has the smallest depth near it; 0 elsewhere."""
     far = torch.where(depth > 0, depth, torch.inf)
     side = 2 * RIM_PX + 1
-    if depth.device.type == "cpu" and depth.dtype == torch.float32:  # in a tenth of the time that torch takes
+    cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
+    if cpu and not torch.compiler.is_exporting():  # in a tenth of the time that torch takes
         import cv2
 
         window, border = np.ones((side, side), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": np.inf}
@@ -75,6 +76,12 @@ def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows c
     return torch.where(nearest.isfinite(), nearest, 0.0)
 
 
+def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
+    """The mean of each cell, where it is cut off of what is left of it."""
+    height, width = image.shape[1:]
+    return F.avg_pool2d(F.pad(image[None], (0, width % 2, 0, height % 2), mode="replicate"), CELL_PX)[0]
+
+
 def scattered(
     values: Shaped[Tensor, "point channel"], at: Int[Tensor, "point 2"], shape: torch.Size
 ) -> Shaped[Tensor, "channel rows columns"]:
@@ -91,5 +98,5 @@ def stacked(*images: Shaped[Tensor, "_channel rows columns"]) -> Shaped[Tensor, 
 def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
     """An image with the index of the point at each row and column; -1 where there is none."""
     image = torch.full(shape, -1, dtype=torch.long, device=at.device)
-    image[tuple(at.T)] = torch.arange(len(at), device=at.device)
+    image[tuple(at.T)] = torch.arange(at.shape[0], device=at.device)
     return image

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, UInt8
@@ -33,10 +33,10 @@ AROUND = 0.06
 class Scale:
     """What lengths in a view are measured by; a part of a view is read by the whole view's."""
 
-    size_m: float
-    """The subject's size."""
-    depth_m: float
-    """The median z-depth, metres."""
+    size_m: float | Float[Tensor, ""]
+    """The subject's size, metres."""
+    depth_m: float | Float[Tensor, ""]
+    """The median z-depth, metres. Both are tensors in what `torch.export` traces."""
 
     @classmethod
     def of(cls, view: IncompleteView) -> "Scale":
@@ -92,10 +92,8 @@ class Rays(NamedTuple):
 class Sight(Protocol):
     """What `SweepNet` looks places up in: a `Rig`, or what an export packs of one."""
 
-    @property
-    def rays_at_once(self) -> int | None:
-        """So many are weighed together; None for all."""
-        ...
+    rays_at_once: ClassVar[int | None]
+    """So many are weighed together; None for all."""
 
     def look_up(self, rays: Rays, source_views: Sequence[str], step_px: float, scale: Scale) -> Places:
         """As the function `look_up`."""
@@ -117,13 +115,13 @@ def look_up(rays: Rays, rig: Rig, source_views: Sequence[str], step_px: float, s
     else:
         from viewmend.inpainting.sweep._lookup_torch import look_up_torch as implementation
     with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
-        step_m = step_px * scale.depth_m / float(rays.camera.K[0, 0, 0])
+        step_m = step_px * float(scale.depth_m) / float(rays.camera.K[0, 0, 0])
         pose = rays.camera.world_from_camera[0]
         middle = pose[:3, 3] + scale.depth_m * pose[:3, 2]
         views = _eyes(rig.views.frame.cameras, rig.pyramids, step_m, middle)
         outlines = _eyes(rig.silhouettes.cameras, rig.silhouette_pyramids, step_m, middle)
         is_source = [float(name in source_views) for name in views.cameras.names]
-        return implementation(rays, views, each(rig.views, "depth"), is_source, outlines, scale.size_m)
+        return implementation(rays, views, each(rig.views, "depth"), is_source, outlines, float(scale.size_m))
 
 
 def _eyes(cameras: Cameras, pyramids: Sequence[Pyramid], step_m: float, middle: Float[Tensor, "3"]) -> Eyes:

@@ -72,6 +72,6 @@ def _weighted(
     trust: Float[Tensor, "ray place view"], values: Float[Tensor, "ray place view value"]
 ) -> Float[Tensor, "ray place value"]:
     """Sums over cameras."""
-    rays, places, views = trust.shape
-    summed = torch.bmm(trust.reshape(-1, 1, views), values.reshape(rays * places, views, -1))
-    return summed.view(rays, places, -1)
+    rays, places, views, channels = values.shape  # all named: there may be no rays
+    summed = torch.bmm(trust.reshape(rays * places, 1, views), values.reshape(rays * places, views, channels))
+    return summed.view(rays, places, channels)

@@ -45,7 +45,7 @@ class Rig:
     silhouettes: Silhouettes
     """The masks of all cameras."""
     silhouette_pyramids: tuple[Pyramid, ...]
-    rays_at_once: ClassVar[int] = 1024
+    rays_at_once: ClassVar[int | None] = 1024
     """So many are weighed together: what is looked up along more does not fit a cache."""
 
     @classmethod

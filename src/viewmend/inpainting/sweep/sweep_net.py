@@ -20,10 +20,18 @@ from viewmend.inpainting.network import Network
 from viewmend.inpainting.protocol import ContextProvider, HeldOut, RenderQuality, State
 from viewmend.inpainting.ray_blend_net import RayBlendNet
 from viewmend.inpainting.sweep.alpha_fit import fitted_slope
-from viewmend.inpainting.sweep.cells import CELL_PX, index_image, nearest_depth, rim_depth, scattered, stacked
+from viewmend.inpainting.sweep.cells import (
+    CELL_PX,
+    cell_means,
+    index_image,
+    nearest_depth,
+    rim_depth,
+    scattered,
+    stacked,
+)
 from viewmend.inpainting.sweep.config import OFFSETS, SweepConfig
 from viewmend.inpainting.sweep.error_net import ErrorMap, ErrorNet, unread
-from viewmend.inpainting.sweep.lookup import COLOUR, MASK, Rays, Scale, Sight
+from viewmend.inpainting.sweep.lookup import COLOUR, FEATURES, MASK, Rays, Scale, Sight
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig, keep_pyramids
 from viewmend.inpainting.sweep.reading import Reading, Swept, finer, uncovered
@@ -195,7 +203,7 @@ class SweepNet(Network):
         rays = Rays(view.camera, middles, along).split(sight.rays_at_once)
         front = nearest_depth(view.depth)
         beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
-        means = F.avg_pool2d(shown[None], CELL_PX, ceil_mode=True)[0]
+        means = cell_means(shown)
         with self.autocast():
             parts = [self.places(sight.look_up(part, view.source_views, float(CELL_PX), scale)) for part in rays]
             weighed = Weighed(*map(torch.cat, zip(*parts, strict=True)))
@@ -228,8 +236,8 @@ class SweepNet(Network):
         with self.autocast():
             weighed = self.pixels(found, before[:, None])
         sharp = uncovered(weighed.colour[:, 0], weighed.mask[:, 0])
-        best = weighed.trust[:, 0].argmax(1)
-        best = found.features[:, 0].take_along_dim(best[:, None, None], 1)[:, 0]
+        best = weighed.trust[:, 0].argmax(1)[:, None, None].expand(-1, 1, FEATURES)
+        best = found.features[:, 0].gather(1, best)[:, 0]
         single = uncovered(best[:, COLOUR], best[:, MASK])
         shares = swept.logits.softmax(1)[..., None]
         means = torch.cat([(shares * part).sum(1) for part in (swept.weighed.colour, swept.weighed.mask)], 1)

@@ -1,0 +1,37 @@
+"""Images in all scales for `torch.export`: each level lies in a canvas whose length is never one, and soon a constant.
+
+A length of one would be taken for a fixed one, and expressions of many nested halves are what a compiler spends its
+time on. So each canvas has at least a row and a column of zeros more than its image, and from `CONSTANT` on canvases
+are as large as the largest image's.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+LARGEST_PX = 4096
+"""Sides of images and views are no longer."""
+CONSTANT = 5
+"""The first level whose canvas is the same for all images."""
+
+
+def halvings(
+    images: Float[Tensor, "image channel height width"], count: int, change: Callable[[Tensor], Tensor]
+) -> list[Float[Tensor, "image channel _height _width"]]:
+    """The images and `count` levels more, each changed means of 2 x 2 pixels of the one before."""
+    levels = [F.pad(images, (0, 1, 0, 1))]
+    for level in range(1, count + 1):
+        half = change(F.avg_pool2d(levels[-1], 2))
+        constant = LARGEST_PX // 2**CONSTANT + 2
+        more = [constant - size if level == CONSTANT else 1 for size in half.shape[:1:-1]]
+        levels.append(F.pad(half, (0, more[0], 0, more[1])))
+    return levels
+
+
+def lengths(size: int, count: int) -> Int[Tensor, "level"]:
+    """What is image of each level's canvas along an axis, pixels."""
+    sides = 2 ** torch.arange(count)
+    return (torch.full((count,), size, dtype=torch.long) + sides - 1) // sides
