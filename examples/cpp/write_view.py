@@ -20,7 +20,7 @@ def studio_view(seed: int = 10003, cameras: int = 8, size: int = 256) -> ViewInp
     net = load_inpainter("views", precision="float32")
     stream = Stream(net, StreamConfig(fit_rig=False))
     seen = stream.push(frame)
-    view = stream.render(orbit([0.4], (size, size), elevation_rad=0.2)[0])
+    view = stream.render(orbit([0.4], (size, size), elevation_rad=0.2))
     return ViewInputs.of(view, ContextProvider(lambda _, names: seen.context(names)), num_views=8)
 
 

@@ -24,14 +24,16 @@ def halvings(
     """The images and `count` levels more, each changed means of 2 x 2 pixels of the one before."""
     levels = [F.pad(images, (0, 1, 0, 1))]
     for level in range(1, count + 1):
-        half = change(F.avg_pool2d(levels[-1], 2))
-        constant = LARGEST_PX // 2**CONSTANT + 2
-        more = [constant - size if level == CONSTANT else 1 for size in half.shape[:1:-1]]
-        levels.append(F.pad(half, (0, more[0], 0, more[1])))
+        half = F.pad(change(F.avg_pool2d(levels[-1], 2)), (0, 1, 0, 1))
+        if level == CONSTANT:
+            for axis in (2, 3):
+                place = torch.arange(LARGEST_PX // 2**CONSTANT + 2)
+                half = half.index_select(axis, place.clamp_max(half.shape[axis] - 1))
+        levels.append(half)
     return levels
 
 
 def lengths(size: int, count: int) -> Int[Tensor, "level"]:
     """What is image of each level's canvas along an axis, pixels."""
-    sides = 2 ** torch.arange(count)
+    sides = torch.tensor([2**level for level in range(count)])
     return (torch.full((count,), size, dtype=torch.long) + sides - 1) // sides

@@ -47,7 +47,7 @@ class PackedLevels(NamedTuple):
         """All scales of images from 0 to 255, whose channel `mask` shows the subject."""
         levels = halvings(images, LEVELS - 1, lambda means: (means + 0.5).floor())
         area = levels[MEASURED][:, mask].double().sum((1, 2)) / 255 * 4**MEASURED
-        sides = 2 ** torch.arange(LEVELS)
+        sides = torch.tensor([2**level for level in range(LEVELS)])
         shortest = (sizes_px.amin(1)[:, None] + sides - 1) // sides
         last = (shortest > SMALLEST_PX).sum(1).clamp_max(LEVELS - 1)
         return cls(*_laid_out(levels), last, area.sqrt().clamp_min(1))

@@ -1,0 +1,109 @@
+"""Is an exported model the model, and what does it take: python benchmarks/exported.py MODEL.pt2 MODEL.onnx [--write].
+
+Each file mends random views of random people, sizes and rigs, beside the model itself; then one view of 320 x 320
+pixels by eight cameras is timed, on one thread.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from statistics import median
+
+import onnxruntime
+import torch
+from measure import timed, write
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from reference.random_views import holed, images, mended, random_view
+
+from viewmend import Stream, StreamConfig, load_inpainter
+from viewmend.deployment.view_inputs import ViewInputs, ViewOutputs
+from viewmend.inpainting.protocol import ContextProvider
+from viewmend.inpainting.sweep.sweep_net import SweepNet
+from viewmend.studio.rigs import orbit
+from viewmend.studio.stage import Studio, StudioConfig
+
+TOLERANCE = 1e-3
+Runner = Callable[[ViewInputs], Sequence[torch.Tensor]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("files", nargs="+", type=Path, help="what viewmend export wrote of --model")
+    parser.add_argument("--model", default="views", help="the model that they were made of")
+    parser.add_argument("--scenes", type=int, default=50, help="how many random views")
+    parser.add_argument("--runs", type=int, default=10, help="how often the timed view is mended")
+    parser.add_argument("--write", action="store_true", help="keep the result under benchmarks/results")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    net = load_inpainter(options.model, precision="float32")
+    assert isinstance(net, SweepNet)
+    runners = {file.suffix[1:]: runner_of(file) for file in options.files}
+    found = {name: {"apart": apart} for name, apart in compared(net, runners, options.scenes).items()}
+    for name, taken in times(net, runners, options.runs).items():
+        found.setdefault(name, {})["view_320_8_cameras"] = taken
+    config = {"model": options.model, "scenes": options.scenes, "tolerance": TOLERANCE}
+    print(write("exported", "cpu", config, found) if options.write else json.dumps(found, indent=1))
+
+
+def runner_of(file: Path) -> Runner:
+    """What mends by a file, on one thread."""
+    if file.suffix == ".pt2":
+        package = torch._inductor.aoti_load_package(str(file))
+        return lambda given: package(*given)
+    threads = onnxruntime.SessionOptions()
+    threads.intra_op_num_threads = threads.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(file, threads)
+    names = [own.name for own in session.get_inputs()]
+    return lambda given: [
+        torch.from_numpy(image) for image in session.run(None, {name: getattr(given, name).numpy() for name in names})
+    ]
+
+
+def compared(net: SweepNet, runners: dict[str, Runner], scenes: int) -> dict[str, dict[str, float]]:
+    """By how much each file's outputs differ from the model's, over all pixels of all views."""
+    furthest: dict[str, dict[str, list[float]]] = {name: {} for name in runners}
+    over, pixels, views = dict.fromkeys(runners, 0), 0, dict.fromkeys(runners, 0)
+    for seed in range(scenes):
+        view, context = random_view(seed, net)
+        view = holed(view) if seed % 2 else view
+        wanted = images(mended(net, view, context))
+        given = ViewInputs.of(view, context, net.config.num_views)
+        pixels += view.mask.numel()
+        for name, run in runners.items():
+            off = {
+                output: (own - wanted[output]).abs()
+                for output, own in zip(ViewOutputs._fields, run(given), strict=True)
+            }
+            for output, image in off.items():
+                furthest[name].setdefault(output, []).append(float(image.max()))
+            wrong = torch.stack([image.reshape(-1, *view.mask.shape).amax(0) > TOLERANCE for image in off.values()])
+            over[name] += int(wrong.any(0).sum())
+            views[name] += bool(wrong.any())
+        print(f"{seed}: {tuple(view.mask.shape)}", {n: max(f["mended_rgb"]) for n, f in furthest.items()}, flush=True)
+    return {
+        name: {f"largest_{output}": max(values) for output, values in furthest[name].items()}
+        | {"median_of_largest_rgb": median(furthest[name]["mended_rgb"])}
+        | {"views_over": views[name], "pixels_over": over[name], "pixels": pixels}
+        for name in runners
+    }
+
+
+def times(net: SweepNet, runners: dict[str, Runner], runs: int) -> dict[str, dict[str, float]]:
+    """Milliseconds of a view, by the model and by each file."""
+    frame = Studio(StudioConfig(seed=10003, cameras=8, frames=1, size_px=320)).read(0)
+    stream = Stream(net, StreamConfig(fit_rig=False))
+    seen = stream.push(frame)
+    view = stream.render(orbit([0.4], (320, 320), elevation_rad=0.2))
+    given = ViewInputs.of(view, ContextProvider(lambda _, names: seen.context(names)), net.config.num_views)
+    work: dict[str, Callable[[], object]] = {
+        "eager": lambda: mended(net, view, ContextProvider(lambda _, names: seen.context(names)))
+    }
+    work |= {name: (lambda run=run: run(given)) for name, run in runners.items()}
+    return {name: timed(one, runs=runs) for name, one in work.items()}
+
+
+if __name__ == "__main__":
+    main()
