@@ -12,7 +12,7 @@ from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import COUNTS, RIGS, SEEDS, assert_same, opencv, random_rig, write_images, write_videos
 
 from viewmend.capture.errors import CaptureError
-from viewmend.capture.formats.footage import paired
+from viewmend.capture.formats.footage import Footage, paired
 from viewmend.capture.formats.recognition import read_any_calibration
 from viewmend.capture.plain import open_capture
 from viewmend.capture.videos import video_facts
@@ -144,3 +144,9 @@ def test_utrecht_as_it_came(shared):
 def test_a_container_may_claim_too_much(shared):
     """Utrecht's claim 428 frames, of which 426 can be decoded."""
     assert video_facts(shared / "captures/utrecht/original/cam1/video.avi").frames == 426
+
+
+def test_a_side_of_hundreds_of_digits_is_said_in_few():
+    footage = Footage(("1",), None, {"left": {"width": 32, "height": 24}})
+    with pytest.raises(ValueError, match=r"'left': expected images of 1e\+09 x -1e\+09 pixels, got 32 x 24; export"):
+        footage.of("left", (10**400, -(10**400)))

@@ -163,7 +163,7 @@ def two_least(values: Float[Tensor, "*place camera"]) -> Float[Tensor, "*place 2
 def _levels(
     levels: PackedLevels, cameras: RigCameras, viewer: Viewer, step_px: float, scale: Scale
 ) -> tuple[Int[Tensor, "camera"], Int[Tensor, "camera"]]:
-    """Of every camera the level whose pixels are as far apart as the rays, and the one that spans `AROUND`."""
+    """Each camera's level with pixels as far apart as the rays are, and its level that spans `AROUND`."""
     depth_m = torch.as_tensor(scale.depth_m).double()
     away_m = (cameras.centers - (viewer.center + depth_m * viewer.forward)).square().sum(-1).sqrt().clamp_min(1e-6)
     fine = levels.level(step_px * depth_m / viewer.focal_px * cameras.focal_px / away_m)

@@ -20,6 +20,8 @@ NO_TAKES = re.compile("background|plate|empty|board|calib|intrinsic")
 """Videos that are so named show no subject."""
 CROPPED_PX = 16
 """Encoders round sizes down to whole blocks; a calibration of a slightly larger image stays right."""
+LONG_PX = 1e9
+"""Sides are said to be no longer: a number of hundreds of digits is no float."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Footage:
         entry = self.entries[name]
         size = entry["width"], entry["height"]
         if told_px and any(not 0 <= told - got <= CROPPED_PX for told, got in zip(told_px, size, strict=True)):
-            told = " x ".join(f"{side:g}" for side in told_px)
+            told = " x ".join(f"{max(-LONG_PX, min(side, LONG_PX)):g}" for side in told_px)
             got = f"{size[0]} x {size[1]}"
             raise ValueError(f"camera '{name}': expected images of {told} pixels, got {got}; export them in that size")
         return {"name": name, **entry}
