@@ -9,6 +9,8 @@ from viewmend.inpainting.coarse_fill import from_near, spread
 
 LEVELS = 12
 """Halvings until one pixel is left of 4096; further ones change nothing."""
+CONSTANT = 3
+"""The first level whose canvas is as large for all views: 514 pixels."""
 
 
 def fill_any_size(
@@ -36,7 +38,7 @@ def pull_push_any_size(
         return torch.cat([colour / weight.clamp_min(1e-6), (weight > 0).to(weight)], 1)
 
     whole = torch.cat([image * known, known[None].to(image)])
-    levels = [level[0] for level in halvings(whole[None], LEVELS, mean)]
+    levels = [level[0] for level in halvings(whole[None], LEVELS, mean, CONSTANT)]
     sides = [(axis, lengths(size, LEVELS + 1)) for axis, size in ((1, height), (2, width))]
     filled = levels[-1][:-1]
     for level in range(LEVELS - 1, -1, -1):

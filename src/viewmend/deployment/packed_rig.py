@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.deployment.halvings import CONSTANT, halvings
+from viewmend.deployment.halvings import halvings
 from viewmend.deployment.rig_cameras import RigCameras, Seen, Viewer, cosines, seen_by
 from viewmend.deployment.view_inputs import ViewInputs
 from viewmend.inpainting.sweep.lookup import AROUND, CONTRAST, FAR, NEAR, Places, Rays, Scale
@@ -20,6 +20,8 @@ from viewmend.inpainting.sweep.pyramids import SMALLEST_PX
 
 LEVELS = 11
 """Scales of an image, each half of the one before: enough for a shorter side of 4096 pixels."""
+CONSTANT = 5
+"""The first level whose canvas is as large for all images: 130 pixels."""
 SPARE = 16
 """Rows that a sheet of levels has beyond the finest: halves of a length add up to no more than it, but for borders."""
 MEASURED = 2
@@ -45,7 +47,7 @@ class PackedLevels(NamedTuple):
         cls, images: Float[Tensor, "camera channel rows columns"], sizes_px: Int[Tensor, "camera 2"], mask: int
     ) -> "PackedLevels":
         """All scales of images from 0 to 255, whose channel `mask` shows the subject."""
-        levels = halvings(images, LEVELS - 1, lambda means: (means + 0.5).floor())
+        levels = halvings(images, LEVELS - 1, lambda means: (means + 0.5).floor(), CONSTANT)
         area = levels[MEASURED][:, mask].double().sum((1, 2)) / 255 * 4**MEASURED
         sides = torch.tensor([2**level for level in range(LEVELS)])
         shortest = (sizes_px.amin(1)[:, None] + sides - 1) // sides
