@@ -82,13 +82,22 @@ inline Tensors read_tensors(const std::string& path) {
   const int64_t size = static_cast<int64_t>(bytes.size() - 8 - length);
   Tensors tensors;
   head.demand('{');
-  while (!head.next('}')) {
-    if (!tensors.empty()) head.demand(',');
+  for (bool begins = true; !head.next('}'); begins = false) {
+    if (!begins) head.demand(',');
     const std::string name = head.text();
     std::string type;
     std::vector<int64_t> shape, range;
     head.demand(':');
     head.demand('{');
+    if (name == "__metadata__") {  // texts by name
+      for (bool first = true; !head.next('}'); first = false) {
+        if (!first) head.demand(',');
+        head.text();
+        head.demand(':');
+        head.text();
+      }
+      continue;
+    }
     for (bool first = true; !head.next('}'); first = false) {
       if (!first) head.demand(',');
       const std::string key = head.text();

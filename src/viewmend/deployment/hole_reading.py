@@ -92,7 +92,9 @@ def along_rays(
     *near, coverage, surface = bilinear(shown.movedim(1, 3), seen).unbind(-1)
     behind = torch.where(coverage > COVERED, (seen.z - surface / coverage.clamp_min(COVERED)) / scale.size_m, 0.0)
     shapes = torch.stack([mask.double() / 255, (proxy > 0).double()], -1)
-    halves = (rgb * mask.float()[:, None])[..., ::2, ::2].movedim(1, -1) / 255**2
+    halves = (rgb * mask.float()[:, None]).movedim(1, -1) / 255**2
+    for axis in (1, 2):  # gathered: of a view with steps not all strides are known
+        halves = halves.index_select(axis, torch.arange(0, halves.shape[axis], 2))
     half = side_px(PATCH / 2, mask)
     shape = Sums.of(shapes).means(seen.u, seen.v, side_px(OUTLINE, mask))
     colour = Sums.of(halves).means(seen.u / 2, seen.v / 2, half)

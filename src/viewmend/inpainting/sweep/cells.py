@@ -95,6 +95,17 @@ def stacked(*images: Shaped[Tensor, "_channel rows columns"]) -> Shaped[Tensor, 
     return torch.cat([image.movedim(0, 2) for image in images], 2)[None].movedim(3, 1)
 
 
+def cut_to(image: Float[Tensor, "channel rows columns"], shape: torch.Size) -> Float[Tensor, "channel height width"]:
+    """The first rows and columns of an image.
+
+    They are gathered in what `torch.export` traces, which else takes it for granted that none are left out, or some.
+    """
+    if torch.compiler.is_exporting():
+        rows, columns = (torch.arange(length, device=image.device) for length in shape)
+        return image.index_select(1, rows).index_select(2, columns)
+    return image[:, : shape[0], : shape[1]]
+
+
 def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
     """An image with the index of the point at each row and column; -1 where there is none."""
     image = torch.full(shape, -1, dtype=torch.long, device=at.device)

@@ -23,6 +23,7 @@ from viewmend.inpainting.sweep.alpha_fit import fitted_slope
 from viewmend.inpainting.sweep.cells import (
     CELL_PX,
     cell_means,
+    cut_to,
     index_image,
     nearest_depth,
     rim_depth,
@@ -276,6 +277,6 @@ class SweepNet(Network):
         """What convolutions over the view make of its pixels."""
         with self.autocast(), heavy_operations():
             near = F.interpolate(decided, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
-            near = near[0, :, : shape[0], : shape[1]]
+            near = cut_to(near[0], shape)
             out = self.finish(stacked(near, scattered(told.to(near), pixels, shape)))
         return out[0, :, pixels[:, 0], pixels[:, 1]].T.float()
