@@ -25,6 +25,11 @@ class _Stacked:
 
     if not TYPE_CHECKING:  # to whom they are fields as others are
 
+        def __new__(cls, *values: object, **fields: object) -> object:
+            """What `dataclasses.replace` makes of it is a copy, of the plain class."""
+            plain = cls.__mro__[2]
+            return plain(*values, **fields) if values or fields else object.__new__(cls)
+
         def __getattr__(self, field: str) -> Tensor:
             parts = vars(self).get("parts", {})
             if field not in parts:
@@ -71,4 +76,4 @@ class ChosenViews(_Stacked, ContextViews):
     def select(self, names: Sequence[str]) -> "ChosenViews":
         """What those of these cameras that are there saw, in the order of `names`."""
         own = self.frame.cameras.names
-        return self.of(self.frame, [n for n in names if n in own], dict(zip(own, self.parts["depth"], strict=True)))
+        return self.of(self.frame, [n for n in names if n in own], dict(zip(own, each(self, "depth"), strict=True)))

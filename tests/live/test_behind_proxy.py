@@ -1,6 +1,7 @@
 """The application behind another program's connections."""
 
 import asyncio
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from live_servers import PIPELINE
@@ -16,6 +17,12 @@ from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
 
 TOKEN = "a token, long enough"
+
+
+def ran(work):
+    """What a coroutine gives; a browser's tests leave a loop running in this thread."""
+    with ThreadPoolExecutor(1) as own:
+        return own.submit(asyncio.run, work).result()
 
 
 async def nothing():
@@ -40,7 +47,7 @@ def asked(app, path, query=b"", headers=()):
     async def receive():
         return {"type": "http.request", "body": b"", "more_body": False}
 
-    asyncio.run(app(scope, receive, send))
+    ran(app(scope, receive, send))
     return sent[0]["status"], b"".join(message.get("body", b"") for message in sent)
 
 
@@ -90,5 +97,5 @@ def test_it_has_started_when_it_is_ready_and_not_before():
     async def send(message):
         order.append(message["type"])
 
-    asyncio.run(BehindProxy(app, ready)({"type": "lifespan"}, nothing, send))
+    ran(BehindProxy(app, ready)({"type": "lifespan"}, nothing, send))
     assert order == ["begun", "ready", "lifespan.startup.complete", "lifespan.shutdown.complete"]

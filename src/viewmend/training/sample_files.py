@@ -212,7 +212,8 @@ def _taken_apart(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
         return {"tensor": name}
     if is_dataclass(value):
         parts = {f.name: _taken_apart(getattr(value, f.name), tensors) for f in fields(value)}
-        return {"kind": type(value).__name__, "fields": parts}
+        kinds = (kind.__name__ for kind in type(value).__mro__)  # a frame's cameras by reference are stored as copied
+        return {"kind": next((kind for kind in kinds if kind in KINDS), type(value).__name__), "fields": parts}
     if isinstance(value, tuple):
         return [_taken_apart(item, tensors) for item in value]
     return value
