@@ -68,6 +68,13 @@ def test_who_is_refused_does_not_insist():
         assert not isinstance(refused.value, ConnectionLostError) and time.monotonic() - start < 5
 
 
+def test_a_wrong_token_is_no_lost_connection():
+    with running(token="a token, long enough") as server:
+        with pytest.raises(ConnectionError, match=r"refuses \(401\)") as refused, Client(server.ws, "no", again_s=30.0):
+            pass
+        assert not isinstance(refused.value, ConnectionLostError)
+
+
 def test_it_gives_up_in_time():
     with running() as server:
         viewer = Client(server.ws, again_s=0.5).__enter__()

@@ -100,12 +100,11 @@ class SharedFrames(FrameSupply):
                 time.sleep(RETRY_S)
                 known = -1
                 continue
+            self.recording.position = state.edge
             if state.version != known or state.source != self._source:
                 known = state.version
                 self._take(state)
                 self.changed()
-            else:
-                self.recording.position = state.edge
 
     def _lose(self) -> None:
         if self.status.error != AWAY:
@@ -119,7 +118,7 @@ class SharedFrames(FrameSupply):
                 self._source, self.rig = state.source, state.rig
                 self._kept.clear()
                 self._wanted, self._ahead = {}, None
-            span, self.status, self.recording.position = state.span, state.status, state.edge
+            span, self.status = state.span, state.status
             # What has happened and is not made yet is nobody's to see.
             self.span = replace(span, end=int(state.edge) + 1) if span.live and state.edge >= span.first else span
             if self._is_edge_watched and int(state.edge) not in self._kept:
