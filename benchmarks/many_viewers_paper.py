@@ -190,7 +190,7 @@ def main() -> None:
     times = shared_times()
     print(json.dumps(times, indent=1), flush=True)
     ray = find_ray(LOCAL)
-    connect(ray, LOCAL, num_cpus=4, object_store_memory=512 * 2**20, configure_logging=False)
+    connect(ray, LOCAL, num_cpus=4, object_store_memory=512 * 2**20)
     calls = ingest_calls(ray)
     print(json.dumps(calls, indent=1), flush=True)
     proxy = proxy_messages(ray)

@@ -54,7 +54,8 @@ def connect(ray: Any, address: str, **own: object) -> None:
     local = address == LOCAL
     try:
         _knock(address)
-        ray.init(None if local else address, include_dashboard=False, log_to_driver=False, **(own if local else {}))
+        quiet = {"include_dashboard": False, "log_to_driver": False, "configure_logging": False}
+        ray.init(None if local else address, **quiet, **(own if local else {}))
     except (OSError, RuntimeError, ValueError) as error:
         raise ValueError(
             f"expected a Ray cluster at '{address}', got none ({' '.join(str(error).split())[:200]}); check --ray, or "

@@ -11,13 +11,14 @@ import sys
 import time
 import urllib.error
 import urllib.request
+from types import SimpleNamespace
 
 import pytest
 
 from viewmend import cluster
 from viewmend.cli import main
 from viewmend.live.client import Client
-from viewmend.live.replicas import ManyViewers, _free_port, serving
+from viewmend.live.replicas import ManyViewers, _demand_no_serve, _free_port, serving
 from viewmend.live.server import ServerConfig
 from viewmend.stream import StreamConfig
 
@@ -64,6 +65,15 @@ def test_a_port_that_is_taken_is_said_before_a_cluster_is_started():
         with pytest.raises(OSError, match=f"port {port} of 127.0.0.1: .* choose another --port"):
             _free_port("127.0.0.1", port)
     assert _free_port("127.0.0.1", port) == port and _free_port("127.0.0.1", 0) > 0
+
+
+def test_a_cluster_on_which_serve_runs_is_refused():
+    def absent(name, namespace):
+        raise ValueError
+
+    _demand_no_serve(SimpleNamespace(get_actor=absent))
+    with pytest.raises(ValueError, match="on which Serve does not run"):
+        _demand_no_serve(SimpleNamespace(get_actor=lambda name, namespace: name))
 
 
 def test_replicas_of_one_machine_share_what_the_ingest_leaves():

@@ -121,19 +121,20 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
         address: of a running cluster, or `cluster.LOCAL`.
 
     Raises:
-        ValueError: Ray is not installed, there is no cluster, or the source cannot be read.
+        ValueError: Ray is not installed, there is no cluster, Serve runs on it, or the source cannot be read.
         OSError: somebody else has the port.
     """
     host, port = served.server.host, _free_port(served.server.host, served.server.port)
     ray = find_ray(address)
     logging.getLogger("ray").setLevel(logging.ERROR)
     cpus = served.replicas[1] + 1
-    connect(ray, address, num_cpus=cpus, object_store_memory=int(1e6 * served.store_mb), configure_logging=False)
+    connect(ray, address, num_cpus=cpus, object_store_memory=int(1e6 * served.store_mb))
     from ray import serve  # pyright: ignore[reportMissingImports]
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
 
     try:
+        _demand_no_serve(ray)
         calls = 4 * served.replicas[1] + 8  # two questions a replica, and as many of those that it replaces
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_concurrency=calls)(IngestActor)
         ingest = actor.remote(served, _put)
@@ -146,7 +147,7 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
             yield f"http://{f'[{host}]' if ':' in host else host}:{port}"
         finally:
             if address != LOCAL:  # which ends as a whole
-                serve.delete(NAME)
+                serve.shutdown()
                 ray.kill(ingest)
     finally:
         ray.shutdown()
@@ -202,6 +203,18 @@ def _put(shared: SharedTime) -> list[Any]:
     import ray  # pyright: ignore[reportMissingImports]
 
     return [ray.put(shared)]
+
+
+def _demand_no_serve(ray: Any) -> None:
+    """See that nobody uses Serve on this cluster: it has one port, which who comes second does not choose."""
+    try:
+        ray.get_actor("SERVE_CONTROLLER_ACTOR", namespace="serve")
+    except ValueError:
+        return
+    raise ValueError(
+        "expected a Ray cluster on which Serve does not run, got one on which it does; end what it serves (serve "
+        "shutdown), or use another cluster"
+    )
 
 
 def _demand(ray: Any, opened: Any) -> None:
