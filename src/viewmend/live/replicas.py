@@ -105,10 +105,11 @@ class RayIngest:
 
     def _answer(self, reference: Any, wait_s: float) -> Any:
         import ray  # pyright: ignore[reportMissingImports]
+        from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
 
         try:
             return ray.get(reference, timeout=wait_s + ANSWER_S)
-        except ray.exceptions.RayError as error:
+        except RayError as error:
             raise ConnectionError(" ".join(str(error).split())[:200]) from error
 
 
