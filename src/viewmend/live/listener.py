@@ -30,6 +30,7 @@ class Server(uvicorn.Server):
                 server.app(),
                 host=config.host,
                 port=config.port,
+                loop="asyncio",  # not uvloop, which Ray brings: `door` was tried with this one alone
                 http=HttpDoor,
                 ws=SocketDoor,
                 ws_ping_interval=5.0,
