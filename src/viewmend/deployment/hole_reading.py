@@ -70,7 +70,7 @@ def read_holes(
     view = given.view
     shown = torch.cat([view.rgb, view.mask[None], view.holes.to(guess)[None], guess])
     features, consistency = along_rays(given, pixels, scale)
-    window = windows(shown, pixels, RADIUS_PX)
+    window = windows(shown, pixels, RADIUS_PX).contiguous()  # else how it lies depends on how many there are
     far = net.far(surroundings(given, guess, pixels, scale)).flatten(1)
     return net.mixed(features, consistency, window, far)
 

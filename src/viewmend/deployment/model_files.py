@@ -28,9 +28,15 @@ OPSET = 18
 """Version of ONNX's operators."""
 DTYPES = {"Float": torch.float32, "Int": torch.int64, "UInt8": torch.uint8, "Bool": torch.bool}
 """What the inputs' annotations stand for."""
-INDUCTOR = {"joint_graph_constant_folding": False, "cpp.dynamic_threads": True, "cpp.simdlen": 1}
-"""Folding wants sizes that are known. Threads are the caller's. Kernels that are not made for vectors by hand take a
-compiler minutes less, and lookups gain nothing by them."""
+INDUCTOR = {
+    "joint_graph_constant_folding": False,
+    "layout_optimization": False,
+    "cpp.dynamic_threads": True,
+    "cpp.simdlen": 1,
+}
+"""Folding wants sizes that are known. Convolutions of a batch that is known only when it runs come out wrong where
+layouts are optimised (torch 2.13). Threads are the caller's. Kernels that are not made for vectors by hand take a
+compiler minutes less, and lookups gain little by them."""
 
 
 def sizes(net: SweepNet) -> dict[str, tuple[int, int]]:

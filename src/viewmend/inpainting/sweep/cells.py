@@ -12,21 +12,23 @@ from viewmend.views import RIM_PX, IncompleteView
 
 CELL_PX = 2
 """Side of the cells in which places are judged."""
+BEYOND_M = 1e30
+"""Farther than anything; not infinite, of which ONNX Runtime's pooling makes its largest number here and there."""
 
 
 def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """The depth, metres, with a rim of `RIM_PX` about the proxy that has the smallest depth near it; 0 elsewhere."""
-    far = torch.where(depth > 0, depth, torch.inf)
+    far = torch.where(depth > 0, depth, BEYOND_M)
     side = 2 * RIM_PX + 1
     cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
     if cpu and not torch.compiler.is_exporting():  # in a tenth of the time that torch takes
         import cv2
 
-        window, border = np.ones((side, side), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": np.inf}
+        window, border = np.ones((side, side), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": BEYOND_M}
         near = torch.from_numpy(cv2.erode(far.numpy(), window, **border))
     else:
         near = -F.max_pool2d(-far[None], side, 1, RIM_PX)[0]
-    return torch.where(near.isfinite(), torch.where(depth > 0, depth, near), 0.0)
+    return torch.where(near < BEYOND_M, torch.where(depth > 0, depth, near), 0.0)
 
 
 def halved(view: IncompleteView) -> IncompleteView:
@@ -71,9 +73,9 @@ def doubled(
 def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
     """The smallest depth in each cell, metres, of the pixels that have any; 0 where none has."""
     height, width = depth.shape
-    far = F.pad(torch.where(depth > 0, depth, torch.inf), (0, width % 2, 0, height % 2), value=torch.inf)
+    far = F.pad(torch.where(depth > 0, depth, BEYOND_M), (0, width % 2, 0, height % 2), value=BEYOND_M)
     nearest = -F.max_pool2d(-far[None], CELL_PX)[0]
-    return torch.where(nearest.isfinite(), nearest, 0.0)
+    return torch.where(nearest < BEYOND_M, nearest, 0.0)
 
 
 def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
