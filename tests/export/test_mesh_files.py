@@ -7,7 +7,7 @@ import trimesh
 from reference.ball import RADIUS_M, photograph, proxy, ring
 
 from viewmend.export.mesh_files import write_glb, write_ply
-from viewmend.export.vertex_colours import vertex_colours
+from viewmend.rendering.vertex_colours import vertex_colours
 from viewmend.views import ContextViews
 
 BALL = proxy(24)

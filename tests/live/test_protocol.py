@@ -52,7 +52,7 @@ def test_every_message_is_understood():
         ({"type": "look", "width": 99.5}, "a whole number"),
         (
             {"type": "look", "modes": ["mended", "mendet"]},
-            'expected rendered or holes or mended or depth or coverage or confidence, got "mendet"',
+            'expected rendered or holes or mended or depth or coverage or confidence or hull or points, got "mendet"',
         ),
         ({"type": "look", "error_rule": "some"}, 'expected unseen or all or wrong, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),

@@ -16,7 +16,6 @@ from viewmend.export.cutout import cutout
 from viewmend.export.depth_files import write_exr_depth
 from viewmend.export.engine_world import engine_from_world
 from viewmend.export.mesh_files import write_glb, write_ply
-from viewmend.export.vertex_colours import vertex_colours
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import GeometryProxy
@@ -24,6 +23,7 @@ from viewmend.geometry.sampling import in_view
 from viewmend.geometry.upright import upright
 from viewmend.inpainting.protocol import State
 from viewmend.observation import Observation
+from viewmend.rendering.vertex_colours import vertex_colours
 from viewmend.stream import Stream
 from viewmend.views import RIM_PX, CompletedView, MultiViewFrame
 

@@ -58,9 +58,10 @@ def frame_message(
     """The message, and the milliseconds of every stage."""
     start = time.perf_counter()
     parts, data = [], []
-    for eye, completed in enumerate(result.completed):
+    for eye, (completed, hulls) in enumerate(result.eyes):
         for mode in look.modes:
-            part, encoded = encoders.encode(picture(completed, mode, look.background), eye, mode, look, info.key)
+            shown = picture(completed, mode, look.background, hulls)
+            part, encoded = encoders.encode(shown, eye, mode, look, info.key)
             parts.append(part)
             data.append(encoded)
         if look.depth:

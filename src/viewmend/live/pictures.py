@@ -1,6 +1,7 @@
 """What is sent of a view: pictures of several kinds, JPEG, and depth for re-projection."""
 
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Float, UInt8, UInt16
 from torch import Tensor
 
 from viewmend.inpainting.sweep.cells import rim_depth
-from viewmend.live.protocol import BLACK, MENDED_MODES
+from viewmend.live.protocol import BLACK, HULL_MODES, MENDED_MODES
 from viewmend.views import FAINT, CompletedView, IncompleteView
 
 Picture = UInt8[np.ndarray, "height width 3"]
@@ -23,19 +24,22 @@ COARSEST_STRIDE = 4
 """Image pixels a depth pixel in longer pictures."""
 
 
-def picture(completed: CompletedView, mode: str, background: str = BLACK) -> Picture:
+def picture(
+    completed: CompletedView, mode: str, background: str = BLACK, hulls: Mapping[str, Tensor] | None = None
+) -> Picture:
     """One of the protocol's modes as 8-bit RGB, on a background (hexadecimal RGB).
 
     rendered: F. holes: F with the pixels that no camera colours in pink, by any error rule. mended: Fhat. depth: near
     is bright. coverage: which camera coloured what, missing pixels pink. confidence: from violet, a guess, to
-    yellow, sure; grey where the inpainter does not tell.
+    yellow, sure; grey where the inpainter does not tell. hull and points: as `hulls` has them (`RenderResult.hulls`).
     """
-    shown = _on_black(completed, mode)
+    hull = (hulls or {})[mode] if mode in HULL_MODES else None
+    shown = _on_black(completed, mode) if hull is None else _eight_bit(hull[:3])
     if background == BLACK:
         return shown
     import cv2
 
-    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask
+    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if hull is None else hull[3]
     bare = (1 - opacity.clamp(0, 1)).cpu().numpy()
     colour = bytes.fromhex(background)
     return cv2.add(shown, cv2.merge([np.rint(bare * level).astype(np.uint8) for level in colour]))

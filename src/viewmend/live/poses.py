@@ -1,7 +1,7 @@
 """Viewers' cameras: around the subject by angles, or anywhere by a matrix."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -105,6 +105,27 @@ def view_camera(asked: Camera, frame: RigFrame, size_px: tuple[int, int], scale:
     if scale < 1:
         camera = camera.resized(*(max(16, 2 * round(side * scale / 2)) for side in size_px))
     return camera
+
+
+def stereo_pair(camera: Cameras, apart_m: float, center: Float[Tensor, "3"]) -> tuple[Cameras, Cameras]:
+    """The left and the right eye about a camera, side by side and parallel.
+
+    Their principal points are moved so that both show `center`'s depth at the same place: that is how far away a
+    screen seems to be.
+
+    Args:
+        camera: one view.
+        apart_m: the eyes' distance, metres.
+        center: the subject's middle, metres; behind the camera, what is infinitely far is at the same place.
+    """
+    z = float(camera.camera_from_world[0, 2, :3] @ center.to(camera.K) + camera.camera_from_world[0, 2, 3])
+    eyes = []
+    for right_m in (-apart_m / 2, apart_m / 2):
+        pose = camera.camera_from_world.clone()
+        pose[:, 0, 3] -= right_m
+        moved = right_m * float(camera.K[0, 0, 0]) / z if z > apart_m else 0.0
+        eyes.append(replace(camera, camera_from_world=pose).moved(moved, 0.0))
+    return eyes[0], eyes[1]
 
 
 def cameras_json(cameras: Cameras) -> list[dict[str, Any]]:

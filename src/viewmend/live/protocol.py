@@ -18,9 +18,11 @@ from viewmend.rendering.error_rules import ERROR_RULES
 from viewmend.timing import StageTimes
 
 VERSION = 1
-MODES = ("rendered", "holes", "mended", "depth", "coverage", "confidence")
+MODES = ("rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points")
 MENDED_MODES = frozenset({"mended", "confidence"})
 """Modes that need the model."""
+HULL_MODES = frozenset({"hull", "points"})
+"""Modes that show the geometry proxy by itself."""
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
 MAX_PARTS = 512

@@ -7,14 +7,15 @@ from contextlib import suppress
 from io import BytesIO
 from typing import Annotated, Generic, Literal, TypeVar
 
+import numpy as np
 from msgspec import Meta, Struct
 
 from viewmend.capture.video_writer import VideoWriter
 from viewmend.inpainting.protocol import RenderQuality, State
 from viewmend.live import protocol
-from viewmend.live.pictures import picture, to_jpeg
-from viewmend.live.poses import view_camera
-from viewmend.live.protocol import MENDED_MODES, Camera, FrameTimes, Limits, ProtocolError, read_message
+from viewmend.live.pictures import Picture, picture, to_jpeg
+from viewmend.live.poses import stereo_pair, view_camera
+from viewmend.live.protocol import HULL_MODES, MENDED_MODES, Camera, FrameTimes, Limits, ProtocolError, read_message
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.sessions import Playback
 
@@ -56,6 +57,8 @@ class PathBody(ViewOptions, frozen=True, kw_only=True):
     poses: Annotated[tuple[Camera, ...], Meta(min_length=1, max_length=MAX_POSES)]
     times: Annotated[tuple[protocol.Count, ...], Meta(min_length=1, max_length=MAX_POSES)] | None = None
     fps: Annotated[float, Meta(ge=1, le=120)] = 30.0
+    stereo_m: Annotated[float, Meta(ge=0.001, le=1)] | None = None
+    """Distance of two eyes, whose pictures lie side by side, left and right, each `width` wide; None for one eye."""
 
     def __post_init__(self) -> None:
         if self.times is not None and len(self.times) != len(self.poses):
@@ -80,7 +83,7 @@ def parse_path(body: bytes | bytearray, limits: Limits) -> PathBody:
         ProtocolError: it does not fit, or the pictures are too large.
     """
     asked: PathBody = read_message(bytes(body), PathBody)
-    limits.check_size(asked.width, asked.height)
+    limits.check_size(asked.width, asked.height, 1 if asked.stereo_m is None else 2)
     return asked
 
 
@@ -130,8 +133,7 @@ class PictureJob(RenderJob[tuple[bytes, RenderResult]]):
 
     def encode(self, result: RenderResult) -> None:
         """Encode the picture."""
-        image = picture(result.completed[0], self._asked.mode, self._asked.background)
-        self.finish((to_jpeg(image, self._asked.quality), result))
+        self.finish((to_jpeg(_pictures(self._asked, result), self._asked.quality), result))
 
 
 class PathJob(RenderJob[bytes]):
@@ -155,23 +157,32 @@ class PathJob(RenderJob[bytes]):
             return None
         if self._times is None:  # the edge as it is now
             self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
-        return _request(self._path, self._path.poses[self._count], self._times[self._count], playback)
+        pose, at = self._path.poses[self._count], self._times[self._count]
+        return _request(self._path, pose, at, playback, self._path.stereo_m)
 
     def encode(self, result: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
         self.viewer: State | None = result.viewer
-        self._video.add(picture(result.completed[0], self._path.mode, self._path.background))
+        self._video.add(_pictures(self._path, result))
         self._count += 1
         if self._count == len(self._path.poses):
             self._video.close()
             self.finish(self._mp4.getvalue())
 
 
-def _request(asked: ViewOptions, pose: Camera, at: float | int, playback: Playback) -> RenderRequest | None:
+def _request(
+    asked: ViewOptions, pose: Camera, at: float | int, playback: Playback, stereo_m: float | None = None
+) -> RenderRequest | None:
     """The view at the nearest time that there is; None while its frame is on its way."""
     time = int(playback.span.clamp(at))
     if playback.span.end <= playback.span.first or not playback.has_frame(time):
         return None
     camera = view_camera(pose, playback.rig_frame, (asked.width, asked.height))
+    eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, playback.rig_frame.center)
     quality = RenderQuality(mend=asked.mode in MENDED_MODES, top_k=asked.top_k)
-    return RenderRequest(time, (camera,), quality, asked.error_rule)
+    return RenderRequest(time, eyes, quality, asked.error_rule, HULL_MODES & {asked.mode})
+
+
+def _pictures(asked: ViewOptions, result: RenderResult) -> Picture:
+    """All eyes' pictures side by side."""
+    return np.hstack([picture(seen, asked.mode, asked.background, hulls) for seen, hulls in result.eyes])

@@ -1,7 +1,13 @@
 """Requests become views: the stream, its rig, and what went wrong, without threads and sockets."""
 
+import time
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -12,6 +18,8 @@ from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.observation import Observation
+from viewmend.rendering.hull_views import hull_points, shaded_hull
+from viewmend.rendering.vertex_colours import vertex_colours
 from viewmend.rig_fit import fitted_to_rig
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.timing import StageTimes
@@ -29,6 +37,8 @@ class RenderRequest:
     quality: RenderQuality
     error_rule: str | None = None
     """None for that of the renderer."""
+    hull_modes: frozenset[str] = frozenset()
+    """Pictures of the geometry proxy that are wanted, too."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,13 @@ class RenderResult:
     """What to ask for the next views with."""
     times: StageTimes
     """Times of all eyes; geometry and context are 0 where another viewer has paid for them."""
+    hulls: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
+    """Of each eye the pictures of the proxy, by mode: RGB in [0, 1] and, last, how much it covers."""
+
+    @property
+    def eyes(self) -> Iterator[tuple[CompletedView, Mapping[str, Tensor]]]:
+        """Each eye's view, with its pictures of the proxy."""
+        return zip(self.completed, self.hulls or repeat({}), strict=False)
 
 
 class FrameNotReadyError(Exception):
@@ -69,6 +86,8 @@ class Renderer:
         """The subject's place; None until the first frame was seen."""
         self.rig_json: dict[str, Any] | None = None
         """The message `rig`."""
+        self._coloured: tuple[GeometryProxy, Tensor] | None = None
+        """The last proxy of which points were wanted, and its vertices' colours."""
         self.model_error: str | None = None
         """Why views are shown with their holes, if they are."""
 
@@ -117,14 +136,31 @@ class Renderer:
         """
         if self._stream is None:
             raise FrameNotReadyError
-        self._observed(self._stream, request.time)
+        observation = self._observed(self._stream, request.time)
         before = viewer or self._stream.viewer()
         stream = self._stream
         if request.error_rule is not None:
             stream = stream.rendered_by(replace(stream.config.render, error_rule=request.error_rule))
         views = [self._view(stream, c.to(self._device), before, request.time, request.quality) for c in request.cameras]
-        completed = tuple(view.completed for view in views)
-        return RenderResult(request.time, completed, views[0].viewer, sum((v.times for v in views), StageTimes()))
+        start = time.perf_counter()
+        hulls = tuple(self._hulls(observation, c.to(self._device), request.hull_modes) for c in request.cameras)
+        drawn = StageTimes(rendering=1000 * (time.perf_counter() - start))
+        completed, times = tuple(view.completed for view in views), sum((v.times for v in views), drawn)
+        return RenderResult(request.time, completed, views[0].viewer, times, hulls)
+
+    def _hulls(self, observation: Observation, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
+        """Pictures of the proxy from this camera; its vertices' colours are found once for each time."""
+        proxy, pictures = observation.proxy, {}
+        assert isinstance(proxy, GeometryProxy), "streams carve hulls"
+        if "hull" in modes:
+            pictures["hull"] = shaded_hull(proxy, camera)
+        if "points" in modes:
+            if self._coloured is None or self._coloured[0] is not proxy:
+                seen = observation.context(observation.frame.cameras.names)
+                assert seen is not None, "a frame without cameras has no hull"
+                self._coloured = proxy, vertex_colours(proxy, seen)
+            pictures["points"] = hull_points(proxy, self._coloured[1], camera)
+        return pictures
 
     def _read(self, at: int) -> MultiViewFrame:
         frame = self._supply.read(at)

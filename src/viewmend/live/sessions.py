@@ -14,7 +14,7 @@ from viewmend.live.clock import Clock, Span
 from viewmend.live.pace import Pace
 from viewmend.live.packing import Encoders, FrameInfo, frame_message
 from viewmend.live.poses import RigFrame, view_camera
-from viewmend.live.protocol import MENDED_MODES, ClockChange, FrameTimes, Look
+from viewmend.live.protocol import HULL_MODES, MENDED_MODES, ClockChange, FrameTimes, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
 
 STILL_S, FULL_S = 0.25, 0.8
@@ -210,7 +210,7 @@ class ViewerSession:
         )
         scale = look.scale * self.drawn.scale
         cameras = tuple(view_camera(eye, rig_frame, (look.width, look.height), scale) for eye in look.cameras)
-        return RenderRequest(at, cameras, quality, look.error_rule)
+        return RenderRequest(at, cameras, quality, look.error_rule, HULL_MODES & {*look.modes})
 
     def show(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Encode and send a frame, and learn from what it took."""

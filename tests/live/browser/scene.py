@@ -8,6 +8,7 @@ CAMERAS = 4
 COLOURS = [[230, 120, 60], [70, 150, 230]]
 SOURCES = ["cam00", "cam01"]
 PINK = (255, 38, 140)
+CLAY = (219, 212, 201)
 FRAMES = 40
 
 
@@ -81,6 +82,9 @@ def picture(rgb: np.ndarray, z: np.ndarray, points: np.ndarray, mode: str) -> np
         return np.where(seen[..., None], np.where(points[..., :1] > 0, COLOURS[0], COLOURS[1]), 0).astype(np.uint8)
     if mode == "confidence":
         return np.where(seen[..., None], (253, 231, 36), 0).astype(np.uint8)
+    if mode in ("hull", "points"):
+        dots = (np.indices(z.shape) % 3 == 0).all(0)
+        return np.where((seen & (dots | (mode == "hull")))[..., None], CLAY, 0).astype(np.uint8)
     fill = {"mended": rgb, "rendered": np.zeros_like(rgb), "holes": np.full_like(rgb, PINK)}[mode]
     return np.where(hole[..., None], fill, rgb).astype(np.uint8)
 

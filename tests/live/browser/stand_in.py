@@ -22,7 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.live.page_files import HEADERS, page_files
 
-MODES = ["rendered", "holes", "mended", "depth", "coverage", "confidence"]
+MODES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"]
 LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
 
 
@@ -277,9 +277,11 @@ def film(body: dict) -> bytes:
     file = io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=body["fps"])
-        stream.width, stream.height, stream.pix_fmt = body["width"], body["height"], "yuv420p"
+        eyes = 1 if body["stereo_m"] is None else 2
+        stream.width, stream.height, stream.pix_fmt = eyes * body["width"], body["height"], "yuv420p"
         for pose, now in zip(body["poses"], body["times"], strict=True):
             image = scene.picture(*scene.render(pose, body["width"], body["height"], now), body["mode"])
+            image = np.hstack([image] * eyes)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")))
         container.mux(stream.encode(None))
     return file.getvalue()

@@ -34,11 +34,11 @@ def test_modes_show_their_pictures(view):
         assert share(seen["Coverage"], tuple(colour)) > 0.01
 
 
-DIGITS = ["rendered", "holes", "mended", None, "depth", "coverage", "confidence"]
+DIGITS = ["rendered", "holes", "mended", None, "depth", "coverage", "confidence", "hull", "points"]
 
 
 def test_digits_choose_modes(desktop):
-    for digit, mode in zip("1234567", DIGITS, strict=True):
+    for digit, mode in zip("123456789", DIGITS, strict=True):
         desktop.page.keyboard.press(digit)
         desktop.settle()
         assert desktop.server.looks[-1]["modes"] == ([mode] if mode else ["rendered", "mended"])

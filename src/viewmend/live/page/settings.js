@@ -2,7 +2,7 @@
 
 /**
  * @typedef {object} Choices
- * @property {"rendered" | "holes" | "mended" | "split" | "depth" | "coverage" | "confidence"} mode
+ * @property {"rendered" | "holes" | "mended" | "split" | "depth" | "coverage" | "confidence" | "hull" | "points"} mode
  * @property {string} left mode on the divider's left
  * @property {string} right mode on its right
  * @property {number} divider where it is, 0 to 1 of the free part's width
@@ -41,7 +41,7 @@ const DEFAULTS = {
   panel: window.innerHeight > 460,
 };
 
-const PICTURES = ["rendered", "holes", "mended", "depth", "coverage", "confidence"];
+const PICTURES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"];
 /** What a choice may be, where not everything is one. @type {Record<string, (value: string) => boolean>} */
 const SENSIBLE = {
   mode: (value) => value === "split" || PICTURES.includes(value),

@@ -13,6 +13,8 @@ export const MODES = {
   depth: "Depth",
   coverage: "Coverage",
   confidence: "Confidence",
+  hull: "Hull",
+  points: "Points",
 };
 
 /** @param {Settings} settings */

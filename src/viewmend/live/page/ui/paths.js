@@ -7,6 +7,9 @@ import { pathFile, pointsOf } from "../view/track_file.js";
 import { byId, download } from "./dom.js";
 import { Film } from "./film.js";
 
+/** How far a film's two eyes are apart, metres; players know by the name's end, _SBS, that they lie side by side. */
+const EYES_M = 0.064;
+
 /**
  * @typedef {object} Surroundings
  * @property {import("../view/motion.js").Motion} motion
@@ -117,10 +120,11 @@ export class PathPanel {
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
   }
 
-  /** What is posted: cameras and times of the film's frames. */
-  #request() {
+  /** What is posted: cameras and times of the film's frames. @param {boolean} stereo whether two eyes share its width */
+  #request(stereo = false) {
     const { motion, transport, settings } = this.around;
-    const [width, height] = byId("path-size").value.split("x").map(Number);
+    const [across, height] = byId("path-size").value.split("x").map(Number);
+    const width = stereo ? across / 2 : across;
     const box = { left: 0, top: 0, width, height };
     const short = (/** @type {number} */ value) => Number(value.toFixed(6));
     const moments = this.track.moments;
@@ -135,7 +139,7 @@ export class PathPanel {
     const times = moments.map((seconds) =>
       still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
     );
-    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground };
+    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground, stereo_m: stereo ? EYES_M : null };
   }
 
   async #export() {
@@ -145,13 +149,14 @@ export class PathPanel {
       this.told = text;
       this.#show();
     });
+    const stereo = byId("path-stereo").checked;
     this.film = film;
     this.told = "";
     byId("path-progress").value = 0;
     this.#show();
     try {
-      const made = await film.make(this.#request());
-      if (made) download(made, "viewmend-path.mp4");
+      const made = await film.make(this.#request(stereo));
+      if (made) download(made, stereo ? "viewmend-path_SBS.mp4" : "viewmend-path.mp4");
       notices.toast(made ? `The film is ready (${((performance.now() - film.since) / 1000).toFixed(0)} s)` : "No film: it was called off");
     } catch (error) {
       notices.toast(`No film: ${/** @type {Error} */ (error).message}`, "error");
