@@ -2,9 +2,10 @@
 
     python benchmarks/baselines.py [--device cuda] [--precision bfloat16] [--quick] [--write]
 
-All have random weights: speed does not depend on them. Every method completes the same rendered view of a stream whose
-past is full: three frames just before it and three further back, which are remembered as in production. Geometry and
-rendering are not in the times.
+All but `views` have random weights: speed does not depend on them. `views` is measured as it is shipped, and by each
+error rule: "views-unseen" does what all others do, "views-wrong" and "views-all" mend more than holes. Every method
+completes the same rendered view of a stream whose past is full: three frames just before it and three further back,
+which are remembered as in production. Geometry and rendering are not in the times.
 
 Each size is a run of its own, with ours and the fastest baseline in it; ratios are of one run. With --write, the file
 keeps the day's runs of other sizes and networks: a slow machine can be measured piece by piece. With --windows N, only
@@ -31,10 +32,12 @@ from viewmend.baselines.framing import Canvas, Window, window_canvas, windows_ov
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
 from viewmend.baselines.published import NETWORKS
 from viewmend.inpainting.chain import build
+from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.config import base, small
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.protocol import ContextProvider, State, ViewInpainter
+from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
@@ -43,10 +46,14 @@ from viewmend.views import IncompleteView
 SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13
 """Frames further back are `STEP` apart, not 10: as many, sooner there."""
 SIZES = ((320, 320), (512, 612), (1024, 1224))
-OURS = {"small": small, "base": base}
+RANDOM = {"small": small, "base": base}
+OURS = ("small", "base", "views-unseen", "views-wrong", "views-all")
 FRAMINGS = ("def", "win", "mul")
 RIVAL = ("dstt", True, "def")
 """In every run: the fastest baseline, as runs of all of them say."""
+
+
+Renderings = Callable[[ViewInpainter, str], IncompleteView]
 
 
 class FewWindows(OnlineInpainter):
@@ -96,8 +103,11 @@ class Clocked:
         return found
 
 
-def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], ContextProvider]:
-    """The views of a stream up to `NOW`, and the cameras around; what was encoded of `NOW` is never remembered."""
+def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], ContextProvider, Renderings]:
+    """The views of a stream up to `NOW`, and the cameras around; what was encoded of `NOW` is never remembered.
+
+    Last, what renders the view of `NOW` by another error rule for a model.
+    """
     studio = Studio(StudioConfig(seed=SEED, cameras=CAMERAS, frames=NOW + 1, size_px=size))
     assert studio.bounds is not None
     target = orbit([0.4], size, elevation_rad=0.25).to(device)
@@ -107,14 +117,23 @@ def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Con
     for observation in seen:  # depths are the geometry's work
         observation.depth(observation.frame.cameras.names)
     memory = [observation.encoded for observation in seen]
-    return views, ContextProvider(
+
+    def by_rule(inpainter: ViewInpainter, rule: str) -> IncompleteView:
+        judge = Stream(inpainter, StreamConfig(render=RenderConfig(error_rule=rule), fit_rig=False), studio.bounds)
+        judge.push(seen[NOW].frame, seen[NOW].proxy)
+        return judge.render(target, NOW)
+
+    context = ContextProvider(
         lambda at, names: seen[at].context(names), memory=lambda at: {} if at == NOW else memory[at]
     )
+    return views, context, by_rule
 
 
 def ours(name: str, views: list[IncompleteView], context: ContextProvider, device: str, precision: str):
     torch.manual_seed(0)
-    inpainter = build(replace(OURS[name](), k_w=STEP)).to(device).eval()
+    if name.startswith("views-"):  # which carries nothing along
+        return load_inpainter("views", device), State()
+    inpainter = build(replace(RANDOM[name](), k_w=STEP)).to(device).eval()
     set_compute_dtype(inpainter, torch.bfloat16 if precision == "bfloat16" else torch.float32)
     state: State = inpainter.initial_state()
     for time_back in sorted(set(window_times(NOW, inpainter.config)) - {NOW}):
@@ -160,7 +179,7 @@ def ratios(figures: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
     """FPS of ours over the fastest baseline, and over each network's mul variants."""
     others = {name: f["fps"] for name, f in figures.items() if name not in OURS}
     found = {}
-    for name in OURS.keys() & figures.keys():
+    for name in [own for own in OURS if own in figures]:
         own = figures[name]["fps"]
         fastest = max(others, key=lambda n: others[n])
         against = {f"fastest ({fastest})": own / others[fastest]}
@@ -182,7 +201,7 @@ def setting(view: IncompleteView) -> dict[str, object]:
 
 
 def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
-    views, context = stage(size, options.device)
+    views, context, by_rule = stage(size, options.device)
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
@@ -190,7 +209,8 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
     wanted = [*product(options.networks, memories, options.framings)]
 
     def add(name: str, inpainter: ViewInpainter, state: State) -> None:
-        figures[name] = timed_steps(inpainter, state, views[NOW], context, options.device, options.seconds)
+        view = by_rule(inpainter, name.removeprefix("views-")) if name.startswith("views-") else views[NOW]
+        figures[name] = timed_steps(inpainter, state, view, context, options.device, options.seconds)
         print(f"{size[0]}x{size[1]} {name}: {figures[name]}", flush=True)
         done(result)
 

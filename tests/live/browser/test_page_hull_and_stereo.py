@@ -27,7 +27,8 @@ def test_the_hull_and_its_points_are_shown_alone_and_beside_others(view):
     assert view.server.looks[-1]["modes"] == ["rendered", "hull"]
 
 
-def test_every_picture_can_be_chosen_on_a_small_screen(view):
+def test_every_picture_can_be_chosen_and_all_are_seen_at_once_on_a_large_screen(view, desktop):
+    assert desktop.page.locator("#modes").evaluate("e => e.scrollWidth <= e.clientWidth")
     strip = view.page.locator("#modes").get_by_role("radio")
     assert strip.count() == 9
     strip.last.scroll_into_view_if_needed()
