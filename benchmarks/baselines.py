@@ -3,7 +3,8 @@
     python benchmarks/baselines.py [--device cuda] [--precision bfloat16] [--quick] [--write]
 
 All but `views` have random weights: speed does not depend on them. `views` is measured as it is shipped, and by each
-error rule: "views-unseen" does what all others do, "views-wrong" and "views-all" mend more than holes. Every method
+error rule: "views-unseen" does what all others do, "views-wrong" and "views-all" mend more than holes. It is given the
+part of the view that shows the subject, as by a stream; baselines make any view as small as they want it. Every method
 completes the same rendered view of a stream whose past is full: three frames just before it and three further back,
 which are remembered as in production. Geometry and rendering are not in the times.
 
@@ -36,7 +37,8 @@ from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.config import base, small
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.network import set_compute_dtype
-from viewmend.inpainting.protocol import ContextProvider, State, ViewInpainter
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, crop_margin_px
+from viewmend.rendering.crop import subject_crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
@@ -121,7 +123,9 @@ def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Con
     def by_rule(inpainter: ViewInpainter, rule: str) -> IncompleteView:
         judge = Stream(inpainter, StreamConfig(render=RenderConfig(error_rule=rule), fit_rig=False), studio.bounds)
         judge.push(seen[NOW].frame, seen[NOW].proxy)
-        return judge.render(target, NOW)
+        view, margin_px = judge.render(target, NOW), crop_margin_px(inpainter, RenderQuality())
+        crop = None if margin_px is None else subject_crop(view, margin_px)
+        return view if crop is None else crop.of_view(view)
 
     context = ContextProvider(
         lambda at, names: seen[at].context(names), memory=lambda at: {} if at == NOW else memory[at]

@@ -11,12 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from measure import write
 from torch import Tensor, nn
+from torch.nn import functional as F
 from whole_views import judge, some
 
 from viewmend.inpainting.sweep.sweep_net import SweepNet
+from viewmend.inpainting.sweep.unet import UNet
 from viewmend.training import whole_view_objective
 from viewmend.training.loop import train
 from viewmend.training.plan import DataPlan, ViewLossWeights, WholeViewRecipe
@@ -107,17 +109,27 @@ def holes(window: WholeView) -> Bool[Tensor, "height width"] | None:
     return window.view.holes if bool(window.view.holes.any()) else None
 
 
+class OneByOne(UNet):
+    """Looks at one cell alone."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__(channels, width)
+        self.first = _layers(width, width, width)
+        self.down = self.up = self.join = nn.ModuleList()
+
+    def across(self, x: Float[Tensor, "1 feature height width"]) -> Float[Tensor, "1 feature height width"]:
+        return F.relu(self.first(x))
+
+
 def one_by_one(make: Callable[..., None]) -> Callable[..., None]:
     """`SweepNet.__init__` whose convolutions look at one cell, or one pixel, alone."""
 
     def init(self: SweepNet, *arguments: object) -> None:
         make(self, *arguments)
-        config, (first, *_, last) = self.config, self.finish
+        first, *_, last = self.finish
         assert isinstance(first, nn.Conv2d) and isinstance(last, nn.Conv2d), "convolutions from one end to the other"
-        self.decide.first = _layers(config.features, config.features, config.features)
-        entering, shapes = self.decide.enter, (first.in_channels, config.fine_features, last.out_channels)
-        self.add_module("decide", nn.Sequential(entering, nn.ReLU(), self.decide.first, nn.ReLU()))
-        self.finish = _layers(*shapes)
+        self.decide = OneByOne(self.decide.enter.in_channels, self.config.features)
+        self.finish = _layers(first.in_channels, self.config.fine_features, last.out_channels)
 
     return init
 

@@ -52,7 +52,7 @@ class RenderResult:
     times: StageTimes
     """Times of all eyes; geometry and context are 0 where another viewer has paid for them."""
     hulls: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
-    """Of each eye the pictures of the proxy, by mode: RGB in [0, 1] and, last, how much it covers."""
+    """Pictures of the proxy by mode, for each eye: RGB in [0, 1] and, last, how much it covers."""
 
     @property
     def eyes(self) -> Iterator[tuple[CompletedView, Mapping[str, Tensor]]]:

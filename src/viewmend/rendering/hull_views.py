@@ -42,7 +42,7 @@ def shaded_hull(proxy: GeometryProxy, camera: Cameras) -> Float[Tensor, "4 heigh
 def hull_points(
     proxy: GeometryProxy, colours: Float[Tensor, "vertex 3"], camera: Cameras
 ) -> Float[Tensor, "4 height width"]:
-    """Its vertices as square dots, the nearest in front: RGB in [0, 1] and, last, 1 where there is a dot.
+    """The vertices as square dots, the nearest in front: RGB in [0, 1] and, last, 1 where there is a dot.
 
     Args:
         proxy: of one time.

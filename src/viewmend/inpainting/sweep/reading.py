@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.sweep.alpha_fit import recomposed, with_slope
-from viewmend.inpainting.sweep.cells import CELL_PX, scattered
+from viewmend.inpainting.sweep.cells import CELL_PX, index_image, scattered
 from viewmend.inpainting.sweep.place_net import Weighed
 from viewmend.views import CompletedView, IncompleteView
 
@@ -88,10 +88,22 @@ def finer(
     values: Float[Tensor, "cell channel"], swept: Swept, pixels: Int[Tensor, "pixel 2"]
 ) -> Float[Tensor, "pixel channel"]:
     """The cells' values at pixels, bilinearly; nothing comes from cells that were not read."""
-    whole = F.pad(values, (0, 1), value=1.0)
-    image = scattered(whole, swept.cells, swept.depth.shape)[None]
-    fine = F.interpolate(image, scale_factor=CELL_PX, mode="bilinear", align_corners=False)[0]
-    at = fine[:, pixels[:, 0], pixels[:, 1]].T
+    whole = F.pad(F.pad(values, (0, 1), value=1.0), (0, 0, 0, 1))  # last, a cell of nothing
+    index = index_image(swept.cells, swept.depth.shape)
+    own = pixels // CELL_PX
+    beside = own + 2 * (pixels % CELL_PX) - 1  # a pixel's middle is a quarter of a cell from its cell's
+    last = torch.tensor(index.shape, device=index.device) - 1
+    beside = torch.minimum(beside.clamp(min=0), last)
+    at = sum(
+        share * whole[index[rows, columns]]
+        for share, rows, columns in (
+            (9 / 16, own[:, 0], own[:, 1]),
+            (3 / 16, beside[:, 0], own[:, 1]),
+            (3 / 16, own[:, 0], beside[:, 1]),
+            (1 / 16, beside[:, 0], beside[:, 1]),
+        )
+    )
+    assert isinstance(at, Tensor)
     return at[:, :-1] / at[:, -1:].clamp_min(1e-6)
 
 

@@ -36,6 +36,7 @@ from viewmend.inpainting.sweep.lookup import COLOUR, FEATURES, MASK, Rays, Scale
 from viewmend.inpainting.sweep.place_net import PlaceNet, Weighed
 from viewmend.inpainting.sweep.pyramids import Rig, keep_pyramids
 from viewmend.inpainting.sweep.reading import Reading, Swept, finer, uncovered
+from viewmend.inpainting.sweep.tiles import in_tiles
 from viewmend.inpainting.sweep.unet import UNet
 from viewmend.views import CompletedView, ContextViews, IncompleteView
 
@@ -209,10 +210,9 @@ class SweepNet(Network):
             parts = [self.places(sight.look_up(part, view.source_views, float(CELL_PX), scale)) for part in rays]
             weighed = Weighed(*map(torch.cat, zip(*parts, strict=True)))
             features = weighed.features.flatten(1).to(self.compute_dtype)
-            volume = scattered(features, cells, depth.shape)
-            told = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(volume)
+            told = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(features)
             with heavy_operations():
-                decided = self.decide(stacked(volume, told))
+                decided = self.decide.of_points(features, cells, stacked(told))
             logits = self.logits(decided)[0, :, cells[:, 0], cells[:, 1]].T.float() + weighed.score.float()
         return Swept(cells, depth, logits, weighed, decided)
 
@@ -276,6 +276,8 @@ class SweepNet(Network):
     ) -> Float[Tensor, "pixel output"]:
         """What convolutions over the view make of its pixels."""
         with self.autocast(), heavy_operations():
+            if told.device.type == "cpu" and not torch.is_grad_enabled():
+                return in_tiles(self.finish, decided, told.to(decided), pixels, shape).float()
             near = F.interpolate(decided, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
             near = cut_to(near[0], shape)
             out = self.finish(stacked(near, scattered(told.to(near), pixels, shape)))

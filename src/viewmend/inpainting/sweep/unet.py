@@ -3,9 +3,11 @@
 from itertools import pairwise
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from viewmend.inpainting.sweep.cells import scattered
 
 WIDER = 16
 """More channels at each coarser scale."""
@@ -27,7 +29,25 @@ class UNet(nn.Module):
 
     def forward(self, image: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 feature height width"]:
         """Features of the same resolution."""
-        x = F.relu(self.enter(image.contiguous(memory_format=torch.channels_last)))
+        return self.across(F.relu(self.enter(image.contiguous(memory_format=torch.channels_last))))
+
+    def of_points(
+        self,
+        values: Float[Tensor, "point first_channel"],
+        at: Int[Tensor, "point 2"],
+        image: Float[Tensor, "1 other_channel height width"],
+    ) -> Float[Tensor, "1 feature height width"]:
+        """What `forward` makes of an image whose first channels are these values at rows and columns, zeros elsewhere.
+
+        The first layer looks at single pixels: where there is no point, it has less to do.
+        """
+        own, weight = values.shape[1], self.enter.weight
+        x = F.conv2d(image.contiguous(memory_format=torch.channels_last), weight[:, own:], self.enter.bias)
+        told = F.linear(values, weight[:, :own, 0, 0]).to(x.dtype)
+        return self.across(F.relu(x + scattered(told, at, image.shape[2:])))
+
+    def across(self, x: Float[Tensor, "1 feature height width"]) -> Float[Tensor, "1 feature height width"]:
+        """All but the first layer."""
         scales = [F.relu(x + self.first(x))]
         for layer in self.down:
             scales.append(layer(scales[-1]))
