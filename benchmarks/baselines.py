@@ -2,9 +2,10 @@
 
     python benchmarks/baselines.py [--device cuda] [--precision bfloat16] [--quick] [--write]
 
-All but `views` have random weights: speed does not depend on them. `views` is measured as it is shipped, and by each
-error rule: "views-unseen" does what all others do, "views-wrong" and "views-all" mend more than holes. It is given the
-part of the view that shows the subject, as by a stream; baselines make any view as small as they want it. Every method
+All but `views` have random weights: speed does not depend on them. `views` is measured as shipped, and as a stream asks
+it: "views-unseen" does what all others do, "views-wrong" and "views-all" mend more than holes, "views-moving" is
+what the live page shows while the view moves: what seems to be background fades, holes are filled from around them. It
+is given the part of the view that shows the subject; baselines make any view as small as they want it. Every method
 completes the same rendered view of a stream whose past is full: three frames just before it and three further back,
 which are remembered as in production. Geometry and rendering are not in the times.
 
@@ -37,25 +38,60 @@ from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.config import base, small
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.network import set_compute_dtype
-from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, crop_margin_px
+from viewmend.inpainting.protocol import (
+    ContextProvider,
+    Memory,
+    RenderQuality,
+    State,
+    ViewInpainter,
+    ViewsAt,
+    crop_margin_px,
+)
+from viewmend.inpainting.sweep.sweep_net import SweepNet
+from viewmend.inpainting.wrong import narrowed
 from viewmend.rendering.crop import subject_crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.views import IncompleteView
+from viewmend.views import CompletedView, ContextViews, IncompleteView
 
 SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13
 """Frames further back are `STEP` apart, not 10: as many, sooner there."""
 SIZES = ((320, 320), (512, 612), (1024, 1224))
 RANDOM = {"small": small, "base": base}
-OURS = ("small", "base", "views-unseen", "views-wrong", "views-all")
+STREAMED = {
+    "views-unseen": ("unseen", None),
+    "views-wrong": ("all", RenderConfig().wrong_fraction),
+    "views-all": ("all", None),
+    "views-moving": ("all", 0.0),
+}
+"""What may change, and which part of the proxy is read at most, where most is to be gained; None for all of it."""
+OURS = ("small", "base", *STREAMED)
 FRAMINGS = ("def", "win", "mul")
 RIVAL = ("dstt", True, "def")
 """In every run: the fastest baseline, as runs of all of them say."""
 
 
-Renderings = Callable[[ViewInpainter, str], IncompleteView]
+class Streamed:
+    """`views` as a stream asks it: first where most is to be gained, then for that. What it encodes is made anew."""
+
+    def __init__(self, views: ViewsAt, fraction: float | None) -> None:
+        net = load_inpainter("views")
+        assert isinstance(net, SweepNet), "which is what is shipped under this name"
+        self.net, self._views, self.fraction = net, views, fraction
+
+    def initial_state(self) -> State:
+        return State()
+
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+        memory: Memory = {}
+        own = ContextProvider(self._views, RenderQuality(read_fraction=self.fraction), memory=lambda _: memory)
+        view = view if self.fraction is None else narrowed(view, self.net, own, self.fraction)
+        return self.net.step(view, own, state)
+
+
+StreamedView = Callable[[str], tuple[Streamed, IncompleteView]]
 
 
 class FewWindows(OnlineInpainter):
@@ -105,10 +141,10 @@ class Clocked:
         return found
 
 
-def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], ContextProvider, Renderings]:
+def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], ContextProvider, StreamedView]:
     """The views of a stream up to `NOW`, and the cameras around; what was encoded of `NOW` is never remembered.
 
-    Last, what renders the view of `NOW` by another error rule for a model.
+    Last, what makes one of `STREAMED` and its part of the view of `NOW`.
     """
     studio = Studio(StudioConfig(seed=SEED, cameras=CAMERAS, frames=NOW + 1, size_px=size))
     assert studio.bounds is not None
@@ -120,23 +156,23 @@ def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Con
         observation.depth(observation.frame.cameras.names)
     memory = [observation.encoded for observation in seen]
 
-    def by_rule(inpainter: ViewInpainter, rule: str) -> IncompleteView:
-        judge = Stream(inpainter, StreamConfig(render=RenderConfig(error_rule=rule), fit_rig=False), studio.bounds)
-        judge.push(seen[NOW].frame, seen[NOW].proxy)
-        view, margin_px = judge.render(target, NOW), crop_margin_px(inpainter, RenderQuality())
-        crop = None if margin_px is None else subject_crop(view, margin_px)
-        return view if crop is None else crop.of_view(view)
+    def at(time: int, names: tuple[str, ...]) -> ContextViews | None:
+        return seen[time].context(names)
 
-    context = ContextProvider(
-        lambda at, names: seen[at].context(names), memory=lambda at: {} if at == NOW else memory[at]
-    )
-    return views, context, by_rule
+    def streamed(name: str) -> tuple[Streamed, IncompleteView]:
+        rule, fraction = STREAMED[name]
+        inpainter, config = Streamed(at, fraction), RenderConfig(error_rule=rule)
+        judge = Stream(Unfilled(), StreamConfig(render=config, fit_rig=False), studio.bounds)
+        judge.push(seen[NOW].frame, seen[NOW].proxy)
+        view, margin_px = judge.render(target, NOW), crop_margin_px(inpainter.net, RenderQuality())
+        crop = None if margin_px is None else subject_crop(view, margin_px)
+        return inpainter, view if crop is None else crop.of_view(view)
+
+    return views, ContextProvider(at, memory=lambda at: {} if at == NOW else memory[at]), streamed
 
 
 def ours(name: str, views: list[IncompleteView], context: ContextProvider, device: str, precision: str):
     torch.manual_seed(0)
-    if name.startswith("views-"):  # which carries nothing along
-        return load_inpainter("views", device), State()
     inpainter = build(replace(RANDOM[name](), k_w=STEP)).to(device).eval()
     set_compute_dtype(inpainter, torch.bfloat16 if precision == "bfloat16" else torch.float32)
     state: State = inpainter.initial_state()
@@ -205,22 +241,25 @@ def setting(view: IncompleteView) -> dict[str, object]:
 
 
 def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[dict], None]) -> dict[str, object]:
-    views, context, by_rule = stage(size, options.device)
+    views, context, streamed = stage(size, options.device)
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
     memories = [variant == "om" for variant in options.variants]
     wanted = [*product(options.networks, memories, options.framings)]
 
-    def add(name: str, inpainter: ViewInpainter, state: State) -> None:
-        view = by_rule(inpainter, name.removeprefix("views-")) if name.startswith("views-") else views[NOW]
+    def add(name: str, inpainter: ViewInpainter, state: State, view: IncompleteView = views[NOW]) -> None:
         figures[name] = timed_steps(inpainter, state, view, context, options.device, options.seconds)
         print(f"{size[0]}x{size[1]} {name}: {figures[name]}", flush=True)
         done(result)
 
     with torch.inference_mode():
         for name in options.ours:
-            add(name, *ours(name, views, context, options.device, options.precision))
+            if name in STREAMED:
+                inpainter, part = streamed(name)
+                add(name, inpainter, State(), part)
+            else:
+                add(name, *ours(name, views, context, options.device, options.precision))
         for network, memory, framing in dict.fromkeys((RIVAL, *wanted)):
             made = baseline(network, memory, framing, views, context, options)
             add(f"{network}-{'om' if memory else 'o'}-{framing}", *made)
