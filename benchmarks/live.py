@@ -84,6 +84,7 @@ def crowd(url: str, size: tuple[int, int], viewers: int, seconds: float) -> dict
     return {
         "fps_each": [viewer["fps"] for viewer in seen],
         "latency_median_ms": [viewer["latency"]["median_ms"] for viewer in seen],
+        "width_mean": [viewer["width_mean"] for viewer in seen],
         "ms_per_view": round(1000 / views, 1),
         "shared": [viewer["shared"] for viewer in seen],
     }
@@ -107,11 +108,13 @@ def main() -> None:
                 label = f"{size[0]}x{size[1]}, " + (f"budget {budget_ms:g} ms" if budget_ms else "no budget")
                 figures[label] = alone[0]
                 print(label, json.dumps(figures[label]), flush=True)
-    with served(SIZES[0], None, options.device, options.model) as (url, _):
-        walk(url, SIZES[0], 3.0, 0.0, [])
-        for viewers in VIEWERS:
-            figures[f"{viewers} viewers"] = crowd(url, SIZES[0], viewers, options.seconds)
-            print(viewers, json.dumps(figures[f"{viewers} viewers"]), flush=True)
+    for budget_ms in options.budget_ms:
+        with served(SIZES[0], budget_ms or None, options.device, options.model) as (url, _):
+            walk(url, SIZES[0], 3.0, 0.0, [])
+            for viewers in VIEWERS:
+                label = f"{viewers} viewers, " + (f"budget {budget_ms:g} ms" if budget_ms else "no budget")
+                figures[label] = crowd(url, SIZES[0], viewers, options.seconds)
+                print(label, json.dumps(figures[label]), flush=True)
     if options.write:
         config = {"seed": SEED, "cameras": CAMERAS, "frames": FRAMES, "fps": FPS, "model": options.model}
         print(write("live", options.device, config, figures))
