@@ -25,6 +25,7 @@ from itertools import product
 from typing import Any
 
 import torch
+from as_streamed import STREAMED, Streamed
 from measure import RESULTS, summarise, synchronise, write
 from torch import Tensor
 
@@ -34,61 +35,31 @@ from viewmend.baselines.framing import Canvas, Window, window_canvas, windows_ov
 from viewmend.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
 from viewmend.baselines.published import NETWORKS
 from viewmend.inpainting.chain import build
-from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.config import base, small
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.protocol import (
     ContextProvider,
-    Memory,
     RenderQuality,
     State,
     ViewInpainter,
-    ViewsAt,
     crop_margin_px,
 )
-from viewmend.inpainting.sweep.sweep_net import SweepNet
-from viewmend.inpainting.wrong import narrowed
 from viewmend.rendering.crop import subject_crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
 from viewmend.studio.rigs import orbit
 from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.views import CompletedView, ContextViews, IncompleteView
+from viewmend.views import ContextViews, IncompleteView
 
 SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13
 """Frames further back are `STEP` apart, not 10: as many, sooner there."""
 SIZES = ((320, 320), (512, 612), (1024, 1224))
 RANDOM = {"small": small, "base": base}
-STREAMED = {
-    "views-unseen": ("unseen", None),
-    "views-wrong": ("all", RenderConfig().wrong_fraction),
-    "views-all": ("all", None),
-    "views-moving": ("all", 0.0),
-}
-"""What may change, and which part of the proxy is read at most, where most is to be gained; None for all of it."""
 OURS = ("small", "base", *STREAMED)
 FRAMINGS = ("def", "win", "mul")
 RIVAL = ("dstt", True, "def")
 """In every run: the fastest baseline, as runs of all of them say."""
-
-
-class Streamed:
-    """`views` as a stream asks it: first where most is to be gained, then for that. What it encodes is made anew."""
-
-    def __init__(self, views: ViewsAt, fraction: float | None) -> None:
-        net = load_inpainter("views")
-        assert isinstance(net, SweepNet), "which is what is shipped under this name"
-        self.net, self._views, self.fraction = net, views, fraction
-
-    def initial_state(self) -> State:
-        return State()
-
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        memory: Memory = {}
-        own = ContextProvider(self._views, RenderQuality(read_fraction=self.fraction), memory=lambda _: memory)
-        view = view if self.fraction is None else narrowed(view, self.net, own, self.fraction)
-        return self.net.step(view, own, state)
 
 
 StreamedView = Callable[[str], tuple[Streamed, IncompleteView]]
