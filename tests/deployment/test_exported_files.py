@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,25 @@ def program(tmp_path_factory):
     subprocess.run(["cmake", *source, f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"], check=True)
     subprocess.run(["cmake", "--build", str(build)], check=True)
     return build / "mend_view"
+
+
+def test_riftcasts_call_mends_holes_alone_bottom_up(net, package, program, tmp_path):
+    view, context = random_view(1, net, longest=120)
+    view = holed(view)
+    view = replace(view, error=view.holes.float())
+    given = ViewInputs.of(view, context, net.config.num_views)
+    image = torch.where(view.mask > 0, view.rgb, 1.0)  # upon white, and four channels: as it is rendered there
+    shown = (torch.cat([image, torch.ones_like(image[:1])]) * 255).round().byte()
+    more = {"image": shown.movedim(0, 2).flip(0).contiguous(), "missing": view.error[..., None].flip(0).contiguous()}
+    del (tensors := given._asdict())["rgb"], tensors["error"]
+    write_tensors(tmp_path / "view.safetensors", tensors | more, {})
+    done = ran(program.with_name("inpaint"), package, tmp_path / "view.safetensors", tmp_path / "out.safetensors")
+    assert done.returncode == 0, done.stderr
+    got = load_file(tmp_path / "out.safetensors")["inpainted"].flip(0).movedim(2, 0)
+    right = view.error == 0
+    assert torch.equal(got[:, right], shown[:3, right].float()) and int((~right).sum()) > 100
+    wanted = mended(net, replace(view, rgb=(view.rgb * 255).round() / 255), context).rgb
+    assert float((got / 255 - wanted)[:, ~right].abs().max()) < 0.5 / 255 + 2e-3
 
 
 def ran(program, *paths):

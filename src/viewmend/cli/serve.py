@@ -65,6 +65,8 @@ class Options:
     """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
     viewers: int = 8
     """How many may watch at once; with --ray, at each replica."""
+    riftcast_port: int | None = None
+    """A port of this machine at which RIFTCast's own clients get their views, too (needs viewmend[riftcast])."""
     ray: str | None = None
     """Address of a Ray cluster whose machines render: HOST:PORT, auto, or local (needs viewmend[ray])."""
     replicas: int = 2
@@ -107,6 +109,7 @@ def run(options: Options) -> int:
     from viewmend.live.memory import loaded, set_up
     from viewmend.live.protocol import token_query
     from viewmend.live.renderer import Renderer
+    from viewmend.live.riftcast_service import RiftcastService, listen
     from viewmend.live.server import LiveServer
     from viewmend.live.service import RenderService
 
@@ -114,10 +117,15 @@ def run(options: Options) -> int:
     config = server_config(options)
     supply = open_supply(options)
     renderer = Renderer(supply, load_inpainter(options), stream_config(options), options.device)
-    server = Server(LiveServer(RenderService(renderer, supply), config), config)
+    service = RenderService(renderer, supply)
+    listener = None if options.riftcast_port is None else listen(options.riftcast_port)
+    riftcast = None if listener is None else RiftcastService(service, config.limits, listener)
+    server = Server(LiveServer(service, config, riftcast), config)
     with server.bound() as address:
         loaded()
         say(f"open {address}/{token_query(config.token)}   (Ctrl-C stops it)")
+        if listener is not None:
+            say(f"RIFTCast's clients: 127.0.0.1, port {listener.getsockname()[1]}")
         server.run_bound()
     return 0
 
@@ -173,13 +181,16 @@ def _check(options: Options) -> None:
     """What can be said before anything heavy is imported."""
     positive = ("width", "context", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
     wrong = [name for name in positive if not getattr(options, name) > 0]
-    wrong += [name for name in ("budget_ms", "port") if not getattr(options, name) >= 0]
+    wrong += ["budget_ms"] if not options.budget_ms >= 0 else []
     wrong += ["cameras"] if options.source == "studio" and options.cameras < 4 else []
     wrong += ["most_replicas"] if (options.most_replicas or options.replicas) < options.replicas else []
     if options.fps is not None and not 0 < options.fps <= 240:
         wrong.append("fps")
-    if wrong or options.port > 65535:
-        name = (wrong or ["port"])[0]
+    wrong += [name for name in ("port", "riftcast_port") if not 0 <= (getattr(options, name) or 0) <= 65535]
+    if options.riftcast_port is not None and options.ray is not None:
+        raise ValueError("expected --riftcast-port or --ray, got both; RIFTCast's clients are served by one process")
+    if wrong:
+        name = wrong[0]
         raise ValueError(f"expected a sensible --{name.replace('_', '-')}, got {getattr(options, name)}; see --help")
 
 

@@ -63,11 +63,10 @@ def exportable(model: nn.Module | object, name: str) -> SweepNet:
 def traced(net: SweepNet) -> ExportedProgram:
     """What `ViewMender` computes, for all sizes; it is traced in float32 on the CPU."""
     ranges = {size: Dim(size, min=low, max=high) for size, (low, high) in sizes(net).items()}
-    example, dynamic = [], []
+    example, dynamic = [], [{axis: ranges[size] for axis, size in own.items()} for own in _named_axes()]
     for kind in ViewInputs.__annotations__.values():
         dtype, shape = DTYPES[kind.__name__.split("[")[0]], kind.dim_str.split()
         example.append(torch.ones([EXAMPLE.get(size) or int(size) for size in shape], dtype=dtype))
-        dynamic.append({axis: ranges[size] for axis, size in enumerate(shape) if size in ranges})
     with torch.enable_grad(), _quiet():  # so that layers take the way of training, which is no compiled loop
         return torch.export.export(
             ViewMender(net).eval().requires_grad_(False),
@@ -75,6 +74,12 @@ def traced(net: SweepNet) -> ExportedProgram:
             dynamic_shapes=(tuple(dynamic),),
             prefer_deferred_runtime_asserts_over_guards=True,
         )
+
+
+def _named_axes() -> tuple[dict[int, str], ...]:
+    """The axes of each input that have a name, with it."""
+    shapes = [kind.dim_str.split() for kind in ViewInputs.__annotations__.values()]
+    return tuple({axis: size for axis, size in enumerate(shape) if size in EXAMPLE} for shape in shapes)
 
 
 def metadata(net: SweepNet, name: str) -> dict[str, str]:
@@ -140,6 +145,7 @@ def write_onnx(program: ExportedProgram, path: Path, told: Mapping[str, str]) ->
             program,
             input_names=ViewInputs._fields,
             output_names=ViewOutputs._fields,
+            dynamic_shapes=(_named_axes(),),  # of a program that is traced already: names alone
             opset_version=OPSET,
             external_data=False,
             verbose=False,

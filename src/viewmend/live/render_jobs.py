@@ -129,11 +129,11 @@ class PictureJob(RenderJob[tuple[bytes, RenderResult]]):
     def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The picture, once its frame has been read."""
         at = playback.edge if self._asked.time == "live" else self._asked.time
-        return None if self.done.done() else _request(self._asked, self._asked.camera, at, playback)
+        return None if self.done.done() else request_for(self._asked, self._asked.camera, at, playback)
 
     def encode(self, result: RenderResult) -> None:
         """Encode the picture."""
-        self.finish((to_jpeg(_pictures(self._asked, result), self._asked.quality), result))
+        self.finish((to_jpeg(pictures_of(self._asked, result), self._asked.quality), result))
 
 
 class PathJob(RenderJob[bytes]):
@@ -158,19 +158,19 @@ class PathJob(RenderJob[bytes]):
         if self._times is None:  # the edge as it is now
             self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
         pose, at = self._path.poses[self._count], self._times[self._count]
-        return _request(self._path, pose, at, playback, self._path.stereo_m)
+        return request_for(self._path, pose, at, playback, self._path.stereo_m)
 
     def encode(self, result: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
         self.viewer: State | None = result.viewer
-        self._video.add(_pictures(self._path, result))
+        self._video.add(pictures_of(self._path, result))
         self._count += 1
         if self._count == len(self._path.poses):
             self._video.close()
             self.finish(self._mp4.getvalue())
 
 
-def _request(
+def request_for(
     asked: ViewOptions, pose: Camera, at: float | int, playback: Playback, stereo_m: float | None = None
 ) -> RenderRequest | None:
     """The view at the nearest time that there is; None while its frame is on its way."""
@@ -183,6 +183,6 @@ def _request(
     return RenderRequest(time, eyes, quality, asked.error_rule, HULL_MODES & {asked.mode})
 
 
-def _pictures(asked: ViewOptions, result: RenderResult) -> Picture:
+def pictures_of(asked: ViewOptions, result: RenderResult) -> Picture:
     """All eyes' pictures side by side."""
     return np.hstack([picture(seen, asked.mode, asked.background, hulls) for seen, hulls in result.eyes])

@@ -25,6 +25,7 @@ from viewmend.live.protocol import HEADER_BYTES, Limits, ProtocolError
 from viewmend.live.push import receive_rig
 from viewmend.live.pushed import PushedFrames
 from viewmend.live.render_jobs import PathJob, PictureJob, RenderJob, Result, parse_path, parse_query
+from viewmend.live.riftcast_service import RiftcastService
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 
@@ -52,8 +53,8 @@ class ServerConfig:
 class LiveServer:
     """The routes, and what they share."""
 
-    def __init__(self, service: RenderService, config: ServerConfig) -> None:
-        self._service = service
+    def __init__(self, service: RenderService, config: ServerConfig, riftcast: RiftcastService | None = None) -> None:
+        self._service, self._riftcast = service, riftcast
         self._guard = Guard(config.host, config.token)
         self._config = config
         self._files = page_files()
@@ -91,7 +92,8 @@ class LiveServer:
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
         self._service.start()
         try:
-            yield
+            async with contextlib.nullcontext() if self._riftcast is None else self._riftcast.running():
+                yield
         finally:
             await asyncio.to_thread(self._service.stop)
 
