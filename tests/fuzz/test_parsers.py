@@ -26,6 +26,7 @@ from viewmend.capture.images import read_mask, read_rgb
 from viewmend.capture.plain import open_capture
 from viewmend.capture.plain_writer import write_capture
 from viewmend.inpainting.checkpoint import load_network, save_inpainter
+from viewmend.live import riftcast_messages
 from viewmend.live.protocol import Limits, parse, unpack
 from viewmend.live.push import RigMessage, read_message
 from viewmend.output_folder import OutputFolder
@@ -235,6 +236,20 @@ def test_messages():
         held(lambda: parse(asked.decode(errors="replace"), Limits()))
         held(lambda: read_message(begun, RigMessage))
         held(lambda: unpack(pushed, "images"))
+
+    fuzz()
+
+
+def test_messages_of_riftcasts_clients():
+    matrices = [np.eye(4), np.array([[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]])]
+    body = b"".join(struct.pack(">I", 64) + np.asarray(m, "<f4").T.tobytes() for m in matrices)
+    good = struct.pack("<HHi", 1, 3, 3) + struct.pack(">II", 48, 48) + body
+    assert isinstance(riftcast_messages.parse(good), riftcast_messages.ImageRequest)
+
+    @FUZZED
+    @given(spoilt(good))
+    def fuzz(message):
+        held(lambda: riftcast_messages.parse(message))
 
     fuzz()
 

@@ -61,8 +61,10 @@ def parse(message: bytes) -> ImageRequest | int:
     (projection_bytes,) = struct.unpack_from(">I", body, 76)
     if (view_bytes, projection_bytes) != (64, 64):
         raise ProtocolError(f"expected two matrices of 64 bytes, got {view_bytes} and {projection_bytes}")
-    view, projection = (np.frombuffer(body, "<f4", 16, at).reshape(4, 4).T.astype(float) for at in (12, 80))
-    return ImageRequest(width, height, camera_of(view, projection, width, height), _inverse(projection @ view))
+    with np.errstate(all="ignore"):  # what comes of odd numbers is looked at
+        view, projection = (np.frombuffer(body, "<f4", 16, at).reshape(4, 4).T.astype(float) for at in (12, 80))
+        camera = camera_of(view, projection, width, height)
+        return ImageRequest(width, height, camera, _inverse(projection @ view))
 
 
 def camera_of(view: Float[np.ndarray, "4 4"], projection: Float[np.ndarray, "4 4"], width: int, height: int) -> Camera:
@@ -86,9 +88,12 @@ def camera_of(view: Float[np.ndarray, "4 4"], projection: Float[np.ndarray, "4 4
 
 def _inverse(matrix: Float[np.ndarray, "4 4"]) -> bytes:
     try:
-        return np.linalg.inv(matrix).T.astype("<f4").tobytes()
+        inverse = np.linalg.inv(matrix).astype("<f4")
     except np.linalg.LinAlgError:
-        raise ProtocolError("expected a projection that can be undone, got another") from None
+        inverse = np.full((4, 4), np.nan)
+    if not np.isfinite(inverse).all():
+        raise ProtocolError("expected a projection that can be undone, got another")
+    return inverse.T.tobytes()
 
 
 def update(request: ImageRequest, jpeg: bytes, depth: Float[Tensor, "height width"]) -> bytes:
