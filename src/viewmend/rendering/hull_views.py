@@ -15,7 +15,7 @@ CLAY = (0.86, 0.83, 0.79)
 """RGB of the surface where it faces the viewer."""
 GRAZING = 0.18
 """How bright it is where it does not face the viewer at all, as a share."""
-DOT = 0.55
+DOT = 0.7
 """A dot's side, as a share of the vertices' distance from one another."""
 BEHIND = 1.5
 """Vertices are hidden that lie more than so many of these distances behind the surface."""
