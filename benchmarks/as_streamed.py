@@ -19,8 +19,8 @@ STREAMED = {
 class Streamed:
     """`views` as a stream asks it: first where most is to be gained, then for that. What it encodes is made anew."""
 
-    def __init__(self, views: ViewsAt, fraction: float | None) -> None:
-        net = load_inpainter("views")
+    def __init__(self, views: ViewsAt, fraction: float | None, device: str) -> None:
+        net = load_inpainter("views", device)
         assert isinstance(net, SweepNet), "which is what is shipped under this name"
         self.net, self._views, self.fraction = net, views, fraction
 

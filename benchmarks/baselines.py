@@ -132,7 +132,7 @@ def stage(size: tuple[int, int], device: str) -> tuple[list[IncompleteView], Con
 
     def streamed(name: str) -> tuple[Streamed, IncompleteView]:
         rule, fraction = STREAMED[name]
-        inpainter, config = Streamed(at, fraction), RenderConfig(error_rule=rule)
+        inpainter, config = Streamed(at, fraction, device), RenderConfig(error_rule=rule)
         judge = Stream(Unfilled(), StreamConfig(render=config, fit_rig=False), studio.bounds)
         judge.push(seen[NOW].frame, seen[NOW].proxy)
         view, margin_px = judge.render(target, NOW), crop_margin_px(inpainter.net, RenderQuality())

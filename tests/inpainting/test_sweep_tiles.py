@@ -5,7 +5,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from viewmend.inpainting.sweep.cells import CELL_PX, scattered
+from viewmend.inpainting.sweep.cells import CELL_PX, index_image, scattered
 from viewmend.inpainting.sweep.reading import Swept, finer
 from viewmend.inpainting.sweep.tiles import AT_ONCE, TILE_PX, in_tiles
 from viewmend.inpainting.sweep.unet import UNet
@@ -90,7 +90,9 @@ def test_cells_at_pixels_are_what_enlarging_gives(shape):
     read[tuple(cells.T)] = True
     inside = read.repeat_interleave(CELL_PX, 0).repeat_interleave(CELL_PX, 1)[: shape[0], : shape[1]]
     pixels = torch.nonzero(inside)
-    swept = Swept(cells, torch.zeros(rows, columns), values, None, None)  # the last two are not looked at
+    swept = Swept(
+        cells, index_image(cells, read.shape), torch.zeros(rows, columns), values, None, None
+    )  # the last two are not looked at
     whole = torch.cat([values, torch.ones(len(cells), 1)], 1)
     image = F.interpolate(scattered(whole, cells, read.shape)[None], scale_factor=CELL_PX, mode="bilinear")[0]
     at = image[:, pixels[:, 0], pixels[:, 1]].T

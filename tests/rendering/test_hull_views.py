@@ -9,7 +9,7 @@ from reference.ball import camera_at, proxy
 
 from viewmend.geometry.cameras import project
 from viewmend.geometry.mesh import Mesh
-from viewmend.rendering.hull_views import BEHIND, CLAY, DOT, GRAZING, hull_points, shaded_hull
+from viewmend.rendering.hull_views import BEHIND, CLAY, DOT, GRAZING, LARGEST_PX, hull_points, shaded_hull
 
 BALL = proxy(24)
 COLOURS = 0.5 + 0.4 * BALL.normals
@@ -62,6 +62,13 @@ def test_the_far_side_does_not_shine_through():
     red = torch.where(BALL.mesh.vertices[:, 2:] < -0.1, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
     shown = hull_points(BALL, red, camera_at(0, "t", size=96))
     assert float(shown[2].sum()) > 200 and float(shown[0].sum()) == 0
+
+
+def test_a_dot_right_before_the_eye_is_bounded():
+    vertices = torch.tensor([[0.0, 0, 1.99], [3, 0, -1], [0, 3, -1]])  # a centimetre before it, and two out of view
+    near = replace(BALL, mesh=Mesh(vertices, torch.tensor([[0, 1, 2]]).int()), normals=torch.eye(3))
+    dot = hull_points(near, torch.ones(3, 3), camera_at(0, "t", size=96))[3]
+    assert float(dot.sum()) == LARGEST_PX**2 and float(dot[48, 48]) == 1
 
 
 def test_nothing_shows_nothing():

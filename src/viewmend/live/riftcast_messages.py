@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from torch import Tensor
 
+from viewmend.capture.formats.riftcast import FLIP
 from viewmend.geometry.cameras import Cameras
 from viewmend.live.protocol import Camera, ProtocolError
 
@@ -26,8 +27,6 @@ BACKGROUND_M = 10.0
 """Depth of what shows no subject: farther than clients draw."""
 NEAR_M, FAR_M = 0.01, 10.0
 """Projections that are sent reach from here to there."""
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL's axes of a camera to ours, and back."""
 
 
 @dataclass(frozen=True)

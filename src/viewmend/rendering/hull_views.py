@@ -17,6 +17,8 @@ GRAZING = 0.18
 """How bright it is where it does not face the viewer at all, as a share."""
 DOT = 0.7
 """A dot's side, as a share of the vertices' distance from one another."""
+LARGEST_PX = 32
+"""Dots are no larger, however near they are."""
 BEHIND = 1.5
 """Vertices are hidden that lie more than so many of these distances behind the surface."""
 
@@ -60,7 +62,7 @@ def hull_points(
         surface = proxy.depth(camera)[0][row, column]
         shown = in_view(uv, z, camera)[0] & ((surface == 0) | (z[0] <= surface + BEHIND * apart_m))
         order = torch.where(shown, z[0], 0.0).argsort(descending=True)[: int(shown.sum())]  # the farthest first
-        sides = (DOT * apart_m * camera.K[0, 0, 0] / z[0, order]).round().clamp(min=1)
+        sides = (DOT * apart_m * camera.K[0, 0, 0] / z[0, order]).round().clamp(1, LARGEST_PX)
         drawn = torch.cat([colours, torch.ones_like(colours[:, :1])], 1)[order]
         _draw(image, *(told.cpu().numpy() for told in (row[order], column[order], sides.long(), drawn)))
     return torch.from_numpy(image).movedim(-1, 0).to(colours)

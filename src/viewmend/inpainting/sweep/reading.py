@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.sweep.alpha_fit import recomposed, with_slope
-from viewmend.inpainting.sweep.cells import CELL_PX, index_image, scattered
+from viewmend.inpainting.sweep.cells import CELL_PX, scattered
 from viewmend.inpainting.sweep.place_net import Weighed
 from viewmend.views import CompletedView, IncompleteView
 
@@ -24,6 +24,8 @@ class Swept(NamedTuple):
 
     cells: Int[Tensor, "cell 2"]
     """Row and column."""
+    cell_index: Int[Tensor, "rows columns"]
+    """Which of them lies there; -1 where none does."""
     depth: Float[Tensor, "rows columns"]
     """The proxy's nearest z-depth in each cell that is read, metres, else 0."""
     logits: Float[Tensor, "cell place"]
@@ -89,21 +91,12 @@ def finer(
 ) -> Float[Tensor, "pixel channel"]:
     """The cells' values at pixels, bilinearly; nothing comes from cells that were not read."""
     whole = F.pad(F.pad(values, (0, 1), value=1.0), (0, 0, 0, 1))  # last, a cell of nothing
-    index = index_image(swept.cells, swept.depth.shape)
     own = pixels // CELL_PX
     beside = own + 2 * (pixels % CELL_PX) - 1  # a pixel's middle is a quarter of a cell from its cell's
-    last = torch.tensor(index.shape, device=index.device) - 1
-    beside = torch.minimum(beside.clamp(min=0), last)
-    at = sum(
-        share * whole[index[rows, columns]]
-        for share, rows, columns in (
-            (9 / 16, own[:, 0], own[:, 1]),
-            (3 / 16, beside[:, 0], own[:, 1]),
-            (3 / 16, own[:, 0], beside[:, 1]),
-            (1 / 16, beside[:, 0], beside[:, 1]),
-        )
-    )
-    assert isinstance(at, Tensor)
+    last = torch.tensor(swept.cell_index.shape, device=own.device) - 1
+    near = ((3 / 4, own), (1 / 4, torch.minimum(beside.clamp(min=0), last)))
+    parts = [a * b * whole[swept.cell_index[rows[:, 0], columns[:, 1]]] for a, rows in near for b, columns in near]
+    at = torch.stack(parts).sum(0)
     return at[:, :-1] / at[:, -1:].clamp_min(1e-6)
 
 

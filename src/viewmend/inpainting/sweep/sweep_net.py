@@ -214,7 +214,7 @@ class SweepNet(Network):
             with heavy_operations():
                 decided = self.decide.of_points(features, cells, stacked(told))
             logits = self.logits(decided)[0, :, cells[:, 0], cells[:, 1]].T.float() + weighed.score.float()
-        return Swept(cells, depth, logits, weighed, decided)
+        return Swept(cells, index_image(cells, depth.shape), depth, logits, weighed, decided)
 
     def _blend(
         self,
@@ -227,7 +227,7 @@ class SweepNet(Network):
     ) -> Reading:
         """The cameras at the depth of each pixel, and what of them it shows."""
         place, offset, certain = self._depth_offset(pixels, swept)
-        cell = index_image(swept.cells, swept.depth.shape)[tuple((pixels // CELL_PX).T)]
+        cell = swept.cell_index[tuple((pixels // CELL_PX).T)]
         own, front = view.depth[tuple(pixels.T)], swept.depth[tuple(swept.cells.T)][cell]
         front = torch.where((own - front).abs() < JOINT * scale.size_m, own, front)
         depth = front + scale.size_m * offset

@@ -39,7 +39,9 @@ def in_tiles(
     number = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
     tiles, own = number.unique(return_inverse=True)
     rows, columns = tiles // across * TILE_PX, tiles % across * TILE_PX
-    border = bool(((rows < halo) | (columns < halo)).any()) or _leaves(rows, columns, halo, shape)
+    end = TILE_PX + halo
+    leaves = (rows < halo) | (columns < halo) | (rows + end > shape[0]) | (columns + end > shape[1])
+    border = bool(leaves.any())
     index = _Framed(index_image(pixels, shape)[None], halo, TILE_PX, -1)
     near = _Framed(decided[0], -(-halo // CELL_PX) + 1, TILE_PX // CELL_PX, None)
     values = F.pad(told, (0, 0, 0, 1))  # last, a pixel of which nothing is told
@@ -84,11 +86,6 @@ def _parts(count: int) -> Iterator[slice]:
         while count - first >= size:
             yield slice(first, first + size)
             first += size
-
-
-def _leaves(rows: Int[Tensor, "tile"], columns: Int[Tensor, "tile"], halo: int, shape: torch.Size) -> bool:
-    end = TILE_PX + halo
-    return bool(((rows + end > shape[0]) | (columns + end > shape[1])).any())
 
 
 def _inside(
