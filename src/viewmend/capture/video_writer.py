@@ -5,9 +5,16 @@ from fractions import Fraction
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
+
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
+
+SMPTE170M, BT709, VIDEO_RANGE = 6, 1, 1
+"""Numbers of ITU-T H.273: the matrix of BT.601, primaries and transfer of BT.709, and luma from 16 to 235."""
 
 Picture = UInt8[np.ndarray, "height width 3"]
 CutOut = UInt8[np.ndarray, "height width 4"]
@@ -36,6 +43,7 @@ class VideoWriter:
         self._container = av.open(file, "w", format="mp4")
         self._stream = self._container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
         self._stream.pix_fmt = "yuv444p" if faithful else "yuv420p"
+        say_colours(self._stream.codec_context)
         self._stream.options = {"crf": "8" if faithful else "18", "preset": "veryfast"}
         self._stream.codec_context.thread_count = threads
         self._begun = False
@@ -66,6 +74,16 @@ class VideoWriter:
         self._container.close()
 
 
+def say_colours(context: "VideoCodecContext") -> None:
+    """Write into a stream how its YUV was made of sRGB, before it is opened.
+
+    By BT.601 in video range, as FFmpeg does it. Untold, browsers take BT.709 from 720 rows on, or always, and colours
+    change by up to 25 of 255.
+    """
+    context.colorspace, context.color_range = SMPTE170M, VIDEO_RANGE
+    context.color_primaries = context.color_trc = BT709  # of sRGB; browsers heed none of the three alone
+
+
 def write_mp4(file: Path | BytesIO, frames: Iterable[Picture], fps: float) -> None:
     """All frames as an MP4 that any player shows.
 
@@ -91,6 +109,7 @@ def write_webm(file: Path, frames: Iterable[CutOut], fps: float) -> None:
     with av.open(file, "w", format="webm") as container:
         stream = container.add_stream("libvpx-vp9", rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuva420p"
+        say_colours(stream.codec_context)
         # Alpha is a second picture beside the first: VP9's frames that are never shown would part the two.
         stream.options = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
         stream.metadata["alpha_mode"] = "1"

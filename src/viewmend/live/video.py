@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from viewmend.capture.video_writer import say_colours
 from viewmend.live.pictures import Picture
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
 ENCODERS = {"vp9": "libvpx-vp9", "h264": "libx264"}
-STRINGS = {"vp9": "vp09.00.41.08", "h264": "avc1.42E02A"}
-"""What VideoDecoder.configure is told: profile and level hold every size that the limits allow."""
+STRINGS = {"vp9": "vp09.00.41.08.01.01.01.06.00", "h264": "avc1.42E02A"}
+"""What VideoDecoder.configure is told: profile and level hold every size that the limits allow. Of VP9 browsers believe
+this, not the stream, about how colours are to be read (`say_colours`)."""
 OPTIONS = {
     "vp9": {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0", "row-mt": "1", "crf": "24", "b": "0"},
     "h264": {"preset": "ultrafast", "tune": "zerolatency", "crf": "21", "profile": "baseline", "level": "4.2"},
@@ -68,6 +70,7 @@ def _open(codec: str, width: int, height: int) -> "VideoCodecContext":
     assert isinstance(context, av.VideoCodecContext)
     context.width, context.height = width, height
     context.pix_fmt = "yuv420p"
+    say_colours(context)
     context.time_base = Fraction(1, 30)
     context.gop_size = KEY_EVERY
     context.thread_count = 1
