@@ -24,7 +24,9 @@ const bytes = Uint8Array.from(atob(data), (sign) => sign.charCodeAt(0));
 FILM = f"""async ([data, type]) => {{ {PAINT}
   const src = URL.createObjectURL(new Blob([bytes], {{ type }}));
   const video = Object.assign(document.createElement("video"), {{ muted: true, src }});
-  await new Promise((done) => {{ video.onloadeddata = done; video.load(); }});
+  const first = new Promise((done) => video.requestVideoFrameCallback(done));
+  await video.play();
+  await first;
   return paint(video, video.videoWidth, video.videoHeight);
 }}"""
 CHUNK = f"""async ([data, codec, width, height]) => {{ {PAINT}
