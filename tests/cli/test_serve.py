@@ -22,6 +22,11 @@ from viewmend.cli import main, serve
         (["--fps", "0"], "--fps"),
         (["--model", "nothing"], "nothing"),
         (["--device", "tpu"], "tpu"),
+        (["--broadcast", "1280"], "expected --broadcast WIDTHxHEIGHT"),
+        (["--broadcast", "1280x719"], "even"),
+        (["--broadcast", "1280x14"], "from 16"),
+        (["--broadcast", "4096x4096"], "2048"),
+        (["--broadcast", "1280x720", "--ray", "local"], "--broadcast or --ray"),
     ],
 )
 def test_what_cannot_be_served_is_one_line(capsys, arguments, words):
@@ -47,6 +52,7 @@ def test_a_capture_without_masks_is_refused(tmp_path, capsys):
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_one_command_and_a_picture(sent):
     options = ["--port", "0", "--size", "96", "--cameras", "4", "--frames", "2", "--model", "nearest"]
+    options += ["--broadcast", "96x64"]
     command = [sys.executable, "-m", "viewmend.cli", "serve", *options]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as server:
@@ -56,6 +62,9 @@ def test_one_command_and_a_picture(sent):
             assert address is not None
             with urllib.request.urlopen(f"{address[0]}/frame.jpg?width=64&height=64", timeout=60) as answer:
                 assert answer.read(2) == b"\xff\xd8"
+            assert f"{address[0]}/watch" in server.stderr.readline()
+            with urllib.request.urlopen(f"{address[0]}/broadcast/live.m3u8", timeout=60) as answer:
+                assert answer.read().startswith(b"#EXTM3U")
             server.send_signal(sent)
             assert server.wait(20) in (0, 130, 143)
             assert "Traceback" not in server.stderr.read()

@@ -45,7 +45,7 @@ def test_every_message_is_understood():
 @pytest.mark.parametrize(
     ("message", "words"),
     [
-        ({"type": "shout"}, 'type: expected hello or look or ack or clock or ping, got "shout"'),
+        ({"type": "shout"}, 'type: expected hello or look or ack or clock or on_air or ping, got "shout"'),
         ({"type": "look", "width": 5000}, "from 16 to 2048, got 5000 x 320"),
         ({"type": "look", "width": 2048, "height": 2048}, "at most 2100000 pixels, got 2048 x 2048"),
         ({"type": "look", "width": 1024, "height": 1100, "eyes": [{}, {}]}, "at most 2100000 pixels"),

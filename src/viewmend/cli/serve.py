@@ -67,6 +67,9 @@ class Options:
     """How many may watch at once; with --ray, at each replica."""
     riftcast_port: int | None = None
     """A port of this machine at which RIFTCast's own clients get their views, too (needs viewmend[riftcast])."""
+    broadcast: str | None = None
+    """WIDTHxHEIGHT of a film for any number who watch at /watch; on the page a viewer goes on air (needs
+    viewmend[video])."""
     ray: str | None = None
     """Address of a Ray cluster whose machines render: HOST:PORT, auto, or local (needs viewmend[ray])."""
     replicas: int = 2
@@ -124,6 +127,8 @@ def run(options: Options) -> int:
     with server.bound() as address:
         loaded()
         say(f"open {address}/{token_query(config.token)}   (Ctrl-C stops it)")
+        if config.broadcast_px is not None:
+            say(f"watch {address}/watch{token_query(config.token)}   (what the viewer who goes on air sees)")
         if listener is not None:
             say(f"RIFTCast's clients: 127.0.0.1, port {listener.getsockname()[1]}")
         server.run_bound()
@@ -143,7 +148,32 @@ def server_config(options: Options) -> "ServerConfig":
         budget_ms=options.budget_ms or None,
         model=options.model or default_method(),
         limits=Limits(viewers=options.viewers),
+        broadcast_px=None if options.broadcast is None else film_size(options.broadcast),
     )
+
+
+def film_size(text: str) -> tuple[int, int]:
+    """Width and height of a film, from `WIDTHxHEIGHT`.
+
+    Raises:
+        ValueError: it is none that can be encoded here.
+    """
+    import re
+
+    from viewmend.live.protocol import Limits
+    from viewmend.live.video import video_codecs
+
+    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text, re.ASCII)
+    size_px = (int(found[1]), int(found[2])) if found else (0, 0)
+    if min(size_px) < 16 or any(side % 2 for side in size_px):
+        raise ValueError(f"expected --broadcast WIDTHxHEIGHT, even, from 16, e.g. 1280x720; got '{text[:40]}'")
+    try:
+        Limits().check_size(*size_px)
+    except ValueError as error:
+        raise ValueError(f"--broadcast: {error}") from None
+    if "h264" not in video_codecs():
+        raise ValueError("--broadcast needs PyAV with x264; install viewmend's extra 'video'")
+    return size_px
 
 
 def stream_config(options: Options) -> "StreamConfig":
@@ -189,6 +219,8 @@ def _check(options: Options) -> None:
     wrong += [name for name in ("port", "riftcast_port") if not 0 <= (getattr(options, name) or 0) <= 65535]
     if options.riftcast_port is not None and options.ray is not None:
         raise ValueError("expected --riftcast-port or --ray, got both; RIFTCast's clients are served by one process")
+    if options.broadcast is not None and options.ray is not None:
+        raise ValueError("expected --broadcast or --ray, got both; the film is made by one process")
     if wrong:
         name = wrong[0]
         raise ValueError(f"expected a sensible --{name.replace('_', '-')}, got {getattr(options, name)}; see --help")

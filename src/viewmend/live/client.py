@@ -108,6 +108,7 @@ class Client:
     def __enter__(self) -> "Client":
         self._looks, self._shown = 0, -1
         self._look: dict[str, Any] = {}
+        self._on_air = False
         self._clock: dict[str, Any] = {}
         """What parts the clock from the edge; with a seek until that is shown."""
         self._connect()
@@ -141,6 +142,8 @@ class Client:
             self.send("clock", **({"seek": self._shown} if self._shown >= 0 else {}) | self._clock)
         if self._look:
             self.send("look", **self._look)
+        if self._on_air:
+            self.send("on_air", on=True)
 
     def __exit__(self, *exception: object) -> None:
         self._socket.close()
@@ -164,6 +167,11 @@ class Client:
         self._looks += 1
         self.send("look", id=self._looks, sent_ms=1000 * time.perf_counter(), **values)
         return self._looks
+
+    def on_air(self, on: bool = True) -> None:
+        """Let what this viewer looks at be what all who watch see, or no more; of a server with --broadcast."""
+        self._on_air = on
+        self.send("on_air", on=on)
 
     def wait_for(self, kind: str) -> dict[str, Any]:
         """The next message of this type; frames on the way are acknowledged and dropped."""

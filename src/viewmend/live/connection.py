@@ -10,15 +10,17 @@ from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from viewmend.live.broadcast import Broadcast
 from viewmend.live.guard import FaultLimit, RateLimit
 from viewmend.live.protocol import (
     MODES,
     VERSION,
     Ack,
-    ClockChange,
     Hello,
     Limits,
     Look,
+    Message,
+    OnAir,
     Ping,
     ProtocolError,
     error_json,
@@ -44,6 +46,8 @@ class SessionRegistry:
     """Fields of the message `welcome`: model, codecs, export, token_needed, server."""
     sessions: list[ViewerSession] = field(default_factory=list)
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
+    broadcast: Broadcast | None = None
+    """The view for many, where there is one."""
 
     def source_json(self) -> dict[str, Any]:
         """The part of the message `state` that is the same for all."""
@@ -111,6 +115,7 @@ class ViewerConnection:
             pass
         finally:
             self._service.leave(self._session)
+            self._go_on_air(False)
             if self._session in self._registry.sessions:
                 self._registry.sessions.remove(self._session)
 
@@ -178,7 +183,11 @@ class ViewerConnection:
             raise ClosingError(code, message)
         self._send_soon(error_json(code, message, fatal=False))
 
-    def _handle(self, message: Hello | Look | Ack | ClockChange | Ping) -> None:
+    def _go_on_air(self, on: bool) -> None:
+        if self._registry.broadcast is not None:
+            self._registry.broadcast.go_on_air(self._session, on)
+
+    def _handle(self, message: Message) -> None:
         if isinstance(message, Ping):
             now_ms = round(1000 * time.monotonic(), 2)
             self._send_soon({"type": "pong", "sent_ms": message.sent_ms, "server_ms": now_ms})
@@ -187,9 +196,15 @@ class ViewerConnection:
             raise ProtocolError("expected one hello, got another")
         if isinstance(message, Look) and message.codec not in self._registry.about["codecs"]:
             raise ProtocolError(f"expected a codec among {self._registry.about['codecs']}, got '{message.codec}'")
+        if isinstance(message, OnAir) and self._registry.broadcast is None:
+            raise ProtocolError("expected a server that broadcasts, got one that does not; start it with --broadcast")
         with self._service.lock:
             if isinstance(message, Look):
                 self._session.look(message)
+                if self._registry.broadcast is not None:
+                    self._registry.broadcast.look(self._session)
+            elif isinstance(message, OnAir):
+                self._go_on_air(message.on)
             elif isinstance(message, Ack):
                 self._session.ack(message.frame)
             else:
@@ -216,6 +231,8 @@ class ViewerConnection:
                 self._send_new_rig()
             source = self._registry.source_json()
             own = self._session.state_json(self._service.supply.span, self._service.edge)
+            if (broadcast := self._registry.broadcast) is not None:
+                own |= {"on_air": broadcast.is_on_air(self._session), "watched": broadcast.watched}
             shown = (source, {key: own[key] for key in own if key not in ("time", "behind")})
             if shown != last or now - state_at >= 0.5:
                 last, state_at = shown, now

@@ -27,6 +27,12 @@ def metrics_text(registry: SessionRegistry) -> str:
             {f'{{stage="{stage}"}}': ms / 1000 for stage, ms in vars(service.times).items() if stage != "wait"},
         ),
     ]
+    if (broadcast := registry.broadcast) is not None:
+        lines += _metric("viewmend_broadcast_watched", "gauge", "1 while it is watched.", {"": int(broadcast.watched)})
+        sent = {_of(kind=kind): broadcast.counts[kind] for kind in ("playlists", "segments")}
+        lines += _metric("viewmend_broadcast_files_total", "counter", "Files of the film that were sent.", sent)
+        size = {"": broadcast.counts["bytes"]}
+        lines += _metric("viewmend_broadcast_bytes_total", "counter", "Bytes of the film that were sent.", size)
     cameras = service.supply.camera_counts()
     if cameras:
         up = {_of(camera=name): counts["up"] for name, counts in cameras.items()}

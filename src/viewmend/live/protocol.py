@@ -166,13 +166,19 @@ class ClockChange(Struct, frozen=True, tag="clock"):
     live: bool = False
 
 
+class OnAir(Struct, frozen=True, tag="on_air"):
+    """Whether this viewer's looks are what all who watch see."""
+
+    on: bool
+
+
 class Ping(Struct, frozen=True, tag="ping"):
     """Answered by a pong."""
 
     sent_ms: ClientMs = 0.0
 
 
-Message = Hello | Look | Ack | ClockChange | Ping
+Message = Hello | Look | Ack | ClockChange | OnAir | Ping
 
 
 def parse(text: str, limits: Limits) -> Message:

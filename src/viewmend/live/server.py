@@ -8,13 +8,16 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 
 from starlette.applications import Starlette
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
 from viewmend.capture.video_writer import can_write_mp4
+from viewmend.live.answers import BODY_BYTES, refusal, whole_body
+from viewmend.live.broadcast import Broadcast
+from viewmend.live.broadcast_answers import film_answer
 from viewmend.live.connection import SessionRegistry, ViewerConnection
 from viewmend.live.door import admit
 from viewmend.live.guard import Guard
@@ -33,7 +36,6 @@ PICTURE_S = 60.0
 ORIGINAL_S = 5.0
 EXPORT_S = 3600.0
 PICTURES_AT_ONCE = 4
-BODY_BYTES, BODY_S = 1_000_000, 10.0
 TOKEN_WANTED = "expected the token, as 'Authorization: Bearer TOKEN' or ?token=TOKEN"
 
 
@@ -48,6 +50,8 @@ class ServerConfig:
     model: str = "views"
     """What `welcome` and /health call it."""
     limits: Limits = field(default_factory=Limits)
+    broadcast_px: tuple[int, int] | None = None
+    """Width and height, even, of the film for all who watch; None for none."""
 
 
 class LiveServer:
@@ -62,14 +66,17 @@ class LiveServer:
         self._exporting = False
         self._film: PathJob | None = None
         self._pushing = False
+        size_px = config.broadcast_px
+        self._broadcast = None if size_px is None else Broadcast(service, size_px, config.budget_ms)
         about = {
             "server": f"viewmend {__version__}",
             "model": config.model,
             "codecs": ["jpeg", *video_codecs()],
             "export": can_write_mp4(),
             "token_needed": bool(config.token),
+            "broadcast": self._broadcast is not None,
         }
-        self.registry = SessionRegistry(service, config.limits, config.budget_ms, about)
+        self.registry = SessionRegistry(service, config.limits, config.budget_ms, about, broadcast=self._broadcast)
 
     def app(self) -> Starlette:
         """The ASGI application; its lifespan starts and stops the service."""
@@ -77,6 +84,8 @@ class LiveServer:
         routes = [
             Route("/", page),
             Route("/page/{name:path}", page),
+            Route("/watch", self._guarded(self._watch, needs_token=False)),
+            Route("/broadcast/{name}", self._guarded(self._film_file)),
             Route("/health", self._guarded(self._health)),
             Route("/metrics", self._guarded(self._metrics)),
             Route("/frame.jpg", self._guarded(self._picture)),
@@ -95,6 +104,8 @@ class LiveServer:
             async with contextlib.nullcontext() if self._riftcast is None else self._riftcast.running():
                 yield
         finally:
+            if self._broadcast is not None:
+                await asyncio.to_thread(self._broadcast.stop)
             await asyncio.to_thread(self._service.stop)
 
     def _guarded(
@@ -103,24 +114,28 @@ class LiveServer:
         async def checked(request: Request) -> Response:
             foreign = self._guard.foreign_origin(request)
             if foreign:
-                return _refusal(403, foreign)
+                return refusal(403, foreign)
             if await self._guard.lacks_token(request):
                 if needs_token:
-                    return _refusal(401, TOKEN_WANTED)
+                    return refusal(401, TOKEN_WANTED)
             else:
                 admit(request)
             try:
                 return await answer(request)
             except ProtocolError as error:
-                return _refusal(400, str(error))
+                return refusal(400, str(error))
 
         return checked
 
     async def _page(self, request: Request) -> Response:
         file = self._files.get(request.path_params.get("name", "index.html"))
         if file is None:
-            return _refusal(404, "there is no such file of the page")
+            return refusal(404, "there is no such file of the page")
         return Response(file.content, media_type=file.media_type, headers=HEADERS)
+
+    async def _watch(self, request: Request) -> Response:
+        request.path_params["name"] = "watch.html"
+        return await self._page(request)
 
     async def _health(self, request: Request) -> Response:
         source = self.registry.source_json()
@@ -147,13 +162,13 @@ class LiveServer:
     async def _picture(self, request: Request) -> Response:
         asked = parse_query(dict(request.query_params), self._config.limits)
         if self._pictures >= PICTURES_AT_ONCE:
-            return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
+            return refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
         job = PictureJob(asked)
         self._pictures += 1
         try:
             image, result = await self._wait(request, job, PICTURE_S)
         except (TimeoutError, RuntimeError) as error:
-            return _refusal(503, str(error) or "the frame did not come in time; see /health")
+            return refusal(503, str(error) or "the frame did not come in time; see /health")
         finally:
             self._pictures -= 1
         timing = ", ".join(f"{stage};dur={ms:.1f}" for stage, ms in vars(result.times).items())
@@ -163,14 +178,14 @@ class LiveServer:
     async def _original(self, request: Request) -> Response:
         asked = parse_original(dict(request.query_params))
         if self._pictures >= PICTURES_AT_ONCE:
-            return _refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
+            return refusal(429, f"expected at most {PICTURES_AT_ONCE} pictures at once; ask again")
         supply, end = self._service.supply, time.monotonic() + ORIGINAL_S
         at = int(supply.span.clamp(self._service.edge if asked.time == "live" else asked.time))
         self._pictures += 1
         try:
             while (frame := supply.read(at)) is None:
                 if time.monotonic() > end:
-                    return _refusal(503, "the frame did not come in time; see /health")
+                    return refusal(503, "the frame did not come in time; see /health")
                 await asyncio.sleep(0.05)
             image = await asyncio.to_thread(original_jpeg, frame, asked.name)
         finally:
@@ -184,23 +199,28 @@ class LiveServer:
 
     async def _export(self, request: Request) -> Response:
         if not can_write_mp4():
-            return _refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
+            return refusal(501, "videos need PyAV; install it, or viewmend's extra 'video'")
         if self._exporting:
-            return _refusal(409, "another path is being rendered; ask again")
+            return refusal(409, "another path is being rendered; ask again")
         self._exporting = True
         try:
-            body = await _body(request)
+            body = await whole_body(request)
             if body is None:
-                return _refusal(413, f"expected at most {BODY_BYTES} bytes")
+                return refusal(413, f"expected at most {BODY_BYTES} bytes")
             # On a thread: a megabyte of JSON takes its time.
             job = PathJob(await asyncio.to_thread(parse_path, body, self._config.limits))
             self._film = job
             video = await self._wait(request, job, EXPORT_S)
         except (TimeoutError, RuntimeError) as error:
-            return _refusal(503, str(error) or "the path took too long; ask for fewer poses")
+            return refusal(503, str(error) or "the path took too long; ask for fewer poses")
         finally:
             self._exporting, self._film = False, None
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
+
+    async def _film_file(self, request: Request) -> Response:
+        if self._broadcast is None:
+            return refusal(404, "this server does not broadcast; start it with --broadcast")
+        return await film_answer(self._broadcast, request)
 
     async def _wait(self, request: Request, job: RenderJob[Result], limit_s: float) -> Result:
         """The job's result. A job is given up when its client goes."""
@@ -219,9 +239,9 @@ class LiveServer:
     async def _welcome(self, socket: WebSocket) -> bool:
         """Whether a socket may be accepted; a foreign page's, or one without the token, is refused in its handshake."""
         if foreign := self._guard.foreign_origin(socket):
-            await socket.send_denial_response(_refusal(403, foreign))
+            await socket.send_denial_response(refusal(403, foreign))
         elif await self._guard.lacks_token(socket):
-            await socket.send_denial_response(_refusal(401, TOKEN_WANTED))
+            await socket.send_denial_response(refusal(401, TOKEN_WANTED))
         else:
             return True
         return False
@@ -239,7 +259,7 @@ class LiveServer:
         if not isinstance(supply, PushedFrames) or self._pushing:
             shows = "reads its own cameras" if supply.span.live else "shows a recording"
             reason = "another rig is pushing" if self._pushing else f"this server {shows}; start viewmend serve live"
-            await socket.send_denial_response(_refusal(409, reason))
+            await socket.send_denial_response(refusal(409, reason))
             return
         self._pushing = True
         try:
@@ -251,27 +271,3 @@ class LiveServer:
         finally:
             self._pushing = False
             supply.lost()
-
-
-async def _body(request: Request) -> bytearray | None:
-    """The request's body; None where it is too large.
-
-    Raises:
-        ProtocolError: it takes too long, or breaks off.
-    """
-    body = bytearray()
-    try:
-        async with asyncio.timeout(BODY_S):
-            async for chunk in request.stream():
-                body += chunk
-                if len(body) > BODY_BYTES:
-                    return None
-    except TimeoutError:
-        raise ProtocolError(f"expected the whole body within {BODY_S:g} s") from None
-    except ClientDisconnect:
-        raise ProtocolError("expected the whole body, got a part of it") from None
-    return body
-
-
-def _refusal(status: int, message: str | None) -> Response:
-    return JSONResponse({"error": message}, status, headers={"Cache-Control": "no-store"})

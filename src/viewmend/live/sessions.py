@@ -123,6 +123,11 @@ class ViewerSession:
         self._look, self._look_at = look, time.monotonic()
         self._wants_key_frame = self._wants_key_frame or look.key
 
+    @property
+    def newest_look(self) -> Look | None:
+        """What the viewer wants to see; None before it said."""
+        return self._look
+
     def change(self, change: ClockChange, span: Span) -> None:
         """Play, pause, seek, change speed, or follow the edge."""
         self.clock.change(change, span)
@@ -221,13 +226,16 @@ class ViewerSession:
         key_frame, self._wants_key_frame = self._wants_key_frame, False
         info = FrameInfo(next(self._frame_numbers), self._full, self._wait_ms, self.dropped, key_frame)
         message, times = frame_message(look, request, result, info, self._encoders)
-        now = time.monotonic()
-        self.recent.append(SentFrame(now, times, len(message)))
-        if self.budget is not None:
-            self.budget.record(replace(self.drawn, scale=self.drawn.scale * self._enlarged(look)), times)
-        self.in_flight, self.in_flight_since = info.frame, now
+        self._learn(look, times, len(message))
+        self.in_flight, self.in_flight_since = info.frame, time.monotonic()
         self._deliver(message)
         return times
+
+    def _learn(self, look: Look, times: FrameTimes, size_bytes: int) -> None:
+        """Remember what a view took."""
+        self.recent.append(SentFrame(time.monotonic(), times, size_bytes))
+        if self.budget is not None:
+            self.budget.record(replace(self.drawn, scale=self.drawn.scale * self._enlarged(look)), times)
 
     def fail(self, message: str) -> None:
         """Report it once; the same view is not tried again, the next one is."""

@@ -14,6 +14,7 @@ import { Layout } from "./ui/layout.js";
 import { MODES, buildModes, placeDivider } from "./ui/modes.js";
 import { Original } from "./ui/original.js";
 import { Notices } from "./ui/notices.js";
+import { OnAir } from "./ui/on_air.js";
 import { PathPanel } from "./ui/paths.js";
 import { Statistics } from "./ui/statistics.js";
 import { buildTools, screenshot } from "./ui/tools.js";
@@ -45,6 +46,7 @@ class Page {
     this.connection = new Connection(token, ["jpeg"]);
     this.link = new ViewerLink(this.connection);
     this.notices = new Notices(() => this.connection.open());
+    this.onAir = new OnAir(this.link, this.notices, token);
     this.statistics = new Statistics();
     this.transport = new Transport(this.link, timeOf(query.get("time")));
     this.place = new Place();

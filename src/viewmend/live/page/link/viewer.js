@@ -49,6 +49,11 @@ export class ViewerLink extends EventTarget {
     return true;
   }
 
+  /** Show all who watch what is looked at here. @param {boolean} on */
+  onAir(on) {
+    this.connection.send({ type: "on_air", on });
+  }
+
   /** @param {{playing?: boolean, speed?: number, seek?: number, live?: boolean}} clock */
   clock(clock) {
     this.connection.send({ type: "clock", ...clock });
