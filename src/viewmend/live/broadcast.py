@@ -9,6 +9,7 @@ from collections import Counter
 from msgspec.structs import replace
 
 from viewmend.geometry.threads import light_operations
+from viewmend.inpainting.protocol import State
 from viewmend.live.film_segments import PLAYLIST, FilmSegments
 from viewmend.live.pictures import Picture, picture
 from viewmend.live.protocol import Camera, FrameTimes, Look
@@ -53,7 +54,7 @@ class BroadcastSession(ViewerSession):
         """Take the picture, and learn from what it took."""
         start, look = time.perf_counter(), self._shown[0]
         assert look is not None, "views are rendered for those who look"
-        self.viewer = result.viewer
+        self.viewer: State | None = result.viewer
         completed, hulls = next(result.eyes)
         with light_operations():
             self.picture = picture(completed, look.modes[0], look.background, hulls)
