@@ -30,12 +30,12 @@ VIEWERS = (1, 2, 4, 8)
 
 
 @contextlib.contextmanager
-def served(size: tuple[int, int], budget_ms: float | None, device: str, model: str):
-    """The address of a server whose frames are all made."""
-    config = StudioConfig(seed=SEED, cameras=CAMERAS, frames=FRAMES, size_px=size, fps=FPS)
-    supply = ReadAhead(lambda: Studio(config), generated=True)
+def served(size: tuple[int, int], budget_ms: float | None, device: str, model: str, **config: object):
+    """The address of a server whose frames are all made, and its service; `config` as `ServerConfig` has it."""
+    scene = StudioConfig(seed=SEED, cameras=CAMERAS, frames=FRAMES, size_px=size, fps=FPS)
+    supply = ReadAhead(lambda: Studio(scene), generated=True)
     renderer = Renderer(supply, load_inpainter(model, device), device=device)
-    service, settings = RenderService(renderer, supply), ServerConfig(port=0, budget_ms=budget_ms)
+    service, settings = RenderService(renderer, supply), ServerConfig(port=0, budget_ms=budget_ms, **config)
     server = Server(LiveServer(service, settings), settings)
     with server.bound() as url:
         thread = threading.Thread(target=server.run_bound)
