@@ -86,8 +86,10 @@ def test_who_watches_sees_what_the_viewer_on_air_looks_at(on_air):
         told(first, on_air=False)
         shown(on_air, ground(GREEN))
         first.frame(first.look(width=48, height=48, background=RED))
+        second.look(width=48, height=48, background=GREEN, moving=True)
         second.on_air(False)
         told(second, on_air=False)
+        assert on_air.live._broadcast._session.newest_look.moving is False
     picture = shown(on_air, lambda picture: True)  # the last view stays, whoever has gone
     assert ground(GREEN)(picture) and not ground(GREEN)(picture[22:, 38:])
 

@@ -41,7 +41,7 @@ class BroadcastSession(ViewerSession):
         """Show what somebody looks at, in the film's size."""
         width, height = self._size_px
         shown = replace(look, camera=centred(look), eyes=None, modes=look.modes[:1], width=width, height=height)
-        super().look(replace(shown, scale=1.0, depth=False))
+        super().look(replace(shown, scale=1.0, depth=False, moving=False))  # whoever leaves in mid-move leaves it at rest
 
     def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The newest look at the edge."""
@@ -117,7 +117,8 @@ class Broadcast:
             if not self._stopped.is_set() and (self._thread is None or not self._thread.is_alive()):
                 self._thread = threading.Thread(target=self._run, name="broadcast", daemon=True)
                 self._thread.start()
-        content = self._film and self._film.file(name)
+        film = self._film  # which its thread may take away meanwhile
+        content = film and film.file(name)
         if content:
             self.counts.update({"playlists" if name == PLAYLIST else "segments": 1, "bytes": len(content)})
         return content
