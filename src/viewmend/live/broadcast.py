@@ -41,7 +41,7 @@ class BroadcastSession(ViewerSession):
         """Show what somebody looks at, in the film's size."""
         width, height = self._size_px
         shown = replace(look, camera=centred(look), eyes=None, modes=look.modes[:1], width=width, height=height)
-        super().look(replace(shown, scale=1.0, depth=False, moving=False))  # whoever leaves in mid-move leaves it at rest
+        super().look(replace(shown, scale=1.0, depth=False, moving=False))  # who leaves, rests
 
     def next_request(self, now: float, playback: Playback) -> RenderRequest | None:
         """The newest look at the edge."""
