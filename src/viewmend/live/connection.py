@@ -115,7 +115,8 @@ class ViewerConnection:
             pass
         finally:
             self._service.leave(self._session)
-            self._go_on_air(False)
+            with self._service.lock:
+                self._go_on_air(False)
             if self._session in self._registry.sessions:
                 self._registry.sessions.remove(self._session)
 

@@ -128,14 +128,16 @@ class LiveServer:
         return checked
 
     async def _page(self, request: Request) -> Response:
-        file = self._files.get(request.path_params.get("name", "index.html"))
+        return self._page_file(request.path_params.get("name", "index.html"))
+
+    async def _watch(self, request: Request) -> Response:
+        return self._page_file("watch.html")
+
+    def _page_file(self, name: str) -> Response:
+        file = self._files.get(name)
         if file is None:
             return refusal(404, "there is no such file of the page")
         return Response(file.content, media_type=file.media_type, headers=HEADERS)
-
-    async def _watch(self, request: Request) -> Response:
-        request.path_params["name"] = "watch.html"
-        return await self._page(request)
 
     async def _health(self, request: Request) -> Response:
         source = self.registry.source_json()

@@ -37,7 +37,6 @@ export class SegmentPlayer {
 
   stop() {
     this.stopped = true;
-    URL.revokeObjectURL(this.video.src);
   }
 
   async #run() {
@@ -57,7 +56,7 @@ export class SegmentPlayer {
       await this.#append(await bytes(name));
       this.last = name;
     }
-    this.#follow();
+    await this.#follow();
   }
 
   /** @param {Uint8Array} init */
@@ -87,12 +86,12 @@ export class SegmentPlayer {
   }
 
   /** Stay near the end, and let go of what was shown. */
-  #follow() {
+  async #follow() {
     const { video, buffer } = this;
     if (!buffer?.buffered.length) return;
     const [start, end] = [buffer.buffered.start(0), buffer.buffered.end(buffer.buffered.length - 1)];
     if (video.currentTime < start || end - video.currentTime > TOO_LATE_S) video.currentTime = Math.max(start, end - BEHIND_S);
-    if (video.currentTime - start > KEPT_S) void this.#change((own) => own.remove(start, video.currentTime - KEPT_S / 2));
+    if (video.currentTime - start > KEPT_S) await this.#change((own) => own.remove(start, video.currentTime - KEPT_S / 2));
   }
 }
 
