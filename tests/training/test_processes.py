@@ -37,9 +37,22 @@ train(recipe, Path(sys.argv[2]))
 """
 
 
-def started(out, steps, shards, streams=1, launcher=()):
+LAST = """
+import sys, time
+from pathlib import Path
+from viewmend.training.processes import processes
+with processes() as own:
+    if own.first:
+        time.sleep(1)
+        Path(sys.argv[2]).mkdir()
+assert Path(sys.argv[2]).is_dir()
+"""
+TORCHRUN = ("-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone")  # on any free port
+
+
+def started(out, steps, shards, streams=1, launcher=(), text=SCRIPT):
     script = out.with_suffix(".py")
-    script.write_text(SCRIPT)
+    script.write_text(text)
     here = str(Path(__file__).parent)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "JAXTYPING_DISABLE": "1"}
     command = [sys.executable, *launcher, str(script), here, str(out), str(steps), str(streams), str(shards)]
@@ -65,9 +78,8 @@ def test_a_killed_run_goes_on_from_a_whole_checkpoint(shards, tmp_path):
 
 
 def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, tmp_path):
-    torchrun = ("-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone")  # on any free port
     assert started(tmp_path / "one", 4, shards, streams=2).wait() == 0
-    two = started(tmp_path / "two", 4, shards, launcher=torchrun)
+    two = started(tmp_path / "two", 4, shards, launcher=TORCHRUN)
     assert two.wait() == 0, (tmp_path / "two.log").read_text()[-3000:]
     one, two = (load_file(tmp_path / n / "model.safetensors") for n in ("one", "two"))
     for key in one:
@@ -75,3 +87,7 @@ def test_two_processes_make_the_loss_curve_of_one_with_the_double_batch(shards, 
     curves = [[e["losses"]["total"] for e in log_of(tmp_path / n)] for n in ("one", "two")]
     assert curves[0] == pytest.approx(curves[1], rel=1e-4)
     assert len(set(curves[0])) == 4
+
+
+def test_processes_leave_together(tmp_path):
+    assert started(tmp_path / "made", 0, "", launcher=TORCHRUN, text=LAST).wait() == 0, "one left before the other"

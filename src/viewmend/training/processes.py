@@ -61,7 +61,7 @@ class Processes:
 
 @contextmanager
 def processes() -> Iterator[Processes]:
-    """This process's place; joins the others when torchrun started it, and leaves them at the end."""
+    """This process's place; joins the others when torchrun started it, and leaves when all are done."""
     count = int(os.environ.get("WORLD_SIZE", "1"))
     rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
     device = torch.device("cuda", local) if torch.cuda.is_available() else torch.device("cpu")
@@ -73,5 +73,7 @@ def processes() -> Iterator[Processes]:
     torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
     try:
         yield Processes(rank, count, device)
+        # What gloo's threads still hold of the last tensors would abort a process that ends at once: all end together.
+        torch.distributed.barrier()
     finally:
         torch.distributed.destroy_process_group()
