@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import pytest
 
+from viewmend.baselines.published import NETWORKS
 from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
 from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
 from viewmend.inpainting.config import small as small_model
 from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.training.recipes import RECIPES
 from viewmend.training.sample_files import read_shard
 
 MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
@@ -30,6 +32,13 @@ def model(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models") / "tiny"
     save_inpainter(build(MODEL), folder, "# tiny\n")
     return folder
+
+
+def test_the_help_names_every_recipe(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    words = set(capsys.readouterr().out.replace(",", " ").replace(";", " ").replace(".", " ").split())
+    assert words >= {*RECIPES, *NETWORKS}
 
 
 def test_fine_tuning_on_a_capture_of_ones_own_goes_on_from_a_model(capture, model, tmp_path, capsys):

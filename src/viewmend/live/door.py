@@ -184,7 +184,10 @@ class HttpDoor(H11Protocol, Visitor):
         """An answer is out. No request can follow one that goes on after its answer: the other side is told so."""
         super().on_response_complete()
         if self._is_answered_early and not self.gone:
-            self.transport.write_eof()
+            try:
+                self.transport.write_eof()
+            except OSError:  # the other side has just gone
+                self.transport.abort()
 
     def send_400_response(self, msg: str) -> None:
         """What came is no HTTP. The request that it was the rest of, if any, gets no other answer."""
