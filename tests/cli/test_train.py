@@ -35,8 +35,7 @@ def model(tmp_path_factory):
 
 
 def test_the_help_names_every_recipe(capsys):
-    with pytest.raises(SystemExit):
-        main(["train", "--help"])
+    assert main(["train", "--help"]) == 0
     words = set(capsys.readouterr().out.replace(",", " ").replace(";", " ").replace(".", " ").split())
     assert words >= {*RECIPES, *NETWORKS}
 
