@@ -7,6 +7,7 @@ import torch
 from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextFrame
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.inpainting.network import Network
 from viewmend.inpainting.patch_transformer import PatchTransformer, Prediction
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State
@@ -38,6 +39,7 @@ class Chain(Network):
         contexts: Sequence[Sequence[ContextFrame | ContextViews]],
         ray_views: Sequence[ContextViews | None] | None = None,
         top_k: int | None = None,
+        matches: Sequence[Correspondences | None] = (),
     ) -> list[Prediction]:
         """One prediction per view. Gradients reach every parameter.
 
@@ -46,9 +48,10 @@ class Chain(Network):
             contexts: of each view, as in `PatchTransformer.refine`.
             ray_views: what the cameras close to each view see at its time, for `RayBlendNet`; None without.
             top_k: context tokens that survive pruning; None takes the config's.
+            matches: as in `PatchTransformer.refine`.
         """
         coarse = self.coarse(views, ray_views or [None] * len(views))
-        return self.patches.refine(views, coarse, contexts, top_k)
+        return self.patches.refine(views, coarse, contexts, top_k, matches)
 
     def encode_past(self, view: IncompleteView, context: ContextProvider) -> None:
         """The patch transformer's."""

@@ -11,6 +11,7 @@ from viewmend.inpainting.assembly import Target, assemble
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextFrame, window_times
 from viewmend.inpainting.coordinates import lift, patch_depths
+from viewmend.inpainting.correspondences import AttentionGuide, Correspondences, sought_keys
 from viewmend.inpainting.decoder import Decoder, blend
 from viewmend.inpainting.encoder import RECEPTIVE_RADIUS_PX
 from viewmend.inpainting.identity_init import identity_init
@@ -47,6 +48,8 @@ class Prediction:
     """Fhat = E Ftilde + (1 - E) F, not clamped; F, upon black, bit for bit where E is 0."""
     alpha: Float[Tensor, "height width"] | None
     """What is not background of a view upon white: M, and all of E that was painted. None upon black, where it is M."""
+    missed: Float[Tensor, ""] | None = None
+    """How far attention is from true correspondences (`AttentionGuide.missed`); None without any."""
 
     @property
     def upon_own(self) -> Float[Tensor, "3 height width"]:
@@ -96,9 +99,10 @@ class PatchTransformer(Network):
         contexts: Sequence[Sequence[ContextFrame | ContextViews]],
         ray_views: Sequence[ContextViews | None] | None = None,
         top_k: int | None = None,
+        matches: Sequence[Correspondences | None] = (),
     ) -> list[Prediction]:
         """`refine` upon the views as they are; `ray_views` are for those that look along rays, and not looked at."""
-        return self.refine(views, [view.rgb for view in views], contexts, top_k)
+        return self.refine(views, [view.rgb for view in views], contexts, top_k, matches)
 
     def refine(
         self,
@@ -106,6 +110,7 @@ class PatchTransformer(Network):
         coarse: Sequence[Float[Tensor, "3 _h _w"]],
         contexts: Sequence[Sequence[ContextFrame | ContextViews]],
         top_k: int | None = None,
+        matches: Sequence[Correspondences | None] = (),
     ) -> list[Prediction]:
         """One prediction per view from its own context. Gradients reach every parameter.
 
@@ -115,6 +120,7 @@ class PatchTransformer(Network):
             contexts: encoded frames of each view, any number, and camera images, which are encoded first, all in one
                 batch. Images of times and cameras that `step` would not look at are passed over.
             top_k: context tokens that survive pruning; None takes the config's.
+            matches: what attention should look at, of each view, or nothing.
 
         Raises:
             ValueError: there is not one context for each view.
@@ -125,10 +131,12 @@ class PatchTransformer(Network):
         targets = self._encode_targets(views, coarse)
         asking = [i for i, target in enumerate(targets) if bool(target.incomplete.any())]
         patches: dict[int, Tensor] = {}
+        missed: dict[int, Tensor | None] = {}
         if asking:
-            decoded = self._decode([targets[i] for i in asking], [frames[i] for i in asking], top_k)
-            patches = dict(zip(asking, decoded, strict=True))
-        return [_prediction(target, patches.get(i), self.config) for i, target in enumerate(targets)]
+            wanted = [matches[i] if matches else None for i in asking]
+            decoded, found = self._decode([targets[i] for i in asking], [frames[i] for i in asking], top_k, wanted)
+            patches, missed = dict(zip(asking, decoded, strict=True)), dict(zip(asking, found, strict=True))
+        return [_prediction(target, patches.get(i), self.config, missed.get(i)) for i, target in enumerate(targets)]
 
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view (section 9); a view without holes comes back at once."""
@@ -197,17 +205,23 @@ class PatchTransformer(Network):
         ]
 
     def _decode(
-        self, targets: Sequence[Target], contexts: Sequence[Sequence[ContextFrame]], top_k: int | None
-    ) -> list[Float[Tensor, "patch output 28 28"]]:
-        """The decoder's patches for each target's incomplete patches."""
+        self,
+        targets: Sequence[Target],
+        contexts: Sequence[Sequence[ContextFrame]],
+        top_k: int | None,
+        matches: Sequence[Correspondences | None],
+    ) -> tuple[list[Float[Tensor, "patch output 28 28"]], list[Tensor | None]]:
+        """The decoder's patches for each target's incomplete patches, and what attention missed of its matches."""
         with self.autocast():
             own = [self.transformer.project_context(t.tokens[~t.incomplete]) for t in targets]
         batch = assemble(targets, contexts, own, self.config)
         top_k = self.config.top_k if top_k is None else top_k
+        guide = _guide(targets, contexts, matches, (batch.at.present.shape[1], batch.context_at.present.shape[1]))
         with self.autocast():
-            tokens = self.transformer(batch.queries, batch.at, batch.keys_values, batch.context_at, top_k)
+            tokens = self.transformer(batch.queries, batch.at, batch.keys_values, batch.context_at, top_k, guide)
             decoded = self.decoder(tokens[batch.at.present], torch.cat([_pixels(t) for t in targets]))
-        return list(decoded.float().split([int(t.incomplete.sum()) for t in targets]))
+        patches = decoded.float().split([int(t.incomplete.sum()) for t in targets])
+        return list(patches), [None] * len(targets) if guide is None else guide.missed
 
 
 def _context_frames(
@@ -239,8 +253,28 @@ def _context_frames(
     return tuple(frames)
 
 
+def _guide(
+    targets: Sequence[Target],
+    contexts: Sequence[Sequence[ContextFrame]],
+    matches: Sequence[Correspondences | None],
+    size: tuple[int, int],
+) -> AttentionGuide | None:
+    """What so many queries should find among so many keys; None where no target has any match."""
+    if all(own is None for own in matches):
+        return None
+    sought = torch.zeros(len(targets), *size, dtype=torch.bool, device=targets[0].tokens.device)
+    for n, (target, frames, own) in enumerate(zip(targets, contexts, matches, strict=True)):
+        if own is not None:
+            found = sought_keys(own, target.places[target.incomplete], frames)
+            sought[n, : found.shape[0], : found.shape[1]] = found
+    return AttentionGuide(sought)
+
+
 def _prediction(
-    target: Target, patches: Float[Tensor, "patch output 28 28"] | None, config: InpainterConfig
+    target: Target,
+    patches: Float[Tensor, "patch output 28 28"] | None,
+    config: InpainterConfig,
+    missed: Float[Tensor, ""] | None,
 ) -> Prediction:
     """Patches back in their places, blended, and the view completed; without patches it stays as it is."""
     view = target.view
@@ -253,7 +287,7 @@ def _prediction(
     if len(merged[0]) > 3:
         inpainted = torch.lerp(target.shown[:3] * coverage, inpainted, merged[0, 3])
     completed = blend(view.rgb, view.error, inpainted, coverage[0], clamp=False)
-    return Prediction(inpainted, coverage[0], target.shown[:3], completed, alpha)
+    return Prediction(inpainted, coverage[0], target.shown[:3], completed, alpha, missed)
 
 
 def _pixels(target: Target) -> Float[Tensor, "patch channel 28 28"]:

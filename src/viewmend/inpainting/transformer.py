@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from viewmend.inpainting import rope
 from viewmend.inpainting.attention import attend, attend_and_sum, attend_weighted
 from viewmend.inpainting.config import InpainterConfig
+from viewmend.inpainting.correspondences import AttentionGuide
 from viewmend.inpainting.pruning import most_attended, straight_through
 
 PRIOR_SPACE = (1.0, 2.0)
@@ -104,8 +105,12 @@ class Transformer(nn.Module):
         keys_values: Float[Tensor, "block 2 sample key dim"],
         context_at: TokenPositions,
         top_k: int | None,
+        guide: AttentionGuide | None = None,
     ) -> Float[Tensor, "sample query dim"]:
-        """The input tokens after all blocks; only they change."""
+        """The input tokens after all blocks; only they change.
+
+        A guide sees what the last group's first block looks at: all keys, by queries that have looked around before.
+        """
         rotations = _Rotations(self, at, context_at)
         count = keys_values.shape[3]
         prune = top_k is not None and top_k < count
@@ -118,6 +123,8 @@ class Transformer(nn.Module):
                 KV = rearrange(keys_values[number], "two b n (h c) -> two b h n c", h=self.config.heads)
                 Q = rearrange(block.query(block.norm_query(tokens)), "b n (h c) -> b h n c", h=self.config.heads)
                 Q = rotations.query(Q)
+                if guide is not None and number == self.config.total_blocks - self.config.blocks:
+                    guide.look(Q, rotations.context(KV, None)[0], context_at.present, self.scale)
                 if number == first and prune and self.config.blocks > 1:
                     assert top_k is not None
                     K, V, present = rotations.context(KV, None)

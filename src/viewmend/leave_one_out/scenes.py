@@ -1,14 +1,15 @@
 """The leave-one-out data set: what a rig without one of its cameras saw, and what that camera saw."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.leave_one_out.true_visibility import SurfaceSeen
 from viewmend.views import MultiViewFrame
 
@@ -42,6 +43,9 @@ class LeaveOneOut:
     """cameras(held): the rig's calibration as it is known without that camera's image; None where it is the frames'."""
     true_view: Callable[[str, int], MultiViewFrame] | None = None
     """true_view(held, time): what that camera should have seen; None where its own image is the truth."""
+    correspondences: Callable[[str, Sequence[int], Sequence[str], Bool[Tensor, "_h _w"]], Correspondences] | None = None
+    """correspondences(held, times, names, missing): where these cameras truly saw, at these times, what the missing
+    pixels of that camera show at the first; None where nobody knows."""
 
     def frame(self, held: str, time: int) -> LeaveOneOutFrame:
         """One time without a camera, and its truth."""

@@ -11,8 +11,12 @@ from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.geometry.sampling import in_view
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.leave_one_out.true_motion import VISIBLE_M
 from viewmend.views import MultiViewFrame
+
+MOST_PIXELS = 512
+"""Of so many missing pixels of a view it is told where cameras saw their surface."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +66,44 @@ def surface_seen(surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh
     names, (height, width) = surfaces[times[0]].cameras.names, raster.triangle.shape[1:]
     seen = torch.zeros(len(times), len(names), height, width, dtype=torch.bool, device=pixels.device)
     for n, time in enumerate(times):
-        surface = surfaces[time]
-        points = interpolate(surface.vertices, mesh, target, raster)[0][index]
-        uv, z = project(points, surface.cameras)
-        inside = in_view(uv, z, surface.cameras)
-        column, row = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)
+        points = interpolate(surfaces[time].vertices, mesh, target, raster)[0][index]
+        _, visible = _visible(points, surfaces[time])
         for view in range(len(names)):
-            there = surface.depth[view, row[view], column[view]].float()
-            seen[n, view][index] = inside[view] & (there > 0) & (z[view] - there < VISIBLE_M)
+            seen[n, view][index] = visible[view]
     return SurfaceSeen(names, seen)
+
+
+def true_correspondences(
+    surfaces: Mapping[int, TrueSurface], mesh: Mesh, target: Cameras, missing: Bool[Tensor, "height width"]
+) -> Correspondences:
+    """Where the cameras saw, at all of these times, the surface that some missing pixels of `target` show.
+
+    Args:
+        surfaces: by time; all with the same cameras.
+        mesh: the true surface at the view's own time.
+        target: the view's camera.
+        missing: what to look for; of many pixels, `MOST_PIXELS` or some more, evenly.
+    """
+    raster = rasterize(mesh, target)
+    pixels = torch.nonzero(missing & (raster.triangle[0] >= 0))
+    pixels = pixels[:: max(1, len(pixels) // MOST_PIXELS)]
+    index = tuple(pixels.unbind(1))
+    found = []
+    for time, surface in surfaces.items():
+        points = interpolate(surface.vertices, mesh, target, raster)[0][index]
+        uv, visible = _visible(points, surface)
+        camera, point = torch.nonzero(visible).unbind(1)
+        found.append((pixels[point], camera, torch.full_like(camera, time), uv[camera, point]))
+    names = next(iter(surfaces.values())).cameras.names
+    return Correspondences(names, *(torch.cat(parts) for parts in zip(*found, strict=True)))
+
+
+def _visible(
+    points: Float[Tensor, "point 3"], surface: TrueSurface
+) -> tuple[Float[Tensor, "view point 2"], Bool[Tensor, "view point"]]:
+    """Where points of the surface are in its cameras' images, and whether these see them."""
+    uv, z = project(points, surface.cameras)
+    inside = in_view(uv, z, surface.cameras)
+    column, row = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)
+    there = surface.depth[torch.arange(len(uv), device=uv.device)[:, None], row, column].float()
+    return uv, inside & (there > 0) & (z - there < VISIBLE_M)

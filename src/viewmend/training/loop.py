@@ -130,6 +130,8 @@ class Run:
                 rate = self.recipe.learning_rate * self._rate_factor(step, at)
                 for group in self.optimizer.param_groups:
                     group["lr"] = rate
+                if isinstance(self.objective, Objective):
+                    self.objective.progress = at
                 losses = self._step(step, batches)
                 step += 1
                 pace = schedule.made(step, sum(map(len, batches)) * self.own.count)

@@ -33,15 +33,29 @@ class Objective(nn.Module):
         super().__init__()
         self.model = model
         self.recipe = recipe
+        self.progress = 0.0
+        """How much of the run is over: what is annealed, is by this."""
         patches = model.patches if isinstance(model, Chain) else model
         patches.context_gradients = recipe.context_gradients
 
     def forward(self, batch: list[Sample]) -> StepOutput:
-        """All terms of `batch`."""
+        """All terms of `batch`.
+
+        Raises:
+            ValueError: attention is to be taught, and a sample does not say by what.
+        """
         weights = self.recipe.loss
         views = [sample for last in batch for sample in last.clip]
+        if weights.attention and any(sample.matches is None for sample in views):
+            raise ValueError(
+                "expected samples that say where their context shows what they miss, got one that does not; make "
+                "samples with --matches, or train without --loss.attention"
+            )
         predictions = self.model(
-            [s.view for s in views], [list(s.context) for s in views], ray_views=[s.ray_views for s in views]
+            [s.view for s in views],
+            [list(s.context) for s in views],
+            ray_views=[s.ray_views for s in views],
+            matches=[s.matches for s in views] if weights.attention else (),
         )
         made, counted = [p.inpainted for p in predictions], [p.coverage for p in predictions]
         if weights.outside == "image":
@@ -55,4 +69,7 @@ class Objective(nn.Module):
                 error[n], counted[n] = error[n] * part.inner[0], counted[n] * part.inner[0]
         image = image_loss(made, counted, error, truth, weights.channels)
         total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
+        missed = [p.missed for p in predictions if p.missed is not None]
+        if missed:
+            total = total + weights.attention * (1 - self.progress) * torch.stack(missed).mean()
         return StepOutput(image, total, tuple(p.upon_own for p in predictions))

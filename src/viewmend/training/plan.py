@@ -42,6 +42,8 @@ class DataPlan:
     """So many windows of a sample are learned from, each around something that is missing; 0: whole views."""
     search_px: int = 16
     """How far around where a window reprojects to its context reaches, beyond what the encoder sees."""
+    matches: bool = False
+    """Whether samples of the studio say where their context truly shows what they miss, for `LossWeights.attention`."""
     context: bool = True
     """Whether samples have context; rays alone need none, and are smaller without."""
     least_context: int = 0
@@ -99,6 +101,9 @@ class LossWeights:
     """The paper's objective, or the hinge."""
     discriminator: Literal["image", "clip"] = "image"
     """Whether D judges single images or clips of `DataPlan.clip_length` of them."""
+    attention: float = 0.0
+    """Weight, at the start, of how far one block's attention is from true correspondences, nats; it falls linearly, to
+    nothing at the end. Ours."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,6 +21,7 @@ from viewmend.atomic_writes import HALF, write_atomically
 from viewmend.foreign_input import InputError
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.inpainting.sweep.lookup import Scale
 from viewmend.inpainting.sweep.pyramids import Pyramid, Rig
 from viewmend.training.ray_batches import RayBatch
@@ -30,7 +31,7 @@ from viewmend.training.whole_views import WholeView
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes, WindowPart
 
 PARTS = (Sample, IncompleteView, ContextViews, WindowPart, MultiViewFrame, Silhouettes, Cameras, Bounds, RayBatch)
-STORED = (StoredScene, StoredView, WholeView, Rig, Scale, Pyramid)
+STORED = (StoredScene, StoredView, WholeView, Rig, Scale, Pyramid, Correspondences)
 Trained = Sample | RayBatch | WholeView
 Stored = Trained | StoredScene
 KINDS = {kind.__name__: kind for kind in (*PARTS, *STORED)}

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from viewmend.baselines.classical import Unfilled
 from viewmend.geometry.hull import HullConfig
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.observation import Observation
 from viewmend.rendering.view import RenderConfig
@@ -35,6 +36,8 @@ class Sample:
     """How much of each pixel the subject truly covers, in 255ths; None where nobody knows."""
     depth: Float[Tensor, "height width"] | None = None
     """True z-depth, metres, 0 where there is no surface; None where nobody knows."""
+    matches: Correspondences | None = None
+    """Where the context truly shows what the view misses; None where nobody knows."""
 
     @property
     def clip(self) -> tuple["Sample", ...]:
@@ -99,7 +102,10 @@ class HeldOutCamera:
         assert truth.mask is not None, "what trains has masks"
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
         seen = tuple(c for c in context if c is not None)
-        return Sample(view, seen, ray_views, black.round().to(torch.uint8), alpha=truth.mask[0])
+        matches = None
+        if self.rig.correspondences is not None and times:
+            matches = self.rig.correspondences(self.held, times, wanted, view.error > 0)
+        return Sample(view, seen, ray_views, black.round().to(torch.uint8), alpha=truth.mask[0], matches=matches)
 
 
 def widened(view: IncompleteView, reach_px: int) -> IncompleteView:

@@ -5,9 +5,14 @@ from dataclasses import replace
 from random import Random
 from typing import Protocol, TypeVar, runtime_checkable
 
+from jaxtyping import Bool
+from torch import Tensor
+
 from viewmend.geometry.hull import HullConfig
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, Split, recordings
+from viewmend.leave_one_out.true_visibility import TrueSurface, true_correspondences
 from viewmend.rendering.view import RenderConfig
 from viewmend.studio.imperfections import Imperfections
 from viewmend.studio.stage import Studio, StudioConfig
@@ -64,7 +69,18 @@ class StudioScenes:
             return studio.truth(studio.true_cameras.select([held]), time)
 
         frames = {time: studio.read(time) for time in self.plan.times}
-        return LeaveOneOut(frames, true_view=truth), random
+        if not self.plan.matches:
+            return LeaveOneOut(frames, true_view=truth), random
+        meshes = {time: studio.scene(time).mesh for time in self.plan.times}
+
+        def correspondences(
+            held: str, times: Sequence[int], names: Sequence[str], missing: Bool[Tensor, "height width"]
+        ) -> Correspondences:
+            seen = {t: replace(frames[t], cameras=studio.true_cameras).select(names) for t in times}
+            surfaces = {t: TrueSurface.of(frame, meshes[t]) for t, frame in seen.items()}
+            return true_correspondences(surfaces, meshes[times[0]], studio.true_cameras.select([held]), missing)
+
+        return LeaveOneOut(frames, true_view=truth, correspondences=correspondences), random
 
 
 def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> StudioConfig:

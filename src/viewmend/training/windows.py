@@ -17,6 +17,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, project, unproject
 from viewmend.inpainting.coordinates import reference_depth
+from viewmend.inpainting.correspondences import Correspondences
 from viewmend.inpainting.patches import MARGIN_STEPS, PATCH_PX, STEP_PX
 from viewmend.rendering.crop import Crop
 from viewmend.training.plan import DataPlan
@@ -84,7 +85,27 @@ def window(sample: Sample, middle: tuple[int, int], side_px: int, search_px: int
     )
     truth, alpha = outer.of_image(sample.truth).contiguous(), sample.alpha
     alpha = None if alpha is None else outer.of_image(alpha).contiguous()
-    return Sample(cut, tuple(context), None, truth, alpha=alpha)
+    matches = None if sample.matches is None else _matches_part(sample.matches, sample.context, context, inner, outer)
+    return Sample(cut, tuple(context), None, truth, alpha=alpha, matches=matches)
+
+
+def _matches_part(
+    matches: Correspondences, whole: Sequence[ContextViews], parts: Sequence[ContextViews], inner: Crop, outer: Crop
+) -> Correspondences:
+    """The correspondences of the part of a view, in the parts of its context that show them."""
+    row, column = matches.pixels.unbind(1)
+    within = (row >= inner.top) & (row < inner.bottom) & (column >= inner.left) & (column < inner.right)
+    shown, uv = torch.zeros_like(within), matches.uv_px.clone()
+    cameras_then = {views.frame.time: views.frame.cameras for views in whole}
+    for part in parts:
+        before = cameras_then[part.frame.time]
+        for camera in part.frame.cameras:
+            own = before.select(camera.names)
+            at = (matches.time == part.frame.time) & (matches.camera == matches.names.index(camera.names[0]))
+            uv[at] -= (own.K - camera.K)[0, :2, 2]
+            shown |= at & ((uv >= 0) & (uv < camera.size_px[0])).all(1)
+    moved = replace(matches, pixels=matches.pixels - torch.tensor([outer.top, outer.left]), uv_px=uv)
+    return moved.select(within & shown)
 
 
 def _start(middle: int, side_px: int, size_px: int) -> int:
