@@ -72,8 +72,8 @@ class AttentionGuide:
     def __init__(self, sought: Bool[Tensor, "sample query key"]) -> None:
         self.sought = sought
         self.missed: list[Float[Tensor, ""] | None] = [None] * len(sought)
-        """Of each sample the cross-entropy, nats: -log of the share of attention, the mean of all heads, that sought
-        keys got, the mean of the queries that seek any; None for a sample without."""
+        """Cross-entropy of each sample, nats: -log of the share of attention, the mean of all heads, that sought keys
+        got, the mean of the queries that seek any; None for a sample without."""
 
     def look(
         self,

@@ -16,7 +16,7 @@ from viewmend.leave_one_out.true_motion import VISIBLE_M
 from viewmend.views import MultiViewFrame
 
 MOST_PIXELS = 512
-"""Of so many missing pixels of a view it is told where cameras saw their surface."""
+"""So many missing pixels of a view, or some more, are looked for in the cameras."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Objective(nn.Module):
         if weights.attention and any(sample.matches is None for sample in views):
             raise ValueError(
                 "expected samples that say where their context shows what they miss, got one that does not; make "
-                "samples with --matches, or train without --loss.attention"
+                "samples with --matches, or train without --attention"
             )
         predictions = self.model(
             [s.view for s in views],
