@@ -7,6 +7,7 @@ import torch
 from training.conftest import PLAN, RUN
 from training.test_windows import SEARCH_PX, SIDE_PX, middle, offset_px
 
+from viewmend.inpainting import patch_transformer, transformer
 from viewmend.inpainting.attention import attend
 from viewmend.inpainting.chain import build
 from viewmend.inpainting.config import paper_small
@@ -165,6 +166,26 @@ def test_the_guide_measures_what_attention_misses():
     assert 1 < len(costs) < 4
     torch.testing.assert_close(guide.missed[0], torch.stack(costs).mean())
     assert guide.missed[1:] == [None, None], "nothing is sought; nothing is there"
+
+
+def test_the_guide_sees_what_the_last_groups_first_block_looks_at(cut, monkeypatch):
+    seen, net = [], build(MODEL)
+
+    def recorded(Q, K, V, present, scale):
+        seen.append((Q.detach(), K.detach(), present, scale))
+        return attend(Q, K, V, present, scale)
+
+    monkeypatch.setattr(transformer, "attend", recorded)
+    monkeypatch.setattr(
+        patch_transformer, "AttentionGuide", lambda sought: guides.append(AttentionGuide(sought)) or guides[-1]
+    )
+    guides = []
+    made = net([cut.view], [list(cut.context)], matches=[cut.matches])[0]
+    again = AttentionGuide(guides[0].sought)
+    again.look(*(seen[2][n] for n in (0, 1, 2, 3)))
+    assert len(seen) == 4 and len(guides) == 1 and guides[0].sought.any()
+    torch.testing.assert_close(made.missed.detach(), again.missed[0])
+    assert net([cut.view], [list(cut.context)])[0].missed is None
 
 
 def recipe(**changes) -> Recipe:
