@@ -17,6 +17,7 @@ from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.output_folder import OutputFolder
 from viewmend.training.adversary import Adversary
+from viewmend.training.autoencoder import PARTS, AutoencoderObjective
 from viewmend.training.logs import Log, LossTerms, Progress
 from viewmend.training.model_card import model_card
 from viewmend.training.objective import Objective, StepOutput
@@ -164,6 +165,8 @@ class Run:
         if self.recipe.part == "rays":
             assert isinstance(self.model, Chain), "recipes that train rays have a model that reads them"
             return RaysObjective(self.model, self.recipe)
+        if self.recipe.part == "autoencoder":
+            return AutoencoderObjective(self.model, self.recipe)
         return Objective(self.model, self.recipe)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
@@ -268,7 +271,9 @@ def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | Pa
             )
         model.load_state_dict(model.state_dict() | fitting)
     for name, parameter in model.named_parameters():
-        parameter.requires_grad_(recipe.part == "all" or name.startswith("coarse.") == (recipe.part == "rays"))
+        taught = name.removeprefix("patches.").split(".")[0] in PARTS
+        of_rays = name.startswith("coarse.") == (recipe.part == "rays")
+        parameter.requires_grad_(taught if recipe.part == "autoencoder" else recipe.part == "all" or of_rays)
     set_compute_dtype(model, torch.bfloat16 if recipe.bfloat16 else torch.float32)
     return model
 

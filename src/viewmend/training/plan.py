@@ -162,8 +162,9 @@ class Recipe:
     """Decay of the averaged weights, which are what is shipped."""
     workers: int = 1
     """Processes that make samples, for each that trains."""
-    part: Literal["rays", "patches", "all"] = "all"
-    """What is trained: `RayBlendNet` alone, on the fill that it makes; all but it; or both."""
+    part: Literal["rays", "patches", "all", "autoencoder"] = "all"
+    """What is trained: `RayBlendNet` alone, on the fill that it makes; all but it; both; or the encoder and the
+    decoder alone, on patches of the cameras' images."""
     pixels_per_view: int = 300
     """For the rays alone: missing pixels that are read of each view, at most."""
     augment: bool = False
@@ -194,8 +195,10 @@ class Recipe:
             raise ValueError(
                 f"expected clips of 2 or more to judge, got {self.data.clip_length}; give --clip-length 2 or more"
             )
-        if self.part == "rays" and self.loss.adversarial:
-            raise ValueError("expected no adversarial loss for rays alone, whose pixels are no image")
+        if self.part in ("rays", "autoencoder") and self.loss.adversarial:
+            raise ValueError(f"expected no adversarial loss for {self.part} alone, whose pixels are no image")
+        if self.part == "autoencoder" and self.validate_every:
+            raise ValueError("expected --validate-every 0 for an autoencoder, which fills nothing")
 
 
 @dataclass(frozen=True, kw_only=True)

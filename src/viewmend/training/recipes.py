@@ -119,6 +119,24 @@ def windows(data: DataPlan) -> Recipe:
     return replace(recipe, name="windows", data=plan, new_per_batch=4, replay_size=300, context_gradients=0.2)
 
 
+def autoencoder(data: DataPlan) -> Recipe:
+    """The encoder and the decoder of `paper_small`, on patches of the windows' camera images: for `windows --from`."""
+    return replace(
+        windows(data),
+        name="autoencoder",
+        warmup=60,
+        ema=0.98,
+        part="autoencoder",
+        loss=LossWeights(channels="sum"),
+        minutes=15.0,
+        batch=8,
+        new_per_batch=2,
+        learning_rate=1e-3,
+        context_gradients=1.0,
+        validate_every=0,
+    )
+
+
 def base(data: DataPlan) -> Recipe:
     """The paper's size with all of our additions, rays and patches together; for a data-centre GPU."""
     return replace(
@@ -165,5 +183,6 @@ RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {
     "paper": paper,
     "paper_small": paper_small,
     "windows": windows,
+    "autoencoder": autoencoder,
     "finetune": finetune,
 }
