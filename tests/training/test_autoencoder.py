@@ -74,6 +74,8 @@ def test_a_run_teaches_encoder_and_decoder_alone_and_another_goes_on_from_it(sha
     after = load_network(str(out)).state_dict()
     moved = {name.split(".")[0] for name in after if not torch.equal(before[name], after[name])}
     assert moved == {"tokeniser", "decoder"}
+    card = (out / "README.md").read_text()
+    assert "L1 of patches of camera images; averaged" in card and "holes" not in card
     begun = train(
         replace(recipe(shards, part="all", steps=1, learning_rate=1e-12), name="on"),
         tmp_path / "on",

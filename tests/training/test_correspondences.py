@@ -220,3 +220,4 @@ def test_a_run_tells_how_much_of_it_is_over(cut, tmp_path):
     plan = replace(PLAN, shards=tmp_path / "shards", ray_views=0)
     run = Run(replace(recipe(), data=plan), tmp_path / "run", None, Processes(0, 1, torch.device("cpu")))
     assert [run.objective.progress for _ in run.steps()] == [0.0, 0.25, 0.5, 0.75]
+    assert "holes (section 8), 1 x attention;" in (tmp_path / "run" / "README.md").read_text()

@@ -19,8 +19,11 @@ def model_card(recipe: Recipe, state: RunState) -> str:
             source += (
                 f", and {data.captures_fraction:.0%} of all from {len(data.captures)} captures of the trainer's own"
             )
-    terms = {name: getattr(recipe.loss, name) for name in ("log_error", "adversarial")}
+    terms = {name: getattr(recipe.loss, name) for name in ("log_error", "adversarial", "attention")}
     extra = ", ".join(f"{weight:g} x {name.replace('_', ' ')}" for name, weight in terms.items() if weight)
+    l1 = (
+        "of patches of camera images" if recipe.part == "autoencoder" else "inside and outside of the holes (section 8)"
+    )
     averaged = "; averaged weights" if recipe.ema else ""
     hardware = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{torch.get_num_threads()} CPU threads"
     return f"""# {recipe.name}
@@ -28,6 +31,6 @@ def model_card(recipe: Recipe, state: RunState) -> str:
 Trained by `viewmend train {recipe.name}`: {state.step} steps of {recipe.batch} samples
 x {len(state.positions)} streams in {state.elapsed_s / 60:.0f} minutes, seed {recipe.seed}, part `{recipe.part}`,
 torch {torch.__version__}, {hardware}.
-Loss: L1 inside and outside of the holes (section 8){", " + extra if extra else ""}{averaged}.
+Loss: L1 {l1}{", " + extra if extra else ""}{averaged}.
 Data: {source}; no test seeds, performers or motions.
 """
