@@ -6,6 +6,7 @@ import gc
 import json
 import threading
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -54,16 +55,23 @@ def test_turns_are_given_one_after_the_other_and_newcomers_first(monkeypatch):
 
 def test_who_is_gone_waits_for_no_turn_and_leaves_nothing(monkeypatch):
     monkeypatch.setattr(turns, "PAUSE_S", 1.0)
+    doors, came, made = weakref.WeakSet(), [], HttpDoor.connection_made
+
+    def noted(door, transport):
+        doors.add(door)
+        came.append(time.monotonic())
+        made(door, transport)
+
+    monkeypatch.setattr(HttpDoor, "connection_made", noted)
     with running(token=TOKEN) as server:
         assert still_serves(server)
         for _ in range(30):
             with opened(server) as raw:
                 raw.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 40_000)
         state = server.server.server_state
-        wait_until(lambda: not state.connections)
+        wait_until(lambda: len(came) > 30 and not state.connections)
         assert not state.turns._waiting, "they would have had half a minute of turns"
-        ours = lambda thing: type(thing) is HttpDoor and thing.server_state is state  # noqa: E731
-        wait_until(lambda: gc.collect() is not None and not any(map(ours, gc.get_objects())))
+        wait_until(lambda: gc.collect() is not None and not doors, seconds=60)  # a whole run has millions of objects
 
 
 @pytest.mark.parametrize(
