@@ -1,14 +1,17 @@
 #!/usr/bin/env bash
-# The campaign: samples, then training; both go on where they stopped. RECIPE=views (whole views) or windows (paper_small).
+# The campaign: samples, then training; both go on where they stopped. RECIPE=views (whole views) or windows (paper_small);
+# RECIPE=autoencoder trains what `windows --from` may begin with, on the windows.
 #
 #   RECIPE=views benchmarks/campaign.sh generate DIR PERFORMERS MOTIONS [COUNT]   one core: 2.4 views a second, 2 MB a
-#                                            scene; or 1.3 windows a second, 1.4 MB each
+#                                            scene; or 1.3 windows a second, 1.4 MB each, with correspondences
 #   RECIPE=views benchmarks/campaign.sh train DIR NAME MINUTES [options of viewmend train]
 #
 # One of eight characters and motions is put aside, and never drawn: a validation of one's own may have them.
 set -euo pipefail
 export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MKL_NUM_THREADS=1
 recipe=${RECIPE:-views} task=$1 folder=$2
+shards=shards-${recipe/autoencoder/windows} told=()
+[ "$recipe" != windows ] || told=(--matches)
 shift 2
 mkdir -p "$folder"
 
@@ -28,13 +31,13 @@ generate)
     put_apart "$1" .glb people 3
     put_apart "$2" .bvh motions 5
     cd "$folder"
-    exec viewmend samples "$recipe" --out "shards-$recipe" --count "${3:-10400}" --performers people --motions motions
+    exec viewmend samples "$recipe" --out "$shards" --count "${3:-10400}" --performers people --motions motions "${told[@]}"
     ;;
 train)
     name=$1 minutes=$2
     shift 2
     cd "$folder"
-    exec viewmend train "$recipe" --shards "shards-$recipe" --out "$name" --minutes "$minutes" --workers 0 \
+    exec viewmend train "$recipe" --shards "$shards" --out "$name" --minutes "$minutes" --workers 0 \
         --validation-views 16 "$@"
     ;;
 *)
