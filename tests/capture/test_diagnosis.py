@@ -233,7 +233,8 @@ def exchanged_images(folder):
 
 ODD = {
     "late": (shifted_in_time("image", "mask"), "late by about 2 frames"),
-    "images late": (shifted_in_time("image"), "the images of camera '{}'"),
+    "images late": (shifted_in_time("image"), "the images of camera '{}': late by about 2 frames"),
+    "masks late": (shifted_in_time("mask"), "camera '{}': late by about 2 frames"),
     "half a mask": (half_a_mask, "'{}'"),
     "a wide mask": (lambda f: change_masks(f, lambda m: cv2.dilate(m, np.ones((13, 13))), names_of(f)[3]), "'{}'"),
     "negative": (spoilt_images(lambda image: 255 - image), "do not show what the others see"),

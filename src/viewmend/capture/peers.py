@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from viewmend.capture.finding import Finding
+from viewmend.capture.own_outlines import delay_text, images_out_of_time
 from viewmend.capture.reduction import reduced
-from viewmend.capture.surface_colours import nearest_agreement, surface_of
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct
@@ -27,7 +27,7 @@ TAKES, TAKING_LEFT_OUT = 0.004, 0.06
 and left out from the larger share on: a smaller error costs less than a camera."""
 TOO_LARGE, LARGE_LEFT_OUT = 0.15, 0.3
 """With such a share of its mask outside the others' hull, beyond three times what is usual, it is odd, too."""
-REACH = 3
+REACH = 4
 """Cameras may be late or early by so many frames at most."""
 LATE = 0.008
 """A camera may be late if that much less of its mask lies outside of the others' hull at another time."""
@@ -35,8 +35,6 @@ CANDIDATES = 3
 """So many cameras are tried: the one across the rig looks late, too."""
 WORTH_SHIFTING = 0.002
 """The camera is late if the masks with its own of another time are explained by that much more."""
-IMAGES_NEARER = 0.75
-"""Images are late if those of another time are nearer to the others' colours by this factor."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +121,10 @@ def _odd(text: str, camera: str, leave_out: bool) -> Finding:
 
 
 def late_camera(frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | None) -> tuple[Finding, ...]:
-    """The camera whose masks, or images, of another time go best with the others' of `frames[middle]`; () for none.
+    """The camera whose masks of another time go best with the others' of `frames[middle]`, or whose images are late.
 
-    `frames` follow each other in time. The hull of the others holds the mask of the same time, whatever moves.
+    `frames` follow each other in time. The hull of the others holds the mask of the same time, whatever moves; () if
+    all are in time.
     """
     small = [reduced(frame, LONGEST_PX) for frame in frames]
     there = [name for name in small[middle].cameras.names if all(name in frame.cameras.names for frame in small)]
@@ -143,8 +142,8 @@ def late_camera(frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | 
     if left:
         view = min(left, key=lambda view: left[view])
         if left[view] < _unexplained(small[middle], bounds) - WORTH_SHIFTING:
-            return (_late(f"camera '{there[view]}'", int(outside[:, view].argmin()) - middle, "masks", "files"),)
-    return late_images(small, middle, bounds)
+            return (_late(there[view], int(outside[:, view].argmin()) - middle),)
+    return images_out_of_time(small)
 
 
 def _with_mask_of(frames: Sequence[MultiViewFrame], middle: int, view: int, time: int) -> MultiViewFrame:
@@ -166,29 +165,7 @@ def _unexplained(frame: MultiViewFrame, bounds: Bounds | None) -> float:
     return float(_missed(frame.mask > FOREGROUND, _padded(covered, frame.mask)).nanmean().nan_to_num(1.0))
 
 
-def late_images(frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | None) -> tuple[Finding, ...]:
-    """The camera whose images of another time go best with the others' of `frames[middle]`; () for none."""
-    frame = frames[middle]
-    if frame.mask is None:
-        return ()
-    try:
-        proxy = reconstruct(frame.mask, frame.cameras, bounds, HULL)
-    except ValueError:
-        return ()
-    surface = surface_of(frame, proxy)
-    now, then = surface.colours(frame.rgb), [surface.colours(other.rgb) for other in frames]
-    distances = torch.stack([nearest_agreement(colours, now)[0] for colours in then]).nan_to_num(torch.inf)
-    ratio = (distances.amin(0) / distances[middle]).nan_to_num(1.0)  # of cameras that share nothing: inf / inf
-    view = int(ratio.argmin())
-    usual = distances[middle][distances[middle].isfinite()]
-    if float(ratio[view]) > IMAGES_NEARER or float(distances[middle, view]) < float(usual.median()):
-        return ()
-    name = frame.cameras.names[view]
-    return (_late(f"the images of camera '{name}'", int(distances[:, view].argmin()) - middle, "images", "images"),)
-
-
-def _late(who: str, by: int, what: str, files: str) -> Finding:
+def _late(name: str, by: int) -> Finding:
     """`by` is at which time, from the middle's, what fits is found."""
-    how = "late" if by > 0 else "early"
-    count = f"{abs(by)} frame{'s' if abs(by) > 1 else ''}"
-    return Finding(f"{who}: {how} by about {count}, by when its {what} fit the others'; shift its {files} in time")
+    fit = "its masks fit the others'; shift its files in time"
+    return Finding(f"camera '{name}': {delay_text(by)}, by when {fit}")
