@@ -23,9 +23,9 @@ from viewmend.inpainting.patches import STEP_PX, merge
 from viewmend.inpainting.protocol import ContextProvider
 from viewmend.inpainting.upon_white import UponWhite
 from viewmend.metrics.image_quality import psnr
-from viewmend.training.autoencoder import through_tokens
 from viewmend.training.sample_files import read_shard, shards_of
 from viewmend.training.samples import Sample
+from viewmend.training.through_tokens import through_tokens
 from viewmend.training.true_images import true_image
 
 

@@ -11,13 +11,14 @@ from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.config import paper_small
 from viewmend.inpainting.images import context_images
-from viewmend.training.autoencoder import AutoencoderObjective, through_tokens
+from viewmend.training.autoencoder import AutoencoderObjective
 from viewmend.training.loop import Run, train
 from viewmend.training.losses import LEAST_SQUARE
 from viewmend.training.plan import LossWeights, Recipe
 from viewmend.training.processes import Processes
 from viewmend.training.recipes import RECIPES
 from viewmend.training.sample_files import read_shard
+from viewmend.training.through_tokens import through_tokens
 
 MODEL = replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2)
 PLAIN = LossWeights(channels="sum")

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 class Options:
     """Train a model: viewmend train RECIPE --out DIR [--from MODEL] [options].
 
-    RECIPE is small (the default), small_rays, views, base, paper, paper_small, windows, autoencoder or finetune; or a
-    published network's, to fine-tune it: dstt, fuseformer, e2fgvi, e2fgvi-hq. Every value of the recipe is an option;
-    defaults are the recipe's. DIR gets the averaged weights, a log, pictures, and what it takes to go on: the same
-    command goes on with a run that was stopped, at any moment and in any way. Under torchrun the same command uses many
-    processes and machines.
+    RECIPE is small (the default), small_rays, views, base, paper, paper_small, windows, autoencoder, copies or
+    finetune; or a published network's, to fine-tune it: dstt, fuseformer, e2fgvi, e2fgvi-hq. Every value of the
+    recipe is an option; defaults are the recipe's. DIR gets the averaged weights, a log, pictures, and what it
+    takes to go on: the same command goes on with a run that was stopped, at any moment and in any way. Under
+    torchrun the same command uses many processes and machines.
     """
 
     recipe: Annotated[Recipe, FLAT]

@@ -175,7 +175,7 @@ class PatchTransformer(Network):
         self, views: Sequence[IncompleteView], contexts: Sequence[Sequence[ContextFrame | ContextViews]]
     ) -> list[list[ContextFrame]]:
         """The contexts, what of them is images encoded in one batch."""
-        contexts = [self._looked_at(*own) for own in zip(views, contexts, strict=True)]
+        contexts = [self.looked_at(*own) for own in zip(views, contexts, strict=True)]
         images = [item for context in contexts for item in context if isinstance(item, ContextViews)]
         encoded = iter(self.encode_contexts(images))
         return [
@@ -183,10 +183,10 @@ class PatchTransformer(Network):
             for context in contexts
         ]
 
-    def _looked_at(
+    def looked_at(
         self, view: IncompleteView, context: Sequence[ContextFrame | ContextViews]
     ) -> list[ContextFrame | ContextViews]:
-        """The context without images of times and cameras that are not the config's."""
+        """The context without images of times and cameras that are not the config's: what `step` would look at."""
         names, times = self.context_names(view), window_times(view.time, self.config)
         kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
         return [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]

@@ -18,6 +18,7 @@ from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.output_folder import OutputFolder
 from viewmend.training.adversary import Adversary
 from viewmend.training.autoencoder import PARTS, AutoencoderObjective
+from viewmend.training.copies import CopyingObjective
 from viewmend.training.logs import Log, LossTerms, Progress
 from viewmend.training.model_card import model_card
 from viewmend.training.objective import Objective, StepOutput
@@ -34,6 +35,12 @@ from viewmend.training.validation import Validation
 NETWORKS = (Chain, PatchTransformer)
 MADE = ("model.safetensors", "config.json", "README.md", "log.jsonl", "validation-*.png", "not-finite-*", "tensorboard")
 """What a run writes besides itself, and another may have lying there."""
+OBJECTIVES: dict[str, Callable[..., nn.Module]] = {
+    "rays": RaysObjective,
+    "autoencoder": AutoencoderObjective,
+    "copies": CopyingObjective,
+}
+"""What teaches parts otherwise than by the paper's objective."""
 
 
 def train(
@@ -162,12 +169,7 @@ class Run:
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
         """A module whose call on a batch of samples is an `StepOutput`."""
         assert isinstance(self.model, NETWORKS)
-        if self.recipe.part == "rays":
-            assert isinstance(self.model, Chain), "recipes that train rays have a model that reads them"
-            return RaysObjective(self.model, self.recipe)
-        if self.recipe.part == "autoencoder":
-            return AutoencoderObjective(self.model, self.recipe)
-        return Objective(self.model, self.recipe)
+        return OBJECTIVES.get(self.recipe.part, Objective)(self.model, self.recipe)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         recipe = self.recipe

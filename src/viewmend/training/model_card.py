@@ -19,7 +19,7 @@ def model_card(recipe: Recipe, state: RunState) -> str:
             source += (
                 f", and {data.captures_fraction:.0%} of all from {len(data.captures)} captures of the trainer's own"
             )
-    terms = {name: getattr(recipe.loss, name) for name in ("log_error", "adversarial", "attention")}
+    terms = {name: getattr(recipe.loss, name) for name in ("log_error", "adversarial", "attention", "autoencoder")}
     extra = ", ".join(f"{weight:g} x {name.replace('_', ' ')}" for name, weight in terms.items() if weight)
     l1 = (
         "of patches of camera images" if recipe.part == "autoencoder" else "inside and outside of the holes (section 8)"

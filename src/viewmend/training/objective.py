@@ -1,5 +1,6 @@
 """The objective of section 8 as a module, so that gradients of many processes meet in its backward pass."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -7,11 +8,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.inpainting.chain import Chain
+from viewmend.inpainting.context import ContextFrame
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.training.losses import ImageLoss, image_loss
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
+from viewmend.training.through_tokens import encode_and_decode
 from viewmend.training.true_images import true_image
+from viewmend.views import ContextViews
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,12 @@ class Objective(nn.Module):
         self.recipe = recipe
         self.progress = 0.0
         """How much of the run is over: what is annealed, is by this."""
-        patches = model.patches if isinstance(model, Chain) else model
-        patches.context_gradients = recipe.context_gradients
+        self.patches.context_gradients = recipe.context_gradients
+
+    @property
+    def patches(self) -> PatchTransformer:
+        """What attends and decodes."""
+        return self.model.patches if isinstance(self.model, Chain) else self.model
 
     def forward(self, batch: list[Sample]) -> StepOutput:
         """All terms of `batch`.
@@ -51,9 +59,14 @@ class Objective(nn.Module):
                 "expected samples that say where their context shows what they miss, got one that does not; make "
                 "samples with --matches, or train without --attention"
             )
+        contexts: Sequence[Sequence[ContextFrame | ContextViews]] = [s.context for s in views]
+        kept = None
+        if weights.autoencoder:
+            looked_at = [self.patches.looked_at(s.view, s.context) for s in views]
+            contexts, kept = encode_and_decode(self.patches, looked_at, weights.channels)
         predictions = self.model(
             [s.view for s in views],
-            [list(s.context) for s in views],
+            contexts,
             ray_views=[s.ray_views for s in views],
             matches=[s.matches for s in views] if weights.attention else (),
         )
@@ -72,4 +85,6 @@ class Objective(nn.Module):
         missed = [p.missed for p in predictions if p.missed is not None]
         if missed:
             total = total + weights.attention * (1 - self.progress) * torch.stack(missed).mean()
+        if kept is not None:
+            total = total + weights.autoencoder * kept
         return StepOutput(image, total, tuple(p.upon_own for p in predictions))

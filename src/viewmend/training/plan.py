@@ -104,6 +104,8 @@ class LossWeights:
     attention: float = 0.0
     """Weight, at the start, of how far one block's attention is from true correspondences, nats; it falls linearly, to
     nothing at the end. Ours."""
+    autoencoder: float = 0.0
+    """Weight of L1 between patches of the context and what the decoder makes of their tokens alone. Ours."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,9 +164,9 @@ class Recipe:
     """Decay of the averaged weights, which are what is shipped."""
     workers: int = 1
     """Processes that make samples, for each that trains."""
-    part: Literal["rays", "patches", "all", "autoencoder"] = "all"
-    """What is trained: `RayBlendNet` alone, on the fill that it makes; all but it; both; or the encoder and the
-    decoder alone, on patches of the cameras' images."""
+    part: Literal["rays", "patches", "all", "autoencoder", "copies"] = "all"
+    """What is trained: `RayBlendNet` alone, on the fill that it makes; all but it; both; the encoder and the decoder
+    alone, on patches of the cameras' images; or all but the rays, on copies of these images."""
     pixels_per_view: int = 300
     """For the rays alone: missing pixels that are read of each view, at most."""
     augment: bool = False
@@ -195,7 +197,7 @@ class Recipe:
             raise ValueError(
                 f"expected clips of 2 or more to judge, got {self.data.clip_length}; give --clip-length 2 or more"
             )
-        if self.part in ("rays", "autoencoder") and self.loss.adversarial:
+        if self.part in ("rays", "autoencoder", "copies") and self.loss.adversarial:
             raise ValueError(f"expected no adversarial loss for {self.part} alone, whose pixels are no image")
         if self.part == "autoencoder" and self.validate_every:
             raise ValueError("expected --validate-every 0 for an autoencoder, which fills nothing")

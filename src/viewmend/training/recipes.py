@@ -137,6 +137,23 @@ def autoencoder(data: DataPlan) -> Recipe:
     )
 
 
+def copies(data: DataPlan) -> Recipe:
+    """`paper_small` on blotted copies of the windows' camera images, from an autoencoder: for `windows --from`."""
+    return replace(
+        windows(data),
+        name="copies",
+        warmup=60,
+        ema=0.99,
+        part="copies",
+        loss=LossWeights(channels="sum", attention=0.1, autoencoder=0.5),
+        minutes=45.0,
+        batch=8,
+        learning_rate=8e-4,
+        context_gradients=1.0,
+        validate_every=0,
+    )
+
+
 def base(data: DataPlan) -> Recipe:
     """The paper's size with all of our additions, rays and patches together; for a data-centre GPU."""
     return replace(
@@ -184,5 +201,6 @@ RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {
     "paper_small": paper_small,
     "windows": windows,
     "autoencoder": autoencoder,
+    "copies": copies,
     "finetune": finetune,
 }
