@@ -7,7 +7,7 @@ of windows of 22 images to learn; here a camera's own image is the truth, so one
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from viewmend.inpainting.coordinates import reference_depth
@@ -102,7 +102,7 @@ def _blots(subject: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"
     return blots
 
 
-def _ellipse(middle: Float[Tensor, "2"], like: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def _ellipse(middle: Int[Tensor, "2"], like: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
     """One, turned and as large as chance will, about row and column."""
     least, largest = BLOT_RADIUS_PX
     radii = least * (largest / least) ** torch.rand(2)
