@@ -64,3 +64,23 @@ def test_the_diagnosis_names_it_once(studio, step_m, words):
     """A large step is seen in the hull; a small one in the outlines alone."""
     said = [finding.text for finding in diagnose(displaced(studio.read(0), "cam03", (step_m, 0.0, 0.0)), studio.bounds)]
     assert len(said) == 1 and "'cam03'" in said[0] and words in said[0] and "its calibration" in said[0]
+
+
+def rough(frame, px, seed):
+    """The frame with all cameras' principal points wrong by a normal deviation of so many pixels."""
+    K = frame.cameras.K.clone()
+    K[:, :2, 2] += px * torch.randn(len(K), 2, generator=torch.Generator().manual_seed(seed))
+    return replace(frame, cameras=replace(frame.cameras, K=K))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("px", [0.5, 1.0])
+def test_of_a_rig_that_never_fits_no_camera_is_named(studio, px, seed):
+    assert odd_outline(rough(studio.read(0), px, seed), studio.bounds) is None
+
+
+@pytest.mark.parametrize("seed, name", [(1, "cam00"), (2, "cam03")])
+def test_a_displaced_camera_of_a_rig_that_never_fits_is_named(studio, seed, name):
+    """More than half of what outlines miss is left without it, but clearly less than without any other."""
+    found = odd_outline(displaced(rough(studio.read(0), 0.5, seed), name, (0.04, 0.0, 0.0)), studio.bounds)
+    assert found is not None and name in found[0] and 1.5 < found[1] < 2

@@ -73,7 +73,7 @@ def _odd(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Finding, ...]:
     if by_outlines is None or (by_hull and any(f"'{name}'" in by_hull[0].text for name in by_outlines[0])):
         return by_hull
     names, times = " or ".join(f"'{name}'" for name in by_outlines[0]), by_outlines[1]
-    text = f"without camera {names} the outlines of all others fit together {times:.0f} times better"
+    text = f"without camera {names} the outlines of all others fit together {times:.2g} times better"
     return (Finding(f"{text}; check its calibration, its mask and whether it is in time"),)
 
 

@@ -24,12 +24,15 @@ LEAST_PX = 0.2
 """Outlines that miss each other by less fit together: those of clean rigs of 128 to 256 pixels miss up to 0.16."""
 LEAST_LEFT_PX = 0.01
 """Less than this is not told apart."""
-STANDS_OUT = 1.6
+STANDS_OUT = 1.25
 """A camera is suspected if its own outline is missed by so many times the median's."""
 SUSPECTS = 3
 """So many are left out in turn."""
 LEFT = 0.5
 """A suspect is the one if so little, or less, of what was missed is left without it."""
+LEFT_ALONE, OTHERS_LEAVE, UNFIT_PX = 0.67, 1.25, 0.4
+"""Or with more left, if without any other suspect there is so many times more: of rigs that never fit quite together,
+whose outlines miss each other by so much or more."""
 ALONE = 0.7
 """It may be the next suspect as well, unless that leaves more than the best one divided by this."""
 
@@ -57,7 +60,9 @@ def odd_outline(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[tuple[str
         return None
     order = np.argsort(left)
     best = left[order[0]]
-    if best > LEFT * missed:
+    second = left[order[1]] if len(order) > 1 else missed
+    apart = missed >= UNFIT_PX and best <= LEFT_ALONE * missed and second >= OTHERS_LEAVE * best
+    if best > LEFT * missed and not apart:
         return None
     either = [view for view in order[:2] if best > ALONE * left[view] or view == order[0]]
     return tuple(names[suspects[view]] for view in either), missed / max(best, LEAST_LEFT_PX)
