@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # The campaign: samples, then training; both go on where they stopped. RECIPE=views (whole views) or windows (paper_small);
-# RECIPE=autoencoder trains what `windows --from` may begin with, on the windows.
+# RECIPE=autoencoder, then RECIPE=copies --from it, train what `windows --from` may begin with, on the windows.
 #
 #   RECIPE=views benchmarks/campaign.sh generate DIR PERFORMERS MOTIONS [COUNT]   one core: 2.4 views a second, 2 MB a
 #                                            scene; or 1.3 windows a second, 1.4 MB each, with correspondences
@@ -10,7 +10,7 @@
 set -euo pipefail
 export OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 MKL_NUM_THREADS=1
 recipe=${RECIPE:-views} task=$1 folder=$2
-shards=shards-${recipe/autoencoder/windows} told=()
+shards=shards-$(sed 's/autoencoder\|copies/windows/' <<<"$recipe") told=()
 [ "$recipe" != windows ] || told=(--matches)
 shift 2
 mkdir -p "$folder"

@@ -1,7 +1,8 @@
 """Models on windows that they did not learn from: python benchmarks/windows.py SHARDS MODEL [MODEL ...] [--write].
 
 SHARDS is a folder that `viewmend samples windows --matches` made, of scenes that no model saw. Means over its windows:
-PSNR of what is missing, upon white, of each model and of Telea; how much attention, of 1, the guided block gives to
+PSNR of what is missing, upon white, of each model and of Telea, also on the subject alone and on the background alone,
+all windows' pixels together; how much attention, of 1, the guided block gives to
 patches that truly show what is missing; and the ceiling, PSNR of the subject in the camera images when each patch
 passes through its own token and back.
 """
@@ -37,10 +38,10 @@ def missing_of(sample: Sample) -> Tensor:
 
 def judged(net: PatchTransformer, samples: list[Sample]) -> dict[str, float]:
     """The means of one model."""
-    holes, ceilings, looked = [], [], []
+    images, ceilings, looked = [], [], []
     for sample in samples:
         made = net([sample.view], [list(sample.context)], matches=[sample.matches])[0]
-        holes.append(score(made.upon_own.float(), sample))
+        images.append(made.upon_own.float())
         if made.missed is not None:
             looked.append(math.exp(-float(made.missed)))
         stack = context_images(sample.context[0], net.config)
@@ -50,25 +51,35 @@ def judged(net: PatchTransformer, samples: list[Sample]) -> dict[str, float]:
         subject = torch.cat([*((covered > 0) & stack.foreground)], 1)
         beside = [torch.cat([*images], 2) for images in (back.clamp(0, 1), stack.channels[:, :3])]
         ceilings.append(psnr(beside[0], beside[1], subject) or 0.0)
-    return {"holes_db": fmean(holes), "attention_on_it": fmean(looked or [math.nan]), "ceiling_db": fmean(ceilings)}
+    return scores(images, samples) | {
+        "attention_on_it": fmean(looked or [math.nan]),
+        "ceiling_db": fmean(ceilings),
+    }
 
 
-def by_telea(samples: list[Sample]) -> float:
+def by_telea(samples: list[Sample]) -> dict[str, float]:
     """What Telea makes of the same."""
     filled = UponWhite(Telea())
-    scores = []
+    images = []
     for sample in samples:
         context = ContextProvider(lambda tau, names: None)
-        completed, _ = filled.step(sample.view, context, filled.initial_state())
-        scores.append(score(completed.rgb, sample))
-    return fmean(scores)
+        images.append(filled.step(sample.view, context, filled.initial_state())[0].rgb)
+    return scores(images, samples)
 
 
-def score(rgb: Tensor, sample: Sample) -> float:
-    """PSNR of what is missing, upon white."""
-    found = psnr(rgb.clamp(0, 1), true_image(sample, "white"), missing_of(sample))
-    assert found is not None, "something is missing"
-    return found
+def scores(images: list[Tensor], samples: list[Sample]) -> dict[str, float]:
+    """PSNR of what is missing, upon white: the windows' mean, and that of all pixels on the subject, and off it."""
+    means, squares = [], {"subject_db": [], "background_db": []}
+    for rgb, sample in zip(images, samples, strict=True):
+        truth, missing = true_image(sample, "white"), missing_of(sample)
+        found = psnr(rgb.clamp(0, 1), truth, missing)
+        assert found is not None and sample.alpha is not None, "something is missing, and the studio knows what"
+        means.append(found)
+        squared, subject = (rgb.clamp(0, 1) - truth).square().mean(0), sample.alpha > 127
+        squares["subject_db"].append(squared[missing & subject])
+        squares["background_db"].append(squared[missing & ~subject])
+    pooled = {name: -10 * float(torch.cat(parts).mean().log10()) for name, parts in squares.items()}
+    return {"holes_db": fmean(means)} | pooled
 
 
 @torch.no_grad()
@@ -80,8 +91,8 @@ def main() -> None:
     options = parser.parse_args()
     samples = [s for path in shards_of(options.shards) for s in read_shard(path) if isinstance(s, Sample)]
     samples = [s for s in samples if float(missing_of(s).sum()) >= 50]
-    figures: dict[str, object] = {"telea_db": round(by_telea(samples), 3)}
-    print(f"{len(samples)} windows, Telea {figures['telea_db']} dB", flush=True)
+    figures: dict[str, object] = {"telea": {key: round(value, 3) for key, value in by_telea(samples).items()}}
+    print(f"{len(samples)} windows, Telea {figures['telea']}", flush=True)
     for name in options.models:
         net = load_network(name)
         assert isinstance(net, PatchTransformer), "no rays before its patches"
