@@ -107,7 +107,7 @@ def _ellipse(middle: Int[Tensor, "2"], like: Bool[Tensor, "height width"]) -> Bo
     least, largest = BLOT_RADIUS_PX
     radii = least * (largest / least) ** torch.rand(2)
     angle = math.pi * float(torch.rand(()))
-    rows, columns = (torch.arange(size).float() - at for size, at in zip(like.shape, middle, strict=True))
+    rows, columns = (torch.arange(size, device=like.device) - at for size, at in zip(like.shape, middle, strict=True))
     along = columns * math.cos(angle) + rows[:, None] * math.sin(angle)
     across = rows[:, None] * math.cos(angle) - columns * math.sin(angle)
     return (along / radii[0]) ** 2 + (across / radii[1]) ** 2 < 1

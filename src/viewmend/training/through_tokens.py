@@ -48,7 +48,7 @@ def encode_and_decode(
     taken = torch.randperm(len(views))[:DECODED].tolist()
     tokens = [frame.tokens for n in taken for frame in encoded[n]]
     if not sum(map(len, tokens)):
-        return frames, torch.zeros(())
+        return frames, torch.zeros((), device=next(model.parameters()).device)
     with model.autocast():
         made, shown = _decoded(model, torch.cat(tokens), [context_images(views[n], model.config) for n in taken])
     return frames, patch_loss(made, shown, channels)
