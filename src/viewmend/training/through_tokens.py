@@ -13,7 +13,7 @@ from viewmend.inpainting.patches import PATCH_PX, STEP_PX, crop, grid_shape, pad
 from viewmend.views import ContextViews
 
 DECODED = 6
-"""Of so many times and views of a batch, which chance takes, the patches of the encoded context are decoded."""
+"""The patches of so many times and views of a batch are decoded; chance takes them."""
 
 
 def through_tokens(model: PatchTransformer, stacks: list[Images]) -> tuple[Tensor, Tensor]:
