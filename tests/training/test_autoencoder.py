@@ -1,6 +1,7 @@
 """Encoder and decoder alone, on patches of camera images."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -28,6 +29,14 @@ def recipe(shards, **changes) -> Recipe:
     data = replace(PLAN, shards=shards, clip_length=2, ray_views=0)
     parts = {"part": "autoencoder", "loss": PLAIN, "validate_every": 0, "model": MODEL} | changes
     return Recipe(name="autoencoder", data=data, **(RUN | parts))
+
+
+def taught_by(run: Recipe, out: Path) -> tuple[dict[str, torch.Tensor], set[str]]:
+    """The weights that a run from nothing, by seed 0, writes to `out`, and the modules in which it moved any."""
+    torch.manual_seed(0)
+    before = build(MODEL).state_dict()
+    after = load_network(str(train(run, out))).state_dict()
+    return after, {name.split(".")[0] for name in after if not torch.equal(before[name], after[name])}
 
 
 def first_samples(shards):
@@ -69,11 +78,8 @@ def test_the_loss_is_that_of_all_patches(shards):
 
 
 def test_a_run_teaches_encoder_and_decoder_alone_and_another_goes_on_from_it(shards, tmp_path):
-    torch.manual_seed(0)
-    before = build(MODEL).state_dict()
-    out = train(recipe(shards, seed=0), tmp_path / "run")
-    after = load_network(str(out)).state_dict()
-    moved = {name.split(".")[0] for name in after if not torch.equal(before[name], after[name])}
+    out = tmp_path / "run"
+    after, moved = taught_by(recipe(shards, seed=0), out)
     assert moved == {"tokeniser", "decoder"}
     card = (out / "README.md").read_text()
     assert "L1 of patches of camera images; averaged" in card and "holes" not in card

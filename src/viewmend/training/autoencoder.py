@@ -1,14 +1,10 @@
 """Encoder and decoder learn first what a token can hold: an autoencoder of patches, without attention. Ours."""
 
 import torch
-from torch import nn
 
-from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.images import context_images
-from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.training.losses import LEAST_SQUARE, ImageLoss
-from viewmend.training.objective import StepOutput
-from viewmend.training.plan import Recipe
+from viewmend.training.objective import Objective, StepOutput
 from viewmend.training.samples import Sample
 from viewmend.training.through_tokens import patch_loss, through_tokens
 
@@ -16,19 +12,13 @@ PARTS = ("tokeniser", "decoder")
 """The modules that learn."""
 
 
-class AutoencoderObjective(nn.Module):
+class AutoencoderObjective(Objective):
     """L1 between the patches of camera images and what the decoder makes of their tokens."""
-
-    def __init__(self, model: Chain | PatchTransformer, recipe: Recipe) -> None:
-        super().__init__()
-        self.model = model
-        self.recipe = recipe
 
     def forward(self, batch: list[Sample]) -> StepOutput:
         """The loss of each sample's cameras at one time, which chance takes."""
-        patches = self.model.patches if isinstance(self.model, Chain) else self.model
         views = [s.context[int(torch.randint(len(s.context), ()))] for s in batch if s.context]
-        made, shown = through_tokens(patches, [context_images(one, patches.config) for one in views])
+        made, shown = through_tokens(self.patches, [context_images(one, self.patches.config) for one in views])
         inside = patch_loss(made, shown, self.recipe.loss.channels)
         log_error = ((made - shown).square().mean() + LEAST_SQUARE).log10()
         loss = ImageLoss(inside, torch.zeros_like(inside), log_error)

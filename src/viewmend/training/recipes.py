@@ -140,17 +140,14 @@ def autoencoder(data: DataPlan) -> Recipe:
 def copies(data: DataPlan) -> Recipe:
     """`paper_small` on blotted copies of the windows' camera images, from an autoencoder: for `windows --from`."""
     return replace(
-        windows(data),
+        autoencoder(data),
         name="copies",
-        warmup=60,
         ema=0.99,
         part="copies",
         loss=LossWeights(channels="sum", attention=0.1, autoencoder=0.5),
         minutes=45.0,
-        batch=8,
+        new_per_batch=4,
         learning_rate=8e-4,
-        context_gradients=1.0,
-        validate_every=0,
     )
 
 
