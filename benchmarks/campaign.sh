@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
 # The campaign: samples, then training; both go on where they stopped. RECIPE=views (whole views) or windows (paper_small);
-# RECIPE=autoencoder, then RECIPE=copies --from it, train what `windows --from` may begin with, on the windows.
+# RECIPE=autoencoder, then RECIPE=copies --from it, train what `windows --from` may begin with, on the windows; upon what
+# they made, `encode` and then RECIPE=tokens --from it train the transformer alone.
 #
 #   RECIPE=views benchmarks/campaign.sh generate DIR PERFORMERS MOTIONS [COUNT]   one core: 2.4 views a second, 2 MB a
 #                                            scene; or 1.3 windows a second, 1.4 MB each, with correspondences
+#   benchmarks/campaign.sh encode DIR MODEL   the windows in shards-windows by a model in DIR, in shards-tokens
 #   RECIPE=views benchmarks/campaign.sh train DIR NAME MINUTES [options of viewmend train]
 #
 # One of eight characters and motions is put aside, and never drawn: a validation of one's own may have them.
@@ -14,6 +16,7 @@ shards=shards-$(sed 's/autoencoder\|copies/windows/' <<<"$recipe") told=()
 [ "$recipe" != windows ] || told=(--matches)
 shift 2
 mkdir -p "$folder"
+here=$(cd "$(dirname "$0")" && pwd)
 
 put_apart() {  # SOURCE SUFFIX NAME REST: links to seven of eight files in NAME, to the others in NAME-val
     mkdir -p "$folder/$3" "$folder/$3-val"
@@ -33,6 +36,10 @@ generate)
     cd "$folder"
     exec viewmend samples "$recipe" --out "$shards" --count "${3:-10400}" --performers people --motions motions "${told[@]}"
     ;;
+encode)
+    cd "$folder"
+    exec python "$here/encode_windows.py" shards-windows "$1" shards-tokens
+    ;;
 train)
     name=$1 minutes=$2
     shift 2
@@ -41,7 +48,7 @@ train)
         --validation-views 16 "$@"
     ;;
 *)
-    echo "expected generate or train, got $task; see the head of this file" >&2
+    echo "expected generate, encode or train, got $task; see the head of this file" >&2
     exit 2
     ;;
 esac

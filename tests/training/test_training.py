@@ -14,11 +14,12 @@ from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.protocol import ContextProvider, State
 from viewmend.training import loop, ray_batches
-from viewmend.training.loop import Run, averaging, train
+from viewmend.training.loop import Run, train
 from viewmend.training.plan import LossWeights
 from viewmend.training.processes import processes
 from viewmend.training.run_files import FILE, RunError
 from viewmend.training.sample_files import sample_from_bytes
+from viewmend.training.schedule import averaging
 from viewmend.training.validation import Validation
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Options:
     """Train a model: viewmend train RECIPE --out DIR [--from MODEL] [options].
 
-    RECIPE is small (the default), small_rays, views, base, paper, paper_small, windows, autoencoder, copies or
+    RECIPE is small (the default), small_rays, views, base, paper, paper_small, windows, autoencoder, copies, tokens or
     finetune; or a published network's, to fine-tune it: dstt, fuseformer, e2fgvi, e2fgvi-hq. Every value of the
     recipe is an option; defaults are the recipe's. DIR gets the averaged weights, a log, pictures, and what it
     takes to go on: the same command goes on with a run that was stopped, at any moment and in any way. Under
@@ -57,7 +57,7 @@ def run(options: Options) -> int:
     if isinstance(start, NETWORKS):
         with torch.device("meta"):
             wanted = build(recipe.model)
-        fitting, count = len(fitting_weights(wanted, start)), len(wanted.state_dict())
+        fitting, count = len(fitting_weights(wanted, start, recipe.anew)), len(wanted.state_dict())
         if 0 < fitting < count:
             begun = recipe_options.started_from(recipe, options.start)
             say(f"{fitting} of {count} tensors begin as {begun} has them, the others at random")

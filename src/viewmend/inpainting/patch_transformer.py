@@ -189,7 +189,8 @@ class PatchTransformer(Network):
         """The context without images of times and cameras that are not the config's: what `step` would look at."""
         names, times = self.context_names(view), window_times(view.time, self.config)
         kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
-        return [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]
+        kept = [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]
+        return [c for c in kept if isinstance(c, ContextFrame) or len(c.frame.cameras)]
 
     def _encode_targets(
         self, views: Sequence[IncompleteView], coarse: Sequence[Float[Tensor, "3 _h _w"]]

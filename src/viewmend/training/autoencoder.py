@@ -8,9 +8,6 @@ from viewmend.training.objective import Objective, StepOutput
 from viewmend.training.samples import Sample
 from viewmend.training.through_tokens import patch_loss, through_tokens
 
-PARTS = ("tokeniser", "decoder")
-"""The modules that learn."""
-
 
 class AutoencoderObjective(Objective):
     """L1 between the patches of camera images and what the decoder makes of their tokens."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel
 
@@ -17,18 +17,19 @@ from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
 from viewmend.output_folder import OutputFolder
 from viewmend.training.adversary import Adversary
-from viewmend.training.autoencoder import PARTS, AutoencoderObjective
+from viewmend.training.autoencoder import AutoencoderObjective
 from viewmend.training.copies import CopyingObjective
+from viewmend.training.from_tokens import TokensObjective
 from viewmend.training.logs import Log, LossTerms, Progress
 from viewmend.training.model_card import model_card
 from viewmend.training.objective import Objective, StepOutput
-from viewmend.training.plan import Recipe
+from viewmend.training.plan import TAUGHT, Recipe
 from viewmend.training.processes import Processes, processes
 from viewmend.training.ray_batches import RaysObjective
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import FILE, PREVIOUS, RunState, last_checkpoint, load_run, save_run
 from viewmend.training.sample_files import Trained, sample_to_bytes
-from viewmend.training.schedule import Schedule, learning_rate_factor
+from viewmend.training.schedule import Schedule, averaging, learning_rate_factor
 from viewmend.training.sources import training_source
 from viewmend.training.validation import Validation
 
@@ -39,6 +40,7 @@ OBJECTIVES: dict[str, Callable[..., nn.Module]] = {
     "rays": RaysObjective,
     "autoencoder": AutoencoderObjective,
     "copies": CopyingObjective,
+    "tokens": TokensObjective,
 }
 """What teaches parts otherwise than by the paper's objective."""
 
@@ -265,7 +267,7 @@ def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | Pa
     """The recipe's model with those weights of `start` whose name and shape it has; its part is ready to learn."""
     model = build(recipe.model).train()
     if start is not None:
-        fitting = fitting_weights(model, start)
+        fitting = fitting_weights(model, start, recipe.anew)
         if not fitting:
             raise ValueError(
                 f"expected a model to begin with of which anything fits {recipe.name}, got none that does: its sizes "
@@ -273,28 +275,23 @@ def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | Pa
             )
         model.load_state_dict(model.state_dict() | fitting)
     for name, parameter in model.named_parameters():
-        taught = name.removeprefix("patches.").split(".")[0] in PARTS
-        of_rays = name.startswith("coarse.") == (recipe.part == "rays")
-        parameter.requires_grad_(taught if recipe.part == "autoencoder" else recipe.part == "all" or of_rays)
+        of_part = recipe.part == "all" or name.startswith("coarse.") == (recipe.part == "rays")
+        parameter.requires_grad_(_module(name) in TAUGHT.get(recipe.part, (_module(name),)) and of_part)
     set_compute_dtype(model, torch.bfloat16 if recipe.bfloat16 else torch.float32)
     return model
 
 
-def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
-    """Moves averages towards weights by 1 - decay; at first faster, to forget what training began with."""
-
-    @torch.no_grad()
-    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], count: Tensor | int) -> None:
-        kept = min(decay, (1 + int(count)) / (10 + int(count)))
-        for average, weight in zip(averages, weights, strict=True):
-            average.lerp_(weight, 1 - kept)
-
-    return update
+def _module(weight: str) -> str:
+    """Which part of a `PatchTransformer`, with or without a coarse fill before it, a weight is of."""
+    return weight.removeprefix("patches.").split(".")[0]
 
 
-def fitting_weights(model: nn.Module, start: nn.Module) -> dict[str, torch.Tensor]:
-    """The weights of `start` whose name and shape `model` has, with or without a coarse fill before the patches."""
+def fitting_weights(model: nn.Module, start: nn.Module, anew: Sequence[str] = ()) -> dict[str, torch.Tensor]:
+    """The weights of `start` whose name and shape `model` has, with or without a coarse fill before the patches.
+
+    Those of the modules `anew` are not among them.
+    """
     own, theirs = model.state_dict(), start.state_dict()
     inner = {name.removeprefix("patches."): weight for name, weight in theirs.items()}
     found = {f"patches.{name}": weight for name, weight in theirs.items()} | inner | theirs
-    return {n: w for n, w in found.items() if n in own and own[n].shape == w.shape}
+    return {n: w for n, w in found.items() if n in own and own[n].shape == w.shape and _module(n) not in anew}

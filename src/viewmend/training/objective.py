@@ -46,11 +46,25 @@ class Objective(nn.Module):
         """What attends and decodes."""
         return self.model.patches if isinstance(self.model, Chain) else self.model
 
+    def contexts(self, samples: Sequence[Sample]) -> Sequence[Sequence[ContextFrame | ContextViews]]:
+        """What each sample's view is completed from.
+
+        Raises:
+            ValueError: a sample's context is encoded already, by what would not learn with it.
+        """
+        if any(sample.encoded is not None for sample in samples):
+            raise ValueError(
+                "expected samples with the images of their context, got encoded ones; train `tokens` on them, or give "
+                "the shards that they were encoded from"
+            )
+        return [sample.context for sample in samples]
+
     def forward(self, batch: list[Sample]) -> StepOutput:
         """All terms of `batch`.
 
         Raises:
-            ValueError: attention is to be taught, and a sample does not say by what.
+            ValueError: attention is to be taught, and a sample does not say by what; or a sample is of another kind
+                than what is trained.
         """
         weights = self.recipe.loss
         views = [sample for last in batch for sample in last.clip]
@@ -59,7 +73,7 @@ class Objective(nn.Module):
                 "expected samples that say where their context shows what they miss, got one that does not; make "
                 "samples with --matches, or train without --attention"
             )
-        contexts: Sequence[Sequence[ContextFrame | ContextViews]] = [s.context for s in views]
+        contexts = self.contexts(views)
         kept = None
         if weights.autoencoder:
             looked_at = [self.patches.looked_at(s.view, s.context) for s in views]

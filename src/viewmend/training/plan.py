@@ -12,6 +12,8 @@ from viewmend.inpainting.sweep.config import SweepConfig
 
 FLAT = tyro.conf.arg(name="")
 """On the command line, the fields are options without a prefix."""
+TAUGHT: dict[str, tuple[str, ...]] = {"autoencoder": ("tokeniser", "decoder"), "tokens": ("transformer",)}
+"""By `Recipe.part`: the modules of a `PatchTransformer` that learn, where not all do."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,9 +166,12 @@ class Recipe:
     """Decay of the averaged weights, which are what is shipped."""
     workers: int = 1
     """Processes that make samples, for each that trains."""
-    part: Literal["rays", "patches", "all", "autoencoder", "copies"] = "all"
+    part: Literal["rays", "patches", "all", "autoencoder", "copies", "tokens"] = "all"
     """What is trained: `RayBlendNet` alone, on the fill that it makes; all but it; both; the encoder and the decoder
-    alone, on patches of the cameras' images; or all but the rays, on copies of these images."""
+    alone, on patches of the cameras' images; all but the rays, on copies of these images; or the transformer alone, on
+    windows that are encoded already."""
+    anew: tuple[Literal["tokeniser", "transformer", "decoder"], ...] = ()
+    """Modules that begin at random whatever model the run begins with: a transformer upon an encoder that was taught."""
     pixels_per_view: int = 300
     """For the rays alone: missing pixels that are read of each view, at most."""
     augment: bool = False

@@ -151,6 +151,21 @@ def copies(data: DataPlan) -> Recipe:
     )
 
 
+def tokens(data: DataPlan) -> Recipe:
+    """The transformer of `paper_small`, on windows that the encoder it begins with has encoded: --from what did so."""
+    return replace(
+        autoencoder(data),
+        name="tokens",
+        ema=0.99,
+        part="tokens",
+        loss=LossWeights(channels="sum", outside="image", attention=0.1),
+        minutes=20.0,
+        new_per_batch=8,
+        replay_size=1,
+        learning_rate=4e-4,
+    )
+
+
 def base(data: DataPlan) -> Recipe:
     """The paper's size with all of our additions, rays and patches together; for a data-centre GPU."""
     return replace(
@@ -199,5 +214,6 @@ RECIPES: dict[str, Callable[[DataPlan], Recipe]] = {
     "windows": windows,
     "autoencoder": autoencoder,
     "copies": copies,
+    "tokens": tokens,
     "finetune": finetune,
 }

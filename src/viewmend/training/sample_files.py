@@ -21,9 +21,11 @@ from viewmend.atomic_writes import HALF, write_atomically
 from viewmend.foreign_input import InputError
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.inpainting.context import ContextFrame
 from viewmend.inpainting.correspondences import Correspondences
 from viewmend.inpainting.sweep.lookup import Scale
 from viewmend.inpainting.sweep.pyramids import Pyramid, Rig
+from viewmend.training.encoded import EncodedContext
 from viewmend.training.ray_batches import RayBatch
 from viewmend.training.samples import Sample
 from viewmend.training.stored_scenes import StoredScene, StoredView
@@ -31,7 +33,7 @@ from viewmend.training.whole_views import WholeView
 from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes, WindowPart
 
 PARTS = (Sample, IncompleteView, ContextViews, WindowPart, MultiViewFrame, Silhouettes, Cameras, Bounds, RayBatch)
-STORED = (StoredScene, StoredView, WholeView, Rig, Scale, Pyramid, Correspondences)
+STORED = (StoredScene, StoredView, WholeView, Rig, Scale, Pyramid, Correspondences, EncodedContext, ContextFrame)
 Trained = Sample | RayBatch | WholeView
 Stored = Trained | StoredScene
 KINDS = {kind.__name__: kind for kind in (*PARTS, *STORED)}

@@ -16,6 +16,7 @@ from viewmend.leave_one_out.scenes import LeaveOneOut
 from viewmend.observation import Observation
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
+from viewmend.training.encoded import EncodedContext
 from viewmend.views import ContextViews, IncompleteView
 
 
@@ -38,6 +39,9 @@ class Sample:
     """True z-depth, metres, 0 where there is no surface; None where nobody knows."""
     matches: Correspondences | None = None
     """Where the context truly shows what the view misses; None where nobody knows."""
+
+    encoded: EncodedContext | None = None
+    """The context as an encoder made it, instead of `context`; None where the images are there."""
 
     @property
     def clip(self) -> tuple["Sample", ...]:

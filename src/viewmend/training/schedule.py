@@ -1,9 +1,13 @@
-"""How far a run is, how fast it goes, and what that makes of the learning rate."""
+"""How far a run is, how fast it goes, and what that makes of the learning rate and of averages."""
 
 import math
 import time
 from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+import torch
+from torch import Tensor
 
 from viewmend.training.plan import Recipe
 
@@ -14,6 +18,18 @@ RECENT_STEPS = 50
 def learning_rate_factor(step: int, progress: float, warmup: int) -> float:
     """Linear warm-up, then a cosine to zero as `progress` goes from 0 to 1."""
     return min((step + 1) / warmup, 1.0) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+
+def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
+    """Moves averages towards weights by 1 - decay; at first faster, to forget what training began with."""
+
+    @torch.no_grad()
+    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], count: Tensor | int) -> None:
+        kept = min(decay, (1 + int(count)) / (10 + int(count)))
+        for average, weight in zip(averages, weights, strict=True):
+            average.lerp_(weight, 1 - kept)
+
+    return update
 
 
 @dataclass(frozen=True)
