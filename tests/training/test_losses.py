@@ -2,7 +2,7 @@
 
 import torch
 
-from viewmend.training.losses import image_loss
+from viewmend.training.losses import image_loss, slivers
 
 
 def loop_twin(predicted, coverage, error, truth):
@@ -49,3 +49,29 @@ def test_the_logarithmic_error_is_a_tenth_of_psnr_in_the_holes(rng):
     loss = image_loss([predicted], [E], [E], [truth])
     psnr = -10 * (predicted - truth)[:, E > 0].square().mean().log10()
     assert torch.allclose(-10 * loss.log_error, psnr, atol=0.02)
+
+
+def sliver_twin(error):
+    """Every square of nine pixels that the image holds a part of, one after the other."""
+    height, width = error.shape
+    missing, wide = error > 0, torch.zeros(height, width, dtype=torch.bool)
+    for v in range(height):
+        for u in range(width):
+            part = missing[max(0, v - 4) : v + 5, max(0, u - 4) : u + 5]
+            if bool(part.all()):
+                wide[max(0, v - 4) : v + 5, max(0, u - 4) : u + 5] = True
+    return missing & ~wide
+
+
+def test_slivers_are_what_no_square_fits_into(rng):
+    error = torch.zeros(40, 50)
+    error[5:14, 5:14] = 0.5  # a square fits exactly
+    error[20:28, 5:40] = 1  # a row too low
+    error[14:20, 9] = 1  # between both
+    error[30:, 41:] = 1  # in a corner
+    found = slivers(error)
+    assert torch.equal(found, sliver_twin(error))
+    assert not found[5:14, 5:14].any() and bool(found[20:28, 5:40].all()) and bool(found[14:20, 9].all())
+    assert not found[30:, 41:].any()
+    random = (torch.rand(60, 60, generator=rng) > 0.03).float()
+    assert torch.equal(slivers(random), sliver_twin(random)) and bool(slivers(random).any())

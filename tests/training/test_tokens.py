@@ -137,6 +137,22 @@ def test_tokens_of_another_encoder_and_images_are_refused(sample):
         Objective(net, replace(run, part="all"))([by(net, sample)])
 
 
+def test_slivers_count_for_nothing_until_it_is_time(sample):
+    net, run = made(0), recipe(None, loss=replace(LOSS, wide_first=0.5))
+    narrow = torch.zeros_like(sample.view.error)
+    rows, columns = torch.nonzero(sample.view.error > 0).unbind(1)
+    narrow[rows[0], columns[0]] = 1
+    one = replace(by(net, sample), view=replace(sample.view, error=narrow))
+    objective = TokensObjective(net, run)
+    with torch.no_grad():
+        before = objective([one]).image
+        objective.progress = 0.5
+        after = objective([one]).image
+        always = TokensObjective(net, recipe(None))([one]).image
+    assert before.inside == 0 < after.inside == always.inside
+    assert before.outside == after.outside == always.outside, "slivers are not outside of holes, either"
+
+
 def test_the_recipe_is_that_of_paper_small_with_what_it_holds_still():
     found = RECIPES["tokens"](PLAN)
     assert found.part == "tokens" and found.model == RECIPES["windows"](PLAN).model

@@ -5,11 +5,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional as F
 
 LEAST_SQUARE = 1e-4
 """Squared error below which nothing is gained: 40 dB."""
+WIDE_PX = 9
+"""Side of the square that fits into a wide hole."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,13 @@ class ImageLoss:
     log_error: Float[Tensor, ""]
     """log10 of the mean squared error in the holes, a tenth of -PSNR. Ours: where nobody can know whether a pixel is
     subject or background, L1 decides for one of them, squares hedge."""
+
+
+def slivers(error: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Pixels of E that no square of `WIDE_PX` pixels of E holds; beyond the image all counts as E."""
+    missing = (error > 0).float()[None]
+    fits = -F.max_pool2d(-missing, WIDE_PX, 1, WIDE_PX // 2)
+    return (missing[0] > 0) & (F.max_pool2d(fits, WIDE_PX, 1, WIDE_PX // 2)[0] == 0)
 
 
 def weighted_l1(

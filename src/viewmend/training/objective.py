@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.context import ContextFrame
 from viewmend.inpainting.patch_transformer import PatchTransformer
-from viewmend.training.losses import ImageLoss, image_loss
+from viewmend.training.losses import ImageLoss, image_loss, slivers
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
 from viewmend.training.through_tokens import encode_and_decode
@@ -94,6 +94,9 @@ class Objective(nn.Module):
         for n, part in enumerate(s.view.part for s in views):
             if part is not None:
                 error[n], counted[n] = error[n] * part.inner[0], counted[n] * part.inner[0]
+        if self.progress < weights.wide_first:
+            counts = [(~slivers(E)).float() for E in error]
+            error, counted = ([x * own for x, own in zip(many, counts, strict=True)] for many in (error, counted))
         image = image_loss(made, counted, error, truth, weights.channels)
         total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
         missed = [p.missed for p in predictions if p.missed is not None]

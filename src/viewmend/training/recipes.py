@@ -162,7 +162,7 @@ def tokens(data: DataPlan) -> Recipe:
         minutes=20.0,
         new_per_batch=8,
         replay_size=1,
-        learning_rate=4e-4,
+        learning_rate=8e-4,
     )
 
 
