@@ -5,7 +5,7 @@
 #
 #   RECIPE=views benchmarks/campaign.sh generate DIR PERFORMERS MOTIONS [COUNT]   one core: 2.4 views a second, 2 MB a
 #                                            scene; or 1.3 windows a second, 1.4 MB each, with correspondences
-#   benchmarks/campaign.sh encode DIR MODEL   the windows in shards-windows by a model in DIR, in shards-tokens
+#   benchmarks/campaign.sh encode DIR MODEL COUNT   windows of shards-windows by a model in DIR, in shards-tokens
 #   RECIPE=views benchmarks/campaign.sh train DIR NAME MINUTES [options of viewmend train]
 #
 # One of eight characters and motions is put aside, and never drawn: a validation of one's own may have them.
@@ -16,7 +16,6 @@ shards=shards-$(sed 's/autoencoder\|copies/windows/' <<<"$recipe") told=()
 [ "$recipe" != windows ] || told=(--matches)
 shift 2
 mkdir -p "$folder"
-here=$(cd "$(dirname "$0")" && pwd)
 
 put_apart() {  # SOURCE SUFFIX NAME REST: links to seven of eight files in NAME, to the others in NAME-val
     mkdir -p "$folder/$3" "$folder/$3-val"
@@ -38,7 +37,7 @@ generate)
     ;;
 encode)
     cd "$folder"
-    exec python "$here/encode_windows.py" shards-windows "$1" shards-tokens
+    exec viewmend samples tokens --shards shards-windows --encoder "$1" --out shards-tokens --count "$2" --workers 0
     ;;
 train)
     name=$1 minutes=$2

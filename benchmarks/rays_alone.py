@@ -1,4 +1,4 @@
-"""What `small` fills before its patches do: viewmend evaluate ... --methods small,benchmarks/rays_alone.py:RaysAlone."""
+"""What `small` fills before its patches: viewmend evaluate ... --methods small,benchmarks/rays_alone.py:RaysAlone."""
 
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.checkpoint import load_network

@@ -9,8 +9,8 @@ from training.test_autoencoder import MODEL, taught_by
 
 from viewmend.inpainting.chain import build
 from viewmend.inpainting.checkpoint import load_network
-from viewmend.training.encoded import encode, fingerprint, with_keys
-from viewmend.training.from_tokens import TokensObjective
+from viewmend.training.encoded import fingerprint, with_keys
+from viewmend.training.from_tokens import TokensObjective, encoded
 from viewmend.training.loop import train
 from viewmend.training.objective import Objective
 from viewmend.training.plan import LossWeights, Recipe
@@ -26,7 +26,7 @@ def made(seed, **changes):
 
 
 def by(net, sample):
-    return replace(sample, context=(), encoded=encode(net, sample.view, sample.context))
+    return encoded(net, sample)
 
 
 def recipe(shards, **changes) -> Recipe:
@@ -56,16 +56,16 @@ def test_a_view_comes_out_as_from_the_images(sample):
 
 def test_only_the_cameras_and_times_that_the_model_looks_at(sample):
     net = made(0)
-    encoded = by(net, sample).encoded
+    own = by(net, sample).encoded
     cameras, now = sample.context[0].frame.cameras.names, sample.view.time
-    kept = {(f.name, f.time) for f in with_keys(net, sample.view, encoded)}
+    kept = {(f.name, f.time) for f in with_keys(net, sample.view, own)}
     assert kept == {(name, views.frame.time) for views in sample.context for name in net.context_names(sample.view)}
     assert len({time for _, time in kept}) == 2 and len(cameras) >= 2
     present = made(0, n_c=0, n_w=0)
-    assert {f.time for f in with_keys(present, sample.view, encoded)} == {now}
+    assert {f.time for f in with_keys(present, sample.view, own)} == {now}
     single = made(0, context_cameras=1)
-    assert {f.name for f in with_keys(single, sample.view, encoded)} == set(sample.view.closest_views(1))
-    assert with_keys(made(0, n_c=0, n_w=0), replace(sample.view, time=now + 90), encoded) == []
+    assert {f.name for f in with_keys(single, sample.view, own)} == set(sample.view.closest_views(1))
+    assert with_keys(made(0, n_c=0, n_w=0), replace(sample.view, time=now + 90), own) == []
 
 
 def test_a_context_that_shows_nothing_to_the_camera_looked_at_is_none(sample):
@@ -82,13 +82,13 @@ def test_a_context_that_shows_nothing_to_the_camera_looked_at_is_none(sample):
 
 def test_keys_and_values_are_the_models_own_and_learn(sample):
     net, other = made(0), made(1)
-    encoded = by(net, sample).encoded
-    assert not any(frame.keys_values.numel() for frame in encoded.frames)
-    frames = with_keys(net, sample.view, encoded)
+    own = by(net, sample).encoded
+    assert not any(frame.keys_values.numel() for frame in own.frames)
+    frames = with_keys(net, sample.view, own)
     for frame in frames:
         expected = net.transformer.project_context(frame.tokens.float())
         torch.testing.assert_close(frame.keys_values, expected)
-    others = with_keys(other, sample.view, encoded)
+    others = with_keys(other, sample.view, own)
     assert not torch.allclose(others[0].keys_values, frames[0].keys_values, atol=1e-3)
     frames[-1].keys_values.sum().backward()
     assert net.transformer.keys_values.weight.grad is not None
@@ -131,7 +131,7 @@ def test_tokens_of_another_encoder_and_images_are_refused(sample):
     assert torch.isfinite(objective([by(net, sample)]).total)
     with pytest.raises(ValueError, match=f"this model's encoder .{fingerprint(net)}.*got {fingerprint(made(1))};"):
         objective([by(net, sample), by(made(1), sample)])
-    with pytest.raises(ValueError, match="got none, but images; encode the shards"):
+    with pytest.raises(ValueError, match="got none, but images; make them with the model"):
         objective([sample])
     with pytest.raises(ValueError, match="expected samples with the images of their context, got encoded ones"):
         Objective(net, replace(run, part="all"))([by(net, sample)])

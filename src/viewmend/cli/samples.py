@@ -1,14 +1,17 @@
 """`viewmend samples`: make training samples ahead of a run."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from viewmend.cli import recipe_options
 from viewmend.training.plan import FLAT, Recipe, WholeViewRecipe
+
+if TYPE_CHECKING:
+    from viewmend.training.sample_files import Stored
 
 SAMPLES_A_SHARD, SCENES_A_SHARD = 48, 16
 PLAN = "plan.txt"
@@ -24,7 +27,8 @@ class Options:
 
     They are the recipe's own kind of samples (small by default), made once for many runs of `viewmend train --shards`.
     Of a recipe that trains rays alone, some pixels' rays are written, looked up: thousands of scenes fit in memory.
-    Of one that trains whole views (views), scenes are written, compressed. A run that was stopped goes on.
+    Of one that trains whole views (views), scenes are written, compressed. Of tokens, windows whose context --encoder
+    encodes, made anew or taken from --shards, all before any again. A run that was stopped goes on.
     Every value of the recipe is an option, as in `viewmend train`.
     """
 
@@ -33,6 +37,8 @@ class Options:
     """Folder for shard-00000.tar and on."""
     count: int = 960
     """How many samples."""
+    encoder: str | None = None
+    """Name or folder of a model: context is written as its encoder makes it, for viewmend train tokens --from it."""
 
 
 def parse(arguments: Sequence[str], prog: str) -> Options:
@@ -62,11 +68,11 @@ def _make(options: Options) -> int:
     from viewmend.training.sample_files import write_shards
     from viewmend.training.sources import stored_source, training_source
 
-    recipe = options.recipe
+    recipe, encoding = options.recipe, _encoding(options)
     whole = isinstance(recipe, WholeViewRecipe)
     per_shard = SCENES_A_SHARD if whole else SAMPLES_A_SHARD
     at = _position(options.out, per_shard if whole else None)
-    _demand_same(options.out, recipe)
+    _demand_same(options.out, recipe, options.encoder)
     count = options.count - at.samples
     if count <= 0:
         say(f"{options.out}: {at.samples} samples are there already")
@@ -74,7 +80,7 @@ def _make(options: Options) -> int:
     seed = f"{recipe.seed}/0"
     source = stored_source(recipe, seed) if whole else training_source(recipe, seed)
     began = time.monotonic()
-    samples = islice(_from(at, samples_in_order(source, at.scene, recipe.workers)), count)
+    samples = map(encoding, islice(_from(at, samples_in_order(source, at.scene, recipe.workers)), count))
     shards = []
     for shard in write_shards(track(samples, "samples", count), options.out, per_shard, at.shards):
         shards.append(shard)
@@ -85,6 +91,34 @@ def _make(options: Options) -> int:
     size_mb = sum(path.stat().st_size for path in shards) / 1e6
     say(f"wrote {count} samples, {len(shards)} shards, {size_mb:.0f} MB to {options.out}: {rate:.1f} samples/s")
     return 0
+
+
+def _encoding(options: Options) -> "Callable[[Stored], Stored]":
+    """What is done to each sample before it is written.
+
+    Raises:
+        ValueError: a recipe wants what another encodes, and nothing says what; or what is said encodes no patches.
+    """
+    if (options.recipe.part == "tokens") != (options.encoder is not None):
+        raise ValueError(
+            f"expected --encoder MODEL for tokens, and for nothing else, got {options.encoder or 'none'} for "
+            f"{options.recipe.name}"
+        )
+    if options.encoder is None:
+        return lambda sample: sample
+    import torch
+
+    from viewmend.inpainting.checkpoint import load_network
+    from viewmend.inpainting.network import set_compute_dtype
+    from viewmend.inpainting.patch_transformer import PatchTransformer
+    from viewmend.training.from_tokens import encoded
+    from viewmend.training.samples import Sample
+
+    net = load_network(options.encoder)
+    if not isinstance(net, PatchTransformer):
+        raise ValueError(f"expected a model of patches alone to encode with, got {options.encoder}; train copies")
+    set_compute_dtype(net.eval(), torch.bfloat16 if options.recipe.bfloat16 else torch.float32)
+    return lambda sample: encoded(net, sample) if isinstance(sample, Sample) else sample
 
 
 @dataclass(kw_only=True)
@@ -152,7 +186,7 @@ def _count_there(out: Path) -> int:
     return len(names)
 
 
-def _demand_same(out: Path, recipe: Recipe) -> None:
+def _demand_same(out: Path, recipe: Recipe, encoder: str | None) -> None:
     """Write down what the folder's scenes are made by, or compare with what was.
 
     Raises:
@@ -160,7 +194,8 @@ def _demand_same(out: Path, recipe: Recipe) -> None:
     """
     from viewmend.atomic_writes import write_text
 
-    plan, file = f"seed {recipe.seed}, {recipe.data}\n", out / PLAN
+    by = "" if encoder is None else f", encoded by {encoder}"
+    plan, file = f"seed {recipe.seed}, {recipe.data}{by}\n", out / PLAN
     if not file.exists():
         write_text(file, plan)
     elif file.read_text() != plan:

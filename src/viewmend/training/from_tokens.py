@@ -1,14 +1,20 @@
 """The transformer alone learns, from windows that the encoder it begins with has encoded. Ours."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from viewmend.inpainting.chain import Chain
 from viewmend.inpainting.context import ContextFrame
 from viewmend.inpainting.patch_transformer import PatchTransformer
-from viewmend.training.encoded import fingerprint, with_keys
+from viewmend.training.encoded import encode, fingerprint, with_keys
 from viewmend.training.objective import Objective
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
+
+
+def encoded(net: PatchTransformer, sample: Sample) -> Sample:
+    """The sample with its context as this net encodes it, instead of images."""
+    return replace(sample, context=(), encoded=encode(net, sample.view, sample.context))
 
 
 class TokensObjective(Objective):
@@ -32,7 +38,7 @@ class TokensObjective(Objective):
         if got:
             raise ValueError(
                 f"expected samples that this model's encoder ({self.encoder}) encoded, got {', '.join(sorted(got))}; "
-                "encode the shards with the model that the run begins with (benchmarks/encode_windows.py)"
+                "make them with the model that the run begins with: viewmend samples tokens --encoder MODEL"
             )
         pairs = zip(samples, known, strict=True)
         return [with_keys(self.patches, s.view, encoded) for s, encoded in pairs if encoded is not None]

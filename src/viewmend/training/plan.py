@@ -13,7 +13,7 @@ from viewmend.inpainting.sweep.config import SweepConfig
 FLAT = tyro.conf.arg(name="")
 """On the command line, the fields are options without a prefix."""
 TAUGHT: dict[str, tuple[str, ...]] = {"autoencoder": ("tokeniser", "decoder"), "tokens": ("transformer",)}
-"""By `Recipe.part`: the modules of a `PatchTransformer` that learn, where not all do."""
+"""The modules of a `PatchTransformer` that learn, where not all do, by `Recipe.part`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +174,7 @@ class Recipe:
     alone, on patches of the cameras' images; all but the rays, on copies of these images; or the transformer alone, on
     windows that are encoded already."""
     anew: tuple[Literal["tokeniser", "transformer", "decoder"], ...] = ()
-    """Modules that begin at random whatever model the run begins with: a transformer upon an encoder that was taught."""
+    """Modules that begin at random whatever the run begins with: a transformer upon an encoder that was taught."""
     pixels_per_view: int = 300
     """For the rays alone: missing pixels that are read of each view, at most."""
     augment: bool = False
