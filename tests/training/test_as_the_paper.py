@@ -6,17 +6,23 @@ import pytest
 import torch
 from inpainting.plates import Rig, context, view
 
+from viewmend.baselines.classical import Telea
 from viewmend.inpainting.chain import build
+from viewmend.inpainting.checkpoint import load_network
 from viewmend.inpainting.config import InpainterConfig, paper, paper_small, small
 from viewmend.inpainting.context import window_times
 from viewmend.inpainting.coordinates import patch_depths
 from viewmend.inpainting.decoder import blend
 from viewmend.inpainting.images import context_images, target_images
 from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.protocol import ContextProvider
+from viewmend.inpainting.upon_white import UponWhite
 from viewmend.training.ablations import ABLATIONS, TABLE_3
 from viewmend.training.losses import image_loss
 from viewmend.training.plan import DataPlan, LossWeights
-from viewmend.training.recipes import RECIPES
+from viewmend.training.recipes import RECIPES, as_the_paper
+from viewmend.training.scenes import StudioScenes
+from viewmend.training.true_images import true_image
 
 CHECKLIST = {
     "widths": ("3: FuseFormer's widths", (64, 64, 128, 256, 384, 512, 384, 256, 128)),
@@ -179,3 +185,22 @@ def test_beyond_a_smaller_image_of_a_stack_there_is_no_white():
     frame = replace(views.frame, cameras=replace(cameras, size_px=size_px), mask=torch.zeros_like(views.frame.mask))
     shown = context_images(replace(views, frame=frame), paper()).channels
     assert not shown[0, :3, :, -10:].any() and (shown[0, :3, :, :-10] == 1).all() and (shown[1, :3] == 1).all()
+
+
+def test_what_is_shipped_under_the_papers_name_is_the_papers_model_and_has_learned():
+    net = load_network("paper-small")
+    assert net.config == paper_small() and type(net) is PatchTransformer
+    plan = replace(as_the_paper(DataPlan()), sizes_px=(224,), cameras=(8, 8), held_cameras=3, hull_resolution=64)
+    samples = StudioScenes(replace(plan, imperfect_fraction=0.0, min_hole_px=200), "shipped", "validation").scene(0)
+    squares = {"ours": [], "telea": []}
+    for sample in samples:
+        truth, judged = true_image(sample, "white"), (sample.view.error > 0) & (sample.alpha > 127)
+        telea = UponWhite(Telea())
+        nothing = ContextProvider(lambda tau, names: None)
+        with torch.no_grad():
+            made = net.eval()([sample.view], [list(sample.context)])[0].upon_own
+        filled = telea.step(sample.view, nothing, telea.initial_state())[0].rgb
+        for name, image in (("ours", made), ("telea", filled)):
+            squares[name].append((image.clamp(0, 1) - truth).square()[:, judged].flatten())
+    ours, telea = (-10 * torch.cat(found).mean().log10() for found in squares.values())
+    assert ours > telea + 0.5, f"{ours:.2f} dB on the subject, Telea {telea:.2f}"
