@@ -1,12 +1,13 @@
 """A copy of a camera image: what is blotted out stands in its context, truly and at known places."""
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from training.conftest import MODEL as CHAIN
-from training.conftest import PLAN, RUN
-from training.test_autoencoder import MODEL, taught_by
+from training.conftest import PLAN
+from training.test_autoencoder import MODEL, recipe_of, taught_by
 
 from viewmend.geometry.cameras import project, unproject
 from viewmend.inpainting.chain import build
@@ -15,7 +16,7 @@ from viewmend.inpainting.images import context_images
 from viewmend.training.copies import BLOT_RADIUS_PX, BLOTS, MISPLACED_PX, CopyingObjective, copy_of
 from viewmend.training.loop import train
 from viewmend.training.objective import Objective
-from viewmend.training.plan import LossWeights, Recipe, WholeViewRecipe
+from viewmend.training.plan import LossWeights, WholeViewRecipe
 from viewmend.training.recipes import RECIPES
 from viewmend.training.sample_files import read_shard
 from viewmend.training.through_tokens import DECODED, encode_and_decode, patch_loss, through_tokens
@@ -23,11 +24,7 @@ from viewmend.training.windows import window
 
 LOSS = LossWeights(channels="sum", attention=0.1, autoencoder=0.5)
 
-
-def recipe(shards, **changes) -> Recipe:
-    data = replace(PLAN, shards=shards, clip_length=2, ray_views=0)
-    parts = {"part": "copies", "loss": LOSS, "validate_every": 0, "model": MODEL} | changes
-    return Recipe(name="copies", data=data, **(RUN | parts))
+recipe = partial(recipe_of, "copies", loss=LOSS)
 
 
 @pytest.fixture

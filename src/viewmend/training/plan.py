@@ -107,8 +107,8 @@ class LossWeights:
     """Weight, at the start, of how far one block's attention is from true correspondences, nats; it falls linearly, to
     nothing at the end. Ours."""
     wide_first: float = 0.0
-    """Share of the run, from its start, in which slivers count for nothing: only holes that a square of
-    `losses.WIDE_PX` pixels fits into. Ours."""
+    """Share of the run, from its start, in which slivers count for nothing: only holes that a square of 9 pixels fits
+    into (`losses.WIDE_PX`). Ours."""
     autoencoder: float = 0.0
     """Weight of L1 between patches of the context and what the decoder makes of their tokens alone. Ours."""
 

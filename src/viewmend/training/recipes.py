@@ -154,15 +154,13 @@ def copies(data: DataPlan) -> Recipe:
 def tokens(data: DataPlan) -> Recipe:
     """The transformer of `paper_small`, on windows that the encoder it begins with has encoded: --from what did so."""
     return replace(
-        autoencoder(data),
+        copies(data),
         name="tokens",
-        ema=0.99,
         part="tokens",
         loss=LossWeights(channels="sum", outside="image", attention=0.1),
         minutes=20.0,
         new_per_batch=8,
         replay_size=1,
-        learning_rate=8e-4,
     )
 
 
