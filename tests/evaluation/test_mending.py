@@ -1,4 +1,4 @@
-"""What `mend` says of its views: each figure under its own name, of its own time, against a truth on black."""
+"""What `mend` says of its views: each figure under its own name, of its own time, upon the background of the truth."""
 
 from dataclasses import fields, replace
 
@@ -6,9 +6,15 @@ import pytest
 import torch
 from reference.ball import BallCapture, camera_at, ring
 
+from viewmend.baselines.classical import Telea
 from viewmend.evaluation.mending import Mender, MendSummary, Scores
 from viewmend.inpainting.coarse_fill import SmoothFill
+from viewmend.inpainting.protocol import ContextProvider, State
+from viewmend.inpainting.upon_white import covered
+from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.view_scores import ViewScores
+from viewmend.rendering.view import RenderConfig
+from viewmend.views import CompletedView
 
 TARGET = camera_at(75, "t", height_m=0.3)
 
@@ -46,3 +52,32 @@ def test_the_truth_is_black_where_its_mask_is():
     bright = replace(truth, rgb=torch.where(truth.mask[:, None] > 127, truth.rgb, 255).to(torch.uint8))
     steps = [Mender(SmoothFill()).mend(source.read(0), TARGET, seen) for seen in (truth, bright)]
     assert steps[0].scores == steps[1].scores and float(steps[1].truth[:, 0, 0].max()) == 0
+
+
+class Snow(SmoothFill):
+    """Paints white wherever it is asked to paint."""
+
+    background = "white"
+
+    def step(self, view, context, state):
+        rgb = view.error + (1 - view.error) * view.rgb
+        return CompletedView(view, rgb, covered(view)), state
+
+
+def test_a_model_that_paints_upon_white_is_shown_and_scored_upon_white():
+    source = BallCapture(ring(6), 1)
+    truth = BallCapture(TARGET, 1).read(0)
+    step = Mender(Snow(), RenderConfig(cameras=2)).mend(source.read(0), TARGET, truth)
+    view, subject, scores = step.completed.view, truth.mask[0] > 127, step.scores
+    assert step.background == "white" and view.holes.sum() > 50
+    for image in (step.mended, step.rendered, step.truth):
+        assert float(image[:, ~subject & (view.mask == 0)].min()) == 1
+    assert float(step.mended[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
+    torch.testing.assert_close(step.mended, torch.where(view.error > 0, 1.0, step.rendered))
+    assert scores.ours.psnr_whole == pytest.approx(psnr(step.mended, step.truth))
+    assert scores.unfilled.psnr_whole == pytest.approx(psnr(step.rendered, step.truth))
+    telea = Telea().step(replace(view, rgb=step.rendered), ContextProvider(lambda *_: None), State())[0].rgb
+    assert scores.telea.psnr_holes == pytest.approx(psnr(telea, step.truth, view.holes), abs=0.01)
+    summary = MendSummary()
+    summary.add(step)
+    assert summary.as_json()["background"] == "white"

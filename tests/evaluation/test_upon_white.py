@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import torch
 
+from viewmend.backgrounds import laid_upon
 from viewmend.baselines.classical import Telea
 from viewmend.evaluation.cells import cell_keys
-from viewmend.evaluation.frame_scores import laid_upon
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
 from viewmend.inpainting.checkpoint import load_inpainter
 from viewmend.inpainting.protocol import ContextProvider, State, own_background

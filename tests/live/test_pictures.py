@@ -1,13 +1,18 @@
+import urllib.request
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from live_servers import running
 
+from viewmend.inpainting.coarse_fill import SmoothFill
+from viewmend.live.client import Client
 from viewmend.live.pictures import (
     COLOURS,
     depth_stride,
+    from_jpeg,
     mean_confidence,
     pack_depth,
     picture,
@@ -90,3 +95,18 @@ def test_depth_of_nothing_is_nothing():
     assert (unpack_depth(pack_depth(torch.zeros(20, 20), 4)) == 0).all()
     flat = unpack_depth(pack_depth(torch.full((20, 20), 2.0), 4))
     assert np.allclose(flat, 2.0, atol=1e-4)
+
+
+def test_pictures_lie_upon_what_the_model_paints_upon_unless_somebody_asks_for_another():
+    class UponWhite(SmoothFill):
+        background = "white"
+
+    with running(inpainter=UponWhite()) as server, Client(server.ws) as viewer:
+        assert viewer.messages["welcome"]["background"] == "ffffff"
+        seen = [viewer.frame(viewer.look(width=64, height=48)).images[0, "mended"]]
+        for asked in ("", "&background=000000"):
+            with urllib.request.urlopen(
+                f"{server.url}/frame.jpg?time=0&width=64&height=48{asked}", timeout=20
+            ) as answer:
+                seen.append(from_jpeg(answer.read()))
+        assert [round(float(image[:4, :4].mean())) for image in seen] == [255, 255, 0]

@@ -102,7 +102,7 @@ def _report(summary: "MendSummary") -> dict[str, object]:
     metrics: tuple[Metric, ...] = ("psnr_whole", "psnr_subject", "psnr_holes", "psnr_holes_fg")
     scores = {fill: {metric: summary.mean(fill, metric) for metric in metrics} for fill in fills}
     rest = summary.as_json()
-    kept = ("frames", "hole_fraction", "mended_fraction", "ssim_whole", "alpha_iou", "stage_ms")
+    kept = ("frames", "background", "hole_fraction", "mended_fraction", "ssim_whole", "alpha_iou", "stage_ms")
     return scores | {key: rest[key] for key in kept}
 
 
@@ -110,7 +110,7 @@ def _table(summary: "MendSummary", steps: "list[MendStep]") -> list[str]:
     from viewmend.cli.console import in_db
 
     holes = sum(int(s.completed.view.holes.sum()) for s in steps)
-    lines = [f"{len(steps)} frames, {holes} missing pixels; PSNR in dB against the truth:"]
+    lines = [f"{len(steps)} frames, {holes} missing pixels; PSNR upon {summary.background} in dB against the truth:"]
     lines.append("              whole image   holes   holes on the subject")
     rows: list[tuple[str, Fill]] = [("left black", "unfilled"), ("Telea", "telea"), ("viewmend", "ours")]
     for label, fill in rows:

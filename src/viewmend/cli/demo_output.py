@@ -42,9 +42,8 @@ def _worth_seeing(steps: Sequence[MendStep]) -> list[int]:
 
 
 def _panel(step: MendStep) -> UInt8[np.ndarray, "height width 3"]:
-    view = step.completed.view
     assert step.truth is not None, "the studio knows the truth"
-    images = {"rendered": view.rgb, "mended": step.completed.rgb, "truth": step.truth}
+    images = {"rendered": step.rendered, "mended": step.mended, "truth": step.truth}
     return side_by_side({name: picture(image) for name, image in images.items()})
 
 

@@ -21,11 +21,13 @@ class Options:
     left out (truth/*.png), all beside each other (compared.mp4) and contact_sheet.png.
 
     With --leave-out the view is that of a camera whose image and mask are used for nothing else, and is scored against
-    it, black background: PSNR in dB of the whole image (also as it was rendered, and with nothing but the holes mended:
-    unseen), of the subject (inside the true mask), of the pixels that a camera coloured (valid), and of those that none
-    did (holes; fg: those inside the true mask), these also for OpenCV's Telea fill; SSIM of the whole image; the IoU of
-    alpha with the true mask. PSNRs are means over frames, in the holes over frames with at least 50 such pixels (if
-    there are any); hole_fraction is the holes' share of the hull's pixels, mended_fraction that of those with E > 0.
+    it: PSNR in dB of the whole image (also as it was rendered, and with nothing but the holes mended: unseen), of the
+    subject (inside the true mask), of the pixels that a camera coloured (valid), and of those that none did (holes; fg:
+    those inside the true mask), these also for OpenCV's Telea fill; SSIM of the whole image; the IoU of alpha with the
+    true mask. PSNRs are means over frames, in the holes over frames with at least 50 such pixels (if there are any);
+    hole_fraction is the holes' share of the hull's pixels, mended_fraction that of those with E > 0.
+
+    All is shown and scored upon black; upon white by a model that paints upon white (paper-small, as the paper's).
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
@@ -139,7 +141,10 @@ def _in_words(summary: "MendSummary") -> list[str]:
     if summary.mean("ours", "psnr_whole") is None:
         return lines
     whole = [in_db(summary.mean(fill, "psnr_whole")) for fill in ("ours", "unfilled", "unseen")]
-    lines += ["PSNR, dB", f"  whole image           {whole[0]}   rendered {whole[1]}   holes alone mended {whole[2]}"]
+    lines += [
+        f"PSNR upon {summary.background}, dB",
+        f"  whole image           {whole[0]}   rendered {whole[1]}   holes alone mended {whole[2]}",
+    ]
     lines.append(f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}")
     lines.append(f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}")
     holes: dict[str, Metric] = {"holes": "psnr_holes", "holes on the subject": "psnr_holes_fg"}

@@ -15,7 +15,7 @@ from viewmend.evaluation.mending import MendStep
 from viewmend.export.cutout import cutout
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.output_folder import OutputFolder
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.views import CompletedView
 
 SHEET_ROWS = 4
 RESULTS = (
@@ -69,7 +69,7 @@ class MendOutput:
     def add(self, step: MendStep) -> None:
         """Write one view and, of a few spread over the run, remember a row of the sheet."""
         completed, number = step.completed, f"{self._count:06d}.png"
-        shown = {"mended": completed.rgb, "holes": completed.view.error[None], "rendered": completed.view.rgb}
+        shown = {"mended": step.mended, "holes": completed.view.error[None], "rendered": step.rendered}
         for name, image in (shown if step.truth is None else shown | {"truth": step.truth}).items():
             write_image(self._draft / name / number, picture(image))
         if self._alpha:
@@ -131,25 +131,26 @@ def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UI
 def sheet_row(step: MendStep) -> list[Tile]:
     """Input cameras, rendered, holes, mended, what the inpainter tells, truth, differences; cut to the subject."""
     completed, view, truth = step.completed, step.completed.view, step.truth
-    box = _box(view.mask > 0 if truth is None else (view.mask > 0) | (truth > 0).any(0))
+    empty = float(step.background == "white")
+    box = _box(view.mask > 0 if truth is None else (view.mask > 0) | (truth != empty).any(0))
     tiles = []
     for name in view.source_views:
         own = step.frame.select([name])
         assert own.mask is not None, "frames without masks are refused"
         tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > FOREGROUND)]))
-    images = {f"rendered, frame {view.time}": view.rgb, "holes": _holes_marked(view), "mended": completed.rgb}
+    images = {f"rendered, frame {view.time}": step.rendered, "holes": _holes_marked(step), "mended": step.mended}
     images |= {name: image[None] for name, image in completed.images.items() if name in ("alpha", "confidence")}
     if truth is not None:
         images["truth"] = truth
-        for name, rgb in {"rendered": view.rgb, "mended": completed.rgb}.items():
+        for name, rgb in {"rendered": step.rendered, "mended": step.mended}.items():
             images[f"{name} - truth, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(0, 1)
     return tiles + [Tile(name, picture(image)[box]) for name, image in images.items()]
 
 
-def _holes_marked(view: IncompleteView) -> Float[Tensor, "3 height width"]:
+def _holes_marked(step: MendStep) -> Float[Tensor, "3 height width"]:
     """F with its holes in magenta."""
-    colour = torch.tensor(HOLE_COLOUR, device=view.rgb.device)[:, None, None]
-    return torch.where(view.holes, colour, view.rgb)
+    colour = torch.tensor(HOLE_COLOUR, device=step.rendered.device)[:, None, None]
+    return torch.where(step.completed.view.holes, colour, step.rendered)
 
 
 def _box(mask: Tensor) -> tuple[slice, slice]:

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from viewmend.evaluation.scorers import SSIM_ONLY, Background, ScoreMap, Scorers
+from viewmend.backgrounds import Background, laid_upon
+from viewmend.evaluation.scorers import SSIM_ONLY, ScoreMap, Scorers
 from viewmend.evaluation.temporal import change, warp_error
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.metrics.image_quality import SSIM_SIZE_PX, SsimWindow, mask_iou, psnr, ssim_map
@@ -120,13 +121,6 @@ def true_view(
     mask = frame.mask[0]
     black = frame.rgb[0].float() / 255 * (mask.float() / 255)
     return TrueView(laid_upon(background, black, mask.float() / 255), mask > FOREGROUND, backward_flow_px)
-
-
-def laid_upon(
-    background: Background, rgb: Float[Tensor, "3 height width"], alpha: Float[Tensor, "height width"]
-) -> Float[Tensor, "3 height width"]:
-    """An image upon black, of what covers so much of each pixel, upon this background."""
-    return rgb if background == "black" else (rgb + (1 - alpha)).clamp(0, 1)
 
 
 def score_frame(

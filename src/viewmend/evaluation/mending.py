@@ -9,13 +9,15 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background, laid_upon
 from viewmend.baselines.classical import Telea
 from viewmend.evaluation.frame_scores import mean_similarity
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
-from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, shown_upon
+from viewmend.inpainting.upon_white import UponWhite
 from viewmend.metrics.image_quality import mask_iou
 from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
 from viewmend.observation import Observation
@@ -50,13 +52,25 @@ class MendStep:
     frame: MultiViewFrame
     """The input cameras."""
     completed: CompletedView
+    background: Background
+    """What the inpainter paints upon, and its views are shown and scored upon."""
     truth: Float[Tensor, "3 height width"] | None
-    """What the view should look like, background black; None where nobody knows."""
+    """What the view should look like, upon the background; None where nobody knows."""
     scores: Scores | None
     """None without truth."""
     hull_iou: dict[str, float]
     """The hull's silhouette against the mask, for each input camera and the truth."""
     times: StageTimes
+
+    @property
+    def mended(self) -> Float[Tensor, "3 height width"]:
+        """Fhat upon the background."""
+        return laid_upon(self.background, self.completed.rgb, self.completed.opacity)
+
+    @property
+    def rendered(self) -> Float[Tensor, "3 height width"]:
+        """F upon the background; holes are black."""
+        return laid_upon(self.background, self.completed.view.rgb, self.completed.view.mask)
 
 
 class Mender:
@@ -72,6 +86,7 @@ class Mender:
     ):
         self._config = StreamConfig(render=render or RenderConfig(), memory_mb=None)
         self._stream = Stream(inpainter, self._config, bounds)
+        self._background: Background = shown_upon(inpainter)
         self._exclude = exclude
         self._quality = quality
         self._viewer: State | None = None
@@ -98,11 +113,11 @@ class Mender:
         self._viewer = mended.viewer
         iou = _hull_iou(observation)
         if truth is None:
-            return MendStep(frame, mended.completed, None, None, iou, mended.times)
-        image, scores = _judge(mended.completed, self._holes_mended(mended.completed), truth)
+            return MendStep(frame, mended.completed, self._background, None, None, iou, mended.times)
+        image, scores = _judge(mended.completed, self._holes_mended(mended.completed), truth, self._background)
         if scores.ours.hull_iou is not None:
             iou[truth.cameras.names[0]] = scores.ours.hull_iou
-        return MendStep(frame, mended.completed, image, scores, iou, mended.times)
+        return MendStep(frame, mended.completed, self._background, image, scores, iou, mended.times)
 
     def _holes_mended(self, completed: CompletedView) -> CompletedView:
         """The same view with nothing but its holes mended, as a stream of its own."""
@@ -115,21 +130,23 @@ class Mender:
 
 
 def _judge(
-    completed: CompletedView, holes_mended: CompletedView, truth: MultiViewFrame
+    completed: CompletedView, holes_mended: CompletedView, truth: MultiViewFrame, background: Background
 ) -> tuple[Float[Tensor, "3 height width"], Scores]:
-    """The true image on black, and the scores against it."""
+    """The true image upon this background, and the scores against it."""
     view = completed.view
     height, width = view.mask.shape
     assert truth.mask is not None, "frames without masks are refused"
     mask = truth.mask[0, :height, :width]
     image, subject = truth.rgb[0, :, :height, :width] / 255 * (mask / 255), mask > FOREGROUND
-    baseline = Telea()
+    image = laid_upon(background, image, mask / 255)
+    baseline = UponWhite(Telea()) if background == "white" else Telea()
     filled, _ = baseline.step(
         replace(view, error=view.holes.to(view.rgb)), ContextProvider(lambda *_: None), baseline.initial_state()
     )
-    fills = (view.rgb, filled.rgb, holes_mended.rgb, completed.rgb)
+    fills = [laid_upon(background, view.rgb, view.mask)]
+    fills += [laid_upon(background, made.rgb, made.opacity) for made in (filled, holes_mended, completed)]
     unfilled, telea, unseen, ours = (score_view(view, rgb, image, subject) for rgb in fills)
-    ssim = mean_similarity(completed.rgb, image)
+    ssim = mean_similarity(fills[-1], image)
     return image, Scores(unfilled, telea, unseen, ours, ssim, mask_iou(completed.opacity > 0.5, subject))
 
 
@@ -145,6 +162,8 @@ class MendSummary:
 
     def __init__(self) -> None:
         self.frames = 0
+        self.background: Background = "black"
+        """What was scored upon."""
         self.hull_iou: dict[str, list[float]] = {}
         """The IoU of each camera, frame by frame."""
         self._hull_px = self._holes_px = self._mended_px = 0
@@ -154,7 +173,7 @@ class MendSummary:
     def add(self, step: MendStep) -> None:
         """Count one more view."""
         view = step.completed.view
-        self.frames += 1
+        self.frames, self.background = self.frames + 1, step.background
         self._hull_px += int((view.mask > 0.5).sum())
         self._holes_px += int(view.holes.sum())
         self._mended_px += int(((view.mask > 0.5) & view.read).sum())
@@ -178,6 +197,7 @@ class MendSummary:
         """The scores; null where there are no such pixels, or no truth. Times are medians, milliseconds."""
         return {
             "frames": self.frames,
+            "background": self.background,
             "hole_fraction": self.hole_fraction,
             "mended_fraction": self.mended_fraction,
             "psnr_whole": self.mean("ours", "psnr_whole"),

@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background, laid_upon
 from viewmend.baselines.classical import Unfilled
 from viewmend.baselines.rgvi import SeesTruth
 from viewmend.contact_sheet import picture
 from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
-from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, laid_upon, score_frame, true_view
+from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
 from viewmend.evaluation.own_stream import all_of, push_again
-from viewmend.evaluation.scorers import Background, Features, Scorers, VideoFeatures, load_scorers
+from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
 from viewmend.inpainting.protocol import State, ViewInpainter, encode_past, own_background
 from viewmend.inpainting.upon_white import UponWhite
 from viewmend.leave_one_out.scenes import LeaveOneOutScene

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background
 from viewmend.metrics.i3d import I3d
 from viewmend.metrics.image_quality import SsimWindow
 from viewmend.metrics.lpips import load_lpips
@@ -17,7 +17,6 @@ from viewmend.metrics.weights import MissingWeightsError
 
 ScoreMap = Callable[[Tensor, Tensor], Tensor | None]
 """score(image, truth): a value for each pixel, NaN where there is none; None for images it cannot score."""
-Background = Literal["black", "white"]
 CLIP_FRAMES = 16
 """A stream is cut into videos of so many frames for VFID. What is left over is one more if it is half as long, or
 alone."""

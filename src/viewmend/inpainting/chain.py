@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
+from viewmend.backgrounds import Background
 from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextFrame
@@ -25,7 +26,7 @@ class Chain(Network):
         self.coarse = RayBlendNet(config.num_ray_views) if config.coarse_fill == "rays" else SmoothFill()
 
     @property
-    def background(self) -> str:
+    def background(self) -> Background:
         """What it paints upon."""
         return self.patches.background
 

@@ -6,6 +6,7 @@ from functools import lru_cache
 import torch
 from torch import nn
 
+from viewmend.backgrounds import Background
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.protocol import State
 from viewmend.timing import ms_since, now_s
@@ -25,7 +26,7 @@ class Network(nn.Module):
     """Whether bfloat16 is as good as float32 for it."""
 
     @property
-    def background(self) -> str | None:
+    def background(self) -> Background | None:
         """What it was trained to paint upon: black or white; None for whatever it is shown."""
         return "black"
 

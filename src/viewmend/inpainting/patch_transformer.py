@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background
 from viewmend.inpainting.assembly import Target, assemble
 from viewmend.inpainting.config import InpainterConfig
 from viewmend.inpainting.context import ContextFrame, window_times
@@ -73,7 +74,7 @@ class PatchTransformer(Network):
             identity_init(self.tokeniser.linear, self.decoder.linear, config)
 
     @property
-    def background(self) -> str:
+    def background(self) -> Background:
         """What it paints upon."""
         return "white" if self.config.background == "white" else "black"
 

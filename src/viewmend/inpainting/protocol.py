@@ -7,6 +7,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background
 from viewmend.own_pages import to_own_pages
 from viewmend.timing import ms_since, now_s
 from viewmend.views import CompletedView, ContextViews, IncompleteView
@@ -199,9 +200,14 @@ def own_error_rule(inpainter: ViewInpainter) -> str:
     return getattr(inpainter, "error_rule", "unseen")
 
 
-def own_background(inpainter: ViewInpainter) -> str | None:
+def own_background(inpainter: object) -> Background | None:
     """What an inpainter was trained to paint upon, black or white; None for whatever it is shown (classical fills)."""
     return getattr(inpainter, "background", None)
+
+
+def shown_upon(inpainter: object) -> Background:
+    """What views that this mended are to be laid upon, since what it takes for background it paints so."""
+    return own_background(inpainter) or "black"
 
 
 def encode_past(inpainter: ViewInpainter, view: IncompleteView, context: ContextProvider) -> None:

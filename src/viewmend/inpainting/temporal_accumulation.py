@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from viewmend.backgrounds import Background
 from viewmend.geometry.cameras import Cameras, project, unproject
 from viewmend.geometry.sampling import in_view, sample_bilinear
 from viewmend.inpainting.protocol import (
@@ -68,7 +69,7 @@ class TemporalAccumulation(nn.Module):
         self.config = getattr(inner, "config", None)
 
     @property
-    def background(self) -> str | None:
+    def background(self) -> Background | None:
         """The inner inpainter's."""
         return own_background(self.inner)
 

@@ -57,7 +57,7 @@ class BroadcastSession(ViewerSession):
         self.viewer: State | None = result.viewer
         completed, hulls = next(result.eyes)
         with light_operations():
-            self.picture = picture(completed, look.modes[0], look.background, hulls)
+            self.picture = picture(completed, look.modes[0], look.background or result.background, hulls)
         times = FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
         self._learn(look, times, size_bytes=0)
         return times

@@ -139,6 +139,7 @@ class ViewerConnection:
             "modes": MODES,
             "error_rules": tuple(ERROR_RULES),
             "error_rule": self._service.renderer.error_rule,
+            "background": self._service.renderer.background,
             "budget_ms": self._registry.budget_ms,
             "limits": asdict(self._registry.limits),
             **self._registry.about,

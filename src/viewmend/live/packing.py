@@ -60,7 +60,7 @@ def frame_message(
     parts, data = [], []
     for eye, (completed, hulls) in enumerate(result.eyes):
         for mode in look.modes:
-            shown = picture(completed, mode, look.background, hulls)
+            shown = picture(completed, mode, look.background or result.background, hulls)
             part, encoded = encoders.encode(shown, eye, mode, look, info.key)
             parts.append(part)
             data.append(encoded)

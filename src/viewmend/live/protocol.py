@@ -52,7 +52,7 @@ TopK = Annotated[int, Meta(ge=1, le=1_000_000)]
 Quality = Annotated[int, Meta(ge=30, le=95)]
 Colour = Annotated[str, Meta(pattern="^[0-9a-f]{6}\\Z")]
 """Red, green and blue in hexadecimal."""
-BLACK = "000000"
+BLACK, WHITE = "000000", "ffffff"
 ShortText = Annotated[str, Meta(max_length=40)]
 
 
@@ -127,8 +127,8 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     key: bool = False
     """Begin video streams anew: the decoder has lost them."""
     quality: Quality = 85
-    background: Colour = BLACK
-    """What the pictures lie upon."""
+    background: Colour | None = None
+    """What the pictures lie upon; None for what the model paints upon."""
 
     def __post_init__(self) -> None:
         force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))

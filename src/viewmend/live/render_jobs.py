@@ -31,7 +31,7 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
     mode: protocol.Mode = "mended"
     top_k: protocol.TopK | None = None
     error_rule: protocol.Rule | None = None
-    background: protocol.Colour = protocol.BLACK
+    background: protocol.Colour | None = None
 
 
 class PictureQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -185,4 +185,5 @@ def request_for(
 
 def pictures_of(asked: ViewOptions, result: RenderResult) -> Picture:
     """All eyes' pictures side by side."""
-    return np.hstack([picture(seen, asked.mode, asked.background, hulls) for seen, hulls in result.eyes])
+    ground = asked.background or result.background
+    return np.hstack([picture(seen, asked.mode, ground, hulls) for seen, hulls in result.eyes])

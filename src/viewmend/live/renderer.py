@@ -12,11 +12,11 @@ from torch import Tensor
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter, own_error_rule
+from viewmend.inpainting.protocol import RenderQuality, State, ViewInpainter, own_error_rule, shown_upon
 from viewmend.live.budget import ladder_for
 from viewmend.live.frames import FrameSupply, Rig
 from viewmend.live.poses import RigFrame, bounds_json, cameras_json, rig_frame, view_camera
-from viewmend.live.protocol import Camera
+from viewmend.live.protocol import BLACK, WHITE, Camera
 from viewmend.observation import Observation
 from viewmend.rendering.hull_views import hull_points, shaded_hull
 from viewmend.rendering.vertex_colours import vertex_colours
@@ -51,6 +51,8 @@ class RenderResult:
     """What to ask for the next views with."""
     times: StageTimes
     """Times of all eyes; geometry and context are 0 where another viewer has paid for them."""
+    background: str = BLACK
+    """What the pictures lie upon where nobody asks for another: what the model paints upon, hexadecimal RGB."""
     hulls: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
     """Pictures of the proxy by mode, for each eye: RGB in [0, 1] and, last, how much it covers."""
 
@@ -95,6 +97,11 @@ class Renderer:
     def error_rule(self) -> str:
         """The rule of views that are asked for without one."""
         return self._config.render.error_rule or own_error_rule(self._inpainter)
+
+    @property
+    def background(self) -> str:
+        """What the model paints upon, hexadecimal RGB."""
+        return WHITE if shown_upon(self._inpainter) == "white" else BLACK
 
     def is_of(self, rig: Rig | None) -> bool:
         """Whether it renders this rig."""
@@ -146,7 +153,7 @@ class Renderer:
         hulls = tuple(self._hulls(observation, c.to(self._device), request.hull_modes) for c in request.cameras)
         drawn = StageTimes(rendering=1000 * (time.perf_counter() - start))
         completed, times = tuple(view.completed for view in views), sum((v.times for v in views), drawn)
-        return RenderResult(request.time, completed, views[0].viewer, times, hulls)
+        return RenderResult(request.time, completed, views[0].viewer, times, self.background, hulls)
 
     def _hulls(self, observation: Observation, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
         """Pictures of the proxy from this camera; its vertices' colours are found once for each time."""

@@ -40,7 +40,7 @@ def score_view(
     truth: Float[Tensor, "3 height width"],
     true_mask: Bool[Tensor, "height width"],
 ) -> ViewScores:
-    """Compare `rgb`, a completion of `view`, with the true image, whose background is black."""
+    """Compare `rgb`, a completion of `view`, with the true image; both lie upon the same background."""
     hull, holes = view.mask > 0.5, view.holes
     holes_fg = holes & true_mask
     whole = psnr(rgb, truth)

@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background
 from viewmend.training.adversarial import Objective, discriminator_objective, inpainter_objective
 from viewmend.training.discriminator import Discriminator, DiscriminatorConfig
 from viewmend.training.plan import LossWeights
@@ -18,9 +19,11 @@ BETAS = (0.0, 0.99)
 class Adversary:
     """D with its optimizer."""
 
-    def __init__(self, loss: LossWeights, learning_rate: float, own: Processes, background: str = "black") -> None:
+    def __init__(
+        self, loss: LossWeights, learning_rate: float, own: Processes, background: Background = "black"
+    ) -> None:
         """`background` is what the inpainter paints upon, where D is shown the truth, too."""
-        self.background = background
+        self.background: Background = background
         self.kind: Objective = loss.adversarial_kind
         self.of_clips = loss.discriminator == "clip"
         layers = 6 if self.of_clips else 4

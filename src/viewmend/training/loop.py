@@ -15,6 +15,7 @@ from viewmend.inpainting.chain import Chain, build
 from viewmend.inpainting.checkpoint import save_inpainter
 from viewmend.inpainting.network import set_compute_dtype
 from viewmend.inpainting.patch_transformer import PatchTransformer
+from viewmend.inpainting.protocol import shown_upon
 from viewmend.output_folder import OutputFolder
 from viewmend.training.adversary import Adversary
 from viewmend.training.autoencoder import AutoencoderObjective
@@ -111,8 +112,7 @@ class Run:
         self.optimizer = self._make_optimizer()
         self.adversary = None
         if recipe.loss.adversarial:
-            background = getattr(self.model, "background", None) or "black"
-            self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own, background)
+            self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own, shown_upon(self.model))
         self.state = RunState(0, 0.0, ())
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}

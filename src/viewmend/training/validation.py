@@ -9,9 +9,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from viewmend.backgrounds import Background
 from viewmend.baselines.classical import Telea
 from viewmend.capture.images import write_image
-from viewmend.inpainting.protocol import ContextProvider, State
+from viewmend.inpainting.protocol import ContextProvider, State, shown_upon
 from viewmend.inpainting.upon_white import UponWhite
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.plan import Recipe
@@ -67,7 +68,7 @@ class Validation:
     @torch.no_grad()
     def judge(self, model: nn.Module, step: int) -> ValidationScores:
         """Mend every view, score it, and leave a picture of the first few."""
-        background = getattr(model, "background", None) or "black"
+        background = shown_upon(model)
         if not self._samples:
             self._samples = self._views()
             self._telea = [_telea(sample, background) for sample in self._samples]
@@ -95,7 +96,7 @@ class Validation:
         return list(islice(samples, self.recipe.validation_views))
 
 
-def _telea(sample: Sample, background: str) -> float:
+def _telea(sample: Sample, background: Background) -> float:
     """What Telea scores upon the model's background."""
     fill = UponWhite(Telea()) if background == "white" else Telea()
     rgb = fill.step(sample.view, ContextProvider(lambda *_: None), State())[0].rgb

@@ -49,6 +49,8 @@ class StandIn:
     """The server, in a thread of its own; tests read what it heard and change what it says."""
 
     playing: bool = False
+    ground: str = "000000"
+    """What the model would paint upon."""
     video: bool = True
     source: str = "ready"
     error: str | None = None
@@ -149,7 +151,7 @@ class StandIn:
             self.hellos.append(message)
             codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
             about = {"version": 1, "viewer": 1, "server": "stand-in", "model": "none", "modes": MODES, "codecs": codecs}
-            about |= {"error_rules": ["unseen", "all", "yours"], "error_rule": "all"}
+            about |= {"error_rules": ["unseen", "all", "yours"], "error_rule": "all", "background": self.ground}
             more = {"export": True, "budget_ms": None, "limits": LIMITS, "token_needed": False}
             await viewer.socket.send_json({"type": "welcome", **about, **more})
             await viewer.socket.send_json(scene.rig())

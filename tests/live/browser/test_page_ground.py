@@ -43,6 +43,16 @@ def test_the_light_page_is_light_and_is_kept(view):
     assert corner(view) == [0, 0, 0]
 
 
+def test_pictures_lie_upon_what_the_model_paints_upon_until_somebody_chooses(desktop):
+    desktop.server.ground = "ffffff"
+    desktop.page.reload()
+    desktop.settle()
+    assert desktop.server.looks[-1]["background"] == "ffffff" and corner(desktop) == [255, 255, 255]
+    desktop.page.locator("#background").fill("#204020")
+    desktop.settle()
+    assert corner(desktop) == [0x20, 0x40, 0x20]
+
+
 def test_text_of_the_light_page_can_be_read(desktop):
     desktop.page.locator("#theme").select_option("light")
     desktop.page.wait_for_timeout(400)  # colours fade over

@@ -119,6 +119,7 @@ class Page {
       this.limits = welcome.limits;
       this.controls.codecs(welcome.codecs);
       this.controls.rules(welcome.error_rules, welcome.error_rule);
+      this.settings.set("modelGround", welcome.background ?? "000000", false);
       this.paths.offer(welcome.export);
       this.wake();
     });

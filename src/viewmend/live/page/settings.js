@@ -16,7 +16,8 @@
  * @property {boolean} reproject
  * @property {boolean} originals whether what a camera took is shown beside the view from its place
  * @property {"dark" | "light"} theme
- * @property {string} background of the pictures, hexadecimal RGB; "" for the theme's
+ * @property {string} background of the pictures, hexadecimal RGB; "" for the theme's, or what the model paints upon
+ * @property {string} modelGround what the model paints upon, hexadecimal RGB; not kept
  * @property {boolean} rig
  * @property {boolean} panel
  */
@@ -37,6 +38,7 @@ const DEFAULTS = {
   originals: true,
   theme: "dark",
   background: "",
+  modelGround: "000000",
   rig: false,
   panel: window.innerHeight > 460,
 };
@@ -48,6 +50,7 @@ const SENSIBLE = {
   left: (value) => PICTURES.includes(value),
   right: (value) => PICTURES.includes(value),
   theme: (value) => value === "dark" || value === "light",
+  modelGround: () => false,
   background: (value) => /^([0-9a-f]{6})?$/.test(value),
   size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
 };
@@ -106,7 +109,9 @@ export class Settings extends EventTarget {
 
   /** What the pictures lie upon. @returns {string} hexadecimal RGB */
   get ground() {
-    return this.values.background || (this.values.theme === "light" ? "f2f4f6" : "000000");
+    const { background, modelGround, theme } = this.values;
+    if (background || modelGround !== "000000") return background || modelGround;
+    return theme === "light" ? "f2f4f6" : "000000";
   }
 
   /** The modes that the server must render. @returns {string[]} */

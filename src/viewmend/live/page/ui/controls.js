@@ -15,7 +15,7 @@ function buildGround(settings) {
     settings.set("theme", byId("theme").value);
   });
   byId("background").addEventListener("input", () => settings.set("background", byId("background").value.slice(1)));
-  settings.watch(["theme", "background"], () => {
+  settings.watch(["theme", "background", "modelGround"], () => {
     byId("theme").value = settings.get("theme");
     byId("background").value = `#${settings.ground}`;
     document.documentElement.dataset.theme = settings.get("theme");
