@@ -25,8 +25,8 @@ from viewmend.views import CompletedView, IncompleteView
 
 KEYS = [
     "frames", "background", "hole_fraction", "mended_fraction", "psnr_whole", "psnr_whole_rendered",
-    "psnr_whole_unseen", "ssim_whole", "psnr_subject", "alpha_iou", "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg",
-    "psnr_holes_fg_telea", "hull_iou", "stage_ms",
+    "psnr_whole_unseen", "ssim_whole", "psnr_subject", "alpha_iou", "psnr_valid", "psnr_holes", "psnr_holes_telea",
+    "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou", "stage_ms",
 ]  # fmt: skip
 
 
