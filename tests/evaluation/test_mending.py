@@ -7,6 +7,9 @@ import torch
 from reference.ball import BallCapture, camera_at, ring
 
 from viewmend.baselines.classical import Telea
+from viewmend.capture.images import read_rgb
+from viewmend.cli.mend_output import MendOutput, sheet_row
+from viewmend.evaluation.frame_scores import mean_similarity
 from viewmend.evaluation.mending import Mender, MendSummary, Scores
 from viewmend.inpainting.coarse_fill import SmoothFill
 from viewmend.inpainting.protocol import ContextProvider, State
@@ -64,10 +67,14 @@ class Snow(SmoothFill):
         return CompletedView(view, rgb, covered(view)), state
 
 
-def test_a_model_that_paints_upon_white_is_shown_and_scored_upon_white():
-    source = BallCapture(ring(6), 1)
+@pytest.fixture
+def snow():
     truth = BallCapture(TARGET, 1).read(0)
-    step = Mender(Snow(), RenderConfig(cameras=2)).mend(source.read(0), TARGET, truth)
+    return Mender(Snow(), RenderConfig(cameras=2)).mend(BallCapture(ring(6), 1).read(0), TARGET, truth), truth
+
+
+def test_a_model_that_paints_upon_white_is_scored_upon_white(snow):
+    step, truth = snow
     view, subject, scores = step.completed.view, truth.mask[0] > 127, step.scores
     assert step.background == "white" and view.holes.sum() > 50
     for image in (step.mended, step.rendered, step.truth):
@@ -75,9 +82,24 @@ def test_a_model_that_paints_upon_white_is_shown_and_scored_upon_white():
     assert float(step.mended[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
     torch.testing.assert_close(step.mended, torch.where(view.error > 0, 1.0, step.rendered))
     assert scores.ours.psnr_whole == pytest.approx(psnr(step.mended, step.truth))
+    assert scores.ssim_whole == pytest.approx(mean_similarity(step.mended, step.truth))
     assert scores.unfilled.psnr_whole == pytest.approx(psnr(step.rendered, step.truth))
     telea = Telea().step(replace(view, rgb=step.rendered), ContextProvider(lambda *_: None), State())[0].rgb
     assert scores.telea.psnr_holes == pytest.approx(psnr(telea, step.truth, view.holes), abs=0.01)
     summary = MendSummary()
     summary.add(step)
     assert summary.as_json()["background"] == "white"
+
+
+def test_a_model_that_paints_upon_white_is_shown_upon_white(snow, tmp_path):
+    step, _ = snow
+    with MendOutput(tmp_path, 15.0) as output:
+        output.add(step)
+    for name in ("mended", "rendered", "truth"):
+        assert (read_rgb(tmp_path / name / "000000.png", name)[:3, :3] == 255).all(), name
+    tiles = {tile.label.split(",")[0]: tile.image for tile in sheet_row(step)}
+    height, width = step.completed.view.mask.shape
+    for name in ("rendered", "holes", "mended", "truth"):
+        assert tiles[name].shape[0] < height and tiles[name].shape[1] < width, "cut to the subject"
+        assert tiles[name][0, 0].tolist() == [255, 255, 255]
+    assert tiles["rendered - truth"][0, 0].tolist() == [0, 0, 0], "white upon white is no difference"
