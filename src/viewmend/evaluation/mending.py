@@ -17,7 +17,7 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, shown_upon
-from viewmend.inpainting.upon_white import UponWhite
+from viewmend.inpainting.upon_white import fill_upon
 from viewmend.metrics.image_quality import mask_iou
 from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
 from viewmend.observation import Observation
@@ -139,7 +139,7 @@ def _judge(
     mask = truth.mask[0, :height, :width]
     image, subject = truth.rgb[0, :, :height, :width] / 255 * (mask / 255), mask > FOREGROUND
     image = laid_upon(background, image, mask / 255)
-    baseline = UponWhite(Telea()) if background == "white" else Telea()
+    baseline = fill_upon(Telea(), background)
     filled, _ = baseline.step(
         replace(view, error=view.holes.to(view.rgb)), ContextProvider(lambda *_: None), baseline.initial_state()
     )

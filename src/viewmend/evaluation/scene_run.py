@@ -17,7 +17,7 @@ from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, scor
 from viewmend.evaluation.own_stream import all_of, push_again
 from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
 from viewmend.inpainting.protocol import State, ViewInpainter, encode_past, own_background
-from viewmend.inpainting.upon_white import UponWhite
+from viewmend.inpainting.upon_white import UponWhite, fill_upon
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import make_method
 from viewmend.metrics.image_quality import SsimWindow
@@ -258,8 +258,8 @@ class _Stream:
     def _made(self) -> ViewInpainter:
         if self._inpainter is None:
             self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
-            if self.settings.background == "white" and own_background(self._inpainter) is None:
-                self._inpainter = UponWhite(self._inpainter)
+            if own_background(self._inpainter) is None:
+                self._inpainter = fill_upon(self._inpainter, self.settings.background)
         return self._inpainter
 
     def _asked(self, stream: Stream, view: IncompleteView) -> IncompleteView:

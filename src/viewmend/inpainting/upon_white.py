@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background
 from viewmend.inpainting.protocol import (
     ContextProvider,
     RenderQuality,
@@ -52,3 +53,8 @@ class UponWhite:
         alpha = covered(view) if completed.alpha is None else completed.alpha
         rgb = torch.where(view.error > 0, completed.rgb - (1 - covered(view)), view.rgb)
         return replace(completed, view=view, rgb=rgb, alpha=alpha), state
+
+
+def fill_upon(fill: ViewInpainter, background: Background) -> ViewInpainter:
+    """What fills by what it is shown, shown views upon this background."""
+    return UponWhite(fill) if background == "white" else fill

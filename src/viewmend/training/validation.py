@@ -13,7 +13,7 @@ from viewmend.backgrounds import Background
 from viewmend.baselines.classical import Telea
 from viewmend.capture.images import write_image
 from viewmend.inpainting.protocol import ContextProvider, State, shown_upon
-from viewmend.inpainting.upon_white import UponWhite
+from viewmend.inpainting.upon_white import fill_upon
 from viewmend.metrics.image_quality import psnr
 from viewmend.training.plan import Recipe
 from viewmend.training.samples import Sample
@@ -98,7 +98,7 @@ class Validation:
 
 def _telea(sample: Sample, background: Background) -> float:
     """What Telea scores upon the model's background."""
-    fill = UponWhite(Telea()) if background == "white" else Telea()
+    fill = fill_upon(Telea(), background)
     rgb = fill.step(sample.view, ContextProvider(lambda *_: None), State())[0].rgb
     return _score(rgb, true_image(sample, background), sample)
 

@@ -110,7 +110,8 @@ export class Settings extends EventTarget {
   /** What the pictures lie upon. @returns {string} hexadecimal RGB */
   get ground() {
     const { background, modelGround, theme } = this.values;
-    if (background || modelGround !== "000000") return background || modelGround;
+    if (background) return background;
+    if (modelGround !== "000000") return modelGround;
     return theme === "light" ? "f2f4f6" : "000000";
   }
 
