@@ -135,6 +135,23 @@ def test_what_is_dropped_is_never_looked_at_again(grid):
                 assert all(past not in sampling.times(later) for later in range(now + 1, 130))
 
 
+@pytest.mark.parametrize("framing", FRAMINGS)
+def test_a_view_that_nobody_wants_filled_leaves_the_state_that_filling_leaves(framing):
+    network = Recorder()
+    inpainter = OnlineInpainter(network, config(framing=framing))
+    filled = passed = inpainter.initial_state()
+    for time in range(25):
+        view = times_view(time)
+        _, filled = inpainter.step(view, Rig(), filled)
+        calls = len(network.clips)
+        passed = inpainter.state_after(view, passed)
+        assert len(network.clips) == calls and passed.frames.keys() == filled.frames.keys()
+        assert all(torch.equal(passed.frames[t], filled.frames[t]) for t in filled.frames)
+        assert passed.canvas_px == filled.canvas_px
+    assert sorted(filled.frames) == [0, 10, 20, 22, 23, 24]
+    assert OnlineInpainter(network, config(memory=True)).state_after(times_view(0), filled) is None
+
+
 @pytest.mark.parametrize("wrong", [{"step": 0}, {"neighbours": -1}, {"references": -1}])
 def test_samplings_that_cannot_be_are_refused(wrong):
     with pytest.raises(ValueError, match="expected neighbours and references of 0 or more"):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from viewmend.baselines.classical import Telea
+from viewmend.baselines.online import OnlineConfig, OnlineInpainter
 from viewmend.evaluation import scene_run
 from viewmend.evaluation.records import records
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
@@ -107,6 +108,42 @@ def test_a_scored_view_is_what_a_stream_of_all_frames_gives(turning, monkeypatch
     assert late.error is None and every.error is None
     for one, other in zip(late.frames, every.frames[-2:], strict=True):
         assert one.hole_px == other.hole_px and one.psnr_holes == pytest.approx(other.psnr_holes, abs=1e-3)
+
+
+class Mean:
+    """A network that fills with the mean of all that it is shown, and writes down how many frames before that were."""
+
+    def __init__(self):
+        self.before = []
+
+    def check_size(self, height, width):
+        pass
+
+    def complete_clip(self, clip):
+        self.before.append(len(clip.neighbours))
+        mean = torch.stack([frames[0] for frames in (clip.now, *clip.neighbours)]).mean((0, 2, 3))
+        return mean[:, None, None].expand(3, 48, 48)
+
+    def complete_remembering(self, now, memory):
+        raise AssertionError("O remembers nothing")
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_a_network_that_keeps_views_alone_is_run_for_scored_ones_alone(turning, monkeypatch, background):
+    def run(scene):
+        network = Mean()
+        inpainter = OnlineInpainter(network, OnlineConfig(size_px=(48, 48)))
+        monkeypatch.setattr(scene_run, "make_method", lambda name, *how: inpainter)
+        done = evaluate_scene(scene, ("x",), RunSettings(background=background)).runs[0]
+        assert done.error is None
+        return done.frames, network.before
+
+    late, before = run(turning)
+    assert before == [3, 3, 3], "of two scored times; the first is done twice"
+    every, before = run(replace(turning, scored_from=0))
+    assert before == [0, 0, 1, 2, 3, 3]
+    for one, other in zip(late, every[-2:], strict=True):
+        assert one.psnr_holes == other.psnr_holes and one.psnr_whole == other.psnr_whole
 
 
 def test_the_region_has_its_own_mean(make_cell, make_frame):

@@ -51,6 +51,48 @@ def test_clips_are_framed_as_a_stream_is(framing, clip_of_two):
     assert bool(clip.truth.movedim(1, -1)[clip.holes].abs().sum() > 0)
 
 
+@pytest.mark.parametrize("framing", ["def", "win", "mul"])
+def test_clips_upon_white_are_what_a_stream_upon_white_shows(framing, clip_of_two):
+    """Beside the holes all that changes is the background; in them, the truth's alone."""
+
+    def white_where_empty(sample):
+        view, empty = sample.view, (sample.view.mask == 0) & (sample.view.error == 0)
+        return replace(sample, view=replace(view, rgb=torch.where(empty, 1.0, view.rgb)))
+
+    def with_background(sample):
+        alpha = torch.full(sample.view.mask.shape, 255, dtype=torch.uint8)
+        alpha[:, :20] = 0
+        mask = sample.view.mask * (alpha > 0)
+        view = replace(sample.view, mask=mask, rgb=sample.view.rgb * (alpha > 0))
+        return replace(sample, view=view, alpha=alpha, truth=sample.truth * (alpha > 0))
+
+    clip = replace(with_background(clip_of_two), previous=with_background(clip_of_two.previous))
+    white = replace(white_where_empty(clip), previous=white_where_empty(clip.previous))
+    torch.manual_seed(0)
+    made = training_clip(clip, SIZE, framing, "white")
+    torch.manual_seed(0)
+    expected = training_clip(white, SIZE, framing)
+    assert torch.equal(made.frames, expected.frames) and torch.equal(made.holes, expected.holes)
+    assert torch.equal(made.references, expected.references)
+    torch.manual_seed(0)
+    black = training_clip(clip, SIZE, framing)
+    left = black.truth[..., 0] == -1
+    assert bool((made.truth[..., 0][left] == 1).any())
+    assert float((made.truth - black.truth).min()) > -0.1, "as bright or brighter, but where resizing rings"
+    with pytest.raises(ValueError, match="samples that tell where the subject is"):
+        training_clip(clip_of_two, SIZE, framing, "white")
+
+
+def test_a_run_upon_white_learns_from_white(clip_of_two):
+    def terms(background):
+        torch.manual_seed(0)
+        bright = replace(clip_of_two, alpha=torch.zeros(clip_of_two.view.mask.shape, dtype=torch.uint8))
+        sample = replace(bright, previous=None)
+        return BaselineObjective(DSTT(), SIZE, False, None, background)([sample]).clips[0]
+
+    assert float(terms("white").truth.min()) > 0.9 > float(terms("black").truth.min())
+
+
 def test_terms_are_means_over_their_own_pixels(clip_of_two, rng):
     clip = training_clip(clip_of_two, SIZE, "win")
     made = 2 * torch.rand(clip.truth.shape, generator=rng) - 1

@@ -81,14 +81,24 @@ class OnlineInpainter:
             pieces, slots = run(windows, look, state)
             filled = self._fitted(stitch(pieces, windows, state.canvas_px, self.config.overlap_px), view)
             completed = blend(view.rgb, view.error, filled, torch.ones_like(view.error))
-        frames = {} if self.config.memory else {view.time: canvas.image, **state.frames}
+        return CompletedView(view, completed), self._kept(replace(state, slots=slots), view.time, canvas)
+
+    def state_after(self, view: IncompleteView, state: State) -> OnlineState | None:
+        """The state after a view that nobody wants filled; OM remembers what only a run makes."""
+        if self.config.memory:
+            return None
+        canvas = self._canvas(view)
+        return self._kept(self._past(state, view.time, canvas), view.time, canvas)
+
+    def _kept(self, state: OnlineState, time: int, canvas: Canvas) -> OnlineState:
+        """What later views may look at of the past and of this time."""
+        frames = {} if self.config.memory else {time: canvas.image, **state.frames}
         wanted = self.config.sampling.is_wanted_after
-        state = replace(
+        return replace(
             state,
-            frames={time: frame for time, frame in frames.items() if wanted(time, view.time)},
-            slots={(window, time): slot for (window, time), slot in slots.items() if wanted(time, view.time)},
+            frames={past: frame for past, frame in frames.items() if wanted(past, time)},
+            slots={(window, past): slot for (window, past), slot in state.slots.items() if wanted(past, time)},
         )
-        return CompletedView(view, completed), state
 
     def _canvas(self, view: IncompleteView) -> Canvas:
         make = resized_canvas if self.config.framing == "def" else window_canvas

@@ -16,7 +16,7 @@ from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_bo
 from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
 from viewmend.evaluation.own_stream import all_of, push_again
 from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
-from viewmend.inpainting.protocol import State, ViewInpainter, encode_past, own_background
+from viewmend.inpainting.protocol import State, ViewInpainter, encode_past, own_background, state_after
 from viewmend.inpainting.upon_white import UponWhite, fill_upon
 from viewmend.leave_one_out.scenes import LeaveOneOutScene
 from viewmend.methods import make_method
@@ -215,7 +215,12 @@ class _Stream:
             return
         stream = self._stream = self._stream or Stream(self._made(), self.settings.stream)
         push_again(stream, moment.observation)
-        self._go_on(stream.mend(self._asked(stream, moment.view), self._viewer), moment)
+        view = self._asked(stream, moment.view)
+        state = state_after(stream.inpainter, view, self._viewer or stream.viewer())
+        if state is None:
+            self._go_on(stream.mend(view, self._viewer), moment)
+        else:
+            self._viewer = state
 
     def _go_on(self, mended: StreamView, moment: _Moment) -> None:
         own = self._inpainter.inner if isinstance(self._inpainter, UponWhite) else self._inpainter

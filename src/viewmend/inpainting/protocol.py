@@ -220,6 +220,15 @@ def encode_past(inpainter: ViewInpainter, view: IncompleteView, context: Context
         own(view, context)
 
 
+def state_after(inpainter: ViewInpainter, view: IncompleteView, state: State) -> State | None:
+    """The state after a view that nobody wants filled; None where only filling it tells.
+
+    An inpainter tells by a method of this name, of the view and the state before; one without fills every view.
+    """
+    own = getattr(inpainter, "state_after", None)
+    return None if own is None else own(view, state)
+
+
 def encode_cameras(inpainter: ViewInpainter, views: ContextViews, context: ContextProvider) -> None:
     """All that an inpainter encodes of these cameras at their time, whatever the view, for `context` to remember.
 

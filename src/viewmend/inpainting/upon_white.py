@@ -18,6 +18,7 @@ from viewmend.inpainting.protocol import (
     ViewInpainter,
     crop_margin_px,
     own_error_rule,
+    state_after,
 )
 from viewmend.views import CompletedView, IncompleteView
 
@@ -25,6 +26,11 @@ from viewmend.views import CompletedView, IncompleteView
 def covered(view: IncompleteView) -> Float[Tensor, "height width"]:
     """What is not background of a view whose E was painted upon white: M, and all of E."""
     return 1 - (1 - view.mask) * (1 - view.error)
+
+
+def view_upon(background: Background, view: IncompleteView) -> IncompleteView:
+    """A view as what fills by what it is shown is shown it: its background so, its holes black."""
+    return view if background == "black" else replace(view, rgb=view.rgb + (1 - view.mask) * (1 - view.error))
 
 
 @dataclass(frozen=True)
@@ -46,10 +52,13 @@ class UponWhite:
         """The inner inpainter's."""
         return self.inner.initial_state()
 
+    def state_after(self, view: IncompleteView, state: State) -> State | None:
+        """The inner inpainter's, of the view upon white."""
+        return state_after(self.inner, view_upon("white", view), state)
+
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
         """The completed view; laid upon white, it is what the inner inpainter made."""
-        shown = replace(view, rgb=view.rgb + (1 - view.mask) * (1 - view.error))
-        completed, state = self.inner.step(shown, context, state)
+        completed, state = self.inner.step(view_upon("white", view), context, state)
         alpha = covered(view) if completed.alpha is None else completed.alpha
         rgb = torch.where(view.error > 0, completed.rgb - (1 - covered(view)), view.rgb)
         return replace(completed, view=view, rgb=rgb, alpha=alpha), state

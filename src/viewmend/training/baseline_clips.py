@@ -7,10 +7,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from viewmend.backgrounds import Background
 from viewmend.baselines.camera_windows import aim, camera_windows, foreground
 from viewmend.baselines.framing import Window, dilated, resized_canvas, window_canvas, windows_over
 from viewmend.baselines.online import OnlineConfig
+from viewmend.inpainting.upon_white import view_upon
 from viewmend.training.samples import Sample
+from viewmend.training.true_images import true_image
 
 FRAMINGS: tuple[Literal["def", "win", "mul"], ...] = ("def", "win", "mul")
 REFERENCES = 3
@@ -31,19 +34,23 @@ class TrainingClip:
     """Whole images of other cameras; none but in mul."""
 
 
-def training_clip(sample: Sample, size_px: tuple[int, int], framing: Literal["def", "win", "mul"]) -> TrainingClip:
+def training_clip(
+    sample: Sample, size_px: tuple[int, int], framing: Literal["def", "win", "mul"], background: Background = "black"
+) -> TrainingClip:
     """The clip that ends in `sample`, in one of the framings; which window and references is random.
 
     Args:
         sample: with those before it.
         size_px: height and width that the network is trained at.
         framing: the whole view resized, or a window that the last view's holes need, without or with the cameras.
+        background: what views and truth are upon; cameras' images are black behind the subject, as on a stream.
     """
     make = resized_canvas if framing == "def" else window_canvas
     dilation_px = OnlineConfig().dilation_px
-    canvases = [make(s.view.rgb, s.view.error > 0, size_px, dilation_px) for s in sample.clip]
-    whole = [torch.zeros_like(s.view.error, dtype=torch.bool) for s in sample.clip]
-    truths = [make(s.truth.float() / 255, none, size_px, 0).image for s, none in zip(sample.clip, whole, strict=True)]
+    views = [view_upon(background, s.view) for s in sample.clip]
+    canvases = [make(view.rgb, view.error > 0, size_px, dilation_px) for view in views]
+    whole = torch.zeros_like(sample.view.error, dtype=torch.bool)
+    truths = [make(true_image(s, background), whole, size_px, 0).image for s in sample.clip]
     window = Window(0, 0)
     if framing != "def":
         windows = windows_over(canvases[-1].holes, size_px, OnlineConfig(size_px=size_px).overlap_px)

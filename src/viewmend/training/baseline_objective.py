@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import l1_loss
 
+from viewmend.backgrounds import Background
 from viewmend.baselines.e2fgvi import E2FGVI, LocalFlows
 from viewmend.baselines.token_transformer import TokenTransformer
 from viewmend.training.baseline_clips import FRAMINGS, TrainingClip, training_clip
@@ -34,15 +35,22 @@ class BaselineObjective(nn.Module):
     """
 
     def __init__(
-        self, model: TokenTransformer | E2FGVI, size_px: tuple[int, int], bfloat16: bool, start: nn.Module | None
+        self,
+        model: TokenTransformer | E2FGVI,
+        size_px: tuple[int, int],
+        bfloat16: bool,
+        start: nn.Module | None,
+        background: Background = "black",
     ) -> None:
         super().__init__()
+        self.background: Background = background
         self.model, self.size_px, self.autocast = model, size_px, bfloat16
         self.teacher = deepcopy(start).requires_grad_(False).eval() if isinstance(start, E2FGVI) else None
 
     def forward(self, batch: list[Sample]) -> BaselineOutput:
         """The terms of `batch`, each sample in a random framing."""
-        clips = [training_clip(s, self.size_px, FRAMINGS[int(torch.randint(len(FRAMINGS), ()))]) for s in batch]
+        framings = [FRAMINGS[int(torch.randint(len(FRAMINGS), ()))] for _ in batch]
+        clips = [training_clip(s, self.size_px, how, self.background) for s, how in zip(batch, framings, strict=True)]
         made, flow_terms = zip(*(self._complete(clip) for clip in clips), strict=True)
         terms = [clip_terms(out, clip) for out, clip in zip(made, clips, strict=True)]
         inside, outside = (torch.stack(parts).mean() for parts in zip(*terms, strict=True))

@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from viewmend.atomic_writes import write_tensors, write_text
+from viewmend.backgrounds import Background
 from viewmend.baselines.e2fgvi import E2FGVI
 from viewmend.baselines.frame_coder import SLOPE
 from viewmend.baselines.published import NETWORKS, TRAINED
@@ -32,6 +33,8 @@ class BaselineRecipe(Recipe):
     """Nothing of ours."""
     size_px: tuple[int, int] = NATIVE_PX
     """Height and width of the frames that it is trained on."""
+    background: Background = "black"
+    """What its views are upon, as the paper's are upon white."""
     started: bool = False
     """Whether it began with a checkpoint; E2FGVI's flow is only compared then, with the checkpoint's."""
 
@@ -80,7 +83,7 @@ class BaselineRun(Run):
 
     def _make_objective(self, start: nn.Module | None) -> nn.Module:
         assert isinstance(self.model, TokenTransformer | E2FGVI)
-        return BaselineObjective(self.model, self.recipe.size_px, self.recipe.bfloat16, start)
+        return BaselineObjective(self.model, self.recipe.size_px, self.recipe.bfloat16, start, self.recipe.background)
 
     def _make_optimizer(self) -> torch.optim.Optimizer:
         return torch.optim.Adam(self.learned, lr=self.recipe.learning_rate, betas=BETAS)
