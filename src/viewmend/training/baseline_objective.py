@@ -49,8 +49,10 @@ class BaselineObjective(nn.Module):
 
     def forward(self, batch: list[Sample]) -> BaselineOutput:
         """The terms of `batch`, each sample in a random framing."""
-        framings = [FRAMINGS[int(torch.randint(len(FRAMINGS), ()))] for _ in batch]
-        clips = [training_clip(s, self.size_px, how, self.background) for s, how in zip(batch, framings, strict=True)]
+        clips = [
+            training_clip(s, self.size_px, FRAMINGS[int(torch.randint(len(FRAMINGS), ()))], self.background)
+            for s in batch
+        ]
         made, flow_terms = zip(*(self._complete(clip) for clip in clips), strict=True)
         terms = [clip_terms(out, clip) for out, clip in zip(made, clips, strict=True)]
         inside, outside = (torch.stack(parts).mean() for parts in zip(*terms, strict=True))
