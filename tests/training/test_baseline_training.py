@@ -83,7 +83,14 @@ def test_clips_upon_white_are_what_a_stream_upon_white_shows(framing, clip_of_tw
         training_clip(clip_of_two, SIZE, framing, "white")
 
 
-def test_a_run_upon_white_learns_from_white(clip_of_two):
+def test_the_recipe_says_what_a_run_learns_from(recipe, tmp_path):
+    with processes() as own:
+        for background in ("black", "white"):
+            run = BaselineRun(replace(recipe, background=background), tmp_path / background, None, own)
+            assert run.objective.background == background
+
+
+def test_what_is_learned_from_white_is_white(clip_of_two):
     def terms(background):
         torch.manual_seed(0)
         bright = replace(clip_of_two, alpha=torch.zeros(clip_of_two.view.mask.shape, dtype=torch.uint8))
