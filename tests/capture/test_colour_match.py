@@ -6,10 +6,12 @@ from dataclasses import replace
 import pytest
 import torch
 
+from viewmend.capture import colour_match as colour_matching
 from viewmend.capture.colour_match import FEWEST_CAMERAS, colour_match
 from viewmend.capture.plain_writer import write_capture
 from viewmend.capture.prepare import prepare
 from viewmend.capture.source import OfSource
+from viewmend.capture.surface_colours import SurfaceColours
 from viewmend.cli import main
 from viewmend.studio.stage import Studio, StudioConfig
 
@@ -65,6 +67,30 @@ def test_cameras_that_agree_stay_as_they_are(studio):
     assert not colour_match(studio.read(0), studio.bounds).helps
     prepared = prepare(studio, align=False)
     assert prepared.colours is None and torch.equal(prepared.read(0).rgb, studio.read(0).rgb)
+
+
+def surface(monkeypatch, rgb):
+    """Every camera sees these points."""
+    seen = torch.ones(rgb.shape[:2], dtype=torch.bool)
+    monkeypatch.setattr(colour_matching, "surface_colours", lambda frame, proxy: SurfaceColours(rgb, seen))
+
+
+def test_what_is_clipped_is_no_measurement(studio, monkeypatch, rng):
+    """A third of the surface is brighter than the sensors of half of the cameras can say."""
+    gains = torch.linspace(0.9, 1.1, CAMERAS)[:, None, None].expand(-1, 1, 3)
+    true = 0.3 + 0.4 * torch.rand(1, 1500, 3, generator=rng)
+    true[:, ::3] = 0.98 + 0.1 * torch.rand(1, 500, 3, generator=rng)
+    surface(monkeypatch, (gains * true).clamp(max=1))
+    match = colour_match(studio.read(0), studio.bounds)
+    left = match.maps @ torch.cat([0.5 * gains[:, 0], torch.ones(CAMERAS, 1)], 1)[..., None]
+    assert match.helps and float((left / left.mean(0) - 1).abs().max()) < 0.002
+
+
+def test_what_maps_bring_is_judged_where_they_were_not_fitted(studio, monkeypatch, rng):
+    """Colours of chance: maps of twelve numbers a camera fit what they see, and say nothing of the rest."""
+    surface(monkeypatch, 0.3 + 0.4 * torch.rand(CAMERAS, 160, 3, generator=rng))
+    match = colour_match(studio.read(0), studio.bounds)
+    assert match.after > 0.97 * match.before and not match.helps
 
 
 def test_a_few_cameras_or_none_that_share_surface_are_left_alone(studio):

@@ -264,7 +264,7 @@ def test_intrinsics_of_images_of_another_size_are_named_and_refused(folder):
     for camera in description["cameras"]:
         camera["K"] = [[2 * x for x in row] for row in camera["K"][:2]] + [[0, 0, 1]]
     file.write_text(json.dumps(description))
-    with pytest.raises(ValueError, match="K is of images 2 times as large"):
+    with pytest.raises(ValueError, match=r"K is of images 2 times as large; scale fx, fy, cx, cy and the skew by 0\.5"):
         prepare(open_capture(folder))
 
 

@@ -16,9 +16,10 @@ from reference.ball import RADIUS_M, BallCapture, camera_at, photograph, ring
 from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
 from viewmend.export.scene import points_of
-from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.geometry.cameras import concatenate_cameras, project
 from viewmend.methods import make_method
 from viewmend.stream import Stream
+from viewmend.views import RIM_PX
 
 
 def rig():
@@ -92,6 +93,30 @@ def test_points_outside_a_mask_are_left_out(depth_m):
     spoilt = points_of(replace(completed, depth=depth), frame, 0.5)
     assert len(points_of(completed, frame, 0.5)) - len(spoilt) == 4
     assert float(spoilt[:, :3].norm(dim=-1).max()) < 0.6
+
+
+@pytest.mark.parametrize("window", [(0, 18, 64, 28), (18, 0, 28, 64)])
+def test_cameras_that_show_a_part_judge_that_part(window):
+    """Images wider or higher than they are square; what lies beside them says nothing."""
+    whole = photograph(rig())
+    stream = Stream(make_method("telea"))
+    stream.push(whole)
+    completed = stream.view(camera_at(15, "view", 64)).completed
+    part = photograph(rig().cropped(*window))
+    everywhere, some = (points_of(completed, frame, 0.5) for frame in (whole, part))
+    assert 0.3 * len(everywhere) < len(some) <= len(everywhere)
+    cameras, mask = part.cameras, part.mask > 127
+    uv = torch.stack([project(everywhere[:, :3], cameras[n])[0][0] for n in range(len(cameras))])
+    for point in range(0, len(everywhere), 7):
+        seen, outside = 0, 0
+        for n in range(len(cameras)):
+            u, v = uv[n, point].tolist()
+            if 0 <= u < window[2] and 0 <= v < window[3]:
+                seen += 1
+                near = mask[n, max(int(v) - RIM_PX, 0) : int(v) + RIM_PX + 1]
+                outside += not near[:, max(int(u) - RIM_PX, 0) : int(u) + RIM_PX + 1].any()
+        kept = bool((some == everywhere[point]).all(1).any())
+        assert kept == (seen >= 2 and not outside)
 
 
 def test_pictures_and_depth_fit_each_other(scene):

@@ -8,7 +8,16 @@ import pytest
 from viewmend.baselines.classical import Telea
 from viewmend.inpainting.sweep.config import SweepConfig
 from viewmend.inpainting.sweep.sweep_net import SweepNet
-from viewmend.live.budget import CONTEXT_LADDER, FULL, READING_LADDER, Budget, QualityLevel, ladder_for
+from viewmend.live.budget import (
+    CONTEXT_LADDER,
+    FULL,
+    MAX_UP_AFTER_FRAMES,
+    MEMORY_FRAMES,
+    READING_LADDER,
+    Budget,
+    QualityLevel,
+    ladder_for,
+)
 from viewmend.live.protocol import FrameTimes
 
 
@@ -112,6 +121,28 @@ def test_impossible_budgets_are_refused():
     for target_ms in (0.0, -1.0, float("nan")):
         with pytest.raises(ValueError, match="expected a positive budget"):
             Budget(target_ms)
+
+
+def test_what_a_picture_takes_grows_with_its_pixels():
+    half = QualityLevel(0.5, 7, None)
+    budget = Budget(100.0, (half, FULL))
+    budget.record(half, FrameTimes(geometry=3.0, rendering=4.0, encode=6.0, wait=50.0))
+    assert budget.predicted_ms(FULL) == pytest.approx(3 + 40) and budget.predicted_ms(half) == pytest.approx(3 + 10)
+    assert budget.measured_ms == pytest.approx(13.0), "waiting is nobody's work"
+
+
+def test_a_level_that_never_holds_is_tried_more_and_more_rarely_but_never_given_up():
+    half = QualityLevel(0.5, 7, None)
+    budget, waits, waited = Budget(100.0, (half, FULL)), [], 0
+    for _ in range(20 * MAX_UP_AFTER_FRAMES):
+        level = budget.level
+        if level == half:
+            waited += 1
+        elif waited:
+            waits, waited = [*waits, waited], 0
+        # Pictures of half the size say that the whole would take 40 ms.
+        budget.record(level, FrameTimes(rendering=10.0 if level == half else 300.0))
+    assert waits[-1] > 20 * waits[1] and max(waits) <= MAX_UP_AFTER_FRAMES + MEMORY_FRAMES and len(waits) > 15
 
 
 def test_it_goes_up_only_where_the_next_level_has_room():

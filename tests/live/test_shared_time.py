@@ -5,10 +5,14 @@ import pickle
 import numpy as np
 import torch
 from live_servers import CAMERAS, PIPELINE
-from reference.ball import photograph
+from reference.ball import camera_at, photograph
 
+from viewmend.geometry.proxy import GeometryProxy
 from viewmend.inpainting.coarse_fill import SmoothFill
-from viewmend.inpainting.protocol import ContextProvider
+from viewmend.inpainting.protocol import ContextProvider, RenderQuality
+from viewmend.live.clock import Span
+from viewmend.live.frames import FrameSupply, Rig
+from viewmend.live.renderer import Renderer, RenderRequest
 from viewmend.live.shared_time import SharedTime
 from viewmend.methods import make_method
 from viewmend.observation import observe
@@ -61,6 +65,30 @@ def test_a_stream_finds_all_made_that_it_would_make():
     assert torch.equal(own.depth(CAMERAS.names), torch.stack([got.depths[name] for name in CAMERAS.names]))
     model.encode_cameras(own.context(CAMERAS.names), ContextProvider(lambda *_: None, memory=lambda _: own.encoded))
     assert own.encoded.keys() == got.encoded.keys() and len(got.encoded) == 2 * len(CAMERAS)
+
+
+def test_a_renderer_renders_no_depth_that_another_process_did(monkeypatch):
+    made = {3: ball_time().observation()}
+
+    class Supply(FrameSupply):
+        def read(self, time):
+            return photograph(CAMERAS, time)
+
+        def made(self, time):
+            return made.get(time)
+
+    supply = Supply(Span(0, 4, 4, 15.0))
+    supply.rig = Rig("ball", None, None)
+    asked = []
+    depth = GeometryProxy.depth
+    monkeypatch.setattr(GeometryProxy, "depth", lambda own, cameras: asked.extend(cameras.names) or depth(own, cameras))
+    renderer = Renderer(supply, SmoothFill(), PIPELINE)
+    assert renderer.prepare(3)
+    renderer.render(RenderRequest(3, (camera_at(20, "view"),), RenderQuality()), None)
+    assert set(asked) <= {"view"}
+    del made[3]
+    assert Renderer(supply, SmoothFill(), PIPELINE).prepare(3)
+    assert set(asked) & set(CAMERAS.names)
 
 
 def test_tokens_of_the_transformer_are_shared_too():
