@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -55,6 +57,20 @@ def test_other_axes_and_units_change_nothing(character_file, motion_file):
     )
     a, b = retarget(character, motion), retarget(character, other)
     torch.testing.assert_close(a.joint_matrices(2.0), b.joint_matrices(2.0), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("height_m", [0.45, 0.8, 1.4])
+@pytest.mark.parametrize("per_m", [1, 10, 100, 1000])
+def test_units_are_powers_of_ten_and_nobody_is_resized(character_file, motion_file, height_m, per_m):
+    """Of a child, an adult and a giant, in metres to millimetres; by how far the hips are from the foot."""
+    character, motion = load_character(character_file), read_bvh(motion_file)
+    file = node_matrices(character, torch.eye(4), (-1,) * len(character.nodes), torch.zeros(0, 3, 3), None)[:, :3, 3]
+    parts = find_parts([n.name for n in character.nodes], [n.parent for n in character.nodes])
+    place = {part: [n.name for n in character.nodes].index(name) for part, name in parts.items()}
+    factor = height_m * per_m / float((file[place["Hips"]] - file[place["LeftFoot"]]).norm())
+    nodes = [replace(n, translation=factor * n.translation) for n in character.nodes]
+    body = retarget(replace(character, nodes=tuple(nodes)), motion)
+    torch.testing.assert_close(body.upright_from_file[:3, :3].norm(dim=0), torch.full((3,), 1.0 / per_m))
 
 
 def test_between_frames_is_between(character_file, tmp_path):
