@@ -9,14 +9,18 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+import torch
 from live_servers import running, wait_until
+from reference.ball import ring
 
 from viewmend.live import broadcast, broadcast_answers, film_segments
 from viewmend.live.broadcast import centred, frames_per_second
 from viewmend.live.broadcast_answers import with_query
 from viewmend.live.client import Client
-from viewmend.live.poses import view_camera
+from viewmend.live.clock import Span
+from viewmend.live.poses import rig_frame, view_camera
 from viewmend.live.protocol import Camera, Look
+from viewmend.live.sessions import Playback
 from viewmend.live.video import video_codecs
 
 av = pytest.importorskip("av")
@@ -144,6 +148,7 @@ def test_nothing_is_done_while_nobody_watches(monkeypatch):
         time.sleep(0.4)
         assert server.service.counts["frames"] == before and not server.service._sessions
         assert refused(server.url, f"/broadcast/{first}")[0] == 404
+        assert server.live._broadcast._session.picture is None, "the next film begins with a new one"
         again = get(server.url, "/broadcast/live.m3u8")[1].decode()  # who comes back finds a film that counts on
         assert "#EXT-X-DISCONTINUITY" in again and int(again.split()[-1].removesuffix(".m4s")) > int(first[:-4])
     assert not encoders()
@@ -195,6 +200,15 @@ def test_without_a_broadcast_there_is_none_and_it_is_said(ball):
         viewer.on_air()
         assert "--broadcast" in viewer.wait_for("error")["message"]
         assert "on_air" not in viewer.wait_for("state")
+
+
+def test_of_a_viewer_who_compares_the_first_picture_is_on_air(on_air):
+    session = broadcast.BroadcastSession(on_air.service, SIZE, None)
+    session.look(Look(modes=("rendered", "mended"), moving=True, depth=True, scale=0.5))
+    playback = Playback(Span(0, 1, 1), 0.0, rig_frame(ring(4), torch.zeros(3), None), lambda time: True, 1)
+    request = session.next_request(time.monotonic(), playback)
+    assert session.newest_look.modes == ("rendered",) and not request.quality.mend, "nothing is mended for nobody"
+    assert tuple(request.cameras[0].size_px[0].tolist()) == SIZE
 
 
 def test_the_token_opens_the_film_and_goes_along():

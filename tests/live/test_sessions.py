@@ -1,16 +1,19 @@
 """What a viewer is shown next: newest look, one frame in flight, better when still."""
 
+import time
+
 import pytest
 import torch
 from reference.ball import ring
 
 from viewmend.inpainting.protocol import State
+from viewmend.live import sessions
 from viewmend.live.budget import CONTEXT_LADDER, FULL, READING_LADDER
 from viewmend.live.clock import Span
 from viewmend.live.poses import rig_frame
-from viewmend.live.protocol import ClockChange, Look, unpack
+from viewmend.live.protocol import ClockChange, FrameTimes, Look, unpack
 from viewmend.live.renderer import RenderResult
-from viewmend.live.sessions import FULL_S, STILL_S, Playback, ViewerSession
+from viewmend.live.sessions import AWAITED_S, FULL_S, STILL_S, Playback, SentFrame, ViewerSession
 from viewmend.timing import StageTimes
 
 FRAME = rig_frame(ring(4), torch.zeros(3), None)
@@ -141,6 +144,74 @@ def test_a_frame_that_is_not_there_is_waited_for():
     assert desk.due() is None and desk.session.buffering
     there.add(0)
     assert desk.due().time == 0 and not desk.session.buffering
+
+
+def test_what_was_waited_for_is_shown_once_and_then_time_goes_on():
+    there = set(range(20)) - {5}
+    desk = Desk(present=lambda time: time in there)
+    desk.look(id=1)
+    assert desk.due(edge=5.0) is None and desk.session.buffering
+    assert desk.due(edge=6.0) is None and desk.session.buffering, "6 is at hand, but 5 is on its way"
+    there.add(5)
+    assert [desk.due(edge=edge).time for edge in (6.5, 7.0, 8.0)] == [5, 7, 8]
+
+
+def test_what_never_comes_is_waited_for_some_seconds():
+    desk = Desk(present=lambda time: time != 5)
+    desk.look(id=1)
+    assert desk.due(edge=5.0) is None
+    assert desk.due(AWAITED_S - 0.1, edge=7.0) is None
+    assert desk.due(0.2, edge=7.0).time == 7
+
+
+def test_a_viewer_counts_for_a_second_after_its_last_frame():
+    desk = Desk()
+    assert not desk.session.is_active(desk.now), "who says nothing waits for nothing"
+    desk.look(id=1)
+    assert desk.session.is_active(desk.now), "waits for a first view"
+    desk.due()
+    assert not desk.session.is_active(desk.now)
+    desk.session.recent.append(SentFrame(desk.now, FrameTimes(), 1))
+    assert desk.session.is_active(desk.now + 0.9) and not desk.session.is_active(desk.now + 1.1)
+
+
+def test_a_key_frame_is_owed_until_a_frame_has_it(monkeypatch):
+    """A look that asks for one may be dropped for the next, which does not."""
+    keys = []
+
+    def message(look, request, result, info, encoders):
+        keys.append(info.key)
+        return b"", FrameTimes()
+
+    monkeypatch.setattr(sessions, "frame_message", message)
+    desk = Desk()
+    for key in (True, False):
+        desk.look(id=1, key=key)
+    result = RenderResult(0, (), State(), StageTimes())
+    for _ in range(2):
+        desk.session.show(desk.due(), result)
+        desk.session.ack(desk.session.in_flight)
+        desk.look(id=2)
+    assert keys == [True, False]
+
+
+def test_statistics_tell_how_many_views_found_the_geometry_made():
+    desk = Desk()
+    for geometry in (7.0, 0.0, 0.0):
+        desk.session.recent.append(SentFrame(time.monotonic(), FrameTimes(geometry=geometry, encode=2.0), 1500))
+    desk.session.recent.appendleft(SentFrame(time.monotonic() - 2, FrameTimes(geometry=900.0), 10**6))
+    stats = desk.session.stats_json(4)
+    assert (stats["shared"], stats["fps"], stats["kb_per_frame"], stats["viewers"]) == (0.667, 3, 1.5, 4)
+    assert stats["stage_ms"]["geometry"] == pytest.approx(7 / 3, abs=0.01) and stats["budget"] is None
+
+
+def test_a_view_at_rest_that_failed_is_not_refined():
+    desk = Desk(budget_ms=50.0)
+    desk.pause()
+    desk.look(id=1)
+    assert desk.due() is not None
+    desk.session.fail("no")
+    assert desk.due(STILL_S) is None and desk.due(FULL_S) is None
 
 
 def test_what_failed_is_said_and_not_tried_again_before_something_changes():
