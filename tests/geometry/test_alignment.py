@@ -1,5 +1,7 @@
 """A shift that all images share is found from the masks, and nothing is found where there is none."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -25,6 +27,21 @@ def test_a_wrong_convention_is_undone(frame, shift):
     found = shared_offset(frame.mask, frame.cameras.moved(shift, 0.0), None, HULL)
     assert found.offset_px[0] == pytest.approx(-shift, abs=0.15)
     assert found.iou_after > found.iou_before + WORTH_MOVING
+
+
+@pytest.mark.parametrize("shift", [(0.7, -0.6), (0.0, 0.7)])
+def test_where_cameras_are_mounted_on_their_side_both_axes_are_found(frame, shift):
+    """Every other camera is turned by a quarter, as for a standing person; across, an upright one tells the shift."""
+    mask, pose = frame.mask.clone(), frame.cameras.camera_from_world.clone()
+    quarter = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    for view in range(0, len(mask), 2):
+        mask[view] = frame.mask[view].rot90()
+        pose[view, :3] = quarter @ pose[view, :3]
+    cameras = replace(frame.cameras, camera_from_world=pose)
+    assert shared_offset(mask, cameras, None, HULL).iou_before > 0.95, "the same subject"
+    found = shared_offset(mask, cameras.moved(*shift), None, HULL)
+    assert found.offset_px == pytest.approx((-shift[0], -shift[1]), abs=0.2)
+    assert found.iou_after > 0.95 and found.iou_after > found.iou_before + WORTH_MOVING
 
 
 def test_one_empty_mask_asks_for_no_shift(frame):

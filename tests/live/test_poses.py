@@ -4,7 +4,7 @@ import pytest
 import torch
 from reference.ball import camera_at, ring
 
-from viewmend.geometry.cameras import project
+from viewmend.geometry.cameras import concatenate_cameras, project
 from viewmend.live.poses import cameras_json, rig_frame, view_camera
 from viewmend.live.protocol import Camera
 from viewmend.studio.rigs import orbit
@@ -58,6 +58,17 @@ def test_a_smaller_picture_shows_the_same(scale):
 def test_a_tall_picture_shows_the_subject_as_wide():
     wide, tall = (view_camera(Camera(), FRAME, size) for size in ((80, 80), (80, 160)))
     assert float(wide.K[0, 0, 0]) == pytest.approx(float(tall.K[0, 0, 0]), rel=1e-5)
+
+
+def test_what_is_asked_for_is_given_in_tall_pictures_too():
+    asked = view_camera(Camera(fov_y=40.0), FRAME, (100, 200))
+    assert float(asked.K[0, 1, 1]) == pytest.approx(100 / math.tan(math.radians(20)), rel=1e-5)
+
+
+@pytest.mark.parametrize(("height_m", "elevation"), [(30.0, 80.0), (-30.0, -80.0), (2.0, 45.0)])
+def test_nobody_begins_right_above_the_subject(height_m, elevation):
+    overhead = concatenate_cameras([camera_at(90 * n, f"c{n}", 48, height_m) for n in range(4)])
+    assert rig_frame(overhead, torch.zeros(3), torch.tensor([0.0, 1, 0])).elevation == pytest.approx(elevation)
 
 
 def test_cameras_are_said_in_flat_lists():

@@ -90,6 +90,14 @@ def test_holes_lie_in_the_subject_and_blobs_add(frame):
     assert bool((blobs >= frame.mask).all()) and not torch.equal(blobs, frame.mask)
 
 
+def test_every_hole_begins_in_the_subject(frame):
+    """A hole beside it would change nothing: a small subject loses as many as a large one."""
+    small = replace(frame, mask=torch.zeros_like(frame.mask))
+    small.mask[:, 18:22, 23:27] = 255
+    hit = [imperfect_frame(small, Imperfections(mask_holes=8.0), seed).mask[0].sum() < 16 * 255 for seed in range(20)]
+    assert all(hit)
+
+
 def test_hard_masks_are_cut_at_one_half(frame):
     soft = replace(frame, mask=(frame.mask.float() * torch.linspace(0, 1, 64)).to(torch.uint8))
     hard = imperfect_frame(soft, Imperfections(mask_hard=True), 2)

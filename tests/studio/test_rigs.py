@@ -23,6 +23,11 @@ def test_rigs_hold_an_upright_person(make, count):
     assert float(cameras.centers[:, 1].min()) > 0.5
 
 
+def test_heights_take_turns():
+    exact = ring_rig(5, seed=1, jitter=0.0, heights_m=(1.1, 1.8, 0.6))
+    torch.testing.assert_close(exact.centers[:, 1], torch.tensor([1.1, 1.8, 0.6, 1.1, 1.8]))
+
+
 def test_a_person_fills_most_of_the_height():
     uv, _ = project(PERSON, ring_rig(12, (512, 512), seed=1))
     height = (uv[:, 0, 1] - uv[:, 1, 1]) / 512
