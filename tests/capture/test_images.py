@@ -55,6 +55,26 @@ def test_a_part_that_is_longer_than_the_data_is_refused(length, tmp_path):
             read(tmp_path / "a.png", "here")
 
 
+def test_images_of_16_bit_are_their_upper_eight_and_dim_ones_are_refused(tmp_path):
+    deep = IMAGE.astype(np.uint16) * 256 + 200
+    cv2.imwrite(str(tmp_path / "deep.png"), deep)
+    assert np.array_equal(read_rgb(tmp_path / "deep.png", "here"), IMAGE[..., ::-1])
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros_like(deep))
+    assert not read_rgb(tmp_path / "black.png", "here").any()
+    cv2.imwrite(str(tmp_path / "twelve.png"), IMAGE.astype(np.uint16) * 16)
+    with pytest.raises(CaptureError, match="16 bit that are used, got uint16 with values up to"):
+        read_rgb(tmp_path / "twelve.png", "here")
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_jpeg_that_is_cut_short_is_no_grey_picture(share, tmp_path):
+    data = cv2.imencode(".jpg", cv2.resize(IMAGE, (320, 240)))[1].tobytes()
+    assert decoded(data, cv2.IMREAD_COLOR) is not None
+    (tmp_path / "a.jpg").write_bytes(data[: int(share * len(data))])
+    with pytest.raises(CaptureError, match="bytes that are none, or cut short"):
+        read_rgb(tmp_path / "a.jpg", "here")
+
+
 @pytest.mark.parametrize("end", [20, 33, 60, -12, -4, -1])
 def test_what_is_cut_short_is_refused(end):
     assert decoded(png()[:end], cv2.IMREAD_COLOR) is None

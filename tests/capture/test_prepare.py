@@ -6,6 +6,7 @@ import pytest
 import torch
 from reference.ball import BallCapture, camera_at, photograph, ring
 
+from viewmend.capture import prepare as preparing
 from viewmend.capture.prepare import prepare
 from viewmend.capture.reduction import reduced
 from viewmend.geometry.cameras import concatenate_cameras
@@ -44,6 +45,19 @@ def test_what_the_camera_left_out_saw_does_not_move_the_inputs():
     inputs = Shifted().cameras.names[1:]
     clean, spoiled = (prepare(Shifted(spoiled), inputs).alignment for spoiled in (False, True))
     assert clean == spoiled != prepare(Shifted(spoiled=True)).alignment
+
+
+def test_colours_are_matched_where_the_moved_cameras_look(monkeypatch):
+    """At full size, by the inputs' images alone."""
+    looked = []
+    monkeypatch.setattr(preparing, "colour_match", lambda frame, bounds: looked.append(frame))
+    capture = Shifted()
+    prepared = prepare(capture, capture.cameras.names[1:], longest_px=48)
+    [frame] = looked
+    assert prepared.colours is None and frame.cameras.names == capture.cameras.names[1:]
+    x_px, y_px = prepared.alignment.offset_px
+    expected = capture.cameras.select(frame.cameras.names).moved(x_px, y_px)
+    assert x_px > 0.4 and torch.equal(frame.cameras.K, expected.K) and frame.rgb.shape[-1] == 96
 
 
 def test_images_are_reduced_with_their_cameras_and_never_enlarged():

@@ -6,7 +6,7 @@ from dataclasses import fields
 import pytest
 import torch
 
-from viewmend.evaluation.averages import speed, tables, tables_by_kind
+from viewmend.evaluation.averages import gains, speed, tables, tables_by_kind
 from viewmend.evaluation.frame_scores import Scores
 from viewmend.evaluation.records import records
 
@@ -73,6 +73,19 @@ def test_the_gain_is_over_scenes_that_both_have(cells):
     assert b.rows[0].over_reference == pytest.approx(statistics.fmean(gains))
     assert b.rows[0].below_reference == sum(gain < 0 for gain in gains)
     assert b.rows[1].over_reference == 0
+
+
+def test_scenes_below_the_reference_are_counted_and_one_that_it_lacks_is_no_gain(make_cell, make_frame):
+    scores = {"a": (20.0, 21.0), "b": (22.0, 20.0), "c": (24.0, 21.0), "d": (30.0, None)}
+    made = [
+        make_cell(scene, method, "A", [] if psnr is None else [make_frame(psnr_holes=psnr)], None if psnr else "broke")
+        for scene, both in scores.items()
+        for method, psnr in zip(METHODS, both, strict=True)
+    ]
+    row = tables(made, METHODS)[0].rows[0]
+    assert (row.below_reference, row.over_reference) == (1, pytest.approx(4 / 3))
+    own, other = (records(made).where(method=name) for name in METHODS)
+    assert gains(own, other) == {"a": -1.0, "b": 2.0, "c": 3.0}
 
 
 def test_what_is_left_out_is_counted(cells):
