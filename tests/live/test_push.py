@@ -3,6 +3,7 @@
 import json
 import struct
 import zlib
+from contextlib import suppress
 from dataclasses import replace
 
 import cv2
@@ -13,6 +14,7 @@ from live_servers import CAMERAS, running, wait_until
 from reference.ball import photograph
 from test_faults import SOON, closing, still_serves
 from test_server import get, truth
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
@@ -216,6 +218,33 @@ def test_an_image_comes_once():
     entry = {"camera": "c0", "kind": "mask", "bytes": len(image)}
     with pytest.raises(ProtocolError, match="one image of each camera and kind"):
         push._frame(pack({"images": [entry] * 100}, [image] * 100), CAMERAS, Present())
+
+
+def whole_frame(names, size=48):
+    """Image and mask of these cameras."""
+    rgb, mask = (cv2.imencode(".png", np.full((size, size, *k), 9, np.uint8))[1].tobytes() for k in ((3,), ()))
+    images = [(name, kind, data) for name in names for kind, data in (("rgb", rgb), ("mask", mask))]
+    listed = [{"camera": name, "kind": kind, "bytes": len(data)} for name, kind, data in images]
+    return pack({"images": listed}, [data for *_, data in images])
+
+
+def test_one_camera_is_no_frame_two_are():
+    with pytest.raises(ProtocolError, match="image and mask of two cameras or more, got 1"):
+        push._frame(whole_frame(["c0"]), CAMERAS, Present())
+    frame = push._frame(whole_frame(["c4", "c1"]), CAMERAS, Present())
+    assert frame.cameras.names == ("c1", "c4") and bool((frame.rgb == 9).all()) and bool((frame.mask == 9).all())
+
+
+def test_what_no_frame_of_the_rig_can_be_is_not_read():
+    """Six cameras of 48 x 48 and their heads are a megabyte and a half; before the rig is known, less is taken."""
+    most = 8 + 1_000_000 + 6 * (4 * 48 * 48 + 65_536)
+    with running(PushedFrames(), ready=False) as server:
+        for size, codes in ((most, (4400,)), (most + 1, (1009, None))):
+            with suppress(ConnectionClosed), connect(f"{server.ws}/push", **SOON) as rig:
+                rig.send(rig_message())
+                assert json.loads(rig.recv(timeout=10))["type"] == "taken"
+                rig.send(bytes(size))
+                assert closing(rig) in codes
 
 
 def test_a_header_is_small():

@@ -15,6 +15,7 @@ from test_server import decoded, get
 
 from viewmend.capture.errors import CaptureError
 from viewmend.cli import main
+from viewmend.live import rig_frames
 from viewmend.live.publisher import Publisher
 from viewmend.live.rig_frames import RigFrames
 
@@ -79,11 +80,40 @@ def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
         rig.write_text("nonsense")
         soon(lambda: "the rig stays as it was" in caplog.text)
         assert supply.rig.number == before and len(supply.camera_counts()) == 6
+        supply._aligner.counts["c0"]["used"] += 1000
         rig.write_text(rig_text(CAMERAS.names[:5]))
         soon(lambda: supply.rig.number > before and newest(supply).cameras.names == CAMERAS.names[:5])
         counts = supply.camera_counts()
         assert all(c["connects"] == 1 and c["up"] for c in counts.values()) and "c5" not in counts
+        assert counts["c0"]["used"] >= 1000 > counts["c1"]["used"], "what was counted goes on, too"
         assert supply.read(supply.span.first - 1) is not None and supply.span.first > 0, "of the other rig"
+
+
+def test_what_was_lost_since_the_last_line_is_said_and_no_more(rig, caplog, monkeypatch):
+    caplog.set_level(logging.WARNING)
+    supply = RigFrames(rig, align=False)
+    for late, torn in ((3, 0), (5, 1), (5, 1), (0, 0), (1, 0)):  # then the camera was opened anew
+        told = {"c0": {"late": late, "torn": torn, "used": 90}, "c1": {"used": 90}}
+        monkeypatch.setattr(supply, "camera_counts", lambda told=told: told)
+        supply._report()
+    said = [message.split(": ", 1)[1] for message in caplog.messages]
+    assert said == ["c0 3 late", "c0 2 late, 1 torn", "c0 1 late"]
+
+
+def test_what_is_wrong_is_said_once_until_something_else_is(rig, caplog):
+    caplog.set_level(logging.WARNING)
+    supply, told = RigFrames(rig, align=False), []
+    supply.changed = lambda: told.append(supply.status.error)
+    for error in ("no light", "no light", "no power"):
+        supply._is_wrong(error)
+    assert caplog.messages == ["no light", "no power"], "on the terminal"
+    assert told == ["no light", "no light", "no power"] and supply.status.state == "failing"
+
+
+def test_recordings_are_played_as_long_as_the_shortest_is(rig, monkeypatch):
+    lengths = dict(zip(CAMERAS.names, (9.0, 7.5, 8.0, 9.0, 7.0, 7.2), strict=True))
+    monkeypatch.setattr(rig_frames, "_length_s", lambda camera: lengths[camera.name])
+    assert RigFrames(rig, align=False)._playback.length_s == 7.0
 
 
 def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
