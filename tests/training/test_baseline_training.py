@@ -178,6 +178,7 @@ def test_a_network_learns_goes_on_and_is_a_method(recipe, tmp_path):
     torch.manual_seed(recipe.seed)
     fresh = DSTT().state_dict()
     assert sum(not torch.equal(whole[key], fresh[key]) for key in fresh) > 150, "all of it learns"
+    assert "Views upon black. Began with random weights." in (tmp_path / "whole" / "README.md").read_text()
     network = load_baseline("dstt", f"@{tmp_path / 'whole'}")
     assert all(torch.equal(value, whole[key]) for key, value in network.state_dict().items())
     with pytest.raises(RunError, match="differs in started"):
