@@ -103,7 +103,9 @@ class BaselineRun(Run):
     def _write_model(self) -> None:
         write_tensors(self.out / TRAINED, self.averaged.state_dict(), {"format": "pt", "network": self.recipe.name})
         begun = "a checkpoint, whose licence goes on" if self.recipe.started else "random weights"
-        said = f"\nViews upon {self.recipe.background}. Began with {begun}. A method: {self.recipe.name}-o-def@FOLDER.\n"
+        said = (
+            f"\nViews upon {self.recipe.background}. Began with {begun}. A method: {self.recipe.name}-o-def@FOLDER.\n"
+        )
         write_text(self.out / "README.md", model_card(self.recipe, self.state) + said)
 
 
