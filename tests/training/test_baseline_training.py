@@ -91,13 +91,13 @@ def test_the_recipe_says_what_a_run_learns_from(recipe, tmp_path):
 
 
 def test_what_is_learned_from_white_is_white(clip_of_two):
-    def terms(background):
+    def clip_upon(background):
         torch.manual_seed(0)
         bright = replace(clip_of_two, alpha=torch.zeros(clip_of_two.view.mask.shape, dtype=torch.uint8))
         sample = replace(bright, previous=None)
         return BaselineObjective(DSTT(), SIZE, False, None, background)([sample]).clips[0]
 
-    assert float(terms("white").truth.min()) > 0.9 > float(terms("black").truth.min())
+    assert float(clip_upon("white").truth.min()) > 0.9 > float(clip_upon("black").truth.min())
 
 
 def test_terms_are_means_over_their_own_pixels(clip_of_two, rng):
