@@ -3,9 +3,6 @@ PYTHON ?= python3
 BIN := .venv/bin
 # Without a GPU: the version whose CPU build the package index is known to have.
 CONSTRAINTS := $(if $(shell command -v nvidia-smi 2>/dev/null),,-c constraints-cpu.txt)
-# The page is tested in Chromium where it is installed (Debian: apt-get install chromium).
-comma := ,
-BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || command -v google-chrome),$(comma)browser)
 
 .PHONY: demo test test-all gate format docs clean
 
@@ -13,10 +10,10 @@ demo: .venv/installed ## environment, install, and the main job on a scene made 
 	$(BIN)/viewmend demo --out out/demo
 
 test: gate docs ## environment, install, the gate, the documents, the tests
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist loadfile
 
 test-all: gate ## the tests that take longer, too
-	$(BIN)/pytest -m ""
+	$(BIN)/pytest -n auto --dist loadfile -m ""
 
 docs: .venv/installed ## the documentation site, in out/site; strict, and nothing is fetched
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
@@ -33,7 +30,7 @@ format: .venv/installed
 
 .venv/installed: pyproject.toml constraints-cpu.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[video,live,engines,docs,dev$(BROWSER)]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(CONSTRAINTS) --editable '.[docs,dev]'
 	touch $@
 
 clean:

@@ -10,28 +10,25 @@ import torch
 torch.set_num_threads(1)
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
-
-
-BROWSER = "tests/live/browser/"
-PAGE: Counter[str] = Counter()
-"""How the tests of the page ended, and why they were skipped."""
+SKIPPED: Counter[str] = Counter()
+"""How many tests were skipped, by reason."""
 
 
 def pytest_runtest_logreport(report):
-    if not report.nodeid.startswith(BROWSER) or (report.when != "call" and report.passed):
-        return
-    PAGE[report.outcome] += 1
-    if report.skipped:
-        PAGE[str(report.longrepr[2]).removeprefix("Skipped: ")] += 1
+    if report.skipped and isinstance(report.longrepr, tuple):
+        SKIPPED[str(report.longrepr[2]).removeprefix("Skipped: ")] += 1
+
+
+def pytest_collectreport(report):
+    if report.skipped and isinstance(report.longrepr, tuple):
+        SKIPPED[f"{Path(report.nodeid).name}: {str(report.longrepr[2]).removeprefix('Skipped: ')}"] += 1
 
 
 def pytest_unconfigure(config):
-    """The last line says whether a browser has seen the page."""
-    if not PAGE or config.option.collectonly:
-        return
-    ran = PAGE["passed"] + PAGE["failed"]
-    why = "; ".join(reason for reason in PAGE if reason not in ("passed", "failed", "skipped"))
-    print(f"The page: {ran} tests in Chromium." if ran else f"The page: NOT TESTED IN A BROWSER ({why}).")
+    """Print what was skipped and why, as the last line."""
+    if not config.option.collectonly:
+        reasons = "; ".join(f"{count} ({reason})" for reason, count in SKIPPED.most_common())
+        print(f"Skipped: {reasons or 'nothing'}.")
 
 
 def pytest_collection_modifyitems(items):
@@ -52,5 +49,5 @@ def rng() -> torch.Generator:
 def shared() -> Path:
     """The developers' folder of real captures and performers; tests that need it are skipped where it is absent."""
     if not SHARED.is_dir():
-        pytest.skip(f"the developers' folder {SHARED.name}/ is not beside the repository")
+        pytest.skip(f"the developers' folder {SHARED.name}/ is not next to the repository")
     return SHARED

@@ -1,37 +1,36 @@
-"""Fills the holes of free-viewpoint video, live.
+"""Real-time inpainting of free-viewpoint video.
 
-`viewmend.__all__` is what others may build on; each name is imported when it is asked for, so that
-`import viewmend` alone stays instant.
+`viewmend.__all__` lists the public names. Each is imported on first use, so that `import viewmend` is instant.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from viewmend.capture.errors import CaptureError
-    from viewmend.capture.plain import open_capture
-    from viewmend.capture.prepare import prepare
+    from viewmend.data.errors import CaptureError
+    from viewmend.data.holdout.riftcast_views import RiftcastViews
+    from viewmend.data.native_capture import open_capture
+    from viewmend.data.prepare import prepare
+    from viewmend.frame_cache import CachedFrame, DepthProvider
     from viewmend.geometry.bounds import Bounds
     from viewmend.geometry.cameras import Cameras, pinhole
     from viewmend.geometry.hull import HullConfig
     from viewmend.geometry.rigid import look_at
-    from viewmend.inpainting.checkpoint import load_inpainter
-    from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter
-    from viewmend.leave_one_out.riftcast_views import RiftcastViews
-    from viewmend.live.client import Client
-    from viewmend.live.publisher import Publisher
-    from viewmend.methods import make_method
-    from viewmend.observation import DepthProvider, Observation
-    from viewmend.rendering.error_rules import Evidence, error_rule
+    from viewmend.live.client import Client, Publisher
+    from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
+    from viewmend.models.checkpoint import load_inpainter
+    from viewmend.models.registry import make_method
+    from viewmend.rendering.error_mask import Evidence, error_rule
     from viewmend.rendering.view import RenderConfig
     from viewmend.stream import Stream, StreamConfig, StreamView
-    from viewmend.timing import StageTimes
-    from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+    from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+    from viewmend.utils.timing import StageTimes
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Bounds",
+    "CachedFrame",
     "Cameras",
     "CaptureError",
     "Client",
@@ -42,8 +41,8 @@ __all__ = [
     "Evidence",
     "HullConfig",
     "IncompleteView",
+    "Inpainter",
     "MultiViewFrame",
-    "Observation",
     "Publisher",
     "RenderConfig",
     "RenderQuality",
@@ -54,7 +53,6 @@ __all__ = [
     "Stream",
     "StreamConfig",
     "StreamView",
-    "ViewInpainter",
     "__version__",
     "error_rule",
     "load_inpainter",
@@ -65,48 +63,48 @@ __all__ = [
     "prepare",
 ]
 
-_ROOM = {
+_MODULES = {
     "Bounds": "geometry.bounds",
     "Cameras": "geometry.cameras",
-    "CaptureError": "capture.errors",
+    "CaptureError": "data.errors",
     "Client": "live.client",
-    "CompletedView": "views",
-    "ContextProvider": "inpainting.protocol",
-    "ContextViews": "views",
-    "DepthProvider": "observation",
-    "Evidence": "rendering.error_rules",
+    "CompletedView": "types",
+    "ContextProvider": "models.base",
+    "ContextViews": "types",
+    "DepthProvider": "frame_cache",
+    "Evidence": "rendering.error_mask",
     "HullConfig": "geometry.hull",
-    "IncompleteView": "views",
-    "MultiViewFrame": "views",
-    "Observation": "observation",
-    "Publisher": "live.publisher",
+    "IncompleteView": "types",
+    "MultiViewFrame": "types",
+    "CachedFrame": "frame_cache",
+    "Publisher": "live.client",
     "RenderConfig": "rendering.view",
-    "RenderQuality": "inpainting.protocol",
-    "RiftcastViews": "leave_one_out.riftcast_views",
-    "Silhouettes": "views",
-    "StageTimes": "timing",
-    "State": "inpainting.protocol",
+    "RenderQuality": "models.base",
+    "RiftcastViews": "data.holdout.riftcast_views",
+    "Silhouettes": "types",
+    "StageTimes": "utils.timing",
+    "State": "models.base",
     "Stream": "stream",
     "StreamConfig": "stream",
     "StreamView": "stream",
-    "ViewInpainter": "inpainting.protocol",
-    "error_rule": "rendering.error_rules",
-    "load_inpainter": "inpainting.checkpoint",
+    "Inpainter": "models.base",
+    "error_rule": "rendering.error_mask",
+    "load_inpainter": "models.checkpoint",
     "look_at": "geometry.rigid",
-    "make_method": "methods",
-    "open_capture": "capture.plain",
+    "make_method": "models.registry",
+    "open_capture": "data.native_capture",
     "pinhole": "geometry.cameras",
-    "prepare": "capture.prepare",
+    "prepare": "data.prepare",
 }
 
 
 def __getattr__(name: str) -> object:
-    """The public name, from the room that defines it."""
-    if name not in _ROOM:
+    """Import a public name on first use."""
+    if name not in _MODULES:
         raise AttributeError(f"module 'viewmend' has no attribute '{name}'; viewmend.__all__ lists those that it has")
-    return getattr(import_module(f"viewmend.{_ROOM[name]}"), name)
+    return getattr(import_module(f"viewmend.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    """What `dir(viewmend)` shows."""
+    """The public names."""
     return __all__

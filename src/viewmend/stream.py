@@ -1,41 +1,38 @@
-"""From what the cameras saw to what a viewer sees: push a frame, render a view, mend what is missing in it.
+"""The pipeline from camera frames to completed novel views.
 
-    frame --push--> observation --render--> incomplete view --mend--> completed view
+    MultiViewFrame ──add_frame──▶ CachedFrame ──render──▶ IncompleteView ──mend──▶ CompletedView
 
-Every command, the live server, the evaluation and the examples go this way (section 9). What does not depend on a view
-is computed once, and shared by all viewers.
+Every command, the live server, the evaluation and the examples use `Stream` (section 9). What depends on the rig or on
+a frame is computed once and shared by all viewers; what depends on a viewer is a `State`, passed in and returned.
 """
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
+from viewmend.frame_cache import CachedFrame, DepthProvider, cache_frame, evict
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.threads import heavy_operations, light_operations
-from viewmend.inpainting.protocol import (
-    ContextProvider,
-    Memory,
-    RenderQuality,
-    State,
-    ViewInpainter,
-    crop_margin_px,
-    own_error_rule,
-)
-from viewmend.inpainting.wrong import narrowed
-from viewmend.observation import DepthProvider, Observation, forget, observe
+from viewmend.models.base import ContextProvider, HeldOutView, Inpainter, Memory, RenderQuality, State
+from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
+from viewmend.rendering.error_mask import Evidence, decide_error_mask
 from viewmend.rendering.view import RenderConfig, render_view
-from viewmend.rig_fit import RigFit
-from viewmend.timing import StageTimes, ms_since, now_s
-from viewmend.views import CompletedView, ContextViews, IncompleteView, MultiViewFrame
+from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame
+from viewmend.utils.timing import StageTimes, ms_since, now_s
+
+CALIBRATION_VIEWS = 3
+"""Cameras that are held out in turn to calibrate an inpainter, spread evenly over the rig's order."""
+MIN_CALIBRATION_CAMERAS = 4
+"""Smaller rigs are not calibrated: views from two cameras say little about views from three."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamConfig:
-    """The system without its inpainter.
+    """Everything about a stream except its inpainter.
 
     Examples:
         >>> from viewmend import Stream, StreamConfig, make_method
@@ -44,28 +41,28 @@ class StreamConfig:
     """
 
     hull: HullConfig = field(default_factory=HullConfig)
-    """How the geometry proxy is carved."""
+    """Parameters of the visual hull."""
     render: RenderConfig = field(default_factory=RenderConfig)
-    """How views are rendered from the cameras."""
+    """How views are rendered, and which of their pixels are inpainted."""
+    background: Background = "black"
+    """Background of the input of inpainters that have none of their own, such as classical fills."""
     memory_mb: float | None = 1000.0
-    """The times looked at longest ago are forgotten above this. None: those older than any window reaches are."""
-    fit_rig: bool = True
-    """Whether an inpainter that can is fitted to the rig when the first frame comes (`rig_fit`)."""
+    """Above this, the least recently used frames are dropped. None: frames are dropped once no temporal window
+    reaches back to them."""
 
 
 @dataclass(frozen=True)
 class StreamView:
-    """What one viewer gets.
+    """One viewer's view.
 
     Examples:
-        >>> import torch
-        >>> from viewmend import Stream, look_at, make_method, pinhole
-        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> from viewmend import Stream, make_method
+        >>> from viewmend.data.synthetic.rigs import orbit
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
-        >>> up, subject = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.95, 0.0])
-        >>> target = pinhole(0.8, 64, 64, look_at(torch.tensor([0.5, 1.0, 3.0]), subject, up))
+        >>> target = orbit([0.4], (64, 64), elevation_rad=0.2)
         >>> stream = Stream(make_method("telea"))
-        >>> first = stream.view(target, time=stream.push(frame).frame.time)
+        >>> first = stream.view(target, time=stream.add_frame(frame).frame.time)
         >>> again = stream.view(target, first.viewer)
         >>> first.times.geometry > 0, again.times.geometry
         (True, 0.0)
@@ -73,110 +70,120 @@ class StreamView:
 
     completed: CompletedView
     viewer: State
-    """What to ask for the next view with: a value, so that no viewer can disturb another."""
+    """State to pass with this viewer's next view."""
     times: StageTimes
 
 
 class Stream:
-    """Frames in, mended views out, for any number of viewers. Call it from one thread at a time.
+    """Frames in, completed views out, for any number of viewers. Call it from one thread at a time.
 
     Examples:
-        >>> import torch
-        >>> from viewmend import Stream, look_at, make_method, pinhole
-        >>> from viewmend.studio.stage import Studio, StudioConfig
+        >>> from viewmend import Stream, make_method
+        >>> from viewmend.data.synthetic.rigs import orbit
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
         >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
-        >>> up, subject = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([0.0, 0.95, 0.0])
-        >>> target = pinhole(0.8, 64, 64, look_at(torch.tensor([0.5, 1.0, 3.0]), subject, up))
+        >>> target = orbit([0.4], (64, 64), elevation_rad=0.2)
         >>> stream = Stream(make_method("telea"))
-        >>> observation = stream.push(frame)
-        >>> seen = stream.view(target)
-        >>> seen.completed.rgb.shape, stream.times
+        >>> cached = stream.add_frame(frame)
+        >>> view = stream.view(target)
+        >>> view.completed.rgb.shape, stream.times
         (torch.Size([3, 64, 64]), (0,))
     """
 
     def __init__(
-        self, inpainter: ViewInpainter, config: StreamConfig | None = None, bounds: Bounds | None = None
+        self,
+        inpainter: Inpainter,
+        config: StreamConfig | None = None,
+        bounds: Bounds | None = None,
+        error_model: Inpainter | None = None,
     ) -> None:
-        """Begin a stream.
+        """Create an empty stream.
 
         Args:
-            inpainter: what fills the holes, e.g. `load_inpainter("small")`.
-            config: how frames become proxies and views.
-            bounds: the volume that may hold the subject; None to find it from the masks.
+            inpainter: completes the views, e.g. `load_inpainter("views")`.
+            config: parameters of geometry, rendering and memory.
+            bounds: the volume that may contain the subject; None to find it from the masks.
+            error_model: predicts errors in place of `inpainter`, if that does not; needed for the error rule
+                'predicted' and for `RenderQuality.refine_fraction` (`registry.error_model_for`).
         """
+        self.inpainter = inpainter
         self.config = config or StreamConfig()
-        self._fit = RigFit(inpainter, self.config.fit_rig)
         self.bounds = bounds
-        self._observations: OrderedDict[int, Observation] = OrderedDict()
-
-    @property
-    def inpainter(self) -> ViewInpainter:
-        """What fills the holes; it may be fitted to the rig."""
-        return self._fit.inpainter
+        self.error_model = error_model
+        self._frames: OrderedDict[int, CachedFrame] = OrderedDict()
 
     @property
     def error_rule(self) -> str:
-        """What E is by: as configured, else what the inpainter is made for."""
-        return self.config.render.error_rule or own_error_rule(self.inpainter)
+        """The error rule in use: the configured one, else the one that the inpainter is made for."""
+        return self.config.render.error_rule or self.inpainter.error_rule
 
-    def rendered_by(self, render: RenderConfig) -> "Stream":
-        """The same times and memory, with views rendered in another way."""
-        other = Stream(self.inpainter, replace(self.config, render=render), self.bounds)
-        other._observations, other._fit = self._observations, self._fit
+    def with_render_config(self, render: RenderConfig) -> "Stream":
+        """A stream with the same frames and memory, but another render configuration."""
+        other = Stream(self.inpainter, replace(self.config, render=render), self.bounds, self.error_model)
+        other._frames = self._frames
         return other
 
     @property
     def times(self) -> tuple[int, ...]:
-        """The times at hand, in order."""
-        return tuple(sorted(self._observations))
+        """Indices of the cached frames, in order."""
+        return tuple(sorted(self._frames))
 
     def viewer(self) -> State:
-        """Someone who has seen nothing yet."""
+        """The state of a new viewer."""
         return self.inpainter.initial_state()
 
-    def push(self, frame: MultiViewFrame, geometry: DepthProvider | None = None) -> Observation:
-        """Take in what the cameras saw at one time; a time that is at hand already stays as it is.
+    def add_frame(self, frame: MultiViewFrame, geometry: DepthProvider | None = None) -> CachedFrame:
+        """Add a frame and compute its geometry proxy. A frame whose time is cached already is not replaced.
 
-        Times may come in any order and with gaps. `geometry` replaces the visual hull: anything that knows its depth
-        in the cameras (`render` needs the hull, `mend` does not); the frame may lack masks then.
+        Frames may come in any order and with gaps.
 
-        Raises:
-            ValueError: the frame has no masks, no foreground, or a single camera, and no `geometry` is given.
-        """
-        if frame.time not in self._observations:
-            frame = replace(frame, depth=None)  # the truth of synthetic captures: nobody looks at it here
-            given = None if geometry is None else Observation(frame, geometry)
-            self._observations[frame.time] = given or observe(frame, self.bounds, self.config.hull)
-            if given is None:
-                self._fit.see(frame, self.bounds, self.config.hull, self.config.render)
-        self._observations.move_to_end(frame.time)
-        forget(self._observations, frame.time, self.config.memory_mb)
-        return self._observations[frame.time]
-
-    def observation(self, time: int | None = None) -> Observation:
-        """What `push` gave for a time that is at hand, the latest by default.
+        Args:
+            frame: the cameras' images; masks are needed unless `geometry` is given.
+            geometry: replaces the visual hull. `view` and `render` need a `GeometryProxy`, `mend` any depth provider.
 
         Raises:
-            ValueError: it is not.
+            ValueError: no `geometry` is given, and the frame has no masks, no foreground, or a single camera.
         """
-        if not self._observations or (time is not None and time not in self._observations):
-            raise ValueError(f"expected a time among those at hand, {self.times}, got {time}; push its frame first")
-        return self._observations[max(self._observations) if time is None else time]
+        if frame.time not in self._frames:
+            frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
+            given = None if geometry is None else CachedFrame(frame, geometry)
+            self._frames[frame.time] = given or cache_frame(frame, self.bounds, self.config.hull)
+        self._frames.move_to_end(frame.time)
+        evict(self._frames, frame.time, self.config.memory_mb)
+        return self._frames[frame.time]
+
+    def calibrate(self, frame: MultiViewFrame) -> None:
+        """Adapt the inpainter to the rig, from views of a few of its own cameras; usually with the first frame.
+
+        Each of `CALIBRATION_VIEWS` cameras is held out and rendered from the others. Does nothing for frames without
+        masks, rigs of fewer than `MIN_CALIBRATION_CAMERAS`, and inpainters that cannot be calibrated.
+        """
+        if frame.mask is not None and len(frame.cameras) >= MIN_CALIBRATION_CAMERAS:
+            self.inpainter = self.inpainter.calibrate_to_rig(self._held_out_views(frame))
+
+    def cached_frame(self, time: int | None = None) -> CachedFrame:
+        """The frame of this index, by default the latest.
+
+        Raises:
+            ValueError: it is not cached.
+        """
+        if not self._frames or (time is not None and time not in self._frames):
+            raise ValueError(f"expected the time of a cached frame, {self.times}, got {time}; add its frame first")
+        return self._frames[max(self._frames) if time is None else time]
 
     def render(self, target: Cameras, time: int | None = None, exclude: Sequence[str] = ()) -> IncompleteView:
-        """The view as the source cameras show it, and what is missing in it: F, M and E of section 1.
+        """Render a novel view from the source cameras, and decide its error mask: F, M and E of section 1.
 
         Args:
             target: the novel view's camera (one view), on the frames' device.
-            time: which of `times`; the latest by default.
+            time: index of the frame, by default the latest.
             exclude: names of cameras whose images must not be used.
 
         Raises:
-            ValueError: that time is not at hand, its geometry is not a `GeometryProxy`, or no camera is left.
+            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, or no camera is left.
         """
-        part, crop = self._render(target, time, exclude)
-        part = self._narrowed(part, self._read_fraction(RenderQuality()), exclude)
-        return part if crop is None else crop.uncropped(part, target)
+        part, evidence, crop = self._render(target, time, exclude, RenderQuality())
+        return crop.uncropped(self._with_error_mask(part, evidence, RenderQuality(), exclude), target)
 
     def mend(
         self,
@@ -185,30 +192,32 @@ class Stream:
         quality: RenderQuality | None = None,
         exclude: Sequence[str] = (),
     ) -> StreamView:
-        """Fill what is missing in a view that `render`, or any other renderer, made of a time that was pushed.
+        """Complete a view of a cached frame that `render`, or any other renderer, made.
 
-        Name in `view.source_views` the cameras that coloured it, and in `view.candidate_views` all that may be looked
-        at, the closest first: holes are read from them.
+        `view.source_views` must name the cameras that coloured it, and `view.candidate_views` all cameras that may be
+        used, the closest first: the inpainter samples their images.
 
         Args:
-            view: what to fill.
-            viewer: what the last view gave; None for a first look.
-            quality: what it may cost.
+            view: the view to complete.
+            viewer: the state that this viewer's last view returned; None for its first.
+            quality: how much work the view may cost.
             exclude: names of cameras whose images must not be used.
 
         Raises:
-            ValueError: the view's time is not at hand, it names cameras that are not in the frame, or the inpainter
-                gives numbers that are not finite.
+            ValueError: the view's frame is not cached, the view names cameras that are not in the frame, or the
+                inpainter returns numbers that are not finite.
         """
         quality = quality or RenderQuality()
-        view.demand_cameras(self.observation(view.time).frame.cameras.names)
-        view = self._narrowed(view, quality.read_fraction if quality.mend else None, exclude)
-        margin_px = crop_margin_px(self.inpainter, quality) if quality.mend else None
-        crop = None if margin_px is None else subject_crop(view, margin_px)
-        if crop is None:
-            return self._fill(view, viewer, quality, exclude)
-        mended = self._fill(crop.of_view(view), viewer, quality, exclude)
-        return replace(mended, completed=crop.pasted(mended.completed, view))
+        view.check_cameras(self.cached_frame(view.time).frame.cameras.names)
+        margin_px = self.inpainter.crop_margin_px(quality) if quality.mend else None
+        crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
+        return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
+
+    def advance(self, view: IncompleteView, viewer: State | None = None) -> State | None:
+        """The state after a view whose completion is not needed; None if only `mend` can compute it."""
+        inpainter = self.inpainter
+        background = self.config.background if inpainter.background is None else "black"
+        return inpainter.advance_state(to_background(background, view), viewer or self.viewer())
 
     @light_operations()
     def view(
@@ -219,82 +228,105 @@ class Stream:
         quality: RenderQuality | None = None,
         exclude: Sequence[str] = (),
     ) -> StreamView:
-        """`render` one novel view, and `mend` it.
+        """Render and complete one novel view: `render`, then `mend`.
 
         Args:
             target: the novel view's camera (one view), on the frames' device.
-            viewer: what the last view gave; None for a first look.
-            time: which of `times`; the latest by default.
-            quality: what it may cost.
+            viewer: the state that this viewer's last view returned; None for its first.
+            time: index of the frame, by default the latest.
+            quality: how much work the view may cost.
             exclude: names of cameras whose images must not be used.
 
         Raises:
-            ValueError: as `render`'s and `mend`'s.
+            ValueError: as `render` and `mend`.
         """
         quality = quality or RenderQuality()
-        margin_px = crop_margin_px(self.inpainter, quality)
         start = now_s(target.K.device)
-        part, crop = self._render(target, time, exclude, margin_px)
-        if crop is not None and margin_px is None and quality.mend:
-            part, crop = crop.uncropped(part, target), None
+        part, evidence, crop = self._render(target, time, exclude, quality)
         rendering_ms = ms_since(start, target.K.device)
-        mended = self._fill(part, viewer, quality, exclude, self._read_fraction(quality))
-        completed = mended.completed if crop is None else crop.uncropped_completed(mended.completed, target)
-        return replace(mended, completed=completed, times=replace(mended.times, rendering=rendering_ms))
-
-    def _read_fraction(self, quality: RenderQuality) -> float | None:
-        """The part of the proxy that may be mended; None for all that the rule asks."""
-        allowed = self.config.render.wrong_fraction if self.error_rule == "wrong" else None
-        return min((part for part in (quality.read_fraction, allowed) if part is not None), default=None)
-
-    def _narrowed(self, view: IncompleteView, fraction: float | None, exclude: Sequence[str]) -> IncompleteView:
-        """The view with E where most is to be gained."""
-        context = ContextProvider(self._context, RenderQuality(read_fraction=fraction), exclude, self._memory)
-        return view if fraction is None else narrowed(view, self.inpainter, context, fraction)
+        made = self._complete(part, evidence, crop, viewer, quality, exclude, target=target)
+        return replace(made, times=replace(made.times, rendering=rendering_ms))
 
     def _render(
-        self, target: Cameras, time: int | None, exclude: Sequence[str], margin_px: int | None = None
-    ) -> tuple[IncompleteView, Crop | None]:
-        """The part of the view that shows the subject, or that can be filled on its own with a margin; and which."""
-        observation = self.observation(time)
-        frame, proxy = observation.frame, observation.proxy
-        if not isinstance(proxy, GeometryProxy):
-            raise ValueError(f"expected a GeometryProxy to render, got {type(proxy).__name__}; render it yourself")
-        room = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
-        crop = mesh_crop(proxy.mesh.vertices, target, *room)
-        camera = target if crop is None else crop.of_camera(target)
-        config, depth = replace(self.config.render, error_rule=self.error_rule), observation.depth
-        return render_view(frame, proxy, camera, config, exclude=exclude, source_depth=depth), crop
+        self, target: Cameras, time: int | None, exclude: Sequence[str], quality: RenderQuality
+    ) -> tuple[IncompleteView, Evidence, Crop]:
+        """Render the part of a view that shows the subject, with the inpainter's margin."""
+        cached = self.cached_frame(time)
+        if not isinstance(cached.proxy, GeometryProxy):
+            got = type(cached.proxy).__name__
+            raise ValueError(f"expected a GeometryProxy to render, got {got}; render the view yourself, and use mend")
+        margin_px = self.inpainter.crop_margin_px(quality)
+        margin = (BORDER_PX, 1) if margin_px is None else (margin_px, grid_px(margin_px))
+        crop = mesh_crop(cached.proxy.mesh.vertices, target, *margin)
+        camera, depth = crop.of_camera(target), cached.depth
+        part, evidence = render_view(cached.frame, cached.proxy, camera, self.config.render, exclude, depth)
+        return part, evidence, crop
 
-    def _fill(
+    def _with_error_mask(
+        self, view: IncompleteView, evidence: Evidence | None, quality: RenderQuality, exclude: Sequence[str]
+    ) -> IncompleteView:
+        """The view, or a part of one, with its final E; without evidence E is only limited by the quality."""
+        by_rule = evidence is not None and self.error_rule == "predicted"
+        fractions = (quality.refine_fraction, self.config.render.refine_fraction if by_rule else None)
+        fraction = min((own for own in fractions if own is not None), default=None) if quality.mend else None
+        context = ContextProvider(self._context, RenderQuality(refine_fraction=fraction), exclude, self._memory)
+        return decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
+
+    def _complete(
         self,
-        view: IncompleteView,
+        part: IncompleteView,
+        evidence: Evidence | None,
+        crop: Crop,
         viewer: State | None,
         quality: RenderQuality,
         exclude: Sequence[str],
-        fraction: float | None = None,
+        *,
+        whole: IncompleteView | None = None,
+        target: Cameras | None = None,
     ) -> StreamView:
-        """A view, or the part of one that matters, completed; at most this fraction of it is read."""
-        now, viewer = self.observation(view.time), viewer or self.viewer()
-        completed = CompletedView(view, view.rgb)
+        """Complete a part of a view, and paste it into `whole`, or into an empty view of `target`."""
+        cached, viewer = self.cached_frame(part.time), viewer or self.viewer()
         context = ContextProvider(self._context, quality, exclude, self._memory)
-        start = now_s(view.rgb.device)
+        start = now_s(part.rgb.device)
+        part = self._with_error_mask(part, evidence, quality, exclude)
+        if target is not None and self.inpainter.crop_margin_px(quality) is None:
+            part, crop = crop.uncropped(part, target), Crop.all_of(target)
+        completed = CompletedView(part, part.rgb)
         if quality.mend:
-            view = self._narrowed(view, fraction, exclude)
             with heavy_operations():
-                completed, viewer = self.inpainter.step(view, context, viewer)
-            completed.demand_finite(type(self.inpainter).__name__)
-        inpainting_ms = ms_since(start, view.rgb.device) - context.encoding_ms if quality.mend else 0.0
-        self._observations.move_to_end(view.time)
-        forget(self._observations, view.time, self.config.memory_mb)
-        times = StageTimes(geometry=now.pay_geometry(), context=context.encoding_ms, inpainting=inpainting_ms)
+                completed, viewer = self.inpainter.step_on(self.config.background, part, context, viewer)
+            completed.check_finite(type(self.inpainter).__name__)
+        inpainting_ms = ms_since(start, part.rgb.device) - context.encoding_ms if quality.mend else 0.0
+        completed = crop.pasted(completed, whole or crop.uncropped(part, target or part.camera))
+        self._frames.move_to_end(part.time)
+        evict(self._frames, part.time, self.config.memory_mb)
+        times = StageTimes(geometry=cached.pop_geometry_ms(), context=context.encoding_ms, inpainting=inpainting_ms)
         return StreamView(completed, viewer, times)
 
+    def _held_out_views(self, frame: MultiViewFrame) -> Iterator[HeldOutView]:
+        """Views of a few of the frame's cameras, each rendered without that camera, and what it saw."""
+        names, inpainter = frame.cameras.names, self.inpainter
+        for name in (names[len(names) * number // CALIBRATION_VIEWS] for number in range(CALIBRATION_VIEWS)):
+            own = frame.select([name])
+            assert own.mask is not None, "`calibrate` is for frames with masks"
+            try:
+                cached = cache_frame(frame.without([name]), self.bounds, self.config.hull)
+            except ValueError:  # the other cameras see no foreground
+                continue
+            assert isinstance(cached.proxy, GeometryProxy), "a visual hull"
+            context = ContextProvider(lambda _, names, cached=cached: cached.context(names))
+            made = render_view(cached.frame, cached.proxy, own.cameras, self.config.render, (), cached.depth)
+            view = decide_error_mask(*made, inpainter.error_rule, None, inpainter, context)
+            truth = own.rgb[0].float() / 255 * (own.mask[0].float() / 255)
+            margin_px = inpainter.crop_margin_px(RenderQuality())
+            crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
+            yield HeldOutView(crop.of_view(view), context, crop.of_image(truth))
+
     def _context(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
-        return self._observations[time].context(names) if time in self._observations else None
+        return self._frames[time].context(names) if time in self._frames else None
 
     def _memory(self, time: int) -> Memory:
-        if time not in self._observations:
+        if time not in self._frames:
             return {}
-        self._observations.move_to_end(time)
-        return self._observations[time].encoded
+        self._frames.move_to_end(time)
+        return self._frames[time].encoded

@@ -6,8 +6,8 @@ import shutil
 import pytest
 from reference.ball import BallCapture, camera_at
 
-from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
+from viewmend.data.native_writer import write_capture
 from viewmend.geometry.cameras import concatenate_cameras
 
 

@@ -2,13 +2,13 @@
 
 import pytest
 import torch
-from inpainting.plates import tiny
+from models.plates import tiny
 from reference.ball import BallCapture, ring
 from safetensors.torch import load_file, save_file
 
-from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
-from viewmend.inpainting.checkpoint import save_inpainter
+from viewmend.data.native_writer import write_capture
+from viewmend.models.checkpoint import save_inpainter
 
 SMALL = ("--frames", "1", "--size", "64")
 

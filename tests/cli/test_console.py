@@ -23,13 +23,13 @@ def test_names_of_others_move_no_cursor(capsys):
 
 
 def test_an_error_is_one_line_whatever_it_names(capsys):
-    assert main(["info", "no\x1b]0;such\x07\u202efolder"]) == 2
+    assert main(["check", "no\x1b]0;such\x07\u202efolder"]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and said[:-1].isprintable() and "\\x1b]0;such\\x07\\u202efolder" in said
 
 
 def test_progress_is_said_without_a_terminal(monkeypatch, capsys):
-    monkeypatch.setattr(console, "BEAT_S", 0.05)
+    monkeypatch.setattr(console, "INTERVAL_S", 0.05)
     for _ in track(range(2), "counting"):
         sleep(0.12)
     with busy("thinking"):
@@ -40,7 +40,7 @@ def test_progress_is_said_without_a_terminal(monkeypatch, capsys):
     assert capsys.readouterr().err == "", "an end is an end"
 
 
-@pytest.mark.parametrize("arguments", [["mend", "x", "--out", ""], ["mend", "x", "--out="], ["info", " "]])
+@pytest.mark.parametrize("arguments", [["mend", "x", "--out", ""], ["mend", "x", "--out="], ["check", " "]])
 def test_an_empty_value_is_refused(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
@@ -54,7 +54,7 @@ def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys)
     with signals.stop_requests() as stopped:
         assert not stopped()
         os.kill(os.getpid(), number)
-        assert stopped() == number and "with a checkpoint" in capsys.readouterr().err
+        assert stopped() == number and "saving a checkpoint" in capsys.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), number)
             sleep(1)
@@ -65,7 +65,7 @@ def test_sigterm_lets_a_command_clean_up(tmp_path):
     program = (
         "import pathlib, sys, time\n"
         "from viewmend.cli import signals\n"
-        "with signals.ended_by_sigterm():\n"
+        "with signals.exit_on_sigterm():\n"
         "    try:\n        print('begun', flush=True)\n        time.sleep(20)\n"
         "    finally:\n        pathlib.Path(sys.argv[1]).write_text('cleaned')\n"
     )

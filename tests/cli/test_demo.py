@@ -6,8 +6,8 @@ import cv2
 import torch
 
 from viewmend.cli import main
-from viewmend.contact_sheet import GAP_PX, LABEL_PX
 from viewmend.evaluation.mending import Mender
+from viewmend.utils.contact_sheet import GAP_PX, LABEL_PX
 
 SMALL = ["--frames", "3", "--size", "72", "--cameras", "4", "--model", "telea", "--seed", "10001"]
 

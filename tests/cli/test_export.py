@@ -10,7 +10,10 @@ from viewmend.cli import main
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["small", "--format", "onnx", "--out", "{}/m.onnx"], "got 'small', a Chain, which looks at a window of times"),
+        (
+            ["paper-small", "--format", "onnx", "--out", "{}/m.onnx"],
+            "got 'paper-small', a PatchTransformer; export 'views'",
+        ),
         (["views", "--format", "pt2", "--out", "{}/m.onnx"], "expected --out to end in .pt2, got"),
         (["views", "--format", "onnx", "--out", "{}/none/m.onnx"], "expected a folder to write to, found none"),
         (["nobody", "--format", "onnx", "--out", "{}/m.onnx"], "one of the shipped models"),
@@ -33,8 +36,6 @@ def test_a_missing_compiler_is_said(tmp_path, capsys, monkeypatch):
 
 def test_a_missing_extra_is_said(tmp_path, capsys, monkeypatch):
     there = importlib.util.find_spec
-    monkeypatch.setattr(
-        "viewmend.deployment.model_files.find_spec", lambda name: None if name == "onnxscript" else there(name)
-    )
+    monkeypatch.setattr("viewmend.export.model.find_spec", lambda name: None if name == "onnxscript" else there(name))
     assert main(["export", "views", "--format", "onnx", "--out", str(tmp_path / "m.onnx")]) == 2
-    assert "expected onnxscript for --format onnx, got none; pip install 'viewmend[export]'" in capsys.readouterr().err
+    assert "expected onnxscript for --format onnx, got none; pip install 'viewmend[all]'" in capsys.readouterr().err

@@ -13,13 +13,13 @@ from pxr import Usd
 from reference import tells_all
 from reference.ball import RADIUS_M, BallCapture, camera_at, photograph, ring
 
-from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
-from viewmend.export.scene import points_of
+from viewmend.data.native_writer import write_capture
+from viewmend.export.scene import extract_points
 from viewmend.geometry.cameras import concatenate_cameras, project
-from viewmend.methods import make_method
+from viewmend.models.registry import make_method
 from viewmend.stream import Stream
-from viewmend.views import RIM_PX
+from viewmend.types import RIM_PX
 
 
 def rig():
@@ -86,12 +86,12 @@ def test_points_outside_a_mask_are_left_out(depth_m):
     """A model may take a pixel for far behind the subject."""
     frame = photograph(rig())
     stream = Stream(make_method("telea"))
-    stream.push(frame)
+    stream.add_frame(frame)
     completed = stream.view(camera_at(15, "view", 64)).completed
     depth = completed.view.depth.clone()
     depth[32, 30:34] = depth_m
-    spoilt = points_of(replace(completed, depth=depth), frame, 0.5)
-    assert len(points_of(completed, frame, 0.5)) - len(spoilt) == 4
+    spoilt = extract_points(replace(completed, depth=depth), frame, 0.5)
+    assert len(extract_points(completed, frame, 0.5)) - len(spoilt) == 4
     assert float(spoilt[:, :3].norm(dim=-1).max()) < 0.6
 
 
@@ -100,10 +100,10 @@ def test_cameras_that_show_a_part_judge_that_part(window):
     """Images wider or higher than they are square; what lies beside them says nothing."""
     whole = photograph(rig())
     stream = Stream(make_method("telea"))
-    stream.push(whole)
+    stream.add_frame(whole)
     completed = stream.view(camera_at(15, "view", 64)).completed
     part = photograph(rig().cropped(*window))
-    everywhere, some = (points_of(completed, frame, 0.5) for frame in (whole, part))
+    everywhere, some = (extract_points(completed, frame, 0.5) for frame in (whole, part))
     assert 0.3 * len(everywhere) < len(some) <= len(everywhere)
     cameras, mask = part.cameras, part.mask > 127
     uv = torch.stack([project(everywhere[:, :3], cameras[n])[0][0] for n in range(len(cameras))])
@@ -169,4 +169,4 @@ def test_what_cannot_be_is_said(folder, tmp_path, capsys, wrong):
 def test_without_openexr_it_says_what_to_install(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     assert main(["export-scene", str(folder), str(tmp_path / "out")]) == 2
-    assert "extra 'engines'" in capsys.readouterr().err
+    assert "viewmend[all]" in capsys.readouterr().err

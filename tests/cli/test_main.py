@@ -12,10 +12,10 @@ from viewmend.cli import console
 
 def run_command(monkeypatch, run, arguments=()):
     """Put `run` in the place of a command."""
-    from viewmend.cli import info
+    from viewmend.cli import check
 
-    monkeypatch.setattr(info, "run", run)
-    return cli.main(["info", "x", *arguments])
+    monkeypatch.setattr(check, "run", run)
+    return cli.main(["check", "x", *arguments])
 
 
 def test_help_comes_at_once():
@@ -26,7 +26,7 @@ def test_help_comes_at_once():
     assert done.returncode == 0 and all(c.name in done.stdout for c in cli.COMMANDS)
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["info", "--help"], ["info"], ["nonsense"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["check", "--help"], ["check"], ["nonsense"]])
 def test_help_and_mistakes_import_nothing_heavy(arguments):
     check = (
         "import sys; from viewmend.cli import main; code = main(sys.argv[1:]);"
@@ -47,7 +47,7 @@ def test_what_a_user_can_get_wrong_is_one_line(monkeypatch, capsys, error, code)
     assert run_command(monkeypatch, run) == code
     out, message = capsys.readouterr()
     assert out == "" and message.startswith(f"viewmend: error: {' '.join(str(error).split())}")
-    assert message.count("\n") == 1 and ("may you write there?" in message) == (getattr(error, "filename", None) == "f")
+    assert message.count("\n") == 1 and ("check the path" in message) == (getattr(error, "filename", None) == "f")
 
 
 def test_our_own_mistakes_show_where(monkeypatch, capsys):

@@ -21,8 +21,8 @@ from viewmend.cli import main
         (["--leave-out", "held", "--path", "orbit"], "either --leave-out CAMERA or --path"),
         (["--leave-out", "held", "--frames", "5:9"], "--frames first:end within 0:2"),
         (["--leave-out", "held", "--frames", "x"], "--frames first:end within 0:2"),
-        (["--leave-out", "held", "--context", "0"], "--context of at least 1"),
-        (["--leave-out", "held", "--device", "abacus"], "expected a device that is there"),
+        (["--leave-out", "held", "--num-source-views", "0"], "--num-source-views of at least 1"),
+        (["--leave-out", "held", "--device", "abacus"], "expected an available device"),
         (["--leave-out", "held", "--model", "nothing"], "nothing"),
         (["--leave-out", "held", "--error-rule", "some"], "expected an error rule among"),
         (["--path", "missing.json"], "missing.json"),
@@ -43,7 +43,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, mend, argume
         ("[[[1, 0], [0, 1]]]", "world_from_camera[0]: expected a list of length 4"),
         (json.dumps([(2 * torch.eye(4)).tolist()]), "pose 0: expected a rotation"),
         (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 30}), "'height'"),
-        (json.dumps([torch.eye(4).tolist()] * 3), "one for each of 2 frames, got 3"),
+        (json.dumps([torch.eye(4).tolist()] * 3), "one per frame (2 frames), got 3"),
         (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "K": [[0] * 3] * 3}), "expected 'K' as"),
         (
             json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 10**8, "height": 9}),
@@ -88,7 +88,7 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, mend):
     code, _, err = mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
     assert (
         code == 2
-        and "notes.txt: expected no such file, or one that an earlier run made" in err
+        and "notes.txt: expected no such file, or an unchanged one from an earlier run" in err
         and notes.read_text() == "precious"
     )
     notes.unlink()
@@ -125,7 +125,7 @@ def test_a_shift_of_all_images_is_said_and_undone(folder, shifted, tmp_path, men
 
 def test_a_model_without_finite_colours_is_refused(folder, tmp_path, capsys):
     (tmp_path / "broken.py").write_text(
-        "import torch\nfrom viewmend.inpainting.coarse_fill import SmoothFill\n\n"
+        "import torch\nfrom viewmend.models.smooth_fill import SmoothFill\n\n"
         "class Broken(SmoothFill):\n"
         "    def __init__(self, device):\n        super().__init__()\n\n"
         "    def step(self, view, context, state):\n"

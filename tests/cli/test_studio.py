@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from viewmend.capture.plain import open_capture
 from viewmend.cli import main
+from viewmend.data.native_capture import open_capture
 
 
 def test_writes_captures_that_can_be_read(tmp_path, capsys):
@@ -27,7 +27,7 @@ def test_who_was_stopped_is_told_how_to_go_on(tmp_path, capsys):
     left = tmp_path / f".scene_10006.unfinished-{2**22 + 1}"
     left.mkdir()
     assert main(["studio", str(tmp_path), *small, "--seed", "10005", "--scenes", "3"]) == 2
-    assert "go on with --seed 10006 --scenes 2, or choose another folder" in capsys.readouterr().err
+    assert "continue with --seed 10006 --scenes 2, or choose another folder" in capsys.readouterr().err
     assert not left.exists()
     assert main(["studio", str(tmp_path), *small, "--seed", "10004", "--scenes", "2"]) == 2
     assert "choose another --seed or folder" in capsys.readouterr().err, "it has not begun there"

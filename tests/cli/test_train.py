@@ -1,22 +1,26 @@
-"""`viewmend train` and `viewmend samples` from the command line."""
+"""`viewmend train` from the command line."""
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+import torch
+from training.conftest import MODEL, VIEWS_MODEL
 
-from viewmend.baselines.published import NETWORKS
-from viewmend.capture.plain_writer import write_capture
 from viewmend.cli import main
-from viewmend.inpainting.chain import build
-from viewmend.inpainting.checkpoint import load_inpainter, save_inpainter
-from viewmend.inpainting.config import small as small_model
-from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.data.native_writer import write_capture
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.models.checkpoint import load_config, save_inpainter
+from viewmend.models.paper.patch_transformer import PatchTransformer
+from viewmend.models.views.model import ViewSynthNet
 from viewmend.training.recipes import RECIPES
-from viewmend.training.sample_files import read_shard
 
-MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
 BRIEF = ("--steps", "2", "--batch", "2", "--workers", "0", "--validate-every", "0")
 
 
@@ -28,105 +32,119 @@ def capture(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("models") / "tiny"
-    save_inpainter(build(MODEL), folder, "# tiny\n")
+def models(tmp_path_factory):
+    """Tiny models of both architectures."""
+    folder = tmp_path_factory.mktemp("models")
+    torch.manual_seed(0)
+    save_inpainter(ViewSynthNet(VIEWS_MODEL), folder / "views", "# tiny\n")
+    save_inpainter(PatchTransformer(replace(MODEL, n_c=1, n_w=0)), folder / "paper", "# tiny\n")
     return folder
+
+
+def finetune(capture, model, out, *more):
+    command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out)]
+    return main([*command, "--captures-fraction", "1", *BRIEF, *more])
 
 
 def test_the_help_names_every_recipe(capsys):
     assert main(["train", "--help"]) == 0
-    words = set(capsys.readouterr().out.replace(",", " ").replace(";", " ").replace(".", " ").split())
-    assert words >= {*RECIPES, *NETWORKS}
+    words = set(capsys.readouterr().out.replace(",", " ").replace(":", " ").replace(".", " ").split())
+    assert words >= set(RECIPES)
 
 
-def test_fine_tuning_on_a_capture_of_ones_own_goes_on_from_a_model(capture, model, tmp_path, capsys):
+@pytest.mark.parametrize("kind", ["views", "paper"])
+def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, tmp_path, capsys):
     out = tmp_path / "mine"
-    command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
-    assert main(command) == 0
-    assert load_inpainter(out).config == MODEL
+    assert finetune(capture, models / kind, out) == 0
+    assert load_config(out) == load_config(models / kind)
     steps = [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
     assert steps == [1, 2]
-    assert main(command) == 0
+    card = (out / "README.md").read_text()
+    assert "100% of the scenes from captures (mine)" in card and f"from `{models / kind}`" in card
+    assert finetune(capture, models / kind, out) == 0
     assert "nothing to do" in capsys.readouterr().err
+    assert finetune(capture, models / kind, out, "--seed", "1") == 2
+    assert "differs in seed" in capsys.readouterr().err
 
 
-def test_samples_made_ahead_train_a_model(capture, model, tmp_path):
-    shards = tmp_path / "shards"
-    command = ["samples", "finetune", "--captures", str(capture), "--out", str(shards)]
-    assert main([*command, "--clip-length", "2", "--count", "3", "--workers", "0"]) == 0
-    assert sorted(p.name for p in shards.glob("*.*") if p.suffix) == ["next.json", "plan.txt", "shard-00000.tar"]
-    assert [len(sample.clip) for sample in read_shard(shards / "shard-00000.tar")] == [2, 2, 2]
-    before = (shards / "shard-00000.tar").read_bytes()
-    assert main([*command, "--clip-length", "2", "--count", "1", "--workers", "0"]) == 0
-    assert (shards / "shard-00000.tar").read_bytes() == before, "shards are never replaced"
-    trained = ["train", "finetune", "--shards", str(shards), "--from", str(model), "--out", str(tmp_path / "out")]
-    assert main([*trained, "--clip-length", "3", *BRIEF]) == 2, "clips are too short"
-    assert main([*trained, "--no-bfloat16", *BRIEF]) == 0
-    assert load_inpainter(tmp_path / "out").config == MODEL
+def test_fine_tuning_refuses_captures_reserved_for_tests(capture, models, tmp_path, capsys):
+    kept = tmp_path / "test" / "mine"
+    shutil.copytree(capture, kept)
+    assert finetune(kept, models / "views", tmp_path / "out") == 2
+    assert "got a folder named 'test'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
-        (["train", "smal"], "expected a recipe among"),
-        (["train", "finetune"], "expected --captures DIR"),
-        (["train", "finetune", "--captures", "here", "--from=nothing"], "one of the shipped models"),
-        (["train", "small", "--performers", "people"], "--performers and --motions together"),
-        (["train", "small", "--adversarial", "1", "--discriminator", "clip"], "give --clip-length 2"),
-        (["train", "small_rays", "--adversarial", "0.01"], "no adversarial loss for rays"),
-        (["train", "small", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
-        (["train", "small", "--from", "nothing"], "one of the shipped models"),
-        (["train", "paper", "--from", "small", *BRIEF], "of which anything fits paper"),
-        (["train", "small", "--steps", "0"], "steps of 0"),
-        (["train", "small", "--checkpoint-every", "0"], "checkpoint_every of 0"),
-        (["train", "small", "--minutes", "nan"], "minutes of nan"),
-        (["train", "small", "--batch", "0"], "batch of 0"),
-        (["train", "small", "--clip-length", "-1"], "clip_length of -1"),
-        (["train", "small", "--data-device", "abacus"], "expected a device that is there"),
-        (["train", "small", "--performers", "nobody", "--motions", "nobody"], "nobody: expected people or motions"),
-        (["samples", "--out", "x", "--count", "0"], "count of at least 1"),
-        (["ablation", "--out", "x", "--variants", "no-ropes"], "expected variants among"),
+        (["smal"], "expected a recipe among"),
+        (["finetune"], "expected --captures DIR"),
+        (["finetune", "--captures", "here", "--from=nothing"], "one of the shipped models"),
+        (["views", "--performers", "people"], "both --performers and --motions"),
+        (["views", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
+        (["views", "--from", "nothing"], "one of the shipped models"),
+        (["views", "--train-params", "errors", *BRIEF], "give --from MODEL"),
+        (["paper", "--from", "views", *BRIEF], "expected a PatchTransformer of the recipe's sizes"),
+        (["views", "--steps", "0"], "steps of 0"),
+        (["views", "--checkpoint-minutes", "-1"], "checkpoint_minutes of -1"),
+        (["views", "--minutes", "nan"], "minutes of nan"),
+        (["views", "--batch", "0"], "batch of 0"),
+        (["views", "--cameras", "3", "80"], "--cameras MIN MAX of 4 to 60"),
+        (["views", "--data-device", "abacus"], "abacus"),
+        (["views", "--performers", "nowhere", "--motions", "nowhere"], "nowhere: expected"),
+        (["dstt", "--from", "absent.pth"], "absent.pth: expected a file of weights, found none"),
+        (["fuseformer", "--size-px", "64", "108"], "frames of 432x240"),
+        (["e2fgvi", "--clip-length", "6", *BRIEF], "expected --clip-length of 1 to 5"),
     ],
 )
-def test_what_cannot_be_is_one_clear_error(arguments, said, tmp_path, monkeypatch, capsys):
+def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
+    assert main(["train", *arguments]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and said in lines[0], lines
+    assert len(lines) == 1 and message in lines[0], lines
 
 
-def test_a_model_that_lies_there_is_not_overwritten(capture, model, tmp_path, capsys):
+def test_a_model_in_the_folder_is_not_overwritten(capture, models, tmp_path, capsys):
     out = tmp_path / "mine"
-    shutil.copytree(model, out)
+    shutil.copytree(models / "views", out)
     before = (out / "model.safetensors").read_bytes()
-    command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out), *BRIEF]
-    assert main(command) == 2
-    assert "model.safetensors: expected no such file, or one that an earlier run made" in capsys.readouterr().err
+    assert finetune(capture, models / "views", out) == 2
+    assert "model.safetensors: expected no such file" in capsys.readouterr().err
     assert (out / "model.safetensors").read_bytes() == before
 
 
-def test_a_sample_that_cannot_be_made_in_a_worker_is_one_line(capture, tmp_path, capfd):
+def test_a_damaged_capture_is_one_line_also_from_a_worker(capture, tmp_path, capfd):
     broken = tmp_path / "broken"
     shutil.copytree(capture, broken)
     for image in broken.glob("image/*/*1.*"):
         image.write_bytes(b"none")
-    command = ["samples", "finetune", "--captures", str(broken), "--out", str(tmp_path / "out")]
+    command = ["make-dataset", "finetune", "--captures", str(broken), "--out", str(tmp_path / "out")]
     assert main([*command, "--count", "40", "--workers", "1"]) == 2
-    said = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
-    assert len(said) == 1 and "expected an image" in said[0] and "Traceback" not in said[0]
+    lines = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
+    assert len(lines) == 1 and "expected an image" in lines[0] and "Traceback" not in lines[0]
 
 
 @pytest.mark.slow
-def test_an_ablation_trains_evaluates_and_goes_on(tmp_path, capsys):
-    command = ["ablation", "--out", str(tmp_path), "--variants", "no-rope", "--seeds", "1", "--samples", "4"]
-    command += ["--steps", "1", "--scenes", "1", "--frames", "1", "--size", "128", "--jobs", "1"]
-    assert main(command) == 0
-    first = capsys.readouterr().out
-    assert "| no-rope |" in first and "| 64 |" in first and "| all |" in first
-    assert {p.name for p in tmp_path.iterdir()} >= {"ablation.md", "ablation.json", "ablation.svg", "models", "samples"}
-    assert load_inpainter(tmp_path / "models/no-rope-s0").config.rope is False
-    assert load_inpainter(tmp_path / "models/full-s0-k64").config.top_k == 64
-    (tmp_path / "ablation.md").unlink()
-    assert main(command) == 0
-    assert capsys.readouterr().out == first
+def test_sigterm_to_the_process_group_ends_a_run_with_a_checkpoint(models, tmp_path):
+    """As service managers send it: to the worker processes, too."""
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "viewmend", "train", "finetune", "--captures", "none", "--out", str(out)]
+    command += ["--from", str(models / "views"), "--workers", "1", "--steps", "100000", "--minutes", "None"]
+    capture = tmp_path / "mine"
+    write_capture(Studio(StudioConfig(seed=3, cameras=5, frames=1, size_px=96)), capture)
+    command[command.index("none")] = str(capture)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "src"), "JAXTYPING_DISABLE": "1"}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    assert process.stderr is not None
+    printed = []
+    while not (out / "log.jsonl").exists() or not (out / "log.jsonl").read_text():
+        assert process.poll() is None, process.stderr.read()
+        try:
+            process.wait(0.2)
+        except subprocess.TimeoutExpired:
+            continue
+    os.killpg(process.pid, signal.SIGTERM)
+    printed = process.communicate(timeout=120)[1]
+    assert process.returncode == 128 + signal.SIGTERM, printed
+    assert "run the same command to resume" in printed and "Traceback" not in printed
+    assert (out / "run.safetensors").exists()

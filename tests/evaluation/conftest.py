@@ -1,21 +1,21 @@
-"""Small scenes of the studio, and cells without any."""
+"""Small synthetic scenes, and cells with given scores."""
 
 from dataclasses import fields
 
 import pytest
 
-from viewmend.evaluation.cells import Cell, CellKey
-from viewmend.evaluation.frame_scores import FrameScores
+from viewmend.data.holdout.studio_scenes import StudioScene
+from viewmend.data.synthetic.stage import StudioConfig
 from viewmend.evaluation.provenance import Provenance
-from viewmend.leave_one_out.studio_scenes import StudioScene
-from viewmend.studio.stage import StudioConfig
+from viewmend.evaluation.result_cache import Cell, CellKey
+from viewmend.evaluation.scores import ViewScores
 
 ORIGIN = Provenance("0", "abc", "3", "2", "cpu", 1, 1, 0.0)
 
 
 @pytest.fixture(scope="session")
 def small_scenes() -> list[StudioScene]:
-    """Three of two sets, each of two frames."""
+    """Three scenes of two sets, with two frames each."""
     return [
         StudioScene(
             name=f"s{seed}",
@@ -32,30 +32,31 @@ def small_scenes() -> list[StudioScene]:
 
 @pytest.fixture
 def make_cell():
-    """Makes cells of scene, method, set, frames (`make_frame`) and error."""
+    """Makes a cell from a scene, a method, a set, frames of `make_frame`, an error, and milliseconds per frame."""
 
-    def make(scene: str, method: str, name: str, frames: list[FrameScores], error: str | None = None) -> Cell:
+    def make(
+        scene: str,
+        method: str,
+        name: str,
+        frames: list[ViewScores],
+        error: str | None = None,
+        step_ms: list[float] | None = None,
+    ) -> Cell:
         key = CellKey(scene, method, f"{scene}-{method}", scene)
-        return Cell(key, name, "ring", "calm", method, tuple(frames), error, ORIGIN)
+        taken = step_ms or [1.0] * len(frames)
+        return Cell(key, name, "ring", "calm", method, tuple(frames), tuple(taken), error, ORIGIN)
 
     return make
 
 
 @pytest.fixture
 def make_frame():
-    """Makes frames of 20 x 10 pixels with these scores, all others None."""
+    """Makes a frame of 20 x 10 pixels with these scores; the others are None."""
 
-    def make(**scores: float | None) -> FrameScores:
-        plain = {
-            "time": 0,
-            "width_px": 20,
-            "height_px": 10,
-            "hull_px": 100,
-            "hole_px": 60,
-            "hole_fg_px": 60,
-            "past_px": 0,
-        }
-        values = dict.fromkeys(f.name for f in fields(FrameScores)) | plain | {"psnr_whole": 30.0, "step_ms": 1.0}
-        return FrameScores(**(values | scores))  # pyright: ignore[reportArgumentType]
+    def make(**scores: float | None) -> ViewScores:
+        pixels = {"time": 0, "width_px": 20, "height_px": 10, "hull_px": 100, "hole_px": 60, "hole_fg_px": 60}
+        values = dict.fromkeys(f.name for f in fields(ViewScores)) | pixels | {"past_px": 0, "psnr_whole": 30.0}
+        values |= {"psnr_whole_rendered": 20.0}
+        return ViewScores(**(values | scores))  # pyright: ignore[reportArgumentType]
 
     return make

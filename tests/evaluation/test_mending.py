@@ -1,4 +1,4 @@
-"""What `mend` says of its views: each figure under its own name, of its own time, upon the background of the truth."""
+"""`Mender` and its summary: each figure under its own name, for the right frame, on the background of the truth."""
 
 from dataclasses import fields, replace
 
@@ -6,42 +6,41 @@ import pytest
 import torch
 from reference.ball import BallCapture, camera_at, ring
 
-from viewmend.baselines.classical import Telea
-from viewmend.capture.images import read_rgb
 from viewmend.cli.mend_output import MendOutput, sheet_row
-from viewmend.evaluation.frame_scores import mean_similarity
-from viewmend.evaluation.mending import Mender, MendSummary, Scores
-from viewmend.inpainting.coarse_fill import SmoothFill
-from viewmend.inpainting.protocol import ContextProvider, State
-from viewmend.inpainting.upon_white import covered
-from viewmend.metrics.image_quality import psnr
-from viewmend.metrics.view_scores import ViewScores
+from viewmend.data.images import read_rgb
+from viewmend.evaluation.mending import FillScores, Mender, MendSummary
+from viewmend.evaluation.scores import ViewScores
+from viewmend.metrics.image_quality import psnr, ssim_map
+from viewmend.models.base import ContextProvider, State
+from viewmend.models.classical import Telea
+from viewmend.models.compositing import painted_alpha
+from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.view import RenderConfig
-from viewmend.views import CompletedView
+from viewmend.stream import StreamConfig
+from viewmend.types import CompletedView
 
 TARGET = camera_at(75, "t", height_m=0.3)
 
 
-def numbered(first):
-    """Scores that are all different."""
+def test_each_figure_has_its_own_name():
     names = [field.name for field in fields(ViewScores)]
-    return ViewScores(**{n: first + k if n.endswith("_px") else float(first + k) for k, n in enumerate(names)})
-
-
-def test_every_figure_stands_under_its_own_name():
+    counts = {name for name in names if name.endswith("_px")} | {"time"}
+    fills = {
+        fill: ViewScores(**{name: (int if name in counts else float)(100 * n + k) for k, name in enumerate(names)})
+        for n, fill in enumerate(("unfilled", "telea", "holes_only", "ours"), 1)
+    }
     summary = MendSummary()
-    fills = {name: numbered(100 * n) for n, name in enumerate(("unfilled", "telea", "unseen", "ours"), 1)}
-    summary._scores.append(Scores(**fills, **{f.name: 0.5 for f in fields(Scores) if f.name not in fills}))
+    summary._scores.append(FillScores(**fills))
     report = summary.as_json()
     for kind in ("holes", "holes_fg"):
         assert report[f"psnr_{kind}_telea"] == getattr(fills["telea"], f"psnr_{kind}")
-    for kind in ("whole", "subject", "valid", "holes", "holes_fg"):
-        assert report[f"psnr_{kind}"] == getattr(fills["ours"], f"psnr_{kind}")
-    assert report["psnr_whole_unseen"] == fills["unseen"].psnr_whole
+    for name in ("psnr_whole", "psnr_subject", "psnr_valid", "psnr_holes", "psnr_holes_fg", "ssim_whole", "alpha_iou"):
+        assert report[name] == getattr(fills["ours"], name)
+    assert report["psnr_whole_unseen"] == fills["holes_only"].psnr_whole
     assert report["psnr_whole_rendered"] == fills["unfilled"].psnr_whole
 
 
-def test_each_time_is_seen_by_itself():
+def test_each_view_shows_its_own_frame():
     source, mender = BallCapture(ring(6), 3), Mender(SmoothFill())
     means = [float(mender.mend(source.read(time), TARGET, None).completed.rgb.mean()) for time in range(3)]
     dimmed = [float(source.read(time).rgb.float().mean()) for time in range(3)]
@@ -49,7 +48,7 @@ def test_each_time_is_seen_by_itself():
     assert means[2] < 0.9 * means[0]
 
 
-def test_the_truth_is_black_where_its_mask_is():
+def test_the_truth_outside_of_its_mask_does_not_matter():
     source = BallCapture(ring(6), 1)
     truth = BallCapture(TARGET, 1).read(0)
     bright = replace(truth, rgb=torch.where(truth.mask[:, None] > 127, truth.rgb, 255).to(torch.uint8))
@@ -58,22 +57,23 @@ def test_the_truth_is_black_where_its_mask_is():
 
 
 class Snow(SmoothFill):
-    """Paints white wherever it is asked to paint."""
+    """Paints all of E white."""
 
     background = "white"
 
     def step(self, view, context, state):
         rgb = view.error + (1 - view.error) * view.rgb
-        return CompletedView(view, rgb, covered(view)), state
+        return CompletedView(view, rgb, painted_alpha(view)), state
 
 
 @pytest.fixture
 def snow():
     truth = BallCapture(TARGET, 1).read(0)
-    return Mender(Snow(), RenderConfig(cameras=2)).mend(BallCapture(ring(6), 1).read(0), TARGET, truth), truth
+    mender = Mender(Snow(), StreamConfig(render=RenderConfig(cameras=2)))
+    return mender.mend(BallCapture(ring(6), 1).read(0), TARGET, truth), truth
 
 
-def test_a_model_that_paints_upon_white_is_scored_upon_white(snow):
+def test_a_model_that_paints_on_white_is_scored_on_white(snow):
     step, truth = snow
     view, subject, scores = step.completed.view, truth.mask[0] > 127, step.scores
     assert step.background == "white" and view.holes.sum() > 50
@@ -82,7 +82,7 @@ def test_a_model_that_paints_upon_white_is_scored_upon_white(snow):
     assert float(step.mended[:, view.holes].min()) == 1 and float(step.rendered[:, view.holes].max()) == 0
     torch.testing.assert_close(step.mended, torch.where(view.error > 0, 1.0, step.rendered))
     assert scores.ours.psnr_whole == pytest.approx(psnr(step.mended, step.truth))
-    assert scores.ssim_whole == pytest.approx(mean_similarity(step.mended, step.truth))
+    assert scores.ours.ssim_whole == pytest.approx(float(ssim_map(step.mended, step.truth).nanmean()))
     assert scores.unfilled.psnr_whole == pytest.approx(psnr(step.rendered, step.truth))
     telea = Telea().step(replace(view, rgb=step.rendered), ContextProvider(lambda *_: None), State())[0].rgb
     assert scores.telea.psnr_holes == pytest.approx(psnr(telea, step.truth, view.holes), abs=0.01)
@@ -91,7 +91,7 @@ def test_a_model_that_paints_upon_white_is_scored_upon_white(snow):
     assert summary.as_json()["background"] == "white"
 
 
-def test_a_model_that_paints_upon_white_is_shown_upon_white(snow, tmp_path):
+def test_a_model_that_paints_on_white_is_shown_on_white(snow, tmp_path):
     step, _ = snow
     with MendOutput(tmp_path, 15.0) as output:
         output.add(step)
@@ -99,7 +99,7 @@ def test_a_model_that_paints_upon_white_is_shown_upon_white(snow, tmp_path):
         assert (read_rgb(tmp_path / name / "000000.png", name)[:3, :3] == 255).all(), name
     tiles = {tile.label.split(",")[0]: tile.image for tile in sheet_row(step)}
     height, width = step.completed.view.mask.shape
-    for name in ("rendered", "holes", "mended", "truth"):
-        assert tiles[name].shape[0] < height and tiles[name].shape[1] < width, "cut to the subject"
+    for name in ("rendered", "holes", "completed", "truth"):
+        assert tiles[name].shape[0] < height and tiles[name].shape[1] < width, "cropped to the subject"
         assert tiles[name][0, 0].tolist() == [255, 255, 255]
-    assert tiles["rendered - truth"][0, 0].tolist() == [0, 0, 0], "white upon white is no difference"
+    assert tiles["rendered - truth"][0, 0].tolist() == [0, 0, 0], "white minus white"

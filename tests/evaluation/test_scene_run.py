@@ -1,42 +1,219 @@
-"""Each time of a scene is judged against its own truth and the time before."""
+"""One scene through several methods: truth, history and background of each frame."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import ClassVar
 
+import pytest
 import torch
 
+from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter
+from viewmend.data.holdout.scenes import LeaveOneOutScene
+from viewmend.data.holdout.studio_scenes import lengthened, procedural_set, turning_set
 from viewmend.evaluation import scene_run
-from viewmend.evaluation.film import subject_box
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
+from viewmend.evaluation.video_strip import subject_box
+from viewmend.models.base import ContextProvider, State
+from viewmend.models.checkpoint import build, load_inpainter
+from viewmend.models.classical import Telea
+from viewmend.models.compositing import composite
+from viewmend.models.paper.config import paper_small
+from viewmend.models.paper.context_tokens import window_times
+from viewmend.stream import Stream
 
 
-def test_each_time_is_compared_with_the_one_before(small_scenes, monkeypatch):
-    asked, score = [], scene_run.score_frame
+@pytest.fixture
+def scored(monkeypatch):
+    """The arguments of each call of `score_view`."""
+    calls, score = [], scene_run.score_view
+    monkeypatch.setattr(scene_run, "score_view", lambda *given: (calls.append(given), score(*given))[1])
+    return calls
 
-    def listening(completed, truth, before, *how):
-        asked.append((completed, truth, before))
-        return score(completed, truth, before, *how)
 
-    monkeypatch.setattr(scene_run, "score_frame", listening)
+def test_each_frame_is_compared_with_its_truth_and_the_previous_frame(small_scenes, scored):
     scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=3))
-    run = evaluate_scene(scene, ("nearest",), RunSettings())
-    assert run.runs[0].error is None and len(asked) == 3 and asked[0][2] is None
-    for (shown, truth, _), (now, _, before) in pairwise(asked):
-        assert torch.equal(before.holes, shown.view.holes) and not torch.equal(before.holes, now.view.holes)
-        assert torch.equal(before.truth, truth.rgb) and torch.equal(before.completed, shown.rgb)
-    assert [completed.view.time for completed, _, _ in asked] == [0, 1, 2]
+    assert evaluate_scene(scene, ("nearest",), RunSettings()).runs[0].error is None
+    assert len(scored) == 3 and scored[0][3] is None
+    for (completed, truth, *_), (now, _, _, previous) in pairwise(scored):
+        assert torch.equal(previous.holes, completed.view.holes) and not torch.equal(previous.holes, now.view.holes)
+        assert torch.equal(previous.truth, truth.rgb) and torch.equal(previous.rgb, completed.rgb)
+    assert [completed.view.time for completed, *_ in scored] == [0, 1, 2]
 
 
-def test_a_film_shows_all_that_is_rendered_and_all_that_is_true(small_scenes, monkeypatch):
-    asked, boxes, score, make = [], [], scene_run.score_frame, scene_run.film
+def test_all_strips_show_the_subject_of_all_frames(small_scenes, scored, monkeypatch):
+    boxes, make = [], scene_run.make_strip
+    monkeypatch.setattr(scene_run, "make_strip", lambda frames, box: (boxes.append(box), make(frames, box))[1])
+    evaluate_scene(small_scenes[0], ("nearest",), RunSettings())
+    first, second = (subject_box((completed.view.mask > 0) | truth.mask) for completed, truth, *_ in scored)
+    assert len(boxes) == 3 and set(boxes) == {first.union(second)}
 
-    def listening(completed, truth, before, *how):
-        asked.append((completed.view.mask > 0) | truth.mask)
-        return score(completed, truth, before, *how)
 
-    monkeypatch.setattr(scene_run, "score_frame", listening)
-    monkeypatch.setattr(scene_run, "film", lambda frames, box: (boxes.append(box), make(frames, box))[1])
-    scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=2))
-    evaluate_scene(scene, ("nearest",), RunSettings())
-    expected = subject_box(asked[0]).around(subject_box(asked[1]))
-    assert len(boxes) == 3 and set(boxes) == {expected}
+@dataclass(frozen=True, kw_only=True)
+class Precomputed(LeaveOneOutScene):
+    """A scene whose frames are given."""
+
+    made: list
+    definition = "precomputed"
+
+    def frames(self, device):
+        yield from self.made
+
+
+@pytest.fixture(scope="module")
+def turning() -> Precomputed:
+    """A turning person, three cameras besides the held-out one, and five frames, of which the last two are scored."""
+    scene = turning_set(64)[3]
+    config = replace(scene.config, cameras=4, frames=5, samples_per_side=1, fps=6)
+    scene = replace(scene, config=config, held="cam00", scored_from=3)
+    kind = {name: getattr(scene, name) for name in ("name", "set", "rig", "style", "held", "scored_from")}
+    return Precomputed(made=list(scene.frames("cpu")), **kind)
+
+
+def test_long_sets_are_the_same_scenes_with_a_full_window_before_the_scored_frames():
+    short, long = procedural_set(), lengthened(procedural_set())
+    assert [s.name for s in long[:2]] == ["P-long-10000", "P-long-10001"] and {s.set for s in long} == {"P-long"}
+    for one, other in zip(short, long, strict=True):
+        assert replace(other.config, frames=one.config.frames) == one.config and other.held == one.held
+        assert len(window_times(other.scored_from, paper_small())) == 7
+        assert other.config.frames - other.scored_from == 10 and one.definition != other.definition
+    assert len(turning_set()) == 24 and {s.config.frames for s in turning_set()} == {41}
+
+
+def test_surface_visible_only_in_the_past_is_known(turning):
+    frames = list(turning.frames("cpu"))
+    assert [f.seen is not None for f in frames] == [False, False, False, True, True]
+    last = frames[-1]
+    names = last.inputs.cameras.names
+    assert last.seen.names == names and last.seen.seen.shape[0] == 4, "this frame, and three before"
+    alone = last.seen.by_past_alone(names)
+    surface = last.truth.depth[0] > 0
+    assert 0 < int(alone.sum()) < int(surface.sum()) and not (alone & ~surface).any()
+    assert torch.equal(alone, last.seen.seen[1:].any((0, 1)) & ~last.seen.seen[0].any(0))
+    assert not replace(last.seen, seen=last.seen.seen[[0, 0]]).by_past_alone(names).any(), "nothing moved"
+
+
+class Counts(Telea):
+    """Telea that counts its steps and the past frames that it could encode."""
+
+    steps, past = 0, 0
+
+    def step(self, view, context, state):
+        type(self).steps += 1
+        return super().step(view, context, state)
+
+    def encode_history(self, view, context):
+        type(self).past += sum(context(time, view.source_views) is not None for time in range(view.time))
+
+
+class Stateful(Counts):
+    def initial_state(self):
+        return OwnState()
+
+
+class OwnState(State):
+    pass
+
+
+@pytest.mark.parametrize(("kind", "steps"), [(Counts, 3), (Stateful, 6)])
+def test_only_stateful_methods_run_on_frames_that_are_not_scored(turning, monkeypatch, kind, steps):
+    kind.steps = kind.past = 0
+    monkeypatch.setattr(scene_run, "make_method", lambda name, *how: kind())
+    run = evaluate_scene(turning, ("telea",), RunSettings()).runs[0]
+    assert run.error is None and [f.time for f in run.frames] == [3, 4]
+    assert kind.steps == steps, "the first scored frame is computed twice"
+    assert kind.past == 3 + 3 + 4, "the whole past can be encoded"
+    assert all(f.past_px > 0 for f in run.frames)
+
+
+def test_a_scored_view_is_what_a_stream_of_all_frames_gives(turning, monkeypatch):
+    torch.manual_seed(0)
+    net = build(replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, blocks=1, n_w=1, k_w=4)).eval()
+    monkeypatch.setattr(scene_run, "make_method", lambda name, *how: net)
+    late, every = (
+        evaluate_scene(scene, ("x",), RunSettings(background="white")).runs[0]
+        for scene in (turning, replace(turning, scored_from=0))
+    )
+    assert late.error is None and every.error is None
+    for one, other in zip(late.frames, every.frames[-2:], strict=True):
+        assert one.hole_px == other.hole_px and one.psnr_holes == pytest.approx(other.psnr_holes, abs=1e-3)
+
+
+class Mean:
+    """A network that fills with the mean of its input, and records the number of past frames."""
+
+    def __init__(self):
+        self.past = []
+
+    def check_size(self, height, width):
+        pass
+
+    def complete_clip(self, clip):
+        self.past.append(len(clip.neighbours))
+        mean = torch.stack([frames[0] for frames in (clip.now, *clip.neighbours)]).mean((0, 2, 3))
+        return mean[:, None, None].expand(3, 48, 48)
+
+    def complete_remembering(self, now, memory):
+        raise AssertionError("O has no memory")
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_a_network_whose_state_is_its_input_runs_on_scored_frames_only(turning, monkeypatch, background):
+    def run(scene):
+        network = Mean()
+        inpainter = OnlineInpainter(network, OnlineConfig(size_px=(48, 48)))
+        monkeypatch.setattr(scene_run, "make_method", lambda name, *how: inpainter)
+        done = evaluate_scene(scene, ("x",), RunSettings(background=background)).runs[0]
+        assert done.error is None
+        return done.frames, network.past
+
+    late, past = run(turning)
+    assert past == [3, 3, 3], "of two scored frames; the first is computed twice"
+    every, past = run(replace(turning, scored_from=0))
+    assert past == [0, 0, 1, 2, 3, 3]
+    for one, other in zip(late, every[-2:], strict=True):
+        assert one.psnr_holes == other.psnr_holes and one.psnr_whole == other.psnr_whole
+
+
+class LooksBack(Telea):
+    """Remembers the true images that are revealed."""
+
+    truths: ClassVar[list] = []
+
+    def initial_state(self):
+        return OwnState()
+
+    def reveal_truth(self, state, truth):
+        self.truths.append(truth)
+        return state
+
+
+def test_the_truth_of_past_frames_is_revealed(small_scenes, scored, monkeypatch):
+    monkeypatch.setattr(scene_run, "make_method", lambda name, *how: LooksBack())
+    evaluate_scene(small_scenes[0], ("x",), RunSettings())
+    assert len(LooksBack.truths) == 2
+    assert all(torch.equal(truth, call[1].rgb) for truth, call in zip(LooksBack.truths, scored, strict=True))
+
+
+def test_classical_fills_get_white_views_and_keep_known_pixels(small_scenes):
+    frame = next(small_scenes[0].frames("cpu"))
+    stream = Stream(Telea())
+    stream.add_frame(frame.inputs)
+    view, nothing = stream.render(frame.truth.cameras), ContextProvider(lambda *_: None)
+    done, _ = Telea().step_on("white", view, nothing, State())
+    holes = view.error > 0
+    assert holes.sum() > 50 and torch.equal(done.rgb[:, ~holes], view.rgb[:, ~holes])
+    white = replace(view, rgb=torch.where(view.mask > 0, view.rgb, 1.0))
+    expected = Telea().step(white, nothing, State())[0].rgb
+    torch.testing.assert_close(composite("white", done.rgb, done.opacity), expected)
+    assert (expected[:, holes].mean() - Telea().step(view, nothing, State())[0].rgb[:, holes].mean()) > 0.02
+
+
+def test_scores_depend_on_the_background(small_scenes):
+    scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=1))
+    black, white = (
+        evaluate_scene(scene, ("telea",), RunSettings(background=background)).runs[0].frames[0]
+        for background in ("black", "white")
+    )
+    assert black.hole_px == white.hole_px
+    assert black.psnr_whole != white.psnr_whole and black.psnr_subject != white.psnr_subject
+    assert Telea().background is None and load_inpainter("views").background == "black"

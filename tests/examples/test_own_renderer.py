@@ -1,4 +1,4 @@
-"""The example does what it says."""
+"""The example completes views of another renderer."""
 
 import importlib.util
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from viewmend.inpainting.checkpoint import load_inpainter
+from viewmend.models.checkpoint import load_inpainter
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "own_renderer.py"
 
@@ -19,8 +19,8 @@ def example():
     return module
 
 
-def test_views_of_another_renderer_are_mended(example):
-    completed, truth = example.run(load_inpainter("small"), frames=2, size=96)
+def test_views_of_another_renderer_are_completed(example):
+    completed, truth = example.run(load_inpainter("views"), frames=2, size=96)
     view = completed.view
     holes, right = view.error > 0, view.error == 0
     assert 0.02 < float(holes.sum()) / float(view.mask.sum()) < 0.6

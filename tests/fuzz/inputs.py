@@ -1,4 +1,4 @@
-"""Inputs that strangers might give, and the bounds that whoever reads them keeps."""
+"""Mutated inputs, and the limits that every parser must keep."""
 
 import copy
 import gc
@@ -8,14 +8,15 @@ import resource
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 INPUTS = int(os.environ.get("VIEWMEND_FUZZ", "60"))
-MOST_S, MOST_MB = 5.0, 600
+MAX_S, MAX_MB = 5.0, 600
 COLLECT_EVERY = 64
-"""After so many inputs of a parser, garbage is looked for: 5,000 networks would take all memory before Python does."""
+"""Inputs between garbage collections: networks are cycles of few objects, which Python collects too late."""
 FUZZED = settings(
     max_examples=INPUTS,
     deadline=None,
@@ -25,31 +26,31 @@ FUZZED = settings(
 )
 NUMBERS = (-1, 0, 1, 2, 0.5, 7, 2**31, 2**40, 10**400, 1e308, -1e308, 1e-300, float("nan"), float("inf"))
 TEXTS = ("", "x", "\0", "../../etc/passwd", "/etc/passwd", "/dev/zero", "\ud800", "a" * 5000)
-NASTY = st.sampled_from([None, True, *NUMBERS, *TEXTS, [], {}, [[]], {"a": {}}, [0] * 100, ["x"] * 3])
+VALUES = st.sampled_from([None, True, *NUMBERS, *TEXTS, [], {}, [[]], {"a": {}}, [0] * 100, ["x"] * 3])
 WORDS = ("", "nan", "1e308", "-1", "999999999", "{", "}", "ROOT", "CHANNELS", "w", "\0")
 
 
 @dataclass
-class Tried:
-    """What a parser was given, and what that took."""
+class Statistics:
+    """Inputs of a test, and their cost."""
 
     inputs: int = 0
     read: int = 0
-    """Inputs that were no fault; the others were refused."""
+    """Inputs that were accepted; the others were rejected."""
     worst_s: float = 0.0
-    """Of the processor."""
+    """User time of the process."""
     worst_mb: float = 0.0
-    """By which the process grew beyond all that it had needed before."""
+    """Growth of the memory peak of the process."""
     failures: int = 0
 
 
-TRIED: dict[str, Tried] = {}
+STATISTICS: dict[str, Statistics] = {}
 """By test."""
 
 
 @st.composite
-def changed(draw, value):
-    """JSON with one to three of its values replaced, removed, doubled or put where another was."""
+def mutated_json(draw, value):
+    """JSON with one to three values replaced, removed, repeated or deeply nested."""
     value, many = copy.deepcopy(value), 3000
     for _ in range(draw(st.integers(1, 3))):
         at, key = value, None
@@ -57,30 +58,31 @@ def changed(draw, value):
             parent, key = at, draw(st.sampled_from(sorted(at) if isinstance(at, dict) else range(len(at))))
             at = parent[key]
         if key is None:
-            return copy.deepcopy(draw(NASTY))  # which the next round may change
-        kind = draw(st.sampled_from(["nasty", "nasty", "remove", "double", "deep"]))
+            return copy.deepcopy(draw(VALUES))  # a copy, since the next iteration may change it
+        kind = draw(st.sampled_from(["value", "value", "remove", "repeat", "deep"]))
         if kind == "remove":
             del parent[key]
-        elif kind == "double" and isinstance(parent, list):
+        elif kind == "repeat" and isinstance(parent, list):
             copies = draw(st.sampled_from([1, many]))
             parent.extend([at] * copies)
-            many = 1 if copies > 1 else many  # lists within so many lists would take all memory before they are read
+            many = 1 if copies > 1 else many  # repeating lists of repeated lists would take all memory
         else:
             parent[key] = (
-                copy.deepcopy(draw(NASTY)) if kind != "deep" else nested(draw(st.sampled_from([3, 900, 5000])))
+                copy.deepcopy(draw(VALUES)) if kind != "deep" else nested(draw(st.sampled_from([3, 900, 5000])))
             )
     return value
 
 
 def nested(depth):
+    """A list in a list in a list, and so on."""
     value: list = []
     for _ in range(depth):
         value = [value]
     return value
 
 
-def text_of(value) -> bytes:
-    """JSON as bytes; of what is too deep for Python's own writer, brackets."""
+def to_json(value) -> bytes:
+    """JSON as bytes; brackets for a value that is too deep for Python's own writer."""
     try:
         return json.dumps(value).encode(errors="replace")
     except RecursionError:
@@ -88,26 +90,26 @@ def text_of(value) -> bytes:
 
 
 class File(bytes):
-    """Bytes that are too many to be shown."""
+    """Bytes with a short representation."""
 
     def __repr__(self) -> str:
-        return f"<{len(self)} bytes that begin with {self[:80]!r}>"
+        return f"<{len(self)} bytes that start with {self[:80]!r}>"
 
 
 @st.composite
-def spoilt(draw, data: bytes):
-    """Bytes with a few of them changed, a piece cut out, doubled, or nothing after it."""
+def mutated_bytes(draw, data: bytes):
+    """Bytes with one to four changes: bytes flipped, removed or repeated, the end cut off, a number overwritten."""
     data = bytearray(data)
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, max(0, len(data) - 1)))
-        kind = draw(st.sampled_from(["flip", "flip", "cut", "end", "double", "number"]))
+        kind = draw(st.sampled_from(["flip", "flip", "remove", "end", "repeat", "number"]))
         if kind == "flip" and data:
             data[at] = draw(st.integers(0, 255))
-        elif kind == "cut":
+        elif kind == "remove":
             del data[at : at + draw(st.integers(1, 40))]
         elif kind == "end":
             del data[at:]
-        elif kind == "double":
+        elif kind == "repeat":
             data[at:at] = data[at : at + 60]
         else:
             data[at : at + 4] = struct.pack("<I", draw(st.sampled_from([0, 1, 2**31, 2**32 - 1])))
@@ -115,52 +117,68 @@ def spoilt(draw, data: bytes):
 
 
 @st.composite
-def reworded(draw, text: str):
-    """Text with a few words replaced."""
+def mutated_words(draw, text: str):
+    """Text with one to three words replaced."""
     words = text.split(" ")
     for _ in range(draw(st.integers(1, 3))):
-        at = draw(st.integers(0, len(words) - 1))
-        words[at] = draw(st.sampled_from(WORDS))
+        words[draw(st.integers(0, len(words) - 1))] = draw(st.sampled_from(WORDS))
     return " ".join(words).encode()
 
 
-def held(read: Callable[[], object], refusals: tuple[type[Exception], ...] = (ValueError,)) -> None:
-    """Read or refuse, in one line, within the bounds."""
-    tried = TRIED.setdefault(os.environ["PYTEST_CURRENT_TEST"].split(" ")[0].split("::")[1], Tried())
-    if tried.inputs % COLLECT_EVERY == 0:
-        gc.collect()  # networks are cycles, which Python counts as few small things
-    began, before = own_time_s(), peak_mb()
-    tried.inputs, tried.failures = tried.inputs + 1, tried.failures + 1
-    try:
+def fuzz(inputs, read: Callable[[bytes], object], refusals: tuple[type[Exception], ...] = (ValueError,)) -> None:
+    """Check that each input is read or rejected with a short message, in limited time and memory."""
+    test = os.environ["PYTEST_CURRENT_TEST"].split(" ")[0].split("::")[1]
+    statistics = STATISTICS.setdefault(test, Statistics())
+
+    @FUZZED
+    @given(inputs)
+    def check(data):
+        if statistics.inputs % COLLECT_EVERY == 0:
+            gc.collect()
+        before = resource.getrusage(resource.RUSAGE_SELF)
+        statistics.inputs += 1
+        statistics.failures += 1
+        try:
+            read(data)
+            statistics.read += 1
+        except refusals as error:
+            assert len(str(error)) < 2000, str(error)[:3000]
+            assert "Error:" not in str(error)[:20]
+        after = resource.getrusage(resource.RUSAGE_SELF)
+        seconds, mb = after.ru_utime - before.ru_utime, (after.ru_maxrss - before.ru_maxrss) / 1000
+        statistics.worst_s, statistics.worst_mb = max(statistics.worst_s, seconds), max(statistics.worst_mb, mb)
+        assert seconds < MAX_S, "too slow"
+        assert mb < MAX_MB, "too much memory"
+        statistics.failures -= 1
+
+    check()
+
+
+def fuzz_file(file: Path, read: Callable[[], object], inputs=None, refusals=(ValueError,)) -> None:
+    """`fuzz` the content of a file, which is restored; by default with mutated bytes, or JSON in a JSON file."""
+    good = file.read_bytes()
+    if inputs is None:
+        inputs = mutated_bytes(good)
+        if file.suffix == ".json":
+            inputs |= mutated_json(json.loads(good)).map(to_json)
+
+    def write_and_read(data):
+        file.write_bytes(data)
         read()
-        tried.read += 1
-    except refusals as error:
-        assert len(str(error)) < 2000, str(error)[:3000]
-        assert "Error:" not in str(error)[:20]
-    taken_s, grown_mb = own_time_s() - began, peak_mb() - before
-    tried.worst_s, tried.worst_mb = max(tried.worst_s, taken_s), max(tried.worst_mb, grown_mb)
-    assert taken_s < MOST_S, "too slow"
-    assert grown_mb < MOST_MB, "too much memory"
-    tried.failures -= 1
+
+    try:
+        fuzz(inputs, write_and_read, refusals)
+    finally:
+        file.write_bytes(good)
 
 
-def own_time_s() -> float:
-    """Seconds that the processor spent on our instructions: how long a system takes to hand out pages is not ours."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_utime
-
-
-def peak_mb() -> float:
-    """The most memory that this process has ever had."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
-
-
-def parts_of(data: bytes) -> tuple[dict, bytes]:
-    """A safetensors file's head, and its tensors."""
+def split_tensors(data: bytes) -> tuple[dict, bytes]:
+    """The header and the data of a safetensors file."""
     size = struct.unpack_from("<Q", data)[0]
     return json.loads(data[8 : 8 + size]), data[8 + size :]
 
 
-def joined(head: object, tensors: bytes) -> bytes:
-    """Inverse of `parts_of`."""
-    text = text_of(head)
+def join_tensors(header: object, tensors: bytes) -> bytes:
+    """Inverse of `split_tensors`."""
+    text = to_json(header)
     return File(struct.pack("<Q", len(text)) + text + tensors)

@@ -7,7 +7,7 @@ import torch
 from geometry.solids import around, ball_masks, camera_at, dome
 from reference.hull_twin import hull_twin
 
-from viewmend.geometry import _hull_torch
+from viewmend.geometry import hull as _hull_torch
 from viewmend.geometry import hull as hull_module
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras

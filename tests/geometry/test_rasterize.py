@@ -5,10 +5,9 @@ import torch
 from geometry.solids import ball_mesh, camera_at, dome
 from reference.raster_twin import raster_twin
 
-from viewmend.geometry._rasterize_torch import rasterize_torch
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers, unproject
 from viewmend.geometry.mesh import Mesh
-from viewmend.geometry.rasterize import NEAR_M, Raster, barycentric, interpolate, rasterize
+from viewmend.geometry.rasterize import NEAR_M, Raster, barycentric, interpolate, rasterize, rasterize_torch
 
 SIDE = {"none": 0, "back": 1, "front": -1}
 
@@ -60,7 +59,7 @@ def test_numba_equals_torch(cull):
 def test_many_chunks_draw_what_one_does(ball_scene, monkeypatch):
     mesh, cameras = ball_scene
     whole = in_torch(mesh, cameras)
-    monkeypatch.setattr("viewmend.geometry._rasterize_torch.CANDIDATES", 100)
+    monkeypatch.setattr("viewmend.geometry.rasterize.CANDIDATES", 100)
     assert torch.equal(in_torch(mesh, cameras).depth, whole.depth)
 
 

@@ -6,10 +6,9 @@ import torch
 from geometry.solids import sides, volume
 from skimage.measure import marching_cubes
 
-from viewmend.geometry._cube_cases import EDGES, triangle_table
 from viewmend.geometry.hull import OccupancyGrid
 from viewmend.geometry.mesh import Mesh, vertex_normals
-from viewmend.geometry.surface import extract_surface, march_numba, march_torch
+from viewmend.geometry.surface import EDGES, extract_surface, march_numba, march_torch, triangle_table
 
 LOW = torch.tensor([1.0, -2.0, 0.5])
 

@@ -1,40 +1,28 @@
-"""Pictures of the geometry alone, and films for two eyes, over real sockets."""
+"""Images of the geometry alone, and stereo videos."""
 
 import io
 import json
-import urllib.error
-import urllib.request
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from live.live_servers import decode, get, post
 from reference.ball import camera_at
 
 from viewmend.geometry.cameras import project
 from viewmend.live.client import Client
-from viewmend.live.pictures import picture
 from viewmend.live.poses import stereo_pair, view_camera
 from viewmend.live.protocol import HULL_MODES, Camera
-from viewmend.rendering.hull_views import CLAY
+from viewmend.rendering.proxy_views import CLAY
 
 
-def posted(url: str, body: dict) -> tuple[int, bytes]:
-    request = urllib.request.Request(url, data=json.dumps(body).encode())
-    try:
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            return answer.status, answer.read()
-    except urllib.error.HTTPError as error:
-        return error.code, error.read()
-
-
-def frames_of(film: bytes) -> list[np.ndarray]:
+def frames_of(video: bytes) -> list[np.ndarray]:
     av = pytest.importorskip("av")
-    with av.open(io.BytesIO(film)) as container:
+    with av.open(io.BytesIO(video)) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def test_the_hull_and_its_points_are_pictures_of_their_own(ball):
+def test_the_hull_and_its_points_are_modes(ball):
     with Client(ball.ws) as viewer:
         assert {*viewer.messages["welcome"]["modes"]} >= HULL_MODES
         viewer.send("clock", seek=0, playing=False)
@@ -46,7 +34,7 @@ def test_the_hull_and_its_points_are_pictures_of_their_own(ball):
     hull, points = (shown.images[0, mode].astype(int) for mode in ("hull", "points"))
     assert np.abs(hull[32, 32] - 255 * np.array(CLAY)).max() < 20, "lit from the viewer"
     for corner in (hull[2, 2], points[2, 2]):
-        assert corner[0] > 230 and corner[1:].max() < 25, "upon the background"
+        assert corner[0] > 230 and corner[1:].max() < 25, "on the background"
     inside = shown.depth[0] > 0
     assert inside.sum() > 100
     body = np.zeros((64, 64), bool)
@@ -54,32 +42,21 @@ def test_the_hull_and_its_points_are_pictures_of_their_own(ball):
     own = black[body & (black.sum(-1) > 150)]
     assert 20 < len(own) < 256, "dots of the ball's colours, and gaps"
     assert np.abs(own.mean(0) - rendered.images[0, "rendered"][body].mean(0)).max() < 25
-    assert shown.header["stage_ms"]["inpainting"] == 0, "no model is asked"
+    assert shown.header["stage_ms"]["inpainting"] == 0, "without the model"
 
 
-def test_colours_of_points_are_found_once_for_each_time(ball, monkeypatch):
+def test_colours_of_points_are_computed_once_per_frame(ball, monkeypatch):
     from viewmend.live import renderer
 
-    found, own = [], renderer.vertex_colours
-    monkeypatch.setattr(renderer, "vertex_colours", lambda proxy, seen: found.append(proxy) or own(proxy, seen))
+    calls, own = [], renderer.vertex_colours
+    monkeypatch.setattr(renderer, "vertex_colours", lambda proxy, views: calls.append(proxy) or own(proxy, views))
     for time, azimuth in ((1, 0), (1, 90), (2, 0)):
         query = f"time={time}&azimuth={azimuth}&mode=points&width=48&height=48"
-        with urllib.request.urlopen(f"{ball.url}/frame.jpg?{query}", timeout=60) as answer:
-            image = cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR)
-        assert image.max() > 100
-    assert len(found) == 2
+        assert decode(get(f"{ball.url}/frame.jpg?{query}")[2]).max() > 100
+    assert len(calls) == 2
 
 
-def test_a_picture_of_the_hull_needs_one(ball_view):
-    with pytest.raises(KeyError):
-        picture(ball_view, "hull")
-    own = torch.zeros(4, 48, 48)
-    own[:, 10:20, 10:20] = 1
-    shown = picture(ball_view, "hull", "0000ff", {"hull": own})
-    assert shown[15, 15].tolist() == [255, 255, 255] and shown[24, 24].tolist() == [0, 0, 255]
-
-
-def test_two_eyes_agree_on_how_far_the_subject_is_and_differ_elsewhere():
+def test_two_eyes_have_no_disparity_at_the_subject_and_some_elsewhere():
     camera = camera_at(40, "t", size=64, distance_m=2.0)
     left, right = stereo_pair(camera, 0.1, torch.zeros(3))
     across = right.centers[0] - left.centers[0]
@@ -91,28 +68,27 @@ def test_two_eyes_agree_on_how_far_the_subject_is_and_differ_elsewhere():
     (l_uv, r_uv) = (project(points, eye)[0][0] for eye in (left, right))
     apart = (l_uv - r_uv)[:, 0]
     assert torch.allclose(apart[:2], torch.zeros(2), atol=1e-3) and torch.allclose(l_uv[:, 1], r_uv[:, 1], atol=1e-3)
-    assert apart[2] > 0.5 and apart[3] < -0.3, "what is nearer is seen crossed"
+    assert apart[2] > 0.5 and apart[3] < -0.3, "nearer points have crossed disparity"
     behind = stereo_pair(camera, 0.1, 5 * camera.centers[0])
     assert all(torch.equal(eye.K, camera.K) for eye in behind)
 
 
-def test_a_film_for_two_eyes_has_them_side_by_side(ball):
+def test_a_stereo_video_has_two_eyes_side_by_side(ball):
     pose = {"azimuth": 20.0}
-    body = {"poses": [pose] * 2, "times": [0, 0], "width": 64, "height": 64, "stereo_m": 0.2}
-    status, film = posted(f"{ball.url}/path.mp4", body)
-    assert status == 200, film
-    both = frames_of(film)[0].astype(int)
+    size = {"width": 64, "height": 64}
+    status, video = post(f"{ball.url}/path.mp4", poses=[pose] * 2, times=[0, 0], stereo_m=0.2, **size)
+    assert status == 200, video
+    both = frames_of(video)[0].astype(int)
     assert both.shape == (64, 128, 3)
-    frame = ball.service.renderer.frame
-    eyes = stereo_pair(view_camera(Camera(**pose), frame, (64, 64)), 0.2, frame.center)
+    home = ball.service.renderer.home
+    eyes = stereo_pair(view_camera(Camera(**pose), home, (64, 64)), 0.2, home.center)
     for half, eye in zip((both[:, :64], both[:, 64:]), eyes, strict=True):
         asked = {
             "R": eye.camera_from_world[0, :3, :3].flatten().tolist(),
             "T": eye.camera_from_world[0, :3, 3].tolist(),
         }
         lens = {"fx": float(eye.K[0, 0, 0]), "cx": float(eye.K[0, 0, 2]), "cy": float(eye.K[0, 1, 2])}
-        one = {"poses": [asked | lens], "times": [0], "width": 64, "height": 64}
-        alone = frames_of(posted(f"{ball.url}/path.mp4", one)[1])[0]
+        alone = frames_of(post(f"{ball.url}/path.mp4", poses=[asked | lens], times=[0], **size)[1])[0]
         assert np.abs(half - alone).mean() < 2
     assert np.abs(both[:, :64] - both[:, 64:]).mean() > 1
 
@@ -120,6 +96,6 @@ def test_a_film_for_two_eyes_has_them_side_by_side(ball):
 @pytest.mark.parametrize(
     ("more", "said"), [({"stereo_m": -1}, "stereo_m"), ({"width": 1600, "height": 1000, "stereo_m": 0.06}, "2100000")]
 )
-def test_eyes_that_are_none_or_too_large_are_refused(ball, more, said):
-    status, answer = posted(f"{ball.url}/path.mp4", {"poses": [{}], "width": 64, "height": 64} | more)
+def test_invalid_stereo_videos_are_refused(ball, more, said):
+    status, answer = post(f"{ball.url}/path.mp4", **{"poses": [{}], "width": 64, "height": 64} | more)
     assert status == 400 and said in json.loads(answer)["error"]

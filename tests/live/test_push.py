@@ -1,4 +1,4 @@
-"""A rig that pushes its frames."""
+"""A rig pushes its frames."""
 
 import json
 import struct
@@ -10,21 +10,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from live_servers import CAMERAS, running, wait_until
+from live.live_servers import CAMERAS, WAIT_S, close_code, get, open_websocket, running, true_image, wait_until
 from reference.ball import photograph
-from test_faults import SOON, closing, still_serves
-from test_server import get, truth
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.live import push
-from viewmend.live.client import Client
-from viewmend.live.door import Visitor
+from viewmend.live.client import Client, Publisher
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import ProtocolError, pack, unpack
-from viewmend.live.publisher import Publisher
-from viewmend.live.pushed import PushedFrames
+from viewmend.live.push import PushSource
 
 BOUNDS = Bounds(torch.full((3,), -0.6), torch.full((3,), 0.6))
 UP = torch.tensor([0.0, 1.0, 0.0])
@@ -34,15 +29,15 @@ def publisher(server, cameras=CAMERAS, **options):
     return Publisher(cameras, server.ws, fps=10.0, name="pushed ball", up=UP, bounds=BOUNDS, **options)
 
 
-def test_what_is_pushed_is_seen_at_the_edge_and_can_be_sought():
-    with running(PushedFrames(), ready=False) as server:
+def test_pushed_frames_are_shown_at_the_edge_and_can_be_sought():
+    with running(PushSource(), ready=False) as server:
         assert json.loads(get(f"{server.url}/health")[2])["status"] == "loading"
         with Client(server.ws) as viewer, publisher(server) as rig:
             assert [rig.push(photograph(CAMERAS)) for _ in range(3)] == [0, 1, 2]
             assert viewer.wait_for("rig")["name"] == "pushed ball"
             look = viewer.look(camera={"azimuth": 200.0}, width=48, height=48, quality=95)
             shown = viewer.frame(look)
-            right = truth(server.service.renderer.frame, (48, 48), azimuth=200.0)
+            right = true_image(server.service.renderer.home, (48, 48), azimuth=200.0)
             assert shown.header["time"] == 2 and np.abs(shown.images[0, "mended"] - right.astype(float)).mean() < 14
             rig.push(photograph(CAMERAS).without(["c7"]))
             assert viewer.frame().header["time"] == 3
@@ -52,8 +47,8 @@ def test_what_is_pushed_is_seen_at_the_edge_and_can_be_sought():
             assert state["kind"] == "live" and state["behind"] == 2 and not state["loops"]
 
 
-def test_a_rig_that_goes_is_missed_and_another_one_may_come():
-    with running(PushedFrames(), ready=False) as server, Client(server.ws) as viewer:
+def test_a_rig_disconnects_and_another_one_connects():
+    with running(PushSource(), ready=False) as server, Client(server.ws) as viewer:
         with publisher(server) as rig:
             rig.push(photograph(CAMERAS))
             viewer.frame(viewer.look(width=32, height=32))
@@ -70,18 +65,18 @@ def test_a_rig_that_goes_is_missed_and_another_one_may_come():
             assert get(f"{server.url}/health")[0] == 200
 
 
-def test_a_rig_changes_its_cameras_while_it_pushes():
-    with running(PushedFrames(), ready=False) as server, Client(server.ws) as viewer, publisher(server) as rig:
+def test_a_rig_changes_its_cameras():
+    with running(PushSource(), ready=False) as server, Client(server.ws) as viewer, publisher(server) as rig:
         rig.push(photograph(CAMERAS))
         viewer.frame(viewer.look(width=32, height=32))
         others = CAMERAS[[0, 2, 3, 5]]
         rig.change(others)
         rig.push(photograph(others))
         wait_until(lambda: len(viewer.wait_for("rig")["cameras"]) == 4)
-        assert server.service.supply.span.first == 1 and server.service.supply.rig.number == 2
+        assert server.service.source.span.first == 1 and server.service.source.rig.number == 2
 
 
-def test_recordings_take_no_pushes(ball):
+def test_a_recording_accepts_no_rig(ball):
     with pytest.raises(ConnectionError, match="viewmend serve live"):
         publisher(ball)
 
@@ -106,11 +101,11 @@ def rig_message(**changes):
         rig_message(bounds={"low": [0, 0, 0], "high": [0, 1, 1]}),
     ],
 )
-def test_rigs_that_cannot_be_are_refused(message):
-    with running(PushedFrames(), ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
+def test_invalid_rigs_are_refused(message):
+    with running(PushSource(), ready=False) as server, open_websocket(server, "/push") as bad:
         bad.send(message)
-        answer = json.loads(bad.recv(timeout=10))
-        assert answer["type"] == "error" and "expected" in answer["message"] and closing(bad) == 4400
+        answer = json.loads(bad.recv(timeout=WAIT_S))
+        assert answer["type"] == "error" and "expected" in answer["message"] and close_code(bad) == 4400
 
 
 def frame_message(name="c0", kind="rgb", data=None, size=48):
@@ -137,21 +132,21 @@ HUGE_PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + CHUNK + struct.pack(">
         pack({"images": [3]}, [b""]),
     ],
 )
-def test_frames_that_cannot_be_end_the_rig_and_nothing_else(message):
-    with running(PushedFrames(), ready=False) as server:
-        with connect(f"{server.ws}/push", **SOON) as bad:
+def test_an_invalid_frame_disconnects_its_rig_only(message):
+    with running(PushSource(), ready=False) as server:
+        with open_websocket(server, "/push") as bad:
             bad.send(rig_message())
-            assert json.loads(bad.recv(timeout=10))["type"] == "taken"
+            assert json.loads(bad.recv(timeout=WAIT_S))["type"] == "taken"
             bad.send(message)
-            answer = json.loads(bad.recv(timeout=10))
+            answer = json.loads(bad.recv(timeout=WAIT_S))
             assert answer["type"] == "error" and "expected" in answer["message"]
         with publisher(server) as rig:
             rig.push(photograph(CAMERAS))
-            assert still_serves(server)
+            assert server.is_serving()
 
 
-def test_an_empty_stage_is_said_and_passes():
-    with running(PushedFrames(), ready=False) as server, Client(server.ws) as viewer:
+def test_an_empty_frame_is_an_error_of_its_views_only():
+    with running(PushSource(), ready=False) as server, Client(server.ws) as viewer:
         frame = photograph(CAMERAS)
         with publisher(server) as rig:
             rig.push(frame)
@@ -162,10 +157,10 @@ def test_an_empty_stage_is_said_and_passes():
             assert viewer.frame().header["time"] == 2
 
 
-def test_frames_without_masks_are_refused_where_they_are_pushed():
+def test_the_client_refuses_frames_without_masks():
     frame = replace(photograph(CAMERAS), mask=None)
     with (
-        running(PushedFrames(), ready=False) as server,
+        running(PushSource(), ready=False) as server,
         publisher(server) as rig,
         pytest.raises(ValueError, match="expected a frame with masks"),
     ):
@@ -173,51 +168,44 @@ def test_frames_without_masks_are_refused_where_they_are_pushed():
 
 
 def test_memory_of_a_live_rig_is_bounded():
-    supply = PushedFrames(memory_mb=0.3)
-    supply.begin("x", 10.0, None, None)
+    source = PushSource(memory_mb=0.3)
+    source.begin("x", 10.0, None, None)
     for _ in range(20):
-        supply.push(photograph(CAMERAS))
-    assert supply.span.end == 20 and 15 <= supply.span.first < 20
-    assert supply.read(supply.span.first) is not None and supply.read(supply.span.first - 1) is None
+        source.add(photograph(CAMERAS))
+    assert source.span.end == 20 and 15 <= source.span.first < 20
+    assert source.read(source.span.first) is not None and source.read(source.span.first - 1) is None
 
 
-def test_cameras_of_odd_shapes_are_counted_as_they_are_kept():
-    """Four of 16 x 16,000 and of 16,000 x 16 pixels have a million pixels, and would lie in a tensor of a billion."""
+def test_cameras_of_different_shapes_count_with_the_largest_sides():
+    """Four cameras of 16 x 16,000 and of 16,000 x 16 pixels have a million pixels, but need a tensor of a billion."""
     shapes = [(16, 16_000), (16_000, 16)] * 2
     odd = [c | {"width": w, "height": h} for c, (w, h) in zip(cameras_json(CAMERAS), shapes, strict=False)]
-    with running(PushedFrames(), ready=False) as server, connect(f"{server.ws}/push", **SOON) as bad:
+    with running(PushSource(), ready=False) as server, open_websocket(server, "/push") as bad:
         bad.send(rig_message(cameras=odd))
-        assert "cameras x widest x highest" in json.loads(bad.recv(timeout=10))["message"] and closing(bad) == 4400
+        assert (
+            "cameras x widest x highest" in json.loads(bad.recv(timeout=WAIT_S))["message"] and close_code(bad) == 4400
+        )
 
 
-def test_an_image_is_judged_by_its_head(monkeypatch):
+def test_the_size_of_an_image_is_checked_before_decoding(monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     with pytest.raises(ProtocolError, match="expected rgb of 48 x 48 pixels, got 100000 x 100000"):
-        push._decoded(HUGE_PNG, "c0", "rgb", CAMERAS)
+        push._decode_image(HUGE_PNG, "c0", "rgb", CAMERAS)
     jpeg = cv2.imencode(".jpg", np.zeros((40, 64), np.uint8))[1].tobytes()
     with pytest.raises(ProtocolError, match="got 64 x 40"):
-        push._decoded(jpeg, "c0", "mask", CAMERAS)
+        push._decode_image(jpeg, "c0", "mask", CAMERAS)
 
 
-class Present(Visitor):
-    gone = False
+def test_a_frame_of_a_rig_that_has_disconnected_is_not_decoded(monkeypatch):
+    monkeypatch.setattr(push, "_decode_image", lambda *_: pytest.fail("decoded"))
+    assert push._decode_frame(frame_message(), CAMERAS, lambda: True) is None
 
 
-class Departed(Visitor):
-    gone = True
-
-
-def test_work_of_a_rig_that_is_gone_is_dropped(monkeypatch):
-    gone = Departed()
-    monkeypatch.setattr(push, "_decoded", lambda *_: pytest.fail("decoded"))
-    assert push._frame(frame_message(), CAMERAS, gone) is None
-
-
-def test_an_image_comes_once():
+def test_a_repeated_image_is_refused():
     image = cv2.imencode(".png", np.zeros((48, 48), np.uint8))[1].tobytes()
     entry = {"camera": "c0", "kind": "mask", "bytes": len(image)}
     with pytest.raises(ProtocolError, match="one image of each camera and kind"):
-        push._frame(pack({"images": [entry] * 100}, [image] * 100), CAMERAS, Present())
+        push._decode_frame(pack({"images": [entry] * 100}, [image] * 100), CAMERAS, lambda: False)
 
 
 def whole_frame(names, size=48):
@@ -228,23 +216,23 @@ def whole_frame(names, size=48):
     return pack({"images": listed}, [data for *_, data in images])
 
 
-def test_one_camera_is_no_frame_two_are():
+def test_a_frame_needs_two_complete_cameras():
     with pytest.raises(ProtocolError, match="image and mask of two cameras or more, got 1"):
-        push._frame(whole_frame(["c0"]), CAMERAS, Present())
-    frame = push._frame(whole_frame(["c4", "c1"]), CAMERAS, Present())
+        push._decode_frame(whole_frame(["c0"]), CAMERAS, lambda: False)
+    frame = push._decode_frame(whole_frame(["c4", "c1"]), CAMERAS, lambda: False)
     assert frame.cameras.names == ("c1", "c4") and bool((frame.rgb == 9).all()) and bool((frame.mask == 9).all())
 
 
-def test_what_no_frame_of_the_rig_can_be_is_not_read():
-    """Six cameras of 48 x 48 and their heads are a megabyte and a half; before the rig is known, less is taken."""
-    most = 8 + 1_000_000 + 6 * (4 * 48 * 48 + 65_536)
-    with running(PushedFrames(), ready=False) as server:
-        for size, codes in ((most, (4400,)), (most + 1, (1009, None))):
-            with suppress(ConnectionClosed), connect(f"{server.ws}/push", **SOON) as rig:
+def test_a_message_that_is_too_large_for_the_rig_is_not_read():
+    """Six cameras of 48 x 48 pixels and the headers have a megabyte and a half."""
+    size = 8 + 1_000_000 + 6 * (4 * 48 * 48 + 65_536)
+    with running(PushSource(), ready=False) as server:
+        for extra, codes in ((0, (4400,)), (3_000_000, (1009, None))):
+            with suppress(ConnectionClosed), open_websocket(server, "/push") as rig:
                 rig.send(rig_message())
-                assert json.loads(rig.recv(timeout=10))["type"] == "taken"
-                rig.send(bytes(size))
-                assert closing(rig) in codes
+                assert json.loads(rig.recv(timeout=WAIT_S))["type"] == "taken"
+                rig.send(bytes(size + extra))
+                assert close_code(rig) in codes
 
 
 def test_a_header_is_small():

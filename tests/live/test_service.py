@@ -1,4 +1,4 @@
-"""Turns: everybody is served, whatever the others do."""
+"""The render thread serves all sessions in turn, whatever happens to one of them."""
 
 from collections import Counter
 
@@ -6,37 +6,36 @@ import pytest
 import torch
 from reference.ball import ring
 
-from viewmend.inpainting.protocol import RenderQuality, State
-from viewmend.live.clock import Span
-from viewmend.live.frames import FrameSupply, Rig, SourceStatus
-from viewmend.live.poses import rig_frame, view_camera
+from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
+from viewmend.live.poses import home_view, view_camera
 from viewmend.live.protocol import Camera, FrameTimes
 from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
-from viewmend.timing import StageTimes
+from viewmend.models.base import RenderQuality, State
+from viewmend.utils.timing import StageTimes
 
-FRAME = rig_frame(ring(4), torch.zeros(3), None)
-CAMERA = view_camera(Camera(), FRAME, (16, 16))
+HOME = home_view(ring(4), torch.zeros(3), None)
+CAMERA = view_camera(Camera(), HOME, (16, 16))
 
 
-class Supply(FrameSupply):
-    """Ten frames that are all there."""
+class FakeSource(FrameSource):
+    """Ten frames in memory."""
 
     def __init__(self):
         super().__init__(Span(0, 10, 10, 10.0))
-        self.status, self.rig = SourceStatus("ready"), Rig("x", None, None)
+        self.status, self.rig = SourceStatus("ready"), RigInfo("x", None, None)
 
-    def read(self, time):
+    def read(self, index):
         return object()
 
 
-class Drawing(Renderer):
-    """A renderer that renders nothing, and fails for one wish."""
+class FakeRenderer(Renderer):
+    """Renders nothing, and fails for one request."""
 
     def __init__(self):
-        self.frame = FRAME
+        self.home = HOME
 
-    def is_of(self, rig):
+    def is_prepared_for(self, rig):
         return True
 
     def render(self, request, viewer):
@@ -46,7 +45,7 @@ class Drawing(Renderer):
 
 
 class Eager:
-    """Always wants a view."""
+    """A session that always requests a view."""
 
     viewer = None
 
@@ -59,9 +58,9 @@ class Eager:
             raise KeyError("mine")
         return RenderRequest(0, (CAMERA,), RenderQuality(top_k=self.top_k))
 
-    def show(self, request, rendered):
+    def deliver(self, request, result):
         self.log.append(self.name)
-        return FrameTimes(**vars(rendered.times), encode=2.0)
+        return FrameTimes(**vars(result.times), encode=2.0)
 
     def fail(self, message):
         self.failures.append(message)
@@ -69,36 +68,36 @@ class Eager:
 
 @pytest.fixture
 def service():
-    return RenderService(Drawing(), Supply())
+    return RenderService(FakeRenderer(), FakeSource())
 
 
-def test_all_take_turns(service):
+def test_sessions_are_served_in_turn(service):
     log = []
     for name in "abc":
         service.join(Eager(name, log))
     for turn in range(9):
         if turn == 4:
             service.join(Eager("d", log))
-        assert service._serve_next()
+        assert service.serve_next()
     assert max(Counter(log).values()) - min(Counter(log[4:]).values()) <= 2 and log[:3] == ["a", "b", "c"]
 
 
-def test_who_fails_is_told_and_stops_nobody(service):
+def test_a_failure_is_reported_to_its_session_only(service):
     log = []
     unlucky, odd = Eager("unlucky", log, top_k=13), Eager("odd", log, bad=True)
     for session in (odd, unlucky, Eager("a", log)):
         service.join(session)
     for _ in range(6):
-        service._serve_next()
+        service.serve_next()
     assert log == ["a"] * 3 and unlucky.failures == ["RuntimeError: bad luck"] * 3 and len(odd.failures) >= 3
     assert service.counts == {"errors": 3, "frames": 3, "shared": 0}
     assert (service.times.encode, service.times.rendering, service.times.total) == (6.0, 12.0, 27.0)
 
 
-def test_who_left_is_served_no_more(service):
+def test_a_session_that_left_is_not_served(service):
     log = []
     session = Eager("a", log)
     service.join(session)
     service.leave(session)
     service.leave(session)
-    assert not service._serve_next() and log == []
+    assert not service.serve_next() and log == []

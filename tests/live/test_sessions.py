@@ -1,51 +1,56 @@
-"""What a viewer is shown next: newest look, one frame in flight, better when still."""
+"""What a session requests next: the newest look, one frame at a time, and a better view once it is still."""
 
-import time
+import itertools
 
 import pytest
 import torch
+from live.live_servers import FakeClock
 from reference.ball import ring
 
-from viewmend.inpainting.protocol import State
 from viewmend.live import sessions
-from viewmend.live.budget import CONTEXT_LADDER, FULL, READING_LADDER
-from viewmend.live.clock import Span
-from viewmend.live.poses import rig_frame
-from viewmend.live.protocol import ClockChange, FrameTimes, Look, unpack
+from viewmend.live.budget import CONTEXT_LADDER, FULL, MAX_WAIT_S, REFINE_LADDER, ResolutionLimit
+from viewmend.live.frame_source import Span
+from viewmend.live.poses import home_view
+from viewmend.live.protocol import ClockChange, FrameTimes, Limits, Look, unpack
 from viewmend.live.renderer import RenderResult
-from viewmend.live.sessions import AWAITED_S, FULL_S, STILL_S, Playback, SentFrame, ViewerSession
-from viewmend.timing import StageTimes
+from viewmend.live.sessions import FULL_S, MAX_AWAITED_S, STILL_S, PlaybackState, SentFrame, ViewerSession
+from viewmend.models.base import State
+from viewmend.utils.timing import StageTimes
 
-FRAME = rig_frame(ring(4), torch.zeros(3), None)
+HOME = home_view(ring(4), torch.zeros(3), None)
 SPAN = Span(0, 20, 20, 10.0)
 
 
 class Desk:
-    """A session, and a hand that turns its clock and acknowledges."""
+    """A session, its clock, and the frames that are in memory."""
 
-    def __init__(self, budget_ms=None, present=lambda time: True, ladder=CONTEXT_LADDER):
-        self.sent, self.errors, self.now = [], [], 1000.0
-        self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms, ladder)
-        self.session._last = self.now
-        self.present, self.edge, self.active_viewers = present, 0.0, 1
+    def __init__(self, budget_ms=None, has_frame=lambda index: True, ladder=CONTEXT_LADDER, span=SPAN):
+        self.sent, self.errors, self.clock = [], [], FakeClock()
+        self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms, ladder, self.clock)
+        self.has_frame, self.span, self.edge, self.active_viewers = has_frame, span, 0.0, 1
+        self.limit = ResolutionLimit()
 
     def look(self, **values):
         self.session.look(Look(**values))
-        self.session._look_at = self.now
 
     def due(self, after=0.01, edge=None):
-        self.now += after
+        """The request some seconds later."""
+        self.clock.advance(after)
         self.edge = self.edge if edge is None else edge
-        return self.session.next_request(self.now, Playback(SPAN, self.edge, FRAME, self.present, self.active_viewers))
+        playback = PlaybackState(self.span, self.edge, HOME, self.has_frame, self.active_viewers, self.limit)
+        return self.session.next_request(self.clock(), playback)
 
     def size(self, request):
         return tuple(request.cameras[0].size_px[0].tolist())
 
+    def change_clock(self, **change):
+        self.session.change_clock(ClockChange(**change), self.span)
+
     def pause(self):
-        self.session.change(ClockChange(playing=False), SPAN)
+        self.change_clock(playing=False)
 
 
-def test_nobody_is_served_who_does_not_look():
+def test_without_a_look_nothing_is_requested():
     assert Desk().due() is None
 
 
@@ -53,11 +58,11 @@ def test_the_newest_look_wins():
     desk = Desk()
     for azimuth in range(5):
         desk.look(id=azimuth)
-    assert desk.due() is not None and desk.session._shown[0].id == 4
+    assert desk.due() is not None and desk.session._requested[0].id == 4
     assert desk.session.dropped == 4
 
 
-def test_the_same_look_again_is_answered_again():
+def test_a_repeated_look_is_answered_again():
     desk = Desk()
     desk.pause()
     for _ in range(3):
@@ -65,7 +70,7 @@ def test_the_same_look_again_is_answered_again():
         assert desk.due() is not None and desk.due() is None
 
 
-def test_one_frame_is_in_flight_until_it_is_acknowledged():
+def test_the_next_frame_waits_for_an_acknowledgement():
     desk = Desk()
     desk.look(id=1)
     assert desk.due() is not None
@@ -78,7 +83,7 @@ def test_one_frame_is_in_flight_until_it_is_acknowledged():
     assert desk.due().time == 3
 
 
-def test_time_goes_on_and_what_was_skipped_is_counted():
+def test_skipped_frames_are_counted():
     desk = Desk()
     desk.look(id=1)
     times = [desk.due(edge=edge).time for edge in (0.0, 1.2, 5.9)]
@@ -95,7 +100,7 @@ def test_a_moving_view_is_small_and_a_still_one_full():
     desk.look(id=2, width=200, height=100)
     request = desk.due()
     assert desk.size(request) == (200, 100) and request.quality.context_times == 7
-    assert desk.due(1.0) is None, "nothing better follows"
+    assert desk.due(1.0) is None, "there is no better view"
     desk.look(id=3, moving=True, adaptive=False, width=200, height=100)
     assert desk.size(desk.due()) == (200, 100)
 
@@ -109,27 +114,27 @@ def test_a_still_view_is_refined_in_two_steps():
     assert desk.due(STILL_S / 2) is None
     better = desk.due(STILL_S)
     assert desk.size(better) == (160, 160) and better.quality.context_times == 0
-    assert not desk.session._full and desk.due(0.1) is None
+    assert not desk.session._is_full and desk.due(0.1) is None
     best = desk.due(FULL_S)
-    assert best.quality.context_times == FULL.context_times and desk.session._full
+    assert best.quality.context_times == FULL.context_times and desk.session._is_full
     assert best.quality.top_k == 100 and desk.due(1.0) is None
 
 
-def test_a_model_that_tells_errors_reads_a_part_while_it_is_looked_for():
-    desk = Desk(ladder=READING_LADDER)
+def test_a_model_that_predicts_errors_refines_less_of_a_moving_view():
+    desk = Desk(ladder=REFINE_LADDER)
     desk.pause()
     desk.look(id=1, moving=True, width=200, height=100)
     request = desk.due()
-    assert desk.size(request) == (200, 100) and request.quality.read_fraction == 0
-    desk = Desk(budget_ms=50.0, ladder=READING_LADDER)
+    assert desk.size(request) == (200, 100) and request.quality.refine_fraction == 0
+    desk = Desk(budget_ms=50.0, ladder=REFINE_LADDER)
     desk.pause()
     desk.look(id=1)
-    assert desk.due().quality.read_fraction is not None
-    assert desk.due(STILL_S).quality.read_fraction == READING_LADDER.still.read_fraction
-    assert desk.due(FULL_S).quality.read_fraction is None
+    assert desk.due().quality.refine_fraction is not None
+    assert desk.due(STILL_S).quality.refine_fraction == REFINE_LADDER.still.refine_fraction
+    assert desk.due(FULL_S).quality.refine_fraction is None
 
 
-def test_budgets_are_shared_among_a_crowd():
+def test_the_budget_is_shared_by_all_active_viewers():
     desk = Desk(budget_ms=80.0)
     desk.active_viewers = 4
     desk.look(id=1)
@@ -137,75 +142,74 @@ def test_budgets_are_shared_among_a_crowd():
     assert desk.session.budget.target_ms == 20
 
 
-def test_a_frame_that_is_not_there_is_waited_for():
+def test_a_missing_frame_is_waited_for():
     there = set()
-    desk = Desk(present=lambda time: time in there)
+    desk = Desk(has_frame=lambda index: index in there)
     desk.look(id=1)
     assert desk.due() is None and desk.session.buffering
     there.add(0)
     assert desk.due().time == 0 and not desk.session.buffering
 
 
-def test_what_was_waited_for_is_shown_once_and_then_time_goes_on():
+def test_an_awaited_frame_is_shown_once():
     there = set(range(20)) - {5}
-    desk = Desk(present=lambda time: time in there)
+    desk = Desk(has_frame=lambda index: index in there)
     desk.look(id=1)
     assert desk.due(edge=5.0) is None and desk.session.buffering
-    assert desk.due(edge=6.0) is None and desk.session.buffering, "6 is at hand, but 5 is on its way"
+    assert desk.due(edge=6.0) is None and desk.session.buffering, "6 is in memory, but 5 is being read"
     there.add(5)
     assert [desk.due(edge=edge).time for edge in (6.5, 7.0, 8.0)] == [5, 7, 8]
 
 
-def test_what_never_comes_is_waited_for_some_seconds():
-    desk = Desk(present=lambda time: time != 5)
+def test_a_frame_that_never_comes_is_waited_for_for_some_seconds():
+    desk = Desk(has_frame=lambda index: index != 5)
     desk.look(id=1)
     assert desk.due(edge=5.0) is None
-    assert desk.due(AWAITED_S - 0.1, edge=7.0) is None
+    assert desk.due(MAX_AWAITED_S - 0.1, edge=7.0) is None
     assert desk.due(0.2, edge=7.0).time == 7
 
 
 def test_a_viewer_counts_for_a_second_after_its_last_frame():
     desk = Desk()
-    assert not desk.session.is_active(desk.now), "who says nothing waits for nothing"
+    assert not desk.session.is_active(desk.clock()), "without a look it waits for nothing"
     desk.look(id=1)
-    assert desk.session.is_active(desk.now), "waits for a first view"
+    assert desk.session.is_active(desk.clock()), "waits for a first view"
     desk.due()
-    assert not desk.session.is_active(desk.now)
-    desk.session.recent.append(SentFrame(desk.now, FrameTimes(), 1))
-    assert desk.session.is_active(desk.now + 0.9) and not desk.session.is_active(desk.now + 1.1)
+    assert not desk.session.is_active(desk.clock())
+    desk.session.recent.append(SentFrame(desk.clock(), FrameTimes(), 1))
+    assert desk.session.is_active(desk.clock() + 0.9) and not desk.session.is_active(desk.clock() + 1.1)
 
 
-def test_a_key_frame_is_owed_until_a_frame_has_it(monkeypatch):
-    """A look that asks for one may be dropped for the next, which does not."""
+def test_a_requested_key_frame_is_not_lost_with_a_dropped_look(monkeypatch):
     keys = []
 
-    def message(look, request, result, info, encoders):
-        keys.append(info.key)
+    def encode(look, request, result, encoders, wait_ms, **fields):
+        keys.append(encoders.key_frame)
         return b"", FrameTimes()
 
-    monkeypatch.setattr(sessions, "frame_message", message)
+    monkeypatch.setattr(sessions, "encode_frame", encode)
     desk = Desk()
     for key in (True, False):
         desk.look(id=1, key=key)
     result = RenderResult(0, (), State(), StageTimes())
     for _ in range(2):
-        desk.session.show(desk.due(), result)
+        desk.session.deliver(desk.due(), result)
         desk.session.ack(desk.session.in_flight)
         desk.look(id=2)
     assert keys == [True, False]
 
 
-def test_statistics_tell_how_many_views_found_the_geometry_made():
+def test_statistics_of_the_last_second():
     desk = Desk()
     for geometry in (7.0, 0.0, 0.0):
-        desk.session.recent.append(SentFrame(time.monotonic(), FrameTimes(geometry=geometry, encode=2.0), 1500))
-    desk.session.recent.appendleft(SentFrame(time.monotonic() - 2, FrameTimes(geometry=900.0), 10**6))
+        desk.session.recent.append(SentFrame(desk.clock(), FrameTimes(geometry=geometry, encode=2.0), 1500))
+    desk.session.recent.appendleft(SentFrame(desk.clock() - 2, FrameTimes(geometry=900.0), 10**6))
     stats = desk.session.stats_json(4)
     assert (stats["shared"], stats["fps"], stats["kb_per_frame"], stats["viewers"]) == (0.667, 3, 1.5, 4)
     assert stats["stage_ms"]["geometry"] == pytest.approx(7 / 3, abs=0.01) and stats["budget"] is None
 
 
-def test_a_view_at_rest_that_failed_is_not_refined():
+def test_a_failed_view_is_not_refined():
     desk = Desk(budget_ms=50.0)
     desk.pause()
     desk.look(id=1)
@@ -214,7 +218,7 @@ def test_a_view_at_rest_that_failed_is_not_refined():
     assert desk.due(STILL_S) is None and desk.due(FULL_S) is None
 
 
-def test_what_failed_is_said_and_not_tried_again_before_something_changes():
+def test_a_failure_is_reported_and_not_tried_again_before_something_changes():
     desk = Desk()
     desk.look(id=1)
     desk.due()
@@ -223,7 +227,7 @@ def test_what_failed_is_said_and_not_tried_again_before_something_changes():
     assert desk.due(edge=1.0) is not None
 
 
-def test_rendering_without_mending_costs_no_filling():
+def test_only_some_modes_need_inpainting():
     desk = Desk()
     desk.look(id=1, modes=("rendered", "holes"))
     assert not desk.due().quality.mend
@@ -235,11 +239,11 @@ def test_rendering_without_mending_costs_no_filling():
 
 
 @pytest.mark.parametrize("mode", ["mended", "depth"])
-def test_frames_say_what_they_are(ball_view, mode):
+def test_the_header_describes_the_frame(ball_view, mode):
     desk = Desk()
     desk.look(id=5, sent_ms=12.5, modes=(mode,), depth=True)
     request = desk.due()
-    desk.session.show(
+    desk.session.deliver(
         request,
         RenderResult(0, (ball_view,), State(), StageTimes(geometry=3.0, context=2.0, rendering=4.0, inpainting=5.0)),
     )
@@ -255,14 +259,77 @@ def test_frames_say_what_they_are(ball_view, mode):
     assert desk.session.in_flight == 0 and desk.session.stats_json(1)["viewers"] == 1
 
 
-def test_a_view_at_rest_may_ask_for_more_pixels_and_the_budget_counts_in_those_of_moving_ones():
+def test_a_still_view_may_have_more_pixels_than_the_budget_counts():
     desk = Desk(budget_ms=50.0)
     desk.pause()
     desk.look(id=1, moving=True, width=200, height=100)
     moving = desk.size(desk.due())
     desk.look(id=2, width=800, height=400)
-    assert desk.size(desk.due()) == moving, "the first answer comes as soon as if nothing had been asked"
+    assert desk.size(desk.due()) == moving, "the first answer is as fast as a moving one"
     assert desk.size(desk.due(STILL_S)) == desk.size(desk.due(FULL_S)) == (800, 400)
-    assert desk.session._enlarged(desk.session._shown[0]) == 4, "sides four times as long"
+    assert desk.session._enlarged(desk.session._requested[0]) == 4, "sides four times as long"
     desk.look(id=3, moving=True, width=800, height=400)
-    assert desk.size(desk.due())[0] == 4 * moving[0], "who moves in large pictures has meant it"
+    assert desk.size(desk.due())[0] == 4 * moving[0], "a large moving view was requested on purpose"
+
+
+@pytest.mark.parametrize(("active", "side"), [(1, 1448), (8, round(1448 * (MAX_WAIT_S / (8 * 2.0)) ** 0.5))])
+def test_resolution_depends_on_the_number_of_active_viewers(active, side):
+    desk = Desk()
+    desk.limit.record(Limits().max_pixels, FULL, 2.0)
+    desk.active_viewers = active
+    desk.look(width=1448, height=1448, adaptive=False)
+    assert desk.size(desk.due()) == pytest.approx((side, side), abs=1)
+
+
+class SlowFrames(Desk):
+    """A playing viewer whose frames are in memory some steps of 0.1 s after they were requested."""
+
+    def __init__(self, steps):
+        super().__init__(has_frame=self.is_read, span=Span(0, 1000, 1000, 30.0))
+        self.change_clock(seek=0, playing=True)
+        self.look()
+        self.steps, self.requested = steps, {}
+
+    def is_read(self, index):
+        return self.clock() - self.requested.setdefault(index, self.clock()) > 0.1 * self.steps - 0.01
+
+    def play(self, steps):
+        """The frames that are shown within these steps."""
+        return [request.time for request in (self.due(0.1) for _ in range(steps)) if request is not None]
+
+
+def test_late_frames_are_shown_one_after_the_other():
+    slow = SlowFrames(5)
+    frames = slow.play(60)
+    assert len(frames) >= 9, "one every six steps"
+    assert all(10 <= later - earlier <= 25 for earlier, later in itertools.pairwise(frames))
+    assert len(slow.requested) <= len(frames) + 1
+
+
+def test_a_paused_viewer_waits_for_the_frame_of_its_clock():
+    slow = SlowFrames(5)
+    slow.due(0.1)
+    slow.change_clock(seek=700, playing=False)
+    assert slow.play(10) == [700]
+
+
+@pytest.mark.parametrize("is_dropped", [False, True])
+def test_playback_goes_on_without_a_frame_that_never_comes(is_dropped):
+    slow = SlowFrames(2)
+    slow.due(0.1)
+    (lost,) = slow.requested
+    slow.requested[lost] = 1e9
+    if is_dropped:
+        slow.span = Span(lost + 1, 1000, None, 30.0, live=True)
+        assert slow.play(6)
+    else:
+        assert not slow.play(50) and slow.play(int(10 * MAX_AWAITED_S))
+
+
+def test_waiting_viewers_are_active():
+    desk = Desk()
+    assert not desk.session.is_active(desk.clock())
+    desk.look()
+    assert desk.session.is_active(desk.clock())
+    desk.session.in_flight = 3
+    assert not desk.session.is_active(desk.clock()), "it has a frame that it has not acknowledged"

@@ -1,12 +1,10 @@
-"""Video streams come back, frame for frame; sizes may change at any time."""
+"""Video streams are encoded without delay; their size may change at any time."""
 
 import json
 
 import numpy as np
 import pytest
-from live_servers import running
-from test_faults import SOON, greet
-from websockets.sync.client import connect
+from live.live_servers import WAIT_S, open_websocket, running, say_hello
 
 from viewmend.live.protocol import unpack
 from viewmend.live.video import ENCODERS, STRINGS, VideoStream, video_codecs
@@ -16,7 +14,7 @@ CODECS = [pytest.param(c, marks=pytest.mark.skipif(c not in video_codecs(), reas
 
 
 def image(step: int, width: int = 64, height: int = 48):
-    """A bright square that moves over a slope."""
+    """A bright square that moves over a gradient."""
     rows, columns = np.mgrid[:height, :width]
     picture = np.stack([rows * 2, columns * 2, 0 * rows + 60], -1).astype(np.uint8)
     picture[10:30, 5 + step : 25 + step] = (240, 200, 40)
@@ -24,7 +22,7 @@ def image(step: int, width: int = 64, height: int = 48):
 
 
 class Decoder:
-    """What the page's decoder does."""
+    """Decodes like the page."""
 
     def __init__(self, codec):
         self.context = av.CodecContext.create("vp9" if codec == "vp9" else "h264", "r")
@@ -36,7 +34,7 @@ class Decoder:
 
 
 @pytest.mark.parametrize("codec", CODECS)
-def test_every_frame_comes_out_at_once_and_as_it_was(codec):
+def test_every_frame_is_encoded_at_once(codec):
     stream = VideoStream()
     chunks = [stream.encode(image(step), codec, key=False) for step in range(6)]
     assert [key for _, key in chunks] == [True] + 5 * [False]
@@ -49,7 +47,7 @@ def test_every_frame_comes_out_at_once_and_as_it_was(codec):
 
 
 @pytest.mark.parametrize("codec", CODECS)
-def test_streams_begin_anew_when_asked_and_when_the_size_changes(codec):
+def test_key_frames_on_request_and_after_a_change_of_size(codec):
     stream = VideoStream()
     stream.encode(image(0), codec, key=False)
     assert not stream.encode(image(1), codec, key=False)[1]
@@ -58,17 +56,26 @@ def test_streams_begin_anew_when_asked_and_when_the_size_changes(codec):
     assert key and Decoder(codec).decode(data).shape == (48, 34, 3)
 
 
-def test_a_viewer_that_can_decode_gets_video():
-    with running() as server, connect(f"{server.ws}/ws", **SOON) as viewer:
-        viewer.send(json.dumps({"type": "hello", "version": 1, "codecs": ["vp9", "h264", "av1"]}))
-        assert json.loads(viewer.recv(timeout=10))["codecs"] == ["jpeg", *video_codecs()]
+def next_frame(viewer):
+    while True:
+        message = viewer.recv(timeout=WAIT_S)
+        if isinstance(message, bytes):
+            header, parts = unpack(message)
+            viewer.send(json.dumps({"type": "ack", "frame": header["frame"]}))
+            return header, parts
+        assert json.loads(message)["type"] != "error", message
+
+
+def test_a_viewer_chooses_a_codec():
+    with running() as server, open_websocket(server) as viewer:
+        assert say_hello(viewer, ["vp9", "h264", "av1"])["codecs"] == ["jpeg", *video_codecs()]
         viewer.send(json.dumps({"type": "clock", "playing": False}))
         for codec in (*video_codecs(), "jpeg"):
             keys = []
             for key in (False, False, True):
                 look = {"type": "look", "codec": codec, "width": 48, "height": 48, "modes": ["rendered", "mended"]}
                 viewer.send(json.dumps(look | {"key": key}))
-                header, parts = frame_of(viewer)
+                header, parts = next_frame(viewer)
                 assert [part["codec"] for part in header["parts"]] == [codec, codec]
                 keys.append(header["parts"][1].get("key"))
             assert keys == ([None] * 3 if codec == "jpeg" else [True, False, True])
@@ -77,21 +84,11 @@ def test_a_viewer_that_can_decode_gets_video():
                 assert Decoder(codec).decode(parts[1]).shape == (48, 48, 3)
 
 
-def frame_of(viewer):
-    while True:
-        message = viewer.recv(timeout=10)
-        if isinstance(message, bytes):
-            header, parts = unpack(message)
-            viewer.send(json.dumps({"type": "ack", "frame": header["frame"]}))
-            return header, parts
-        assert json.loads(message)["type"] != "error", message
-
-
-def test_codecs_that_are_not_there_are_refused(ball, monkeypatch):
+def test_a_codec_that_is_not_available_is_refused(ball, monkeypatch):
     monkeypatch.setitem(ball.live.registry.about, "codecs", ["jpeg"])
-    with connect(f"{ball.ws}/ws", **SOON) as viewer:
-        assert greet(viewer)["codecs"] == ["jpeg"]
+    with open_websocket(ball) as viewer:
+        assert say_hello(viewer)["codecs"] == ["jpeg"]
         viewer.send(json.dumps({"type": "look", "codec": "vp9"}))
-        while (note := json.loads(viewer.recv(timeout=10)))["type"] != "error":
+        while (note := json.loads(viewer.recv(timeout=WAIT_S)))["type"] != "error":
             pass
         assert "expected a codec among ['jpeg'], got 'vp9'" in note["message"]

@@ -1,28 +1,27 @@
-"""VFID: Frechet's distance against the formula, I3D's shape and modes."""
+"""VFID: the Frechet distance against its formula, and the features of I3D."""
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import sqrtm
 
-from viewmend.metrics.i3d import I3d
-from viewmend.metrics.vfid import frechet_distance, video_features
+from viewmend.metrics.vfid import I3d, frechet_distance, video_features
 
 
 def formula(a, b):
-    """As written, with a matrix root."""
+    """The definition, with a matrix square root."""
     a, b = a.double().numpy(), b.double().numpy()
     A, B = np.cov(a, rowvar=False), np.cov(b, rowvar=False)
     root = sqrtm(A @ B)
     return float(((a.mean(0) - b.mean(0)) ** 2).sum() + np.trace(A + B - 2 * root.real))
 
 
-def test_distance_is_the_formulas(rng):
+def test_the_distance_matches_the_formula(rng):
     a, b = torch.randn(40, 6, generator=rng), 0.5 * torch.randn(30, 6, generator=rng) + 1
     assert frechet_distance(a, b) == pytest.approx(formula(a, b), rel=1e-9)
 
 
-def test_few_videos_of_many_features_are_no_trouble(rng):
+def test_few_videos_of_many_features(rng):
     a, b = torch.randn(5, 1024, generator=rng), torch.randn(5, 1024, generator=rng) + 0.1
     turned = torch.linalg.qr(torch.randn(1024, 1024, generator=rng, dtype=torch.float64))[0]
     expected = frechet_distance(a, b)
@@ -33,24 +32,15 @@ def test_few_videos_of_many_features_are_no_trouble(rng):
     assert frechet_distance(a[:1], b) is None
 
 
-@pytest.fixture(scope="module")
-def network():
+def test_i3d_has_the_published_layers_and_modes_leave_no_trace(rng):
     torch.manual_seed(0)
-    return I3d().eval()
-
-
-def test_i3d_has_the_published_layers(network):
-    keys = network.state_dict()
-    assert sum(p.numel() for p in network.parameters()) == 12_287_264  # 12.70 M with the 400 logits
-    assert keys["Conv3d_1a_7x7.conv3d.weight"].shape == (64, 3, 7, 7, 7)
-    assert keys["Mixed_3b.b1b.conv3d.weight"].shape == (128, 96, 3, 3, 3)
-    assert keys["Mixed_5c.b3b.bn.running_var"].shape == (128,)
-    assert "Mixed_4f.b2a.bn.bias" in keys
-
-
-def test_any_size_and_length_has_features_and_modes_leave_no_trace(network, rng):
-    frames = [torch.rand(3, 45, 61, generator=rng) for _ in range(3)]
+    network = I3d().eval()
     before = {key: value.clone() for key, value in network.state_dict().items()}
+    assert sum(p.numel() for p in network.parameters()) == 12_287_264  # 12.70 M with the 400 logits
+    assert before["Conv3d_1a_7x7.conv3d.weight"].shape == (64, 3, 7, 7, 7)
+    assert before["Mixed_3b.b1b.conv3d.weight"].shape == (128, 96, 3, 3, 3)
+    assert before["Mixed_5c.b3b.bn.running_var"].shape == (128,) and "Mixed_4f.b2a.bn.bias" in before
+    frames = [torch.rand(3, 45, 61, generator=rng) for _ in range(3)]
     one, other = (video_features(network, frames, mode) for mode in ("eval", "train"))
     assert one.shape == (1024,) and one.isfinite().all() and not torch.allclose(one, other)
     assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())

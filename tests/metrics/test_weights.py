@@ -1,19 +1,11 @@
-"""Weights of known networks are found and checked."""
+"""Published weights are found by name and checked by hash."""
 
 import hashlib
 
 import pytest
 
-from viewmend.metrics.weights import (
-    KNOWN,
-    KnownWeights,
-    MissingWeightsError,
-    checked_weights,
-    find_weights,
-    known_weights,
-    places,
-)
-from viewmend.weight_files import WeightsError
+from viewmend.metrics.weights import KNOWN, KnownWeights, checked_weights, find_weights, known_weights, weight_folders
+from viewmend.utils.weight_files import MissingWeightsError, WeightsError
 
 
 @pytest.fixture
@@ -31,7 +23,7 @@ def known(**hashes: str) -> KnownWeights:
 
 
 def test_the_users_folders_come_first(folder):
-    assert places() == (
+    assert weight_folders() == (
         folder / "a", folder / "b", folder / "home/viewmend/weights", folder / "torch/hub/checkpoints",
     )  # fmt: skip
     assert find_weights(known()) is None
@@ -40,7 +32,7 @@ def test_the_users_folders_come_first(folder):
     assert find_weights(known()) == folder / "a" / "other.pth"
 
 
-def test_a_missing_file_is_named_with_all_that_is_needed(folder):
+def test_the_error_for_a_missing_file_says_how_to_get_it(folder):
     with pytest.raises(MissingWeightsError) as missing:
         checked_weights(known(sha256="abc123"))
     for word in ("the weights", "w.pth or other.pth", "abc123", str(folder / "b"), "their author", "VIEWMEND_WEIGHTS"):
@@ -59,7 +51,7 @@ def test_hashes_are_checked(folder):
             checked_weights(wrong)
 
 
-def test_what_is_known_has_a_hash_and_a_source():
+def test_known_weights_have_a_hash_and_a_source():
     metrics = ("alexnet", "vgg16", "lpips-alex", "lpips-vgg", "i3d")
     assert len({k.name for k in KNOWN}) == len(KNOWN) and {k.name for k in KNOWN} >= set(metrics)
     assert all(known_weights(name).sha256 or known_weights(name).git_sha1 for name in metrics)

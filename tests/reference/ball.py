@@ -10,7 +10,7 @@ from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pix
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rigid import look_at
-from viewmend.views import MultiViewFrame
+from viewmend.types import MultiViewFrame
 
 RADIUS_M = 0.5
 

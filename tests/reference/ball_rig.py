@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from reference.ball import BallCapture, ring
 
-from viewmend.capture.images import write_image
-from viewmend.capture.plain_writer import write_capture
+from viewmend.data.images import write_image
+from viewmend.data.native_writer import write_capture
 
 CAMERAS = ring(6)
 

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import torch
 
-from viewmend.inpainting.protocol import ContextProvider, State
-from viewmend.inpainting.sweep.sweep_net import SweepNet
+from viewmend.data.synthetic.rigs import orbit
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.models.base import ContextProvider, State
+from viewmend.models.views.model import ViewSynthNet
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
-from viewmend.studio.rigs import orbit
-from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.views import CompletedView, IncompleteView, MultiViewFrame
+from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 
 
-def random_view(seed: int, net: SweepNet, longest: int = 200) -> tuple[IncompleteView, ContextProvider]:
+def random_view(seed: int, net: ViewSynthNet, longest: int = 200) -> tuple[IncompleteView, ContextProvider]:
     """A view that is anywhere about a person, and what the cameras saw.
 
     One camera's image is smaller than the others'; in every third view E is soft and leaves half of the subject out.
@@ -26,8 +26,8 @@ def random_view(seed: int, net: SweepNet, longest: int = 200) -> tuple[Incomplet
     size = between(80, longest), between(80, longest)
     studio = Studio(StudioConfig(seed=10000 + seed, cameras=between(4, 11), frames=1, size_px=size))
     frame = smaller(studio.read(0), between(0, len(studio.cameras) - 1), between(0, 15))
-    stream = Stream(net, StreamConfig(render=RenderConfig(cameras=between(1, 3), error_rule="all"), fit_rig=False))
-    seen = stream.push(frame)
+    stream = Stream(net, StreamConfig(render=RenderConfig(cameras=between(1, 3), error_rule="all")))
+    seen = stream.add_frame(frame)
     angle, height = torch.rand(2, generator=chance).tolist()
     target = orbit([6.28 * angle], (between(64, longest), between(64, longest)), elevation_rad=height - 0.3)
     view = stream.render(target)
@@ -51,7 +51,7 @@ def holed(view: IncompleteView) -> IncompleteView:
     return replace(view, rgb=view.rgb * (weights.sum(0) > 0), weights=weights)
 
 
-def mended(net: SweepNet, view: IncompleteView, context: ContextProvider) -> CompletedView:
+def mended(net: ViewSynthNet, view: IncompleteView, context: ContextProvider) -> CompletedView:
     """What the model itself makes of it."""
     return net.step(view, context, State())[0]
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from viewmend.studio.bvh import Motion
-from viewmend.studio.gltf import Character
-from viewmend.studio.skeletons import find_parts
+from viewmend.data.synthetic.bvh import Motion
+from viewmend.data.synthetic.gltf import Character
+from viewmend.data.synthetic.retarget import find_parts
 
 LIMB_ENDS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
 

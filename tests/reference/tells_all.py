@@ -3,21 +3,18 @@
 import torch
 from torch.nn import functional as F
 
-from viewmend.inpainting.protocol import State
-from viewmend.views import CompletedView
+from viewmend.models.base import Inpainter
+from viewmend.types import CompletedView
 
 COLOUR = (0.8, 0.4, 0.2)
 SURE, UNSURE = 0.75, 0.25
 
 
-class TellsAll:
+class TellsAll(Inpainter):
     """One colour wherever E allows, fading to the outline, a hand nearer than the proxy; sure of what was rendered."""
 
     def __init__(self, device):
         self.colour = torch.tensor(COLOUR, device=device)[:, None, None]
-
-    def initial_state(self):
-        return State()
 
     def step(self, view, context, state):
         alpha = F.avg_pool2d(view.mask[None, None], 7, 1, 3)[0, 0] * view.mask

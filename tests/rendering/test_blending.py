@@ -1,4 +1,4 @@
-"""The blending rule: against its slow twin, and case by case."""
+"""The blending rule, against its slow reference and case by case."""
 
 from dataclasses import replace
 
@@ -13,13 +13,13 @@ from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.rendering._blend_numba import blend_numba
 from viewmend.rendering._blend_torch import blend_torch
 from viewmend.rendering.blending import BlendConfig, blend
-from viewmend.views import ContextViews, MultiViewFrame
+from viewmend.types import ContextViews, MultiViewFrame
 
 BIAS_M = 0.01
 
 
 def scene(target, cameras):
-    """What `blend` wants, for the ball: target, depth, normals, sources."""
+    """The arguments of `blend` for the ball: target, depth, normals, sources."""
     ball, frame = proxy(), photograph(cameras)
     raster = rasterize(ball.mesh, target)
     normals = interpolate(ball.normals, ball.mesh, target, raster)[0]
@@ -52,7 +52,7 @@ def hard():
 
 @pytest.mark.parametrize("fast", [blend_torch, blend_numba])
 @pytest.mark.parametrize("config", [BlendConfig(), BlendConfig(normal_power=1, view_power=4, slope_px=3.0)])
-def test_both_paths_equal_the_twin(hard, fast, config):
+def test_both_implementations_equal_the_reference(hard, fast, config):
     expected = blend_twin(*hard, BIAS_M, config)
     result = fast(*hard, BIAS_M, config)
     for got, want in zip((result.rgb, result.weights, result.disagreement), expected, strict=True):
@@ -62,7 +62,7 @@ def test_both_paths_equal_the_twin(hard, fast, config):
     assert (expected[1].sum(0) > 0).sum() > 100
 
 
-def test_both_paths_equal_the_twin_without_masks(hard):
+def test_both_implementations_equal_the_reference_without_masks(hard):
     target, depth, normals, sources = hard
     sources = ContextViews(replace(sources.frame, mask=None), sources.depth)
     expected = blend_twin(target, depth, normals, sources, BIAS_M, BlendConfig())
@@ -109,10 +109,10 @@ def weights_of_one(camera, **changes):
 
 
 EVERYWHERE = torch.full((1, 48, 48), 255, dtype=torch.uint8)
-"""A mask that rules nothing out."""
+"""A mask that excludes nothing."""
 
 
-def test_what_is_behind_a_camera_never_counts():
+def test_points_behind_a_camera_get_nothing_from_it():
     assert weights_of_one(camera_at(20, "before"), mask=EVERYWHERE).sum() > 1
     away = camera_at(20, "away")
     turn = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # about its own y axis: the ball is now behind it
@@ -120,7 +120,7 @@ def test_what_is_behind_a_camera_never_counts():
     assert weights_of_one(away, mask=EVERYWHERE).sum() == 0
 
 
-def test_what_is_outside_the_image_never_counts():
+def test_points_outside_the_image_get_nothing_from_it():
     camera = camera_at(20, "c")
     assert weights_of_one(camera.cropped(0, 0, 48, 48), mask=EVERYWHERE).sum() > 1
     assert weights_of_one(camera.cropped(100, 0, 48, 48), mask=EVERYWHERE).sum() == 0
@@ -136,7 +136,7 @@ def test_an_occluder_takes_the_weight():
     assert hidden.sum() == 0
 
 
-def test_background_samples_count_less_the_softer():
+def test_soft_background_samples_count_less():
     camera = camera_at(20, "c")
     full = weights_of_one(camera, mask=EVERYWHERE)
     torch.testing.assert_close(weights_of_one(camera, mask=EVERYWHERE // 5), full / 5)
@@ -144,7 +144,7 @@ def test_background_samples_count_less_the_softer():
 
 
 def test_background_does_not_bleed_in():
-    """White cameras with black background: what is coloured is white up to the rim."""
+    """White images on black: coloured pixels are white up to the rim."""
     target, depth, normals, sources = scene(camera_at(0, "t"), ring(12)[[0, 1]])
     white = (sources.frame.mask[:, None] > 0).expand(-1, 3, -1, -1) * torch.tensor(255, dtype=torch.uint8)
     sources = ContextViews(replace(sources.frame, rgb=white.contiguous()), sources.depth)
@@ -165,7 +165,7 @@ def test_disagreement_is_the_spread_of_the_samples():
 
 @pytest.mark.parametrize("fast", [blend_torch, blend_numba])
 def test_a_surface_that_faces_a_camera_counts_in_every_pixel(fast):
-    """Where the cosine is 1, rounding makes some larger, and such a pixel's slope no number."""
+    """Where the cosine is 1, rounding may exceed it, and the slope would be NaN."""
     target, depth, _, sources = scene(camera_at(0, "t"), camera_at(0, "c"))
     row, column = (depth > 0).nonzero(as_tuple=True)
     points = unproject((torch.stack([column, row], -1) + 0.5)[None], depth[row, column][None], target)[0]

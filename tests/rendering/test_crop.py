@@ -1,42 +1,42 @@
-"""Working on the subject's part of a view alone changes nothing but the time it takes."""
+"""Processing only the part of a view that shows the subject gives the same result."""
 
 import pytest
 import torch
-from inpainting.plates import Rig, tiny, view
 
-from viewmend.inpainting.checkpoint import load_inpainter
-from viewmend.inpainting.protocol import RenderQuality, State
-from viewmend.live.poses import rig_frame, view_camera
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.live.poses import home_view, view_camera
 from viewmend.live.protocol import Camera
+from viewmend.models.base import Inpainter, RenderQuality
+from viewmend.models.checkpoint import load_inpainter
 from viewmend.rendering import crop
 from viewmend.rendering.crop import Crop, mesh_crop, subject_crop
 from viewmend.rendering.view import render_view
 from viewmend.stream import Stream
-from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.views import CompletedView
+from viewmend.types import CompletedView
 
 
 @pytest.fixture(scope="module")
 def scene():
     studio = Studio(StudioConfig(seed=7, cameras=6, frames=2, size_px=96))
-    stream = Stream(load_inpainter("small"), bounds=studio.bounds)
+    stream = Stream(load_inpainter("rays"), bounds=studio.bounds)
     for time in range(2):
-        observation = stream.push(studio.read(time))
-    return stream, rig_frame(studio.cameras, observation.proxy.mesh.vertices.mean(0), studio.up), observation.proxy
+        observation = stream.add_frame(studio.read(time))
+    return stream, home_view(studio.cameras, observation.proxy.mesh.vertices.mean(0), studio.up), observation.proxy
 
 
 @pytest.mark.parametrize("context_times", [0, 1, None])
 @pytest.mark.parametrize(("azimuth", "distance"), [(20.0, 1.0), (75.0, 1.0), (140.0, 0.6)])
-def test_the_same_picture_as_of_the_whole_view(scene, azimuth, distance, context_times, monkeypatch):
+def test_a_crop_gives_the_same_image_as_the_whole_view(scene, azimuth, distance, context_times, monkeypatch):
     stream, frame, proxy = scene
     asked = Camera(azimuth=frame.azimuth + azimuth, elevation=8.0, distance=distance * frame.distance_m)
     camera = view_camera(asked, frame, (420, 330))
     quality = RenderQuality(context_times=context_times)
     part = stream.view(camera, quality=quality).completed
     filled = subject_crop(part.view, stream.inpainter.crop_margin_px(quality))
-    assert mesh_crop(proxy.mesh.vertices, camera) is not None and (filled is not None or distance < 1)
-    observation = stream.observation()
-    whole_view = render_view(observation.frame, proxy, camera, stream.config.render)
+    whole_image = Crop.all_of(camera)
+    assert mesh_crop(proxy.mesh.vertices, camera) != whole_image and (filled != whole_image or distance < 1)
+    observation = stream.cached_frame()
+    whole_view, _ = render_view(observation.frame, proxy, camera, stream.config.render)
     monkeypatch.setattr(stream.inpainter, "crop_margin_px", lambda quality: None)
     whole = stream.mend(whole_view, quality=quality).completed
     assert bool((whole.view.error > 0).any())
@@ -49,21 +49,7 @@ def test_the_same_picture_as_of_the_whole_view(scene, azimuth, distance, context
     assert whole.view.weights.shape == part.view.weights.shape
 
 
-def test_the_margin_is_what_patches_look_around_themselves(monkeypatch):
-    """The encoder tells the black within a view from what is beyond it."""
-    monkeypatch.setattr(crop, "grid_px", lambda margin_px: 16)
-    net, size = tiny(coarse_fill="none"), {"width": 420, "height": 360}
-    incomplete = view(0, (150, 200, 180, 240), **size)
-    whole, _ = net.step(incomplete, Rig(**size), net.initial_state())
-    errors = []
-    for margin_px in (net.crop_margin_px(RenderQuality()), 2):
-        found = subject_crop(incomplete, margin_px)
-        part, _ = net.step(found.of_view(incomplete), Rig(**size), net.initial_state())
-        errors.append(float((part.rgb - found.of_image(whole.rgb)).abs().max()))
-    assert errors[0] < 2e-5 < errors[1]
-
-
-def test_a_view_without_holes_shown_keeps_its_identity(scene):
+def test_an_unchanged_image_is_not_copied(scene):
     stream, frame, _ = scene
     camera = view_camera(Camera(azimuth=frame.azimuth), frame, (200, 160))
     part = stream.view(camera, quality=RenderQuality(mend=False)).completed
@@ -74,17 +60,17 @@ def test_crops_lie_within_the_view(scene):
     _, frame, proxy = scene
     away = view_camera(Camera(azimuth=0.0, target=(5.0, 0.0, 0.0)), frame, (64, 48))
     found = mesh_crop(proxy.mesh.vertices, away)
-    assert found is None or (found.left < found.right <= 64 and found.top < found.bottom <= 48)
+    assert found.left < found.right <= 64 and found.top < found.bottom <= 48
     near = view_camera(Camera(distance=0.05), frame, (64, 48))
-    assert mesh_crop(proxy.mesh.vertices, near) is None  # some of the subject is behind
-    assert mesh_crop(torch.zeros(0, 3), away) is None
+    assert mesh_crop(proxy.mesh.vertices, near) == Crop.all_of(near), "a part of the subject is behind the camera"
+    assert mesh_crop(torch.zeros(0, 3), away) == Crop.all_of(away)
 
 
-def test_what_is_filled_lies_on_the_grid_and_has_its_margin(scene):
+def test_crops_are_on_the_grid_and_have_their_margin(scene):
     stream, frame, _ = scene
     view = stream.render(view_camera(Camera(azimuth=frame.azimuth), frame, (700, 500)))
     found = subject_crop(view, 30)
-    assert found is not None
+    assert found != Crop.all_of(view.camera)
     assert all(
         side % crop.grid_px(30) == 0 or side in (500, 700)
         for side in (found.left, found.top, found.right, found.bottom)
@@ -105,7 +91,7 @@ def test_the_grid_is_the_first_power_of_two_that_holds_the_margin(margin_px, exp
     assert crop.grid_px(margin_px) == expected
 
 
-def test_a_crops_camera_sees_the_same_rays(scene):
+def test_the_camera_of_a_crop_has_the_same_rays(scene):
     _, frame, _ = scene
     camera = view_camera(Camera(), frame, (64, 48))
     seen = Crop(16, 0, 40, 30).of_camera(camera)
@@ -113,14 +99,11 @@ def test_a_crops_camera_sees_the_same_rays(scene):
     assert float(seen.K[0, 0, 2]) == pytest.approx(float(camera.K[0, 0, 2]) - 16)
 
 
-def test_what_an_inpainter_tells_beside_colours_comes_back_in_the_whole_view(scene):
-    """Around the part that was completed there is no subject, and colours stay as they were rendered."""
+def test_alpha_confidence_and_depth_are_pasted_into_the_whole_view(scene):
+    """Outside the crop there is no subject, and colours stay as rendered."""
     stream, frame, _ = scene
 
-    class Tells:
-        def initial_state(self):
-            return State()
-
+    class PredictsAll(Inpainter):
         def crop_margin_px(self, quality):
             return 4
 
@@ -129,8 +112,8 @@ def test_what_an_inpainter_tells_beside_colours_comes_back_in_the_whole_view(sce
             return CompletedView(view, rgb, 0.5 * view.mask, view.mask, 2 * view.depth), state
 
     camera = view_camera(Camera(azimuth=30.0, elevation=8.0, distance=frame.distance_m), frame, (420, 330))
-    telling = Stream(Tells(), stream.config)
-    telling.push(stream.observation().frame, stream.observation().proxy)
+    telling = Stream(PredictsAll(), stream.config)
+    telling.add_frame(stream.cached_frame().frame, stream.cached_frame().proxy)
     for completed in (telling.view(camera).completed, telling.mend(telling.render(camera)).completed):
         assert completed.rgb.shape == (3, 330, 420)
         assert torch.equal(completed.alpha, 0.5 * completed.view.mask)

@@ -1,4 +1,4 @@
-"""A run that takes a second: tiny scenes, a tiny model."""
+"""Runs that take a second: tiny scenes and tiny models."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,23 +6,21 @@ from typing import Any
 
 import pytest
 
-from viewmend.inpainting.config import small as small_model
-from viewmend.training.plan import DataPlan, Recipe
-from viewmend.training.sample_files import write_shards
-from viewmend.training.scenes import StudioScenes
+from viewmend.models.paper.config import paper_small
+from viewmend.models.views.config import ViewsConfig
+from viewmend.rendering.view import RenderConfig
+from viewmend.training.config import SamplingConfig, SceneConfig, TrainConfig
+from viewmend.training.paper import PaperObjectiveConfig
+from viewmend.training.scenes import SampleScenes, StudioRigs
+from viewmend.training.shards import write_shards
 
-PLAN = DataPlan(
-    sizes_px=(96,),
-    cameras=(5, 5),
-    times=(0, 1),
-    held_cameras=2,
-    targets_per_camera=1,
-    min_hole_px=5,
-    ray_views=3,
-    hull_resolution=48,
-)
-MODEL = replace(small_model(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2, num_ray_views=3)
-
+SCENES = SceneConfig(sizes_px=(96,), cameras=(5, 5), num_holdout_views=2, hull_resolution=48)
+SAMPLING = SamplingConfig(frames=(0, 1), with_context=True, num_ray_views=3, min_hole_px=5)
+MODEL = replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, groups=1, blocks=2)
+VIEWS_SCENES = replace(SCENES, cameras=(5, 6))
+VIEWS_SAMPLING = SamplingConfig(num_ray_views=4)
+VIEWS_MODEL = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_features=8, error_features=8)
+VIEWS_RENDER = RenderConfig(error_rule="all")
 RUN: dict[str, Any] = {
     "steps": 4,
     "batch": 2,
@@ -31,32 +29,29 @@ RUN: dict[str, Any] = {
     "warmup": 1,
     "workers": 0,
     "ema": 0.5,
-    "bfloat16": False,
-    "checkpoint_every": 2,
+    "precision": "float32",
+    "checkpoint_minutes": 1e9,
+    "validate_every": 0,
+    "validation_views": 2,
 }
 
 
-@pytest.fixture
-def plan() -> DataPlan:
-    return PLAN
+def studio_samples(seed: str = "0", scenes: SceneConfig = SCENES, **sampling: Any) -> SampleScenes:
+    """Samples of small studio scenes."""
+    own = replace(SAMPLING, **sampling)
+    return SampleScenes(StudioRigs(scenes, own.frames, seed), scenes, own)
 
 
 @pytest.fixture(scope="session")
 def shards(tmp_path_factory) -> Path:
     """Clips of two frames, made once for all runs."""
     folder = tmp_path_factory.mktemp("shards")
-    scenes = StudioScenes(replace(PLAN, clip_length=2), "tests")
-    list(write_shards((sample for number in range(3) for sample in scenes.scene(number)), folder, per_shard=2))
+    source = studio_samples("tests", clip_length=2)
+    list(write_shards((sample for number in range(3) for sample in source.scene(number)), folder, shard_size=2))
     return folder
 
 
 @pytest.fixture
-def tiny(shards) -> Recipe:
-    return Recipe(
-        name="tiny",
-        model=MODEL,
-        data=replace(PLAN, shards=shards, clip_length=2),
-        **RUN,
-        validate_every=0,
-        validation_views=2,
-    )
+def tiny(shards) -> TrainConfig:
+    objective = PaperObjectiveConfig(model=MODEL, sampling=SAMPLING, adversarial=0.0)
+    return TrainConfig(name="tiny", objective=objective, scenes=SCENES, shards=shards, **RUN)

@@ -1,5 +1,6 @@
-"""Samples come from the production pipeline, know nothing of the camera that is left out, and follow from numbers."""
+"""Samples come from the production pipeline, do not depend on the held-out camera, and follow from numbers."""
 
+import shutil
 import tarfile
 from dataclasses import replace
 from pathlib import Path
@@ -7,20 +8,24 @@ from random import Random
 
 import pytest
 import torch
+from training.conftest import SAMPLING, SCENES, studio_samples
 
-from viewmend.baselines.classical import Unfilled
-from viewmend.capture.prepare import prepare
-from viewmend.capture.reduction import reduced
-from viewmend.evaluation.frame_scores import true_view
+from viewmend.data.holdout.capture_scenes import make_splits, read_splits, splits_json
+from viewmend.data.holdout.scenes import LeaveOneOut
+from viewmend.data.holdout.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
+from viewmend.data.native_writer import write_capture
+from viewmend.data.prepare import prepare
+from viewmend.data.resize import limit_size
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.evaluation.scores import true_view
 from viewmend.geometry.hull import HullConfig
-from viewmend.leave_one_out.scenes import LeaveOneOut
-from viewmend.leave_one_out.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
+from viewmend.models.classical import Unfilled
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream
-from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.training.capture_scenes import CaptureScenes, MixedScenes
 from viewmend.training.replay import SampleReplay, samples_in_order
-from viewmend.training.sample_files import (
+from viewmend.training.samples import HeldOutCamera, Sample, rig_samples
+from viewmend.training.scenes import CaptureRigs, MixedRigs, SampleScenes, Scene, StudioRigs, random_studio, rig_source
+from viewmend.training.shards import (
     ShardError,
     ShardScenes,
     read_shard,
@@ -28,9 +33,6 @@ from viewmend.training.sample_files import (
     sample_to_bytes,
     write_shards,
 )
-from viewmend.training.samples import HeldOutCamera, Sample, widened
-from viewmend.training.scenes import StudioScenes, random_stage, rig_samples
-from viewmend.training.sources import scene_source
 
 
 @pytest.fixture(scope="module")
@@ -42,23 +44,29 @@ def same(a, b):
     return sample_to_bytes(a) == sample_to_bytes(b)
 
 
-def test_the_last_of_just_enough_times_is_a_target(studio, plan):
-    rig, plan = LeaveOneOut({time: studio.read(time) for time in (0, 1)}), replace(plan, times=(0, 1), held_cameras=1)
-    samples = rig_samples(rig, replace(plan, least_past=1, min_hole_px=0), Random(0))
+def capture_samples(capture, **changes):
+    """Samples of one capture."""
+    scenes = replace(SCENES, **changes)
+    return SampleScenes(CaptureRigs([(capture, None)], scenes, (0, 1), "0"), scenes, SAMPLING)
+
+
+def test_the_last_frame_with_enough_history_is_a_target(studio):
+    rig, scenes = LeaveOneOut({time: studio.read(time) for time in (0, 1)}), replace(SCENES, num_holdout_views=1)
+    samples = rig_samples(rig, scenes, replace(SAMPLING, min_history=1, min_hole_px=0), Random(0))
     assert samples and {sample.view.time for sample in samples} == {1}
-    with pytest.raises(ValueError, match="more than 2 times"):
-        rig_samples(rig, replace(plan, least_past=2), Random(0))
+    with pytest.raises(ValueError, match="with 2 frames before"):
+        rig_samples(rig, scenes, replace(SAMPLING, min_history=2), Random(0))
 
 
-def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
+def test_a_sample_does_not_depend_on_the_image_of_the_held_out_camera(studio):
     held = studio.cameras.names[2]
     frame = studio.read(1)
-    vandalised = replace(frame, rgb=frame.rgb.clone(), mask=frame.mask.clone())
-    vandalised.rgb[2] = 255
-    vandalised.mask[2] = 255
+    changed = replace(frame, rgb=frame.rgb.clone(), mask=frame.mask.clone())
+    changed.rgb[2] = 255
+    changed.mask[2] = 255
     first, second = (
-        HeldOutCamera(LeaveOneOut({1: f}), held, HullConfig(resolution=48)).sample(1, (1,), RenderConfig(), 0)
-        for f in (frame, vandalised)
+        HeldOutCamera(LeaveOneOut({1: f}), held, HullConfig(resolution=48)).sample(1, (1,), RenderConfig(), SAMPLING)
+        for f in (frame, changed)
     )
     assert first is not None and second is not None
     assert torch.equal(first.view.rgb, second.view.rgb) and torch.equal(first.view.error, second.view.error)
@@ -66,167 +74,160 @@ def test_a_sample_does_not_depend_on_what_the_camera_left_out_sees(studio):
     assert all(held not in views.frame.cameras.names for views in first.context)
 
 
-def test_training_is_shown_what_evaluation_is():
+def test_training_views_equal_evaluated_views():
     config = StudioConfig(seed=3, cameras=5, frames=2, size_px=96, background="stage")
     scene = StudioScene(name="s", set="A", rig="", style="", config=config, held="cam02")
     rig = LeaveOneOut({time: scene.studio().read(time) for time in range(2)})
     camera, stream = HeldOutCamera(rig, scene.held, HullConfig()), Stream(Unfilled())
     for frame in scene.frames("cpu"):
-        observation, time = stream.push(frame.inputs), frame.inputs.time
-        sample = camera.sample(time, (time,), RenderConfig(), 1, (0, 4))
+        cached, time = stream.add_frame(frame.inputs), frame.inputs.time
+        sample = camera.sample(time, (time,), RenderConfig(), replace(SAMPLING, num_ray_views=4))
         assert sample is not None and sample.truth.any()
-        view, near = stream.render(frame.truth.cameras), observation.context(sample.view.candidate_views)
-        truth = (255 * true_view(frame.truth, None).rgb).round().to(torch.uint8)
-        assert (
-            same(sample, Sample(view, sample.context, near, truth, alpha=frame.truth.mask[0])) and len(near.depth) == 4
-        )
+        view, near = stream.render(frame.truth.cameras), cached.context(sample.view.candidate_views)
+        truth = (255 * true_view(frame.truth).rgb).round().to(torch.uint8)
+        assert same(sample, Sample(view, sample.context, near, truth, alpha=frame.truth.mask[0]))
+        assert len(near.depth) == 4
 
 
-def test_truth_is_black_where_the_mask_is_and_context_is_past(plan):
-    samples = StudioScenes(plan, "0").scene(0)
+def test_the_truth_is_on_black_and_the_context_is_in_the_past():
+    samples = studio_samples().scene(0)
     assert samples
     for sample in samples:
         times = [views.frame.time for views in sample.context]
         assert times[0] == sample.view.time and times == sorted(times, reverse=True)
-        assert float(sample.view.error.sum()) >= plan.min_hole_px
+        assert float(sample.view.error.sum()) >= SAMPLING.min_hole_px
         assert not sample.truth[:, 0].any(), "the top row is background"
 
 
-def test_a_clip_is_one_camera_at_consecutive_times(plan):
-    samples = StudioScenes(replace(plan, clip_length=2), "0").scene(0)
+def test_a_clip_is_one_camera_at_consecutive_frames():
+    samples = studio_samples(clip_length=2).scene(0)
     assert samples
     for sample in samples:
         before, now = sample.clip
         assert before.view.time == now.view.time - 1 and before.view.camera.names == now.view.camera.names
-    with pytest.raises(ValueError, match="expected 3 consecutive times"):
-        StudioScenes(replace(plan, clip_length=3), "0").scene(0)
+    with pytest.raises(ValueError, match="expected clips of 3 consecutive frames"):
+        studio_samples(clip_length=3).scene(0)
 
 
-def test_no_stage_takes_a_seed_that_is_kept_for_validation_or_tests(plan):
+def test_no_studio_uses_a_seed_reserved_for_validation_or_tests():
     random = Random(1)
-    seeds = [random_stage(plan, random).seed for _ in range(300)]
+    seeds = [random_studio(SCENES, 1, random).seed for _ in range(300)]
     assert {*seeds} < {*range(9000)} and len(set(seeds)) > 250
-    kept = [random_stage(plan, random, "validation").seed for _ in range(300)]
-    assert {*kept} < {*range(9000, 10000)}
+    validation = [random_studio(SCENES, 1, random, "validation").seed for _ in range(300)]
+    assert {*validation} < {*range(9000, 10000)}
     assert all(min(scenes) >= 10000 for scenes in (P_SEEDS, Q_SEEDS))
-    source = scene_source(replace(plan, shards=Path("any")), "validation", "validation")
-    assert isinstance(source, StudioScenes) and source.split == "validation"
 
 
-def test_training_refuses_what_is_kept_for_tests(plan, tmp_path):
-    with pytest.raises(ValueError, match="got those for tests"):
-        StudioScenes(plan, "0", "test")
-    other, kept = tmp_path / "train", tmp_path / "test"
-    for performers, motions in ((kept, other), (other, kept), (kept / "ann.glb", other)):
-        with pytest.raises(ValueError, match="not kept for tests, got a folder named 'test'"):
-            scene_source(replace(plan, performers=performers, motions=motions), "0")
+def test_training_refuses_test_data(tmp_path):
+    with pytest.raises(ValueError, match="training or validation, got test"):
+        StudioRigs(SCENES, (0,), "0", "test")
+    other, test = tmp_path / "train", tmp_path / "test"
+    for performers, motions in ((test, other), (other, test), (test / "ann.glb", other)):
+        with pytest.raises(ValueError, match="got a folder named 'test'"):
+            rig_source(replace(SCENES, performers=performers, motions=motions), (0,), "0")
     for split in ("training", "validation"):
-        with pytest.raises(ValueError, match="not kept for tests"):
-            scene_source(replace(plan, captures=(kept / "wd",)), "0", split)
-    assert isinstance(scene_source(replace(plan, performers=other, motions=other), "0"), StudioScenes)
+        with pytest.raises(ValueError, match="got a folder named 'test'"):
+            rig_source(replace(SCENES, captures=(test / "wd",)), (0,), "0", split)
+    assert isinstance(rig_source(replace(SCENES, performers=other, motions=other), (0,), "0"), StudioRigs)
 
 
-def test_a_staged_plan_has_a_stage_behind_everyone_and_differs_in_nothing_else(plan):
-    plain, staged = (random_stage(replace(plan, staged=staged), Random(2)) for staged in (False, True))
+def test_a_backdrop_is_the_only_difference_of_with_backdrop():
+    plain, staged = (random_studio(replace(SCENES, with_backdrop=on), 1, Random(2)) for on in (False, True))
     assert staged == replace(plain, background="stage") != plain
 
 
-def test_rough_stages_are_only_more_wrong_than_imperfect_ones(plan):
-    def stages(**changes):
+def test_hard_scenes_have_larger_errors_than_imperfect_ones():
+    def errors(**changes):
         random = Random(3)
-        return [random_stage(replace(plan, **changes), random).imperfections for _ in range(100)]
+        return [random_studio(replace(SCENES, **changes), 1, random).imperfections for _ in range(100)]
 
-    assert {it.calibration_px for it in stages(imperfect_fraction=0.0, rough_fraction=1.0)} == {0.0}
-    usual, rough = stages(imperfect_fraction=1.0), stages(imperfect_fraction=1.0, rough_fraction=1.0)
-    assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in rough) <= 2.5
-    assert max(it.mask_edge_px for it in usual) <= 1 < max(it.mask_edge_px for it in rough) <= 2
+    assert {it.calibration_px for it in errors(imperfect_fraction=0.0, hard_fraction=1.0)} == {0.0}
+    usual, hard = errors(imperfect_fraction=1.0), errors(imperfect_fraction=1.0, hard_fraction=1.0)
+    assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in hard) <= 2.5
+    assert max(it.mask_edge_px for it in usual) <= 1 < max(it.mask_edge_px for it in hard) <= 2
 
 
-def test_samples_are_the_same_whoever_makes_them_and_wherever_one_begins(plan):
-    source = StudioScenes(plan, "7")
+def test_samples_depend_neither_on_workers_nor_on_where_a_stream_resumes():
+    source = studio_samples("7")
     alone, helped = (samples_in_order(source, 0, workers) for workers in (0, 2))
     first = [next(alone) for _ in range(3)]
     for (scene, number, sample), (other_scene, other_number, other) in zip(first, helped, strict=False):
         assert (scene, number) == (other_scene, other_number) and same(sample, other)
     helped.close()
-    feed = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0)
-    batches = [feed.batch(step, 2) for step in range(4)]
-    assert [len(batch) for batch in batches] == [1, 2, 2, 2] and feed.position.sample == 1, "in the middle of a scene"
-    again = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0, start=feed.position)
-    for one, other in zip(feed.batch(4, 2), again.batch(4, 2), strict=True):
+    stream = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0)
+    batches = [stream.batch(step, 2) for step in range(4)]
+    assert [len(batch) for batch in batches] == [1, 2, 2, 2] and stream.position.sample == 1, "within a scene"
+    again = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0, start=stream.position)
+    for one, other in zip(stream.batch(4, 2), again.batch(4, 2), strict=True):
         assert same(one, other)
-    assert feed.position == again.position
+    assert stream.position == again.position
 
 
-def test_widened_holes_reach_so_far_and_stay_on_the_subject(plan):
-    view = StudioScenes(plan, "0").scene(0)[0].view
-    wider = widened(view, 2)
-    missing = torch.nonzero(view.error > 0)
-    for row, column in torch.nonzero(view.mask >= 0).tolist():
-        reach = int((missing - torch.tensor([row, column])).abs().amax(1).min())
-        widens = 0 < reach <= 2 and bool(view.mask[row, column] > 0)
-        assert bool(wider.error[row, column] > 0) == (widens or reach == 0)
-        if widens:
-            assert not wider.rgb[:, row, column].any() and not wider.weights[:, row, column].any()
-        elif reach:
-            assert torch.equal(wider.rgb[:, row, column], view.rgb[:, row, column])
-    assert int((wider.error > 0).sum()) > len(missing)
-    assert torch.equal(widened(view, 0).error, view.error)
+class Counted:
+    """A source of empty scenes or rigs that records what is requested."""
 
+    def __init__(self):
+        self.requested = []
 
-def test_dropped_cameras_are_missing_from_what_a_sample_sees(plan):
-    plan = replace(plan, cameras=(8, 8), ray_views=8, targets_per_camera=2)
-    whole, dropped = (StudioScenes(replace(plan, dropped_fraction=share), "0").scene(0) for share in (0.0, 1.0))
-    assert whole and dropped
-    assert {len(s.view.silhouettes.cameras) for s in whole} == {7}
-    assert {len(s.view.silhouettes.cameras) for s in dropped} <= {5, 6, 7}
-    assert min(len(s.view.silhouettes.cameras) for s in dropped) < 7
-
-
-class Empty:
     def scene(self, number):
         return []
 
+    def rig(self, number):
+        self.requested.append(number)
+        return Scene(LeaveOneOut({}), Random(number))
 
-def test_scenes_without_holes_are_an_error_not_a_wait():
+
+def test_scenes_without_holes_are_an_error():
     with pytest.raises(ValueError, match="got none in 100 scenes"):
-        SampleReplay(Empty(), "0", 1, 3, 0).batch(0, 1)
+        SampleReplay(Counted(), "0", 1, 3, 0).batch(0, 1)
 
 
-def test_samples_come_back_from_disk_bit_for_bit_and_damage_is_noticed(plan, tmp_path):
-    samples = StudioScenes(replace(plan, clip_length=2), "0").scene(0)
+def test_a_mix_has_the_requested_fractions():
+    real, studio = Counted(), Counted()
+    mix = MixedRigs(real, studio, 0.75, "0")
+    for number in (*range(400), *range(400)):
+        mix.rig(number)
+    assert 0.68 < len(real.requested) / 800 < 0.82
+    assert real.requested[: len(real.requested) // 2] == real.requested[len(real.requested) // 2 :]
+    assert {*real.requested, *studio.requested} == {*range(400)} and not {*real.requested} & {*studio.requested}
+
+
+def test_samples_are_stored_losslessly_and_damage_is_detected(tmp_path):
+    samples = studio_samples(clip_length=2).scene(0)
     assert all(same(sample_from_bytes(sample_to_bytes(s)), s) for s in samples)
-    paths = list(write_shards(samples, tmp_path, per_shard=1))
+    paths = list(write_shards(samples, tmp_path, shard_size=1))
     assert [path.name for path in paths] == [f"shard-{n:05d}.tar" for n in range(len(samples))]
-    scenes = ShardScenes(tmp_path, "0", (Sample,))
+    scenes = ShardScenes(tmp_path, "0", Sample)
     drawn = [scenes.scene(number)[0] for number in range(len(samples))]
     assert {sample_to_bytes(s) for s in drawn} == {sample_to_bytes(s) for s in samples}
+    with pytest.raises(ShardError, match="expected clips of 3 frames, got 2"):
+        ShardScenes(tmp_path, "0", Sample, clip_length=3).scene(0)
     paths[0].write_bytes(paths[0].read_bytes()[:3000])
     with pytest.raises(ShardError, match=r"shard-00000\.tar: expected a tar of samples"):
         read_shard(paths[0])
     with tarfile.open(tmp_path / "other.tar", "w") as tar:
         tar.add(__file__, "notes.txt")
-    with pytest.raises(ShardError, match="expected a sample"):
+    with pytest.raises(ShardError, match=r"other\.tar: expected a tar of samples"):
         read_shard(tmp_path / "other.tar")
     with pytest.raises(ShardError, match="expected tar files, found none"):
-        ShardScenes(tmp_path / "nowhere", "0", (Sample,))
+        ShardScenes(tmp_path / "nowhere", "0", Sample)
 
 
-def test_captures_are_scenes_whose_truth_is_the_camera_left_out(studio, plan):
-    scenes = CaptureScenes([studio], replace(plan, sizes_px=(64,)), "0")
+def test_the_truth_of_a_capture_is_the_image_of_the_held_out_camera(studio):
+    scenes = capture_samples(studio, sizes_px=(64,))
     samples = scenes.scene(0)
     assert samples and all(same(a, b) for a, b in zip(samples, scenes.scene(0), strict=True))
     for sample in samples:
         held = sample.view.camera.names[0]
         assert max(sample.truth.shape) == 64 and held not in sample.view.source_views
-        seen = reduced(studio.read(sample.view.time), 64).select([held])
-        expected = (seen.rgb[0].float() * (seen.mask[0].float() / 255)).round().to(torch.uint8)
+        image = limit_size(studio.read(sample.view.time), 64).select([held])
+        expected = (image.rgb[0].float() * (image.mask[0].float() / 255)).round().to(torch.uint8)
         assert torch.equal(sample.truth, expected)
 
 
-def test_a_capture_is_aligned_without_the_camera_that_is_left_out(plan):
-    class Looked(Studio):
-        """States principal points beside the true ones."""
+def test_a_capture_is_aligned_without_the_held_out_camera():
+    class Shifted(Studio):
+        """States wrong principal points."""
 
         @property
         def cameras(self):
@@ -235,8 +236,8 @@ def test_a_capture_is_aligned_without_the_camera_that_is_left_out(plan):
         def read(self, time):
             return replace(super().read(time), cameras=self.cameras)
 
-    capture = Looked(StudioConfig(seed=3, cameras=6, frames=2, size_px=96))
-    samples = CaptureScenes([capture], replace(plan, sizes_px=(96,)), "0").scene(0)
+    capture = Shifted(StudioConfig(seed=3, cameras=6, frames=2, size_px=96))
+    samples = capture_samples(capture).scene(0)
     assert samples
     for sample in samples:
         held = sample.view.camera.names[0]
@@ -244,29 +245,35 @@ def test_a_capture_is_aligned_without_the_camera_that_is_left_out(plan):
         assert torch.equal(sample.view.camera.K, expected.select([held]).K)
         near = sample.context[0].frame.cameras
         assert torch.equal(near.K, expected.select(near.names).K)
-    assert not torch.equal(expected.K, capture.cameras.K), "there is a shift to undo"
+    assert not torch.equal(expected.K, capture.cameras.K), "there is a shift to correct"
 
 
-def test_a_mix_takes_its_share_from_each(plan):
-    class Counted(Empty):
-        asked = ()
-
-        def scene(self, number):
-            self.asked = (*self.asked, number)
-            return []
-
-    real, studio = Counted(), Counted()
-    mix = MixedScenes(real, studio, 0.75, "0")
-    for number in (*range(400), *range(400)):
-        mix.scene(number)
-    assert 0.68 < len(real.asked) / 800 < 0.82
-    assert real.asked[: len(real.asked) // 2] == real.asked[len(real.asked) // 2 :], "a number is always of one source"
-    assert {*real.asked, *studio.asked} == {*range(400)} and not {*real.asked} & {*studio.asked}
-
-
-def test_hulls_are_as_fine_as_the_plan_says(plan):
-    coarse, fine = (StudioScenes(replace(plan, hull_resolution=n), "0").scene(0) for n in (12, 48))
+def test_hulls_have_the_configured_resolution():
+    coarse, fine = (studio_samples(scenes=replace(SCENES, hull_resolution=n)).scene(0) for n in (12, 48))
     assert len(coarse) == len(fine) > 0
-    covers = [[int((sample.view.mask > 0).sum()) for sample in samples] for samples in (coarse, fine)]
-    assert sum(covers[0]) < 0.5 * sum(covers[1]), "large voxels lose what is thin"
-    assert all(same(a, b) for a, b in zip(fine, StudioScenes(plan, "0").scene(0), strict=True))
+    covered = [sum(int((sample.view.mask > 0).sum()) for sample in samples) for samples in (coarse, fine)]
+    assert covered[0] < 0.5 * covered[1], "large voxels lose thin parts"
+
+
+@pytest.fixture
+def splits(tmp_path) -> Path:
+    takes = [tmp_path / name for name in ("ada", "bea", "cleo")]
+    for number, take in enumerate(takes):
+        write_capture(Studio(StudioConfig(seed=number, cameras=5, frames=2, size_px=64)), take, images="png")
+    file = tmp_path / "splits.json"
+    file.write_text(splits_json(make_splits(takes, tmp_path)))
+    return file
+
+
+def test_of_a_splits_file_only_the_training_captures_are_used(splits):
+    training = {scene.name: scene.left_out for scene in read_splits(splits).scenes if scene.split == "training"}
+    config = replace(SCENES, sizes_px=(64,), captures=(splits,), captures_fraction=1.0)
+    rigs = rig_source(config, (0, 1), "0")
+    assert [capture.name for capture, _ in rigs.first.captures] == list(training)
+    samples = SampleScenes(rigs, config, SAMPLING)
+    held = {sample.view.camera.names[0] for number in range(4) for sample in samples.scene(number)}
+    assert held and held <= set(training.values())
+    for one, other in (("ada", "bea"), ("bea", "cleo")):
+        shutil.copy(splits.parent / other / "cameras.json", splits.parent / one)
+    with pytest.raises(ValueError, match="take that version of the data"):
+        rig_source(config, (0,), "0")

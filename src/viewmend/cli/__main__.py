@@ -1,4 +1,4 @@
-"""`python -m viewmend.cli` is `viewmend`."""
+"""Runs the `viewmend` command: `python -m viewmend.cli`."""
 
 import sys
 

@@ -8,7 +8,7 @@ import tyro
 
 if TYPE_CHECKING:
     from viewmend.geometry.bounds import Bounds
-    from viewmend.views import MultiViewFrame
+    from viewmend.types import MultiViewFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +18,7 @@ class Options:
     With --board SOURCE holds a video or a folder of images for each camera, named after it, all begun at the same
     moment, of a ChArUco board that is carried about; OUT/residuals.png shows what the calibration misses. With
     --silhouettes SOURCE is a capture with masks; cameras that are left out in turn must agree better with the others
-    afterwards, or nothing is written. Files are named in OUT/cameras.json as in SOURCE: put it there, or beside
+    afterwards, or nothing is written. Files are named in OUT/cameras.json as in SOURCE: put it there, or next to
     footage of the same names.
     """
 
@@ -35,10 +35,10 @@ class Options:
     silhouettes: bool = False
     """Refine the capture's poses and focal lengths by its masks."""
     times: int = 12
-    """So many frames of a capture are looked at, spread over those that are chosen."""
+    """Number of frames of a capture to use, spread over the chosen ones."""
     frames: str | None = None
     """Which frames, as FIRST:END by index; either may be left out."""
-    kind: str | None = None
+    format: str | None = None
     """The capture's format, as docs/formats.md names it; by default it is recognised."""
     json: bool = False
     """Write the figures as one JSON object to standard output, and nothing else there."""
@@ -46,14 +46,14 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; the exit code."""
-    from viewmend.capture.plain_writer import whole_folder
     from viewmend.cli.console import print_json, say, show
+    from viewmend.data.native_writer import atomic_folder
 
     if (options.board is not None) == options.silhouettes:
         raise ValueError("expected either --board or --silhouettes, got both or neither; choose one of them")
     if options.every < 1 or options.times < 1:
         raise ValueError(f"expected --every and --times of at least 1, got {options.every} and {options.times}")
-    with whole_folder(options.out) as unfinished:
+    with atomic_folder(options.out) as unfinished:
         figures = (_by_silhouettes if options.silhouettes else _by_board)(options, unfinished)
     if options.json:
         print_json(figures)
@@ -71,14 +71,12 @@ Figures = dict[str, dict[str, int | float]]
 
 
 def _by_board(options: Options, out: Path) -> Figures:
-    from viewmend.capture.calibration.board import parse_board
-    from viewmend.capture.calibration.bundle import calibrate
-    from viewmend.capture.calibration.footage import look_for, open_footage
-    from viewmend.capture.calibration.report import residual_picture
-    from viewmend.capture.images import write_image
-    from viewmend.capture.plain_format import write_calibration
     from viewmend.cli.checks import chosen_times
     from viewmend.cli.console import busy, track
+    from viewmend.data.images import write_image
+    from viewmend.data.native_format import write_calibration
+    from viewmend.preprocess.calibration.board import look_for, open_footage, parse_board
+    from viewmend.preprocess.calibration.bundle import calibrate, residual_picture
 
     assert options.board is not None
     board, footage = parse_board(options.board, options.dictionary), open_footage(options.source)
@@ -103,11 +101,11 @@ def _by_board(options: Options, out: Path) -> Figures:
 
 
 def _by_silhouettes(options: Options, out: Path) -> Figures:
-    from viewmend.capture.calibration.held_out import best_hold, left_out, refined_all, refined_without
-    from viewmend.capture.calibration.report import with_cameras
-    from viewmend.capture.formats.recognition import read_any_calibration
-    from viewmend.capture.plain_format import write_calibration
     from viewmend.cli.console import busy, say, track
+    from viewmend.data.formats import read_any_calibration
+    from viewmend.data.native_format import write_calibration
+    from viewmend.preprocess.calibration.bundle import with_cameras
+    from viewmend.preprocess.calibration.silhouettes import best_hold, left_out, refined_all, refined_without
 
     frames, bounds = _frames(options)
     names = frames[0].cameras.names
@@ -129,18 +127,18 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
         refined = refined_all(frames, bounds, hold)
     out.mkdir()
     path = options.source.parent if options.source.is_file() else options.source
-    write_calibration(out, with_cameras(read_any_calibration(path, options.kind), refined.cameras))
+    write_calibration(out, with_cameras(read_any_calibration(path, options.format), refined.cameras))
     held = {f"{score.camera} left out": {"iou": score.before, "refined": score.after} for score in scores}
     return {"outlines": {"missed_px": refined.before_px, "refined_px": refined.after_px}} | held
 
 
 def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     """Some times at which all cameras are there and right, and the capture's bounds."""
-    from viewmend.capture.calibration.silhouettes import LEAST_CAMERAS
-    from viewmend.capture.prepare import open_masked, prepare
     from viewmend.cli.checks import chosen_times
+    from viewmend.data.prepare import open_masked, prepare
+    from viewmend.preprocess.calibration.silhouettes import LEAST_CAMERAS
 
-    capture = open_masked(options.source, kind=options.kind)
+    capture = open_masked(options.source, format=options.format)
     times = chosen_times(options.frames, len(capture.frame_ids))
     count = min(options.times, len(times))
     prepared = prepare(capture, match_colours=False, first=times[0])

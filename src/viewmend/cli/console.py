@@ -1,4 +1,4 @@
-"""What commands say to people: progress and messages on standard error, results on standard output."""
+"""Messages and progress on standard error, results on standard output."""
 
 import contextlib
 import json
@@ -8,20 +8,19 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
-from viewmend.terminal import printable
+from viewmend.utils.logging import printable
 
 _Item = TypeVar("_Item")
 QUIET_S = 2.0
-"""A bar appears only after this long: what is quick needs none."""
-BEAT_S = 30.0
-"""Seconds between lines that say how far a command is, where there is no terminal for a bar."""
+"""Progress is shown only for work that takes longer."""
+INTERVAL_S = 30.0
+"""Seconds between progress lines if standard error is not a terminal."""
 
 
 def track(items: Iterable[_Item], description: str, total: int | None = None) -> Iterator[_Item]:
-    """Pass `items` on, with a progress bar on standard error once two seconds went by.
+    """Iterate over `items` with a progress bar on standard error, or progress lines if it is not a terminal.
 
-    Where that is no terminal, a line every half minute says how far it is. `total` is the number of items; it is found
-    by `len` where it is not given. A bar of an unknown total pulses.
+    `total` is the number of items, by default their `len`. Without either, the bar shows activity only.
     """
     if total is None and hasattr(items, "__len__"):
         total = len(items)  # pyright: ignore[reportArgumentType]
@@ -35,7 +34,7 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
     try:
         for done, item in enumerate(items):
             if bar is None and time.monotonic() - start > QUIET_S:
-                bar = _bar()
+                bar = _progress_bar()
                 bar.start()
                 task = bar.add_task(description, total=total)
             if bar is not None and task is not None:
@@ -46,7 +45,7 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
             bar.stop()
 
 
-def _bar():
+def _progress_bar():
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -56,10 +55,7 @@ def _bar():
 
 @contextlib.contextmanager
 def busy(description: str) -> Iterator[None]:
-    """Say what is going on once two seconds went by, for work that cannot be counted.
-
-    Where there is no terminal, a line every half minute says it.
-    """
+    """Show that work of unknown length is going on; lines on standard error if it is not a terminal."""
     if not sys.stderr.isatty():
         with Heartbeat(description):
             yield
@@ -78,12 +74,12 @@ def busy(description: str) -> Iterator[None]:
 
 
 class Heartbeat:
-    """Says its text on standard error every half minute; a context manager."""
+    """Prints its text to standard error at a regular interval; a context manager."""
 
     def __init__(self, text: str) -> None:
         self.text = text
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._beat, daemon=True)
+        self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> "Heartbeat":
         self._thread.start()
@@ -93,36 +89,36 @@ class Heartbeat:
         self._ended.set()
         self._thread.join()
 
-    def _beat(self) -> None:
-        while not self._ended.wait(BEAT_S):
+    def _run(self) -> None:
+        while not self._ended.wait(INTERVAL_S):
             say(self.text)
 
 
 def say(message: str) -> None:
-    """A line for the person who watches, on standard error."""
+    """Print a line for the user to standard error."""
     print(printable(message), file=sys.stderr, flush=True)
 
 
 def show(*lines: str) -> None:
-    """Lines of a result, on standard output."""
+    """Print lines of a result to standard output."""
     print("\n".join(map(printable, lines)), flush=True)
 
 
 def print_json(value: object) -> None:
-    """`value` as JSON on standard output; not-a-number becomes null, since JSON has none."""
-    print(json.dumps(_without_nan(value), indent=2, allow_nan=False))
+    """Print a value as JSON to standard output. NaN and infinity, which JSON does not have, become null."""
+    print(json.dumps(_replace_nan(value), indent=2, allow_nan=False))
 
 
-def _without_nan(value: object) -> object:
+def _replace_nan(value: object) -> object:
     if isinstance(value, float):
         return value if abs(value) < float("inf") else None
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: _replace_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
+        return [_replace_nan(item) for item in value]
     return value
 
 
 def in_db(value: float | None) -> str:
-    """A figure of a table, five characters wide."""
+    """A number of a table, five characters wide."""
     return "    -" if value is None else f"{value:5.2f}"

@@ -1,4 +1,4 @@
-"""`viewmend convert`: a capture of any format that is read, as a plain one."""
+"""`viewmend convert`: converts a capture of any supported format."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,49 +10,49 @@ import tyro
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Write a capture of any format that is read as a plain one: undistorted images, masks, cameras.json.
+    """Convert a capture of any supported format to our own: undistorted images, masks and cameras.json.
 
-    Or as a data set of RIFTCast (--to riftcast): JPEG images, masks as run lengths, calibration.json, dataset.json.
+    Or, with --to riftcast, to a RIFTCast data set: JPEG images, run-length masks, calibration.json and dataset.json.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
-    """The capture's folder, or the file that stands for it (a .smc file of DNA-Rendering, a meta file of RIFTCast)."""
+    """Folder of the capture, or the file that stands for it (a .smc file of DNA-Rendering, a RIFTCast meta file)."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Folder for what is written; it must not be in use."""
+    """Output folder; it must be new or empty."""
     to: Literal["plain", "riftcast"] = "plain"
-    """What is written."""
-    kind: str | None = None
-    """The source's format, as docs/formats.md names it; by default it is recognised."""
+    """Output format."""
+    format: str | None = None
+    """Format of the source, see docs/formats.md; by default it is recognised."""
     frames: str | None = None
-    """Which frames, as FIRST:END by index; either may be left out."""
+    """Range of frame indices, FIRST:END; either may be omitted."""
     scale: float = 1.0
-    """Scale of the images' sides, above 0 and at most 1; below 1 depth is left out."""
+    """Scale of the image sides, above 0 and at most 1. Below 1, depth is dropped."""
     cameras: tuple[str, ...] = ()
     """Names of the cameras to keep; by default all."""
     images: Literal["jpeg", "png"] = "png"
-    """Image files of a plain capture: exact, or smaller."""
+    """Image files of the plain format: lossless PNG, or smaller JPEG."""
 
 
 def run(options: Options) -> int:
-    """Run the command; the exit code."""
-    from viewmend.capture.part import CapturePart
-    from viewmend.capture.plain import open_capture
-    from viewmend.capture.plain_writer import write_capture
-    from viewmend.capture.riftcast_writer import write_riftcast
+    """Run the command and return the exit code."""
     from viewmend.cli.checks import chosen_times
     from viewmend.cli.console import say, track
+    from viewmend.data.formats.riftcast import write_riftcast
+    from viewmend.data.native_capture import open_capture
+    from viewmend.data.native_writer import write_capture
+    from viewmend.data.source import CaptureSubset
 
     if not 0 < options.scale <= 1:
         raise ValueError(f"expected --scale above 0 and at most 1, got {options.scale}; choose again")
-    capture = open_capture(options.source, options.cameras or None, options.kind)
-    part = CapturePart(capture, chosen_times(options.frames, len(capture.frame_ids)), options.scale)
+    capture = open_capture(options.source, options.cameras or None, options.format)
+    subset = CaptureSubset(capture, chosen_times(options.frames, len(capture.frame_ids)), options.scale)
 
     def progress(times: Iterable[int]) -> Iterable[int]:
         return track(times, options.out.name)
 
     if options.to == "riftcast":
-        write_riftcast(part, options.out, progress=progress)
+        write_riftcast(subset, options.out, progress=progress)
     else:
-        write_capture(part, options.out, images=options.images, progress=progress)
-    say(f"{options.out}: {len(part.cameras)} cameras, {len(part.frame_ids)} frames")
+        write_capture(subset, options.out, images=options.images, progress=progress)
+    say(f"{options.out}: {len(subset.cameras)} cameras, {len(subset.frame_ids)} frames")
     return 0

@@ -1,44 +1,266 @@
-"""`viewmend evaluate`: methods on fixed scenes and on captures, in tables and pictures."""
+"""`viewmend evaluate`: compare methods on synthetic scenes and captures, in tables and images."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.evaluating import RunOptions
+from viewmend.cli.checks import check_device
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from viewmend.data.holdout.scenes import LeaveOneOutScene
+    from viewmend.evaluation.report import Report
+    from viewmend.evaluation.result_cache import CellStore
+    from viewmend.evaluation.scene_run import RunSettings
+
+WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
+"""Files in OUT besides cells, models and samples."""
+LONG_SETS = ("P-long", "Q-long", "P-turn")
+POSITIVE = ("frames", "every", "scenes", "size", "jobs", "num_source_views", "shown")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Options of all commands that evaluate."""
+
+    out: Path
+    """Folder for the results."""
+    weights: Path | None = None
+    """Folder of published weights, searched first; methods and metrics without weights are n/a (viewmend weights)."""
+    performers: Path | None = None
+    """Folder of the people of set Q: glTF characters in it or in its test/, BVH motions in its motions/test/, motions/
+    or next to them."""
+    motions: Path | None = None
+    """Folder of BVH motions, if they are elsewhere."""
+    format: str | None = None
+    """Format of the captures (docs/formats.md); recognised by default."""
+    inputs: str = "all"
+    """Cameras of a capture to use: all, or a number, spread evenly around; several numbers separated by commas."""
+    num_source_views: int = 3
+    """Cameras that colour a view: the closest to it."""
+    error_rule: str | None = None
+    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
+    themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
+    that each method is made for. Scores in the holes cover the same pixels with every rule."""
+    refine_fraction: float = 0.15
+    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
+    frames: int | None = None
+    """Frames of each scene, from the first. By default 10 of P and Q, all of a capture. Long sets have 41, of which the
+    last 10 are scored."""
+    every: int = 1
+    """Use only every n-th scene of each set: a quick look at all kinds of scenes."""
+    scenes: int | None = None
+    """Largest number of scenes of each set, after `every`."""
+    size: int = 512
+    """Width and height of the views of P, Q and the long sets."""
+    background: Literal["black", "stage"] = "black"
+    """Background behind the people of P: a stage for models without masks."""
+    score_background: Literal["black", "white"] = "black"
+    """Background on which views and truth are scored. The paper uses white; whole-image scores on different
+    backgrounds are not comparable."""
+    ssim: Literal["gaussian", "uniform7"] = "gaussian"
+    """Window of SSIM: Gaussian of 11 x 11 pixels, or uniform of 7 x 7."""
+    jobs: int = 1
+    """Number of processes. Milliseconds are comparable only within a run."""
+    ray: str | None = None
+    """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
+    device: str = "cpu"
+    """Device: cpu, or cuda."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Precision of our networks."""
+    shown: int = 12
+    """Scenes of each set with images in report.html; sheets/ has all of them."""
+    video: bool = True
+    """Leave videos out of report.html."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options(RunOptions):
-    """Compare methods on views of cameras that are left out, and write tables and pictures to --out.
+    """Compare methods on views of held-out cameras, and write tables and images to --out.
 
-    OUT gets report.html to look at, report.md, report.csv, report.json, sheets/ with a picture of each scene, and
-    cells/ with what was computed: a run that was stopped goes on from there, and another method or scene costs only
-    itself. docs/evaluation.md says what is measured.
+    OUT gets report.html, report.md, report.csv, report.json, sheets/ with one image per scene, and cells/ with all
+    results: an interrupted run resumes from there, and only new methods and scenes are computed. docs/evaluation.md
+    defines the scores.
     """
 
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="P|Q|P-long|Q-long|P-turn|CAPTURE...")]
-    """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same for 41 frames,
-    the last ten scored, with a whole past. P-turn: people who turn. Anything else is a capture: each of its
-    cameras is left out in turn; or a file of `viewmend splits`, whose scenes for tests are taken."""
+    """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same with 41 frames,
+    of which the last ten are scored after a full window. P-turn: people who turn. CAPTURE: each camera of a capture is
+    held out in turn; or a file of `viewmend splits`, whose test scenes are used."""
     methods: str = "all"
-    """Names with commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model's name, a
-    model's folder, a baseline like dstt-o-def, FILE.py:NAME; all for everything that is shipped, baselines for those
+    """Names separated by commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model,
+    a model's folder, a baseline such as dstt-o-def, FILE.py:NAME; 'all' for all shipped methods, 'baselines' for those
     of the paper's first table."""
     json: bool = False
-    """Write the report as JSON to standard output, too."""
+    """Also write the report as JSON to standard output."""
 
 
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.console import show
-    from viewmend.cli.evaluating import evaluate, report_folder, write_report
-    from viewmend.evaluation.report_data import report_json
-    from viewmend.evaluation.report_markdown import summary
+    from viewmend.evaluation.report import report_json, summary
 
     with report_folder(options.out):
-        found = evaluate(options, options.sets, options.methods)
-        write_report(options, found)
-    text = report_json(found.report) if options.json else summary(found.report)
+        report = evaluate(options, options.sets, options.methods)
+    text = report_json(report) if options.json else summary(report)
     show(*text.rstrip().split("\n"))
-    return 1 if found.failed else 0
+    return exit_code(report)
+
+
+def exit_code(report: "Report") -> int:
+    """1 if a cell failed, else 0."""
+    return int(any(cell.error is not None for cell in report.cells))
+
+
+@contextmanager
+def report_folder(out: Path) -> "Iterator[None]":
+    """Lock OUT for this run, and record its files.
+
+    Raises:
+        ValueError: another run writes there, or a foreign file has the name of one that will be written.
+    """
+    from viewmend.utils.atomic_writes import remove_partial_files
+    from viewmend.utils.output_folder import OutputFolder
+
+    cells = any((out / "cells").glob("*--*--*.json"))
+    with OutputFolder(out) as folder:
+        if folder.listed or not cells:  # a folder of cells without a manifest is of an early version
+            folder.check_own_files(*WRITTEN)
+        folder.made(*WRITTEN, changing=True)  # a run that is killed leaves files that the next may replace
+        for place in ("cells", "sheets"):
+            remove_partial_files(out / place)
+        try:
+            yield
+        finally:
+            folder.made(*WRITTEN)
+
+
+def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Report":
+    """Run the methods on the sets, and write the report to OUT; cells are in the order of sets and methods.
+
+    Raises:
+        ValueError: an option is not valid.
+    """
+    _check(options, sets)
+    from viewmend.cli.console import say, track
+    from viewmend.evaluation.report import make_report
+    from viewmend.evaluation.result_cache import CellStore
+    from viewmend.evaluation.runner import run_evaluation
+    from viewmend.evaluation.scores import available_networks
+    from viewmend.models.registry import method_names, split_missing
+
+    if options.weights is not None:
+        _search_first(options.weights)
+    scenes = [scene for name in sets for scene in scenes_of(name, options)]
+    names = method_names(methods)
+    available, missing = split_missing(names, options.device)
+    networks, missing_networks = available_networks()
+    settings = _settings(options, networks)
+    if missing or missing_networks:
+        say(f"n/a (the report has the reasons): {', '.join(missing | missing_networks)}")
+    store, cells = CellStore(options.out / "cells"), []
+    steps = run_evaluation(scenes, available, store, settings, options.jobs, options.ray)
+    total = len(scenes) * len(available)
+    for cell in track((cell for found in steps for cell in found), "evaluating", total):
+        cells.append(cell)
+        if cell.error is not None:
+            say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
+    order = {key: n for n, key in enumerate((s.name, m) for s in scenes for m in names)}
+    cells.sort(key=lambda cell: order[cell.key.scene, cell.key.method])
+    report = make_report(cells, names, settings, missing, missing_networks)
+    _write(options, report, store)
+    return report
+
+
+def _write(options: RunOptions, report: "Report", store: "CellStore") -> None:
+    from viewmend.cli.console import say
+    from viewmend.evaluation.report import markdown, report_csv, report_json
+    from viewmend.evaluation.report_page import page, write_sheets
+    from viewmend.utils.atomic_writes import write_text
+
+    if not report.cells and (options.out / "report.json").exists():
+        raise ValueError(f"{options.out}: expected results for the report there, got none; it is unchanged")
+    forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
+    forms["html"] = page(report, store, options.shown, options.video)
+    for name, text in forms.items():
+        write_text(options.out / f"report.{name}", text)
+    write_sheets(report.cells, store, options.out / "sheets")
+    say(f"wrote {options.out}")
+
+
+def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
+    """The scenes of a synthetic set, of a capture, or of a file of splits.
+
+    Raises:
+        ValueError: the options do not fit the set.
+    """
+    from viewmend.data.holdout import studio_scenes as studio
+    from viewmend.data.holdout.capture_scenes import capture_set, is_splits, split_scenes
+
+    part = slice(None, options.scenes and options.every * options.scenes, options.every)
+    if name in LONG_SETS and options.frames not in (None, studio.LONG_FRAMES):
+        raise ValueError(
+            f"expected no --frames with {name}, whose {studio.LONG_FRAMES} frames make a full window, got "
+            f"{options.frames}; leave it out, or use P or Q"
+        )
+    frames = studio.LONG_FRAMES if name in LONG_SETS else options.frames or studio.FRAMES
+    if name == "P-turn":
+        return list(studio.turning_set(options.size)[part])
+    if name in ("P", "P-long", "Q", "Q-long"):
+        if name[0] == "P":
+            scenes = studio.procedural_set(frames, options.size, options.background)
+        elif options.performers is None:
+            raise ValueError(f"expected --performers DIR for set {name}, got none; P needs nothing")
+        else:
+            scenes = studio.performer_set(options.performers, options.motions, frames, options.size)
+        return list((studio.lengthened(scenes) if name in LONG_SETS else scenes)[part])
+    if is_splits(Path(name)):
+        return list(split_scenes(Path(name), options.frames)[part])
+    inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
+    if not inputs:
+        raise ValueError("expected --inputs all or a number of cameras, got none; leave it out for all")
+    return [s for number in inputs for s in capture_set(Path(name), number, options.frames, options.format)[part]]
+
+
+def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
+    from viewmend.evaluation.scene_run import RunSettings
+    from viewmend.rendering.view import RenderConfig
+    from viewmend.stream import StreamConfig
+
+    render = RenderConfig(
+        cameras=options.num_source_views, error_rule=options.error_rule, refine_fraction=options.refine_fraction
+    )
+    return RunSettings(
+        device=options.device,
+        precision=options.precision,
+        stream=StreamConfig(render=render, memory_mb=None),
+        ssim=options.ssim,
+        background=options.score_background,
+        networks=networks,
+    )
+
+
+def _check(options: RunOptions, sets: tuple[str, ...]) -> None:
+    wrong = [n for n in POSITIVE if (v := getattr(options, n)) is not None and v < 1]
+    if wrong or not sets:
+        got = f"--{wrong[0].replace('_', '-')} {getattr(options, wrong[0])}" if wrong else "no set"
+        raise ValueError(f"expected at least one set, and positive numbers, got {got}; P needs nothing")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+    check_device(options.device)
+
+
+def _search_first(folder: Path) -> None:
+    """Search this folder for weights first, also in worker processes."""
+    import os
+
+    from viewmend.metrics.weights import FOLDERS_VARIABLE
+
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected a folder of weights, found none; check --weights")
+    others = os.environ.get(FOLDERS_VARIABLE)
+    os.environ[FOLDERS_VARIABLE] = os.pathsep.join([str(folder.resolve()), *([others] if others else [])])

@@ -1,4 +1,4 @@
-"""`viewmend export-scene`: a capture as a scene for Blender, Unreal, Unity, Houdini and their like."""
+"""`viewmend export-scene`: exports a capture as a scene for Blender, Unreal, Unity, Houdini and similar programs."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,46 +9,46 @@ import tyro
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from viewmend.capture.prepare import PreparedCapture
-    from viewmend.capture.source import CaptureSource
+    from viewmend.data.prepare import PreparedCapture
+    from viewmend.data.source import CaptureSource
+    from viewmend.frame_cache import CachedFrame
     from viewmend.geometry.cameras import Cameras
-    from viewmend.observation import Observation
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Write a capture as a scene that engines take.
+    """Export a capture as a scene for 3D engines.
 
-    OUT gets, for each time, the hull with the cameras' colours (hull/*.glb and *.ply) and the points that the mended
-    views show (points/*.ply); for each view and time its picture, RGB and alpha (rgba/VIEW/*.png), and z-depth in
-    metres as 32-bit float (depth/VIEW/*.exr, 0 where there is no subject); and the cameras of the rig and of the views,
-    as USD (cameras.usda) and as a script that opens all of it in Blender (open_in_blender.py). Metres, +y up.
+    Written to OUT, per frame: the hull in the cameras' colours (hull/*.glb and *.ply) and the points of the completed
+    views (points/*.ply). Per view and frame: its image with alpha (rgba/VIEW/*.png) and its z-depth in metres as 32-bit
+    float (depth/VIEW/*.exr, 0 where there is no subject). And the cameras of the rig and of the views, as USD
+    (cameras.usda) and in a script that opens everything in Blender (open_in_blender.py). Metres, +y up.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
-    """A capture of any format that is read, with masks."""
+    """A capture of any supported format, with masks."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Folder for the scene."""
-    kind: str | None = None
-    """The capture's format, as docs/formats.md names it; by default it is recognised."""
+    """Folder to write the scene to."""
+    format: str | None = None
+    """The capture's format, as named in docs/formats.md; recognised by default."""
     views: int = 8
-    """How many views about the subject are mended at every time."""
+    """Number of views around the subject that are completed in every frame."""
     path: Path | None = None
-    """A JSON file of views instead, as `viewmend mend --path` takes it; every one is mended at every time."""
+    """A JSON file of views to use instead, as for `viewmend mend --path`; all are completed in every frame."""
     frames: str | None = None
-    """Which frames, as FIRST:END by index; either may be left out."""
+    """Frames to export, as FIRST:END by index; either may be left out."""
     longest_px: int | None = None
-    """Reduce images to at most this length of their longer side; views about the subject are as large."""
+    """Downscale images to at most this length of their longer side; views around the subject have the same size."""
     model: str | None = None
-    """What mends: a shipped model's name or a model's folder, or any method that `viewmend evaluate` takes."""
+    """Name of a shipped model, a model's folder, or any method of `viewmend evaluate`."""
     least_confidence: float = 0.5
-    """Pixels less sure than this are no points, 0 to 1, where the model tells."""
+    """Pixels below this confidence, 0 to 1, make no points, if the model predicts a confidence."""
     align: bool = True
-    """Take the calibration as it is; by default a shift that all images share is undone."""
+    """Use the calibration as it is; by default, a shift that all images share is corrected."""
     match_colours: bool = True
-    """Leave the cameras' colours as they are; by default they are matched, as `viewmend mend` does."""
+    """Keep the cameras' colours as they are; by default they are matched, as in `viewmend mend`."""
     device: str = "cpu"
-    """Where to compute: cpu, or cuda."""
+    """Device to compute on: cpu, or cuda."""
 
 
 def run(options: Options) -> int:
@@ -58,28 +58,28 @@ def run(options: Options) -> int:
             f"expected --views of at least 1 and --least-confidence from 0 to 1, got {options.views} and "
             f"{options.least_confidence}; choose again"
         )
-    from viewmend.capture.prefetch import prefetch
-    from viewmend.capture.prepare import open_masked
     from viewmend.cli.checks import chosen_times, load_named
     from viewmend.cli.console import say, track
-    from viewmend.export.depth_files import demand_openexr
-    from viewmend.export.scene import RESULTS, export_scene
-    from viewmend.output_folder import OutputFolder
+    from viewmend.data.prepare import open_masked
+    from viewmend.data.source import prefetch
+    from viewmend.export.scene import RESULTS, check_openexr, export_scene
     from viewmend.stream import Stream
+    from viewmend.utils.output_folder import OutputFolder
 
-    demand_openexr()
-    opened = open_masked(options.capture, kind=options.kind)
+    check_openexr()
+    opened = open_masked(options.capture, format=options.format)
     times = chosen_times(options.frames, len(opened.frame_ids))
     stream = Stream(load_named(options.model, options.device), bounds=opened.bounds)
     with OutputFolder(options.out) as folder:
-        folder.demand_own(*RESULTS)
+        folder.check_own_files(*RESULTS)
         capture = _prepared(options, opened, times[0])
-        first = stream.push(capture.read(times[0]).to(options.device))
+        frame = capture.read(times[0]).to(options.device)
+        stream.calibrate(frame)
+        first = stream.add_frame(frame)
         views = _views(options, first, capture.cameras, capture.up)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))
-        shown = track(frames, "exporting", len(times))
         written = export_scene(
-            shown,
+            track(frames, "exporting", len(times)),
             stream,
             views,
             capture.cameras,
@@ -90,15 +90,15 @@ def run(options: Options) -> int:
         )
         folder.publish(*RESULTS)
     say(
-        f"{options.out}: {written.times} times of {written.views} views; {written.vertices} vertices of hulls, "
+        f"{options.out}: {written.frames} frames of {written.views} views; {written.vertices} hull vertices, "
         f"{written.points} points"
     )
     return 0
 
 
 def _prepared(options: Options, opened: "CaptureSource", first: int) -> "PreparedCapture":
-    from viewmend.capture.prepare import prepare
-    from viewmend.cli.prepared import say_prepared
+    from viewmend.cli.checks import log_preparation
+    from viewmend.data.prepare import prepare
 
     capture = prepare(
         opened,
@@ -107,19 +107,20 @@ def _prepared(options: Options, opened: "CaptureSource", first: int) -> "Prepare
         match_colours=options.match_colours,
         first=first,
     )
-    say_prepared(capture)
+    log_preparation(capture)
     return capture
 
 
-def _views(options: Options, first: "Observation", rig: "Cameras", up: "Tensor | None") -> "Cameras":
-    from viewmend.capture.camera_path import read_path
+def _views(options: Options, first: "CachedFrame", rig: "Cameras", up: "Tensor | None") -> "Cameras":
+    from viewmend.data.camera_path import read_camera_path
     from viewmend.geometry.orbit import orbit_around
     from viewmend.geometry.proxy import GeometryProxy
 
     if options.path is not None:
-        return read_path(options.path, rig)
-    assert isinstance(first.proxy, GeometryProxy), "no other geometry was pushed"
+        return read_camera_path(options.path, rig)
+    assert isinstance(first.proxy, GeometryProxy), "no other geometry was given"
     center, count = first.proxy.mesh.vertices.mean(0).cpu(), options.views
     around = orbit_around(center, rig, up, count, count)
-    back = count > 2 and around.centers[1].allclose(around.centers[-1], atol=1e-4)
-    return orbit_around(center, rig, up, count, 2 * count - 2) if back else around  # a swing: only there
+    # A rig on one side makes the path swing to and fro: then only its way there is used.
+    swings = count > 2 and around.centers[1].allclose(around.centers[-1], atol=1e-4)
+    return orbit_around(center, rig, up, count, 2 * count - 2) if swings else around

@@ -1,4 +1,4 @@
-"""The files of `viewmend mend`: views as rendered, mended and true, and a contact sheet. All of them, or none."""
+"""The files of `viewmend mend`: rendered, completed and true views, and a contact sheet. All of them, or none."""
 
 import shutil
 from collections.abc import Iterator
@@ -6,16 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from torch import Tensor
 
-from viewmend.capture.images import MAX_DEPTH_M, read_rgb, read_rgba, write_depth, write_image
-from viewmend.contact_sheet import Tile, contact_sheet, picture
+from viewmend.data.images import MAX_DEPTH_M, read_rgb, read_rgba, write_depth, write_image
+from viewmend.data.videos import write_mp4, write_webm
 from viewmend.evaluation.mending import MendStep
-from viewmend.export.cutout import cutout
+from viewmend.export.scene import cutout
 from viewmend.geometry.hull import FOREGROUND
-from viewmend.output_folder import OutputFolder
-from viewmend.views import CompletedView
+from viewmend.types import CompletedView
+from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
+from viewmend.utils.output_folder import OutputFolder
 
 SHEET_ROWS = 4
 RESULTS = (
@@ -27,23 +28,16 @@ DIFFERENCE_GAIN = 3.0
 
 
 class MendOutput:
-    """Takes one step after another; a context manager that puts the files into `out` when all went well.
-
-    Until then they lie in a hidden folder of it, which an error removes.
-    """
+    """Context manager that collects views in a hidden draft folder, and publishes the files if there was no error."""
 
     def __init__(self, out: Path, fps: float, alpha: bool = False, depth: bool = False):
-        """Begin.
+        """Create the output.
 
         Args:
-            out: where to write.
-            fps: of the films.
+            out: folder for the files.
+            fps: frame rate of the videos.
             alpha: write cutout/*.png, RGB and straight alpha, and cutout.webm.
-            depth: write depth/*.png, see `depth_picture_m`.
-
-        Raises:
-            ValueError: `out` has results of something else.
-            OSError: `out` cannot be made.
+            depth: write depth/*.png, see `depth_image_m`.
         """
         self._folder, self._fps, self._alpha, self._depth = OutputFolder(out), fps, alpha, depth
         self._draft = self._folder.draft
@@ -52,22 +46,22 @@ class MendOutput:
         self._stride = 1
 
     def __enter__(self) -> "MendOutput":
-        """Begin.
+        """Lock the folder.
 
         Raises:
-            ValueError: files lie there that no earlier run made, or another run writes there.
-            OSError: the folder cannot be made.
+            ValueError: there are files of no earlier run, or another run writes there.
+            OSError: the folder cannot be created.
         """
         self._folder.__enter__()
         try:
-            self._folder.demand_own(*RESULTS)
+            self._folder.check_own_files(*RESULTS)
         except ValueError:
             self._folder.__exit__()
             raise
         return self
 
     def add(self, step: MendStep) -> None:
-        """Write one view and, of a few spread over the run, remember a row of the sheet."""
+        """Write one view, and keep a few views, spread over the run, as rows of the contact sheet."""
         completed, number = step.completed, f"{self._count:06d}.png"
         shown = {"mended": step.mended, "holes": completed.view.error[None], "rendered": step.rendered}
         for name, image in (shown if step.truth is None else shown | {"truth": step.truth}).items():
@@ -75,7 +69,7 @@ class MendOutput:
         if self._alpha:
             write_image(self._draft / "cutout" / number, cutout(completed))
         if self._depth:
-            write_depth(self._draft / "depth" / number, depth_picture_m(completed))
+            write_depth(self._draft / "depth" / number, depth_image_m(completed))
         if self._count % self._stride == 0:
             if len(self._rows) == SHEET_ROWS:
                 self._rows, self._stride = self._rows[::2], 2 * self._stride
@@ -88,48 +82,43 @@ class MendOutput:
             if kind is None and self._count:
                 write_image(self._draft / "contact_sheet.png", contact_sheet(self._rows, 260, 400))
                 if self._count > 1:
-                    self._to_films()
+                    self._write_videos()
                 self._folder.publish(*RESULTS)
         finally:
             self._folder.__exit__()
 
-    def _to_films(self) -> None:
-        """Make films of the pictures, where PyAV is installed; that of the mended ones replaces them."""
-        from viewmend.capture.video_writer import write_mp4, write_webm
-
-        try:
-            write_mp4(self._draft / "mended.mp4", self._read("mended"), self._fps)
-        except ImportError:
-            return
+    def _write_videos(self) -> None:
+        """Encode the images as videos; mended.mp4 replaces its images."""
+        write_mp4(self._draft / "mended.mp4", self._read("mended"), self._fps)
         kinds = [name for name in ("rendered", "mended", "truth") if (self._draft / name).is_dir()]
         sides = zip(*(self._read(name) for name in kinds), strict=True)
         panels = (side_by_side(dict(zip(kinds, images, strict=True))) for images in sides)
         write_mp4(self._draft / "compared.mp4", panels, self._fps)
         if self._alpha:
-            cut = (read_rgba(file, str(file)) for file in self._pictures("cutout"))
+            cut = (read_rgba(file, str(file)) for file in self._images("cutout"))
             write_webm(self._draft / "cutout.webm", cut, self._fps)
         shutil.rmtree(self._draft / "mended")
 
-    def _pictures(self, name: str) -> list[Path]:
+    def _images(self, name: str) -> list[Path]:
         return sorted((self._draft / name).glob("*.png"))
 
     def _read(self, name: str) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        return (read_rgb(file, str(file)) for file in self._pictures(name))
+        return (read_rgb(file, str(file)) for file in self._images(name))
 
 
-def depth_picture_m(completed: CompletedView) -> Float32[np.ndarray, "height width"]:
-    """Refined z-depth of the subject, else the proxy's, metres; 0 where there is none, 65.535 from there on."""
+def depth_image_m(completed: CompletedView) -> Float32[np.ndarray, "height width"]:
+    """z-depth of the subject in metres: the refined depth, or the proxy's; 0 without subject, clamped at 65.535."""
     return completed.surface_depth.clamp(max=MAX_DEPTH_M).float().cpu().numpy()
 
 
-def side_by_side(pictures: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "_height _width 3"]:
-    """Whole views in their own size, with their names above."""
-    width = max(image.shape[1] for image in pictures.values())
-    return contact_sheet([[Tile(name, image) for name, image in pictures.items()]], width)
+def side_by_side(images: dict[str, UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "_height _width 3"]:
+    """Whole views in their own size with their names above."""
+    width = max(image.shape[1] for image in images.values())
+    return contact_sheet([[Tile(name, image) for name, image in images.items()]], width)
 
 
 def sheet_row(step: MendStep) -> list[Tile]:
-    """Input cameras, rendered, holes, mended, what the inpainter tells, truth, differences; cut to the subject."""
+    """Source cameras, rendered, holes, completed, alpha and confidence, truth, differences; cropped to the subject."""
     completed, view, truth = step.completed, step.completed.view, step.truth
     empty = float(step.background == "white")
     box = _box(view.mask > 0 if truth is None else (view.mask > 0) | (truth != empty).any(0))
@@ -138,23 +127,19 @@ def sheet_row(step: MendStep) -> list[Tile]:
         own = step.frame.select([name])
         assert own.mask is not None, "frames without masks are refused"
         tiles.append(Tile(f"input {name}", picture(own.rgb[0])[_box(own.mask[0] > FOREGROUND)]))
-    images = {f"rendered, frame {view.time}": step.rendered, "holes": _holes_marked(step), "mended": step.mended}
+    magenta = torch.tensor(HOLE_COLOUR, device=step.rendered.device)[:, None, None]
+    holes = torch.where(view.holes, magenta, step.rendered)
+    images = {f"rendered, frame {view.time}": step.rendered, "holes": holes, "completed": step.mended}
     images |= {name: image[None] for name, image in completed.images.items() if name in ("alpha", "confidence")}
     if truth is not None:
         images["truth"] = truth
-        for name, rgb in {"rendered": step.rendered, "mended": step.mended}.items():
+        for name, rgb in {"rendered": step.rendered, "completed": step.mended}.items():
             images[f"{name} - truth, x{DIFFERENCE_GAIN:.0f}"] = (DIFFERENCE_GAIN * (rgb - truth).abs()).clamp(0, 1)
     return tiles + [Tile(name, picture(image)[box]) for name, image in images.items()]
 
 
-def _holes_marked(step: MendStep) -> Float[Tensor, "3 height width"]:
-    """F with its holes in magenta."""
-    colour = torch.tensor(HOLE_COLOUR, device=step.rendered.device)[:, None, None]
-    return torch.where(step.completed.view.holes, colour, step.rendered)
-
-
 def _box(mask: Tensor) -> tuple[slice, slice]:
-    """Rows and columns of what is not empty, and a margin; all where it is empty."""
+    """Rows and columns of the mask with a margin; everything for an empty mask."""
     rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
     if not len(rows):
         return slice(None), slice(None)

@@ -1,4 +1,4 @@
-"""`viewmend evaluate parity`: whether our baselines compute what the published networks compute."""
+"""`viewmend evaluate parity`: compare our baselines with the published networks."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +11,14 @@ import tyro
 class Options:
     """Compare DSTT, FuseFormer and E2FGVI, and their variants with memory, with outputs of the published networks.
 
-    Each file says which network to run and from which seed its weights and input are made. The largest absolute
-    difference is printed; the exit code is 1 where one is above 1e-3 or is not a number.
+    Each file names the network, and the seed of its weights and input. Prints the largest absolute difference; the exit
+    code is 1 if one is above 1e-3 or not a number.
     """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """Parity files (.npz)."""
     device: str = "cpu"
-    """Where to run the networks."""
+    """Device: cpu, or cuda."""
     json: bool = False
     """Write one JSON list to standard output and nothing else there."""
 
@@ -27,9 +27,9 @@ def run(options: Options) -> int:
     """Run the command; the exit code."""
     from dataclasses import asdict
 
-    from viewmend.baselines.parity import TOLERANCE, check
     from viewmend.cli.checks import check_device
     from viewmend.cli.console import busy, print_json, show
+    from viewmend.contrib.baselines.parity import TOLERANCE, check
 
     if not options.files:
         raise ValueError("expected one or more parity files, got none; see viewmend evaluate parity --help")

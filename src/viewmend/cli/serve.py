@@ -1,179 +1,176 @@
-"""`viewmend serve`: walk around the subject in a browser, while it happens."""
+"""`viewmend serve`: a page on which a person moves around the subject, live."""
 
+import os
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import tyro
 
-from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS
+from viewmend.utils.plugins import import_object
 
 if TYPE_CHECKING:
-    from viewmend.capture.source import CaptureSource
-    from viewmend.inpainting.protocol import ViewInpainter
-    from viewmend.live.frames import FrameSupply
+    from viewmend.data.source import CaptureSource
+    from viewmend.live.frame_source import FrameSource
     from viewmend.live.server import ServerConfig
+    from viewmend.models.base import Inpainter
     from viewmend.stream import StreamConfig
 
 TOKEN_VARIABLE = "VIEWMEND_TOKEN"
+RIG_SOURCE = "viewmend.contrib.live_rig.frames:RigSource"
+RAY_SETTINGS, SERVE_ON_RAY = "viewmend.contrib.ray.replicas:ManyViewers", "viewmend.contrib.ray.replicas:serving"
+"""Optional parts, as MODULE:NAME; those of the server itself are in `live.server.EXTENSIONS`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Open a page where a person walks around the subject: rendered, its holes, and mended, live.
+    """Open a page on which a person moves around the subject, live: as rendered, with its holes, or inpainted.
 
-    The page is at the address that is printed; nothing else is needed, and it asks nothing of anywhere else. Only this
-    machine can open it, unless --host and --token say otherwise. The page itself shows the keys (press ?);
-    docs/live.md has the rest: the clock, the budget, single pictures over HTTP, how to push a live rig;
-    docs/guide/live-rig.md the rig's file.
+    The command prints the page's address. Only this machine can open it unless --host and --token are given. See
+    docs/live.md for the page, the budget, single images over HTTP and live rigs.
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = "studio"
-    """A capture of any format that is read, with masks; a rig's TOML file, which names its cameras (webcams, network
-    streams, videos as if they were live); 'studio' for a synthetic scene made on the spot; or 'live' for a rig that
-    pushes its frames."""
-    kind: str | None = None
-    """The capture's format, as docs/formats.md names it; by default it is recognised."""
+    """A capture with masks; a TOML file that lists the cameras of a live rig (docs/guide/live-rig.md); 'studio' for a
+    synthetic scene; or 'live' for a rig that pushes its frames."""
+    format: str | None = None
+    """The capture's format, as named in docs/formats.md; by default it is recognised."""
     port: int = 8008
     """Port; 0 takes a free one."""
     host: str = "127.0.0.1"
-    """Address to bind to; another than this machine's own needs --token."""
+    """Address to bind to; an address that other machines can reach needs --token."""
     token: str | None = None
-    """What viewers must know, 16 signs or more. Who lists this machine's processes sees it here, not in --token-file or
-    in the variable VIEWMEND_TOKEN."""
+    """Access token, at least 16 characters. It is visible in the process list; prefer --token-file or the environment
+    variable VIEWMEND_TOKEN."""
     token_file: Path | None = None
-    """A file whose first line is the token."""
+    """File whose first line is the token."""
     model: str | None = None
-    """A shipped model's name or a model's folder; 'telea' and 'nearest' are the classical fills. By default 'views',
-    as `viewmend mend` has: of a view whose time does not suffice for all of it, the most useful part is mended."""
+    """A shipped model's name or a model's folder; 'telea' and 'nearest' are classical fills. By default 'views'."""
     fps: float | None = None
-    """Frames a second, instead of the capture's."""
+    """Frames per second; by default those of the capture."""
     budget_ms: float = 100.0
-    """Milliseconds that a view may take: what it is made with is chosen by that, frame by frame. 0: always all."""
-    width: int = 1024
-    """The longest side of the cameras' images: larger ones are made smaller when they are read."""
+    """Milliseconds that a view may take; quality is reduced to hold this time. 0: always full quality."""
+    max_image_size: int = 1024
+    """Longest side of the cameras' images, in pixels; larger images are reduced when they are read."""
     align: bool = True
-    """Take a capture's calibration as it is. By default it is aligned as `viewmend mend` does."""
+    """Use the calibration as it is. By default it is aligned as in `viewmend mend`."""
     match_colours: bool = True
-    """Leave the cameras' colours as they are. By default they are matched as `viewmend mend` does."""
+    """Use the cameras' colours as they are. By default they are matched as in `viewmend mend`."""
     context: int = 3
-    """How many cameras colour a view and are the inpainter's context."""
+    """Number of cameras that colour a view and are the inpainter's context."""
     error_rule: str | None = None
-    """What is mended, as `viewmend mend` takes it; by default what the model is made for."""
-    wrong_fraction: float = 0.15
-    """Error rule 'wrong': at most this part of the subject is mended, beside what no camera colours."""
+    """Pixels to inpaint, as in `viewmend mend`: 'holes', 'all', 'predicted', or FILE.py:NAME. By default the rule that
+    the model is made for."""
+    refine_fraction: float = 0.15
+    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
     viewers: int = 8
-    """How many may watch at once; with --ray, at each replica."""
+    """Maximum number of viewers; with --ray, per replica."""
     riftcast_port: int | None = None
-    """A port of this machine at which RIFTCast's own clients get their views, too (needs viewmend[riftcast])."""
+    """Port on this machine for RIFTCast's own clients."""
     broadcast: str | None = None
-    """WIDTHxHEIGHT of a film for any number who watch at /watch; on the page a viewer goes on air (needs
-    viewmend[video])."""
+    """WIDTHxHEIGHT of a video for any number of people at /watch; one viewer controls the broadcast view."""
     ray: str | None = None
-    """Address of a Ray cluster whose machines render: HOST:PORT, auto, or local (needs viewmend[ray])."""
+    """Address of a Ray cluster that renders: HOST:PORT, auto, or local (needs viewmend[ray])."""
     replicas: int = 2
-    """With --ray: how many processes render, at least."""
-    most_replicas: int | None = None
-    """With --ray: how many render when there are many viewers; by default as many as always."""
+    """With --ray: minimum number of rendering processes."""
+    max_replicas: int | None = None
+    """With --ray: maximum number of rendering processes; by default --replicas."""
     cameras: int = 8
-    """Cameras of the studio's ring."""
+    """Number of cameras of the studio."""
     frames: int = 60
-    """Length of the studio's scene."""
+    """Number of frames of the studio's scene."""
     size: int = 320
-    """Width and height of the studio's images."""
-    seed: int = PROCEDURAL_SEEDS["test"][1]
-    """Seed of the studio's scene."""
+    """Width and height of the studio's images, in pixels."""
+    seed: int | None = None
+    """Seed of the studio's scene; by default one that no model was trained with."""
     device: str = "cpu"
-    """Where to compute: cpu, or cuda."""
+    """Device to compute on: cpu or cuda."""
     memory_mb: float = 3000.0
-    """Memory for frames at hand and what was computed of them; with --ray, half of it is what processes share."""
+    """Memory for frames and what is computed from them; with --ray, half of it is the processes' shared memory."""
 
 
 def run(options: Options) -> int:
     """Serve until interrupted."""
     _check(options)
-    try:
-        import starlette  # noqa: F401
-        import uvicorn  # noqa: F401
-    except ImportError:
-        raise ValueError("viewmend serve needs its extra 'live'; from the clone: pip install -e '.[live]'") from None
-    import os
-
-    # Before torch is loaded. Its threads would spin between two pieces of work, on cores that a browser may need.
+    # Before torch is imported: idle threads must not spin on cores that a browser may need.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # what a pushed image may claim to be
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # of a pushed image
     if options.ray is not None:
-        from viewmend.cli.serving_many import serve_many
-
-        serve_many(options)
+        _serve_on_ray(options, options.ray)
     from viewmend.cli.console import say
     from viewmend.live.listener import Server
-    from viewmend.live.memory import loaded, set_up
     from viewmend.live.protocol import token_query
     from viewmend.live.renderer import Renderer
-    from viewmend.live.riftcast_service import RiftcastService, listen
     from viewmend.live.server import LiveServer
     from viewmend.live.service import RenderService
+    from viewmend.models.registry import error_model_for
+    from viewmend.utils.heap import configure_allocator, freeze_loaded_objects
 
-    set_up()
+    configure_allocator()
     config = server_config(options)
-    supply = open_supply(options)
-    renderer = Renderer(supply, load_inpainter(options), stream_config(options), options.device)
-    service = RenderService(renderer, supply)
-    listener = None if options.riftcast_port is None else listen(options.riftcast_port)
-    riftcast = None if listener is None else RiftcastService(service, config.limits, listener)
-    server = Server(LiveServer(service, config, riftcast), config)
-    with server.bound() as address:
-        loaded()
-        say(f"open {address}/{token_query(config.token)}   (Ctrl-C stops it)")
-        if config.broadcast_px is not None:
-            say(f"watch {address}/watch{token_query(config.token)}   (what the viewer who goes on air sees)")
-        if listener is not None:
-            say(f"RIFTCast's clients: 127.0.0.1, port {listener.getsockname()[1]}")
-        server.run_bound()
+    source = open_source(options)
+    inpainter, device = load_inpainter(options), options.device
+    renderer = Renderer(source, inpainter, stream_config(options), device, error_model_for(inpainter, device))
+    live = LiveServer(RenderService(renderer, source), config)
+    server = Server(live, config)
+    with server.bind() as address:
+        freeze_loaded_objects()
+        query = token_query(config.token)
+        say(f"open {address}/{query}   (Ctrl-C stops it)")
+        for extension in live.extensions:
+            if extension.notice:
+                say(extension.notice.format(address=address, query=query))
+        server.run()
     return 0
 
 
-def server_config(options: Options) -> "ServerConfig":
-    """Where and for whom is served."""
-    from viewmend.live.protocol import Limits
-    from viewmend.live.server import ServerConfig
-    from viewmend.methods import default_method
+def _check(options: Options) -> None:
+    """Raise a ValueError for an option that is out of range, before anything heavy is imported."""
+    positive = ("max_image_size", "context", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
+    checks = [(name, getattr(options, name) > 0, "positive") for name in positive]
+    checks += [
+        ("cameras", options.source != "studio" or options.cameras >= 4, "at least 4"),
+        ("fps", options.fps is None or 0 < options.fps <= 240, "above 0 and at most 240"),
+        ("budget_ms", options.budget_ms >= 0, "0 or more"),
+        ("max_replicas", (options.max_replicas or options.replicas) >= options.replicas, "at least --replicas"),
+        ("port", 0 <= options.port <= 65535, "from 0 to 65535"),
+        ("riftcast_port", 0 <= (options.riftcast_port or 0) <= 65535, "from 0 to 65535"),
+    ]
+    for name, is_valid, limit in checks:
+        if not is_valid:
+            raise ValueError(f"--{name.replace('_', '-')} must be {limit}, got {getattr(options, name)}")
+    for flag, value in (("--riftcast-port", options.riftcast_port), ("--broadcast", options.broadcast)):
+        if value is not None and options.ray is not None:
+            raise ValueError(f"expected {flag} or --ray, got both; {flag} needs a server of one process")
+    if options.ray is not None and options.source == "live":
+        raise ValueError(
+            "expected a capture, rig.toml or studio with --ray, got live: a rig would push to one process only; "
+            "leave out --ray, or list the rig's cameras in a file (docs/guide/live-rig.md)"
+        )
 
+
+def server_config(options: Options) -> "ServerConfig":
+    """Address, limits and optional parts of the server; ValueError or OSError if an option cannot be used."""
+    from viewmend.live.auth import AccessControl
+    from viewmend.live.protocol import Limits
+    from viewmend.live.server import EXTENSIONS, ServerConfig, load_extension
+    from viewmend.models.registry import default_method
+
+    token = _token(options)
+    AccessControl(options.host, token)
+    values = {"broadcast": options.broadcast, "riftcast": options.riftcast_port}
     return ServerConfig(
         host=options.host,
         port=options.port,
-        token=_token(options),
+        token=token,
         budget_ms=options.budget_ms or None,
         model=options.model or default_method(),
         limits=Limits(viewers=options.viewers),
-        broadcast_px=None if options.broadcast is None else film_size(options.broadcast),
+        extensions=tuple(load_extension(name, values[name]) for name in EXTENSIONS if values[name] is not None),
     )
-
-
-def film_size(text: str) -> tuple[int, int]:
-    """Width and height of a film, from `WIDTHxHEIGHT`.
-
-    Raises:
-        ValueError: it is none that can be encoded here.
-    """
-    import re
-
-    from viewmend.live.protocol import Limits
-    from viewmend.live.video import video_codecs
-
-    found = re.fullmatch(r"(\d{2,5})x(\d{2,5})", text, re.ASCII)
-    size_px = (int(found[1]), int(found[2])) if found else (0, 0)
-    if min(size_px) < 16 or any(side % 2 for side in size_px):
-        raise ValueError(f"expected --broadcast WIDTHxHEIGHT, even, from 16, e.g. 1280x720; got '{text[:40]}'")
-    try:
-        Limits().check_size(*size_px)
-    except ValueError as error:
-        raise ValueError(f"--broadcast: {error}") from None
-    if "h264" not in video_codecs():
-        raise ValueError("--broadcast needs PyAV with x264; install viewmend's extra 'video'")
-    return size_px
 
 
 def stream_config(options: Options) -> "StreamConfig":
@@ -181,94 +178,99 @@ def stream_config(options: Options) -> "StreamConfig":
     from viewmend.rendering.view import RenderConfig
     from viewmend.stream import StreamConfig
 
-    render = RenderConfig(cameras=options.context, error_rule=options.error_rule, wrong_fraction=options.wrong_fraction)
+    rule, fraction = options.error_rule, options.refine_fraction
+    render = RenderConfig(cameras=options.context, error_rule=rule, refine_fraction=fraction)
     return StreamConfig(render=render, memory_mb=options.memory_mb / 2)
 
 
-def load_inpainter(options: Options) -> "ViewInpainter":
-    """The model, where it renders."""
+def load_inpainter(options: Options) -> "Inpainter":
+    """Load the model; with --ray, in each process that renders."""
     from viewmend.cli.checks import load_named
 
     return load_named(options.model, options.device)
 
 
 def _token(options: Options) -> str | None:
-    """The token from the option, the file or the environment; None where none is given."""
-    import os
-
-    given = options.token or os.environ.get(TOKEN_VARIABLE)
+    """The token from the option, the file or the environment; None if there is none."""
+    token = options.token or os.environ.get(TOKEN_VARIABLE)
     if options.token_file is not None:
         if options.token is not None:
             raise ValueError("expected --token or --token-file, got both; give one of them")
         with options.token_file.open(encoding="utf-8") as file:
-            given = file.readline(4096).strip()
-        if not given:
-            raise ValueError(f"{options.token_file}: expected the token in its first line, got nothing")
-    return given or None
+            token = file.readline(4096).strip()
+        if not token:
+            raise ValueError(f"{options.token_file}: expected the token in its first line, got an empty line")
+    return token or None
 
 
-def _check(options: Options) -> None:
-    """What can be said before anything heavy is imported."""
-    positive = ("width", "context", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
-    wrong = [name for name in positive if not getattr(options, name) > 0]
-    wrong += ["budget_ms"] if not options.budget_ms >= 0 else []
-    wrong += ["cameras"] if options.source == "studio" and options.cameras < 4 else []
-    wrong += ["most_replicas"] if (options.most_replicas or options.replicas) < options.replicas else []
-    if options.fps is not None and not 0 < options.fps <= 240:
-        wrong.append("fps")
-    wrong += [name for name in ("port", "riftcast_port") if not 0 <= (getattr(options, name) or 0) <= 65535]
-    if options.riftcast_port is not None and options.ray is not None:
-        raise ValueError("expected --riftcast-port or --ray, got both; RIFTCast's clients are served by one process")
-    if options.broadcast is not None and options.ray is not None:
-        raise ValueError("expected --broadcast or --ray, got both; the film is made by one process")
-    if wrong:
-        name = wrong[0]
-        raise ValueError(f"expected a sensible --{name.replace('_', '-')}, got {getattr(options, name)}; see --help")
+def open_source(options: Options) -> "FrameSource":
+    """The source of frames; ValueError or OSError if it cannot be used."""
+    from viewmend.live.frame_source import RecordedSource
+    from viewmend.live.push import PushSource
 
-
-def open_supply(options: Options) -> "FrameSupply":
-    """Where frames come from; ValueError or OSError for a source that cannot be read."""
-    from viewmend.live.frames import ReadAhead
-    from viewmend.live.pushed import PushedFrames
-
-    memory_mb = options.memory_mb / 2
+    memory_mb, size_px = options.memory_mb / 2, options.max_image_size
+    align, match = options.align, options.match_colours
     if options.source == "live":
-        return PushedFrames(options.fps, memory_mb)
+        return PushSource(options.fps, memory_mb)
     if options.source.endswith(".toml"):
-        from viewmend.live.rig_frames import RigFrames
+        rig_source: Callable[..., FrameSource] = import_object(RIG_SOURCE)
+        return rig_source(Path(options.source), options.fps, memory_mb, size_px, align, match)
+    if options.source == "studio":
+        return RecordedSource(partial(_make_studio, options), options.fps, generated=True, memory_mb=memory_mb)
+    from viewmend.cli.checks import log_preparation
+    from viewmend.data.prepare import open_masked, prepare
 
-        return RigFrames(
-            Path(options.source), options.fps, memory_mb, options.width, options.align, options.match_colours
-        )
-    made = options.source == "studio"
-    return ReadAhead(_studio(options) if made else _capture(options), options.fps, generated=made, memory_mb=memory_mb)
-
-
-def _studio(options: Options) -> "Callable[[], CaptureSource]":
-    """Opens the studio; called on the thread that makes its frames, so that the page is there at once."""
-
-    def open_studio() -> "CaptureSource":
-        from viewmend.capture.prepare import prepare
-        from viewmend.studio.stage import Studio, StudioConfig
-
-        config = StudioConfig(
-            seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0
-        )
-        return prepare(Studio(config), longest_px=options.width, align=False, match_colours=False)
-
-    return open_studio
+    # Prepared before the address is printed, so that an unusable capture is an error of the command.
+    capture = open_masked(options.source, format=options.format)
+    prepared = prepare(capture, longest_px=size_px, align=align, match_colours=match)
+    log_preparation(prepared)
+    return RecordedSource(lambda: prepared, options.fps, memory_mb=memory_mb)
 
 
-def _capture(options: Options) -> "Callable[[], CaptureSource]":
-    """Prepares the capture, so that one that cannot be rendered is refused before anybody is told an address."""
-    from viewmend.capture.prepare import open_masked, prepare
-    from viewmend.cli.prepared import say_prepared
+def _make_studio(options: Options) -> "CaptureSource":
+    """The synthetic scene; made on the thread that reads its frames, so that the page is available at once."""
+    from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS
+    from viewmend.data.prepare import prepare
+    from viewmend.data.synthetic.stage import Studio, StudioConfig
 
-    prepared = prepare(
-        open_masked(options.source, kind=options.kind),
-        longest_px=options.width,
-        align=options.align,
-        match_colours=options.match_colours,
+    seed = PROCEDURAL_SEEDS["test"][1] if options.seed is None else options.seed
+    config = StudioConfig(seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0)
+    return prepare(Studio(config), longest_px=options.max_image_size, align=False, match_colours=False)
+
+
+def _serve_on_ray(options: Options, address: str) -> NoReturn:
+    """Serve on a Ray cluster until interrupted: one process reads the rig, several render."""
+    from viewmend.cli.console import say
+    from viewmend.cli.signals import exit_on_sigterm
+    from viewmend.live.auth import is_loopback
+    from viewmend.live.protocol import token_query
+
+    config = server_config(options)
+    if not is_loopback(config.host):
+        say("Ray's proxy does not limit unauthenticated connections; use another proxy that does (docs/live.md)")
+    elsewhere = {name: _absolute(getattr(options, name)) for name in ("source", "model", "error_rule")}
+    remote = replace(options, **elsewhere)
+    settings = import_object(RAY_SETTINGS)(
+        open_source=partial(open_source, remote),
+        load_inpainter=partial(load_inpainter, remote),
+        server=config,
+        stream=stream_config(remote),
+        device=options.device,
+        replicas=(options.replicas, options.max_replicas or options.replicas),
+        store_mb=options.memory_mb / 2,
     )
-    say_prepared(prepared)
-    return lambda: prepared
+    # Ray has a signal handler of its own.
+    with import_object(SERVE_ON_RAY)(settings, address) as url, exit_on_sigterm():
+        say(f"open {url}/{token_query(config.token)}   (Ctrl-C stops it)")
+        while True:  # returns to this thread now and then, which has to handle signals
+            time.sleep(0.5)
+
+
+def _absolute(name: str | None) -> str | None:
+    """The absolute path of a file or folder, for other processes; any other name as it is."""
+    if name is None:
+        return None
+    path, colon, attribute = name.rpartition(":")
+    if colon and Path(path).is_file():
+        return f"{Path(path).resolve()}:{attribute}"
+    return str(Path(name).resolve()) if Path(name).exists() else name

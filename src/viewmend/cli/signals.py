@@ -1,4 +1,4 @@
-"""What ends a command from outside: Ctrl-C and SIGTERM."""
+"""Signals that end a command: Ctrl-C (SIGINT) and SIGTERM."""
 
 import contextlib
 import os
@@ -13,37 +13,40 @@ Handler = Callable[[int, FrameType | None], None]
 
 
 @contextlib.contextmanager
-def ended_by_sigterm() -> Iterator[None]:
-    """Have SIGTERM end a command as Ctrl-C does, so that what it has begun to write is removed."""
-    own = os.getpid()
+def exit_on_sigterm() -> Iterator[None]:
+    """Make SIGTERM unwind the stack as Ctrl-C does, so that partial output is removed."""
+    parent = os.getpid()
 
     def end(number: int, _: object) -> None:
-        if os.getpid() != own:  # a child that was forked, of which nobody waits to hear
+        if os.getpid() != parent:  # a forked child: nothing to clean up
             os._exit(128 + number)
         raise SystemExit(128 + number)
 
-    with _handled(end, signal.SIGTERM):
+    with _handle(end, signal.SIGTERM):
         yield
 
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[Callable[[], int]]:
-    """Which of Ctrl-C and SIGTERM asked for the end of what goes on in steps, 0 for none; once more ends it at once."""
-    asked: list[int] = []
+    """Let a loop finish its step after Ctrl-C or SIGTERM; a second signal interrupts it at once.
 
-    def ask(number: int, _: object) -> None:
-        if asked:
+    Yields a function that returns the number of the signal, or 0 if there was none.
+    """
+    received: list[int] = []
+
+    def request(number: int, _: object) -> None:
+        if received:
             raise KeyboardInterrupt
-        asked.append(number)
-        say("stopping after this step, with a checkpoint; once more to stop at once, with the last one")
+        received.append(number)
+        say("stopping after this step and saving a checkpoint; press again to stop at once with the last checkpoint")
 
-    with _handled(ask, signal.SIGINT, signal.SIGTERM):
-        yield lambda: sum(asked)
+    with _handle(request, signal.SIGINT, signal.SIGTERM):
+        yield lambda: sum(received)
 
 
 @contextlib.contextmanager
-def _handled(handler: Handler, *signals: signal.Signals) -> Iterator[None]:
-    """Handle signals; only the main thread can, elsewhere all stays as it was."""
+def _handle(handler: Handler, *signals: signal.Signals) -> Iterator[None]:
+    """Install a handler; does nothing outside the main thread, where Python does not allow it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""`viewmend studio`: synthetic multi-camera captures with exact truth."""
+"""`viewmend studio`: generates synthetic multi-camera captures with ground truth."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,56 +9,54 @@ import tyro
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Write synthetic captures with exact truth: OUT/scene_SEED for each scene, as plain capture folders."""
+    """Generate synthetic captures with ground truth, as capture folders OUT/scene_SEED."""
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Folder for the captures; it is made if it is not there."""
+    """Output folder; it is created if it does not exist."""
     scenes: int = 1
-    """How many captures; their seeds are --seed and the numbers after it."""
+    """Number of captures. Their seeds are --seed and the numbers after it."""
     cameras: int = 12
-    """Cameras of each rig, 4 to 60."""
+    """Number of cameras, 4 to 60."""
     frames: int = 30
-    """Frames of each capture, 30 a second."""
+    """Number of frames, at 30 per second."""
     size: int = 512
     """Width and height of the images."""
     seed: int = 0
-    """The first capture's; the same seed gives the same capture."""
+    """Seed of the first capture. The same seed generates the same capture."""
     rig: Literal["ring", "dome"] = "ring"
-    """How the cameras stand."""
+    """Arrangement of the cameras."""
     performers: Path | None = None
-    """A glTF character (.glb, .gltf) or a folder of them, instead of the procedural people; needs --motions."""
+    """A glTF character (.glb, .gltf) or a folder of them, instead of procedural people; needs --motions."""
     motions: Path | None = None
     """A BVH motion or a folder of them, for the characters."""
     background: Literal["black", "stage"] = "black"
-    """What the cameras see behind the subject: nothing, or a plain wall and floor."""
+    """What is behind the subject: nothing, or a plain wall and floor."""
     imperfect: bool = False
-    """Add what real stages get wrong: noise, colour, compression, mask and calibration errors."""
+    """Add the imperfections of real stages: noise, colour, compression, mask and calibration errors."""
     images: Literal["jpeg", "png"] = "png"
-    """Image files: exact, or smaller."""
+    """Image files: lossless PNG, or smaller JPEG."""
     json: bool = False
-    """Write one JSON object to standard output: the folders and who performs in them."""
+    """Write one JSON object to standard output: the folders and their performers."""
 
 
 def run(options: Options) -> int:
-    """Run the command; the exit code."""
-    least = {"scenes": 1, "cameras": 4, "frames": 1, "size": 1, "seed": 0}
-    wrong = [name for name, low in least.items() if getattr(options, name) < low]
-    if wrong:
-        name = wrong[0]
-        raise ValueError(f"expected --{name} of at least {least[name]}, got {getattr(options, name)}; see --help")
-    from viewmend.capture.errors import CaptureError
-    from viewmend.capture.plain_writer import remove_unfinished, write_capture
+    """Run the command and return the exit code."""
+    for name, low in {"scenes": 1, "cameras": 4, "frames": 1, "size": 1, "seed": 0}.items():
+        if getattr(options, name) < low:
+            raise ValueError(f"expected --{name} of at least {low}, got {getattr(options, name)}; see --help")
     from viewmend.cli.console import print_json, say, track
-    from viewmend.studio.imperfections import Imperfections
-    from viewmend.studio.stage import Studio, StudioConfig
+    from viewmend.data.errors import CaptureError
+    from viewmend.data.native_writer import remove_unfinished, write_capture
+    from viewmend.data.synthetic.imperfections import Imperfections
+    from viewmend.data.synthetic.stage import Studio, StudioConfig
 
     seeds = range(options.seed, options.seed + options.scenes)
     folders = [options.out / f"scene_{seed:05d}" for seed in seeds]
     for folder in folders:
         remove_unfinished(folder)
-    if any(taken := [folder.exists() for folder in folders]):
-        first = folders[taken.index(True)]
-        raise CaptureError(f"{first}: expected no such folder, it exists; {_advice(options, taken)}")
+    if any(existing := [folder.exists() for folder in folders]):
+        first = folders[existing.index(True)]
+        raise CaptureError(f"{first}: expected a new folder, got an existing one; {_advice(options, existing)}")
     report = []
     for seed, folder in zip(seeds, folders, strict=True):
         config = StudioConfig(
@@ -81,9 +79,9 @@ def run(options: Options) -> int:
     return 0
 
 
-def _advice(options: Options, taken: list[bool]) -> str:
-    """What to do where captures exist: whoever was stopped goes on with the first that is not there."""
-    done = taken.index(False) if False in taken else len(taken)
-    if done in (0, len(taken)) or any(taken[done:]):
+def _advice(options: Options, existing: list[bool]) -> str:
+    """How to proceed if captures exist; an interrupted run continues with the first missing one."""
+    done = existing.index(False) if False in existing else len(existing)
+    if done in (0, len(existing)) or any(existing[done:]):
         return "choose another --seed or folder"
-    return f"go on with --seed {options.seed + done} --scenes {len(taken) - done}, or choose another folder"
+    return f"continue with --seed {options.seed + done} --scenes {len(existing) - done}, or choose another folder"

@@ -1,1 +1,1 @@
-"""Comparisons on fixed scenes."""
+"""Scores, tables and reports on fixed scenes."""

@@ -1,17 +1,76 @@
-"""A report's tables: queries of the records, set by set and kind by kind."""
+"""From the scores of frames to the tables of a report.
+
+Scores are averaged over the frames of a scene first: a `Record` is one metric of one method on one scene. Tables, plots
+and files are queries of records.
+"""
 
 import statistics
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
 
-from viewmend.evaluation.cells import Cell
-from viewmend.evaluation.records import Records, mean, over_sets, records, wide
-from viewmend.evaluation.scorers import KINDS
-from viewmend.methods import REFERENCE
+from viewmend.evaluation.result_cache import Cell
+from viewmend.evaluation.scores import KINDS, MIN_HOLE_PX, ViewScores
 from viewmend.metrics.vfid import frechet_distance
+from viewmend.models.registry import REFERENCE
+
+REGIONS = ("holes_fg", "holes", "masked", "whole", "subject", "valid", "still", "past")
+"""Pixels that a score covers: the last part of its field's name."""
+IRREGULAR = {
+    "alpha_iou": ("alpha_iou", "whole"),
+    "hull_iou": ("hull_iou", "whole"),
+    "psnr_whole_rendered": ("psnr_rendered", "whole"),
+}
+"""Metric and region of fields whose name does not end with a region; all others refer to the holes."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One metric of one region of the pixels, of one method on one scene."""
+
+    scene: str
+    set: str
+    rig: str
+    style: str
+    method: str
+    region: str
+    metric: str
+    value: float
+    """Mean over the frames that have one."""
+
+
+@dataclass(frozen=True)
+class Records:
+    """A set of records."""
+
+    all: tuple[Record, ...]
+
+    def __iter__(self) -> Iterator[Record]:
+        return iter(self.all)
+
+    def where(self, **facts: str) -> "Records":
+        """The records whose fields have these values."""
+        return Records(tuple(r for r in self.all if all(getattr(r, name) == fact for name, fact in facts.items())))
+
+    def by_scene(self, metric: str, region: str) -> dict[str, float]:
+        """Values by scene, of the records of one method."""
+        return {r.scene: r.value for r in self.all if (r.metric, r.region) == (metric, region)}
+
+    def mean(self, metric: str, region: str) -> float | None:
+        """Mean over scenes, of the records of one method; None without any."""
+        return mean(self.by_scene(metric, region).values())
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Duration of an inpainter's steps."""
+
+    fps: float
+    """1000 / mean milliseconds."""
+    ms_p50: float
+    ms_p95: float
 
 
 @dataclass(frozen=True)
@@ -20,65 +79,51 @@ class Row:
 
     method: str
     scores: Records = field(repr=False)
-    """The method's figures, one of each scene; of each set in a table over all."""
+    """Its records: one per scene, or one per set in a table over all sets."""
     over_reference: float | None
-    """PSNR in the holes over that of `REFERENCE`, mean over the scenes where both have it."""
+    """Gain in PSNR in the holes over `REFERENCE`: mean over the scenes where both have a score."""
     below_reference: int
-    """Scenes where it is below the reference."""
+    """Number of scenes with a loss."""
     scenes: int
     scored_scenes: int
-    """Scenes with a frame that has enough holes."""
+    """Scenes that have a frame with enough hole pixels."""
     failed: int
-    vfid: "Vfid"
-    speed: "Speed | None"
-    """Speed of the inpainter's step over all frames with holes; None without any."""
-
-
-@dataclass(frozen=True)
-class Vfid:
-    """Distances of a method's videos from the truth's, by `scorers.KINDS`; None without I3D or with one video."""
-
-    whole_eval: float | None
-    masked_eval: float | None
-    whole_train: float | None
-    masked_train: float | None
-
-
-@dataclass(frozen=True)
-class Speed:
-    """How long steps take."""
-
-    fps: float
-    """Frames a second if one step follows the other: 1000 over the mean."""
-    ms_p50: float
-    ms_p95: float
+    vfid: dict[str, float | None]
+    """By `scores.KINDS`; None without I3D or with a single video."""
+    speed: Speed | None
+    """Over all frames with holes; None without any."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Methods on some scenes."""
+    """Methods on a set of scenes."""
 
     title: str
     rows: tuple[Row, ...]
     frames: int
-    """Frames of all scenes together that any method has."""
+    """Number of frames of all scenes."""
     thin_frames: int
-    """Frames left out of the scores in the holes: they miss too little."""
+    """Frames with too few hole pixels for the scores in the holes."""
     empty_frames: int
-    """Frames without any hole: thin ones, too."""
+    """Frames without holes; they count as thin, too."""
     sizes_px: tuple[tuple[int, int], ...]
-    """Widths and heights of their views."""
+    """Widths and heights of the views."""
+
+
+def records(cells: Iterable[Cell]) -> Records:
+    """The scores of these cells; scores in the holes are means over the frames with enough pixels."""
+    return Records(tuple(record for cell in cells for record in _records_of_cell(cell)))
 
 
 def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
-    """One for each set, and one over all sets first if there are several (the mean of the sets' means)."""
+    """One table per set; with several sets, first one over all (the mean of the sets' means)."""
     sets = list(dict.fromkeys(cell.set for cell in cells))
     per_set = [_table(name, [c for c in cells if c.set == name], methods) for name in sets]
     return per_set if len(sets) < 2 else [_overall(per_set, cells), *per_set]
 
 
 def tables_by_kind(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
-    """Tables of each set: one for each rig and each style that it has more than one of."""
+    """For each set, one table per rig and per style, where it has several."""
     found = []
     for name in dict.fromkeys(cell.set for cell in cells):
         own = [c for c in cells if c.set == name]
@@ -91,16 +136,71 @@ def tables_by_kind(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]
 
 
 def gains(own: Records, other: Records) -> dict[str, float]:
-    """Scene by scene, one method's PSNR in the holes over another's, where both have one."""
+    """Gain of one method's PSNR in the holes over another's, by scene, where both have a score."""
     reference = other.by_scene("psnr", "holes")
     return {scene: db - reference[scene] for scene, db in own.by_scene("psnr", "holes").items() if scene in reference}
 
 
+def mean(values: Iterable[float | None]) -> float | None:
+    """Mean of the values that are not None; None without any."""
+    there = [value for value in values if value is not None]
+    return statistics.fmean(there) if there else None
+
+
+def vfid(cells: Sequence[Cell]) -> dict[str, float | None]:
+    """Distance between all videos of these cells and those of the truth."""
+    pairs = [(c.features, c.true_features) for c in cells if c.features is not None and c.true_features is not None]
+    if not pairs:
+        return dict.fromkeys(KINDS)
+    sides = {kind: [torch.from_numpy(np.concatenate([p[n][kind] for p in pairs])) for n in (0, 1)] for kind in KINDS}
+    return {kind: frechet_distance(*side) for kind, side in sides.items()}
+
+
+def speed(cells: Sequence[Cell]) -> Speed | None:
+    """Speed of the steps on frames with holes."""
+    taken = sorted(ms for cell in cells for ms, f in zip(cell.step_ms, cell.frames, strict=True) if f.hole_px)
+    if not taken:
+        return None
+    p95 = taken[min(len(taken) - 1, int(0.95 * len(taken)))]
+    return Speed(1000 / max(statistics.fmean(taken), 1e-6), statistics.median(taken), p95)
+
+
+def frames_with_holes(frames: Sequence[ViewScores]) -> list[ViewScores]:
+    """Frames with enough hole pixels to be scored there."""
+    return [frame for frame in frames if frame.hole_px >= MIN_HOLE_PX]
+
+
+def _records_of_cell(cell: Cell) -> Iterator[Record]:
+    facts = cell.key.scene, cell.set, cell.rig, cell.style, cell.key.method
+    inside = [frame for frame in cell.frames if frame.hole_fg_px >= MIN_HOLE_PX]
+    past = [frame for frame in cell.frames if frame.past_px >= MIN_HOLE_PX]
+    holes = frames_with_holes(cell.frames)
+    enough = {"holes": holes, "masked": holes, "fg": inside, "past": past}  # by the last word of a field's name
+    figures = {
+        _metric_and_region(f.name): mean(
+            getattr(frame, f.name) for frame in enough.get(f.name.split("_")[-1], cell.frames)
+        )
+        for f in fields(ViewScores)
+        if f.name != "time" and not f.name.endswith("_px")
+    }
+    figures["hole_fraction", "hull"] = mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in cell.frames)
+    figures["hole_fraction", "image"] = mean(f.hole_px / f.image_px for f in cell.frames)
+    figures["hole_fraction", "only_past"] = mean(f.past_px / f.hole_fg_px for f in inside)
+    for (metric, region), value in figures.items():
+        if value is not None:
+            yield Record(*facts, region, metric, value)
+
+
+def _metric_and_region(name: str) -> tuple[str, str]:
+    region = next((region for region in REGIONS if name.endswith(f"_{region}")), None)
+    return IRREGULAR.get(name) or ((name, "holes") if region is None else (name.removesuffix(f"_{region}"), region))
+
+
 def _table(title: str, cells: Sequence[Cell], methods: Sequence[str]) -> Table:
-    # All methods of a scene saw the same frames: any cell that did not fail counts them.
+    # All methods of a scene have the same frames: count them in any cell that did not fail.
     frames = [f for cell in {c.key.scene: c for c in cells if c.error is None}.values() for f in cell.frames]
     sizes = dict.fromkeys((f.width_px, f.height_px) for f in frames)
-    thin, empty = len(frames) - len(wide(frames)), sum(f.hole_px == 0 for f in frames)
+    thin, empty = len(frames) - len(frames_with_holes(frames)), sum(f.hole_px == 0 for f in frames)
     scores = records(cells)
     rows = tuple(_row(name, [c for c in cells if c.key.method == name], scores) for name in methods)
     return Table(title, rows, len(frames), thin, empty, tuple(sizes))
@@ -131,10 +231,10 @@ def _overall(per_set: Sequence[Table], cells: Sequence[Cell]) -> Table:
         rows.append(
             Row(
                 method=name,
-                scores=over_sets(row.scores for row in parts),
+                scores=_average_sets(row.scores for row in parts),
                 over_reference=mean(row.over_reference for row in parts),
                 **{count: sum(getattr(row, count) for row in parts) for count in counts},
-                vfid=Vfid(**{kind: mean(getattr(row.vfid, kind) for row in parts) for kind in KINDS}),
+                vfid={kind: mean(row.vfid[kind] for row in parts) for kind in KINDS},
                 speed=speed([c for c in cells if c.key.method == name and c.error is None]),
             )
         )
@@ -143,19 +243,15 @@ def _overall(per_set: Sequence[Table], cells: Sequence[Cell]) -> Table:
     return Table("mean of the sets", tuple(rows), frames, thin, empty, tuple(sizes))
 
 
-def vfid(cells: Sequence[Cell]) -> Vfid:
-    """Between all videos of these cells and of their scenes' truths."""
-    pairs = [(c.features, c.true_features) for c in cells if c.features is not None and c.true_features is not None]
-    if not pairs:
-        return Vfid(*[None] * len(KINDS))
-    sides = {kind: [torch.from_numpy(np.concatenate([p[n][kind] for p in pairs])) for n in (0, 1)] for kind in KINDS}
-    return Vfid(**{kind: frechet_distance(*side) for kind, side in sides.items()})
-
-
-def speed(cells: Sequence[Cell]) -> Speed | None:
-    """Speed of the steps in frames that have a hole."""
-    taken = sorted(f.step_ms for cell in cells for f in cell.frames if f.hole_px)
-    if not taken:
-        return None
-    p95 = taken[min(len(taken) - 1, int(0.95 * len(taken)))]
-    return Speed(1000 / max(statistics.fmean(taken), 1e-6), statistics.median(taken), p95)
+def _average_sets(per_set: Iterable[Records]) -> Records:
+    """Records of each set's means, with the set in place of the scene."""
+    found: dict[tuple[str, str, str, str], list[float]] = {}
+    for own in per_set:
+        for r in own:
+            found.setdefault((r.set, r.method, r.region, r.metric), []).append(r.value)
+    return Records(
+        tuple(
+            Record(set_, set_, "", "", method, region, metric, statistics.fmean(values))
+            for (set_, method, region, metric), values in found.items()
+        )
+    )

@@ -1,247 +1,211 @@
-"""What a view costs: milliseconds, operations and bytes of each stage, and the least that this machine could take.
+"""The cost of a view on this machine: the time of each stage, and how the time grows."""
 
-The stages are those of the stream's own record of times (`StageTimes`); nothing here calls them in another order than
-`Stream` does.
-"""
-
+import json
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from statistics import median
 
-import torch
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils.flop_counter import FlopCounterMode
+from msgspec import Struct
 
+from viewmend.data.synthetic.rigs import orbit
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.evaluation.provenance import Provenance
 from viewmend.geometry.cameras import Cameras
-from viewmend.inpainting.protocol import RenderQuality, ViewInpainter
+from viewmend.models.base import Inpainter, RenderQuality
 from viewmend.stream import Stream
-from viewmend.studio.rigs import orbit
-from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.timing import StageTimes
+from viewmend.utils.atomic_writes import write_text
+from viewmend.utils.timing import StageTimes
+from viewmend.utils.untrusted_input import bounded_bytes, read_json, typed
 
 STAGES = ("geometry", "context", "rendering", "inpainting")
-GEMM_SIDE, COPY_BYTES = 1024, 1 << 27
-ASKED = {"pixels": 1.0, "cameras": 0.5, "holes": 1.0, "viewers": 0.4}
-"""Cost may grow with at most these powers."""
-
-
-@dataclass(frozen=True)
-class Ceilings:
-    """What the machine does at its best, measured."""
-
-    flops_per_s: float
-    """The speed of a product of two square float32 matrices."""
-    bytes_per_s: float
-    """Bytes that a copy of a large tensor reads and writes."""
+SCALES = (0.5, 0.71, 1.0, 1.41)
+"""Sizes of the measured views, relative to the image size."""
+VIEWERS = (1, 2, 4, 8)
+FRACTIONS = (0.125, 0.25, 0.5, 1.0)
+"""Refined fractions of the subject that are measured."""
+MAX_EXPONENT = {"pixels": 1.0, "cameras": 0.5, "holes": 1.0, "viewers": 0.4}
+"""Required scaling: the time may grow at most with these powers."""
+SLOWER = 1.2
+"""A stage that takes this many times as long as before is reported as slower."""
 
 
 @dataclass(frozen=True)
 class StageCost:
-    """One stage of a view, or of a time."""
+    """One stage of the first view of a frame."""
 
     stage: str
     ms: float
     """Median."""
-    flops: int
-    """Operations of products and convolutions that torch dispatches. Those of numba's kernels are not seen."""
-    bytes: int
-    """Bytes that the operations torch dispatches read and write. What a cache keeps counts, too."""
-    floor_ms: float
-    """Least time for these at the ceilings."""
-    ratio: float | None
-    """How many times the least time it took. None where nothing was counted."""
+    ms_p95: float
 
 
 @dataclass(frozen=True)
 class Growth:
-    """Milliseconds as something grows."""
+    """Milliseconds of a frame and its views as a size grows."""
 
     by: str
     sizes: tuple[float, ...]
     ms: tuple[float, ...]
     exponent: float
-    """The power of the size that fits best."""
+    """Exponent of the best-fitting power law."""
     asked: float
-    """The exponent is to be at most this."""
+    """Largest exponent allowed (`MAX_EXPONENT`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CostScene:
-    """The scene and the sizes that are measured."""
+class CostReport:
+    """All measurements."""
 
-    size_px: int = 256
-    cameras: int = 8
-    repeats: int = 3
-    """Times that each figure is the median of."""
-    seed: int = 10000
-    scales: Sequence[float] = (0.5, 0.71, 1.0, 1.41)
-    """Parts of `size_px` at which views are measured."""
-    rigs: Sequence[int] = (4, 8, 16)
-    viewers: Sequence[int] = (1, 2, 4, 8)
-    fractions: Sequence[float] = (0.125, 0.25, 0.5, 1.0)
-    """Parts of the subject that are read, where the model chooses."""
+    model: str
+    size_px: int
+    cameras: int
+    machine: Provenance
+    stages: Sequence[StageCost]
+    growth: Sequence[Growth]
 
+    def write(self, path: Path) -> None:
+        """Write the report as JSON."""
+        write_text(path, json.dumps(asdict(self), indent=1) + "\n")
 
-@dataclass
-class _Traffic(TorchDispatchMode):
-    """Counts bytes of the operations' tensors; views move none."""
-
-    bytes: int = field(default=0)
-
-    def __post_init__(self) -> None:
-        super().__init__()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        out = func(*args, **(kwargs or {}))
-        if not getattr(func, "is_view", False):
-            tensors = [*_tensors(args), *_tensors(tuple((kwargs or {}).values())), *_tensors((out,))]
-            self.bytes += sum(t.numel() * t.element_size() for t in tensors)
-        return out
-
-
-def _tensors(values: Sequence[object]) -> list[Tensor]:
-    found: list[Tensor] = []
-    for value in values:
-        if isinstance(value, Tensor):
-            found.append(value)
-        elif isinstance(value, tuple | list):
-            found.extend(_tensors(value))
-    return found
-
-
-def ceilings() -> Ceilings:
-    """Measure them: the best of ten tries each."""
-    a, source = torch.ones(GEMM_SIDE, GEMM_SIDE), torch.zeros(COPY_BYTES, dtype=torch.uint8)
-    target = torch.empty_like(source)
-    return Ceilings(2 * GEMM_SIDE**3 / _best_s(lambda: a @ a), 2 * COPY_BYTES / _best_s(lambda: target.copy_(source)))
-
-
-def _best_s(work: Callable[[], object]) -> float:
-    def once() -> float:
-        start = time.perf_counter()
-        work()
-        return time.perf_counter() - start
-
-    return min(once() for _ in range(10))
-
-
-def _counted(work: Callable[[], object]) -> tuple[int, int]:
-    """Operations and bytes of what is done, without compiled regions, which hide theirs."""
-    traffic = _Traffic()
-    with torch.compiler.set_stance("force_eager"), FlopCounterMode(display=False) as flops, traffic:
-        work()
-    return flops.get_total_flops(), traffic.bytes
-
-
-def _less(a: tuple[int, int], b: tuple[int, int]) -> tuple[int, int]:
-    """What `a` has beyond `b`, of each."""
-    return max(0, a[0] - b[0]), max(0, a[1] - b[1])
-
-
-class CostBench:
-    """Measures one model on a studio's scene."""
-
-    def __init__(self, inpainter: ViewInpainter, config: CostScene) -> None:
-        self.inpainter, self.config = inpainter, config
-        self.studio = self._studio(config.cameras)
-
-    def _studio(self, cameras: int) -> Studio:
-        config = self.config
-        frames = config.repeats + 1  # the first warms up
-        return Studio(StudioConfig(seed=config.seed, cameras=cameras, frames=frames, size_px=config.size_px))
-
-    def _view(self, azimuth_rad: float = 0.4, size_px: int | None = None) -> Cameras:
-        side = size_px or self.config.size_px
-        return orbit([azimuth_rad], (side, side), elevation_rad=0.2)
-
-    def _stream(self, studio: Studio, first: int = 0, frames: int = 0) -> Stream:
-        stream = Stream(self.inpainter, bounds=studio.bounds)
-        for at in range(first, first + frames):
-            stream.push(studio.read(at))
-        return stream
-
-    def stages(self, machine: Ceilings) -> list[StageCost]:
-        """Each stage of a view that is the first of its time."""
-        target, count = self._view(), self.config.repeats
-        stream, times = self._stream(self.studio), list[StageTimes]()
-        for at in range(count + 1):
-            stream.push(self.studio.read(at))
-            times.append(stream.view(target, time=at).times)
-        counts = self._counts(target)
-        return [
-            self._stage(name, median(getattr(t, name) for t in times[1:]), *counts[name], machine) for name in STAGES
+    def lines(self) -> list[str]:
+        """The report as text."""
+        size, machine = f"{self.size_px} x {self.size_px}", self.machine
+        lines = [
+            f"{self.model}, views of {size} from {self.cameras} cameras; {machine.device}, load {machine.load}",
+            "  stage         median ms   p95 ms",
         ]
-
-    def _stage(self, name: str, ms: float, flops: int, moved: int, machine: Ceilings) -> StageCost:
-        floor_ms = 1000 * max(flops / machine.flops_per_s, moved / machine.bytes_per_s)
-        ratio = round(ms / floor_ms, 2) if floor_ms > 0 else None
-        return StageCost(name, round(ms, 3), flops, moved, round(floor_ms, 4), ratio)
-
-    def _counts(self, target: Cameras) -> dict[str, tuple[int, int]]:
-        """Operations and bytes by stage: what a time's second viewer does not pay again is context."""
-        stream, frame = self._stream(self.studio, 0, 1), self.studio.read(1)
-        stream.view(target, time=0)
-        pushed = _counted(lambda: stream.push(frame))
-        first = _counted(lambda: stream.view(target, time=1))
-        second = _counted(lambda: stream.view(target, time=1))
-        rendered = _counted(lambda: stream.view(target, time=1, quality=RenderQuality(mend=False)))
-        return {
-            "geometry": pushed,
-            "context": _less(first, second),
-            "rendering": rendered,
-            "inpainting": _less(second, rendered),
-        }
-
-    def _time_ms(self, studio: Studio, work: Callable[[Stream, int], object]) -> float:
-        """Median milliseconds of one time's frame and the views of it."""
-        stream, took = self._stream(studio), list[float]()
-        for at in range(self.config.repeats + 1):
-            frame = studio.read(at)
-            start = time.perf_counter()
-            stream.push(frame)
-            work(stream, at)
-            took.append(1000 * (time.perf_counter() - start))
-        return median(took[1:])
-
-    def growth(self) -> list[Growth]:
-        """Cost of a time and its views against pixels, cameras, what is mended, and viewers."""
-        config, studio, found = self.config, self.studio, list[Growth]()
-        sides = [max(32, round(config.size_px * scale / 4) * 4) for scale in config.scales]
-        views = [self._view(size_px=side) for side in sides]
-        by_pixels = [self._time_ms(studio, lambda s, at, view=view: s.view(view, time=at)) for view in views]
-        found.append(fitted("pixels", [side * side for side in sides], by_pixels))
-        target = self._view()
-        rigs = [self._studio(count) for count in config.rigs]
-        by_cameras = [self._time_ms(rig, lambda s, at: s.view(target, time=at)) for rig in rigs]
-        found.append(fitted("cameras", config.rigs, by_cameras))
-        if getattr(self.inpainter, "tells_errors", False):
-            qualities = [replace(RenderQuality(), read_fraction=part) for part in config.fractions]
-            by_holes = [
-                self._time_ms(studio, lambda s, at, quality=quality: s.view(target, time=at, quality=quality))
-                for quality in qualities
-            ]
-            found.append(fitted("holes", config.fractions, by_holes))
-        around = [self._view(2 * math.pi * n / max(config.viewers)) for n in range(max(config.viewers))]
-        by_viewers = [
-            self._time_ms(studio, lambda s, at, n=n: [s.view(view, time=at) for view in around[:n]])
-            for n in config.viewers
-        ]
-        found.append(fitted("viewers", config.viewers, by_viewers))
-        return found
+        lines += [f"  {cost.stage:<12}{cost.ms:11.1f}{cost.ms_p95:9.1f}" for cost in self.stages]
+        for grown in self.growth:
+            verdict = "met" if grown.exponent <= grown.asked else "missed"
+            lines.append(f"  time ~ {grown.by}^{grown.exponent:.2f} (limit {grown.asked}: {verdict})")
+        return lines
 
 
-def fitted(by: str, sizes: Sequence[float | int], ms: Sequence[float]) -> Growth:
-    """A growth with the exponent that fits best: least squares of logarithms.
+class _Stage(Struct, frozen=True):
+    stage: str
+    ms: float
+
+
+class EarlierReport(Struct, frozen=True):
+    """The compared part of an earlier report."""
+
+    model: str
+    size_px: int
+    cameras: int
+    stages: tuple[_Stage, ...]
+
+
+def read_report(path: Path) -> EarlierReport:
+    """Read a report that `CostReport.write` wrote.
 
     Raises:
-        ValueError: there are less than two different sizes.
+        ValueError: the file is not such a report.
+    """
+    try:
+        return typed(read_json(bounded_bytes(path)), EarlierReport, "give a file of viewmend benchmark --out")
+    except OSError as error:
+        raise ValueError(f"{path}: expected a report, got: {error.strerror}; check --versus") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def compare(now: CostReport, before: EarlierReport) -> list[str]:
+    """The change of each stage as text, ending with the stages that got slower.
+
+    Raises:
+        ValueError: the reports are not of the same model and scene.
+    """
+    own, other = ((r.model, r.size_px, r.cameras) for r in (now, before))
+    if own != other:
+        raise ValueError(f"expected a report of model, size and cameras {own}, got {other}; measure the same")
+    earlier = {stage.stage: stage.ms for stage in before.stages}
+    lines, slower = ["  stage          before      now   ratio"], []
+    for cost in now.stages:
+        was = earlier.get(cost.stage, 0.0)
+        ratio = cost.ms / was if was > 0 else float("nan")
+        lines.append(f"  {cost.stage:<12}{was:9.1f}{cost.ms:9.1f}{ratio:8.2f}")
+        slower += [cost.stage] if ratio >= SLOWER else []
+    return [*lines, f"slower: {', '.join(slower)}" if slower else "no stage is slower"]
+
+
+def fit_growth(by: str, sizes: Sequence[float | int], ms: Sequence[float]) -> Growth:
+    """Fit a power law: least squares of the logarithms.
+
+    Raises:
+        ValueError: there are fewer than two different sizes.
     """
     if len(set(sizes)) < 2 or min(*sizes, *ms) <= 0:
         raise ValueError(f"expected two or more different sizes and times above 0, got {list(sizes)}; give more")
     x, y = [math.log(size) for size in sizes], [math.log(value) for value in ms]
     mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
     slope = sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True)) / sum((a - mean_x) ** 2 for a in x)
-    return Growth(by, tuple(map(float, sizes)), tuple(round(v, 2) for v in ms), round(slope, 3), ASKED[by])
+    return Growth(by, tuple(map(float, sizes)), tuple(round(v, 2) for v in ms), round(slope, 3), MAX_EXPONENT[by])
+
+
+class CostBench:
+    """Measures an inpainter on a synthetic scene, through a `Stream`."""
+
+    def __init__(
+        self, inpainter: Inpainter, size_px: int = 256, cameras: int = 8, repeats: int = 3, seed: int = 10000
+    ) -> None:
+        """Create the scene.
+
+        Args:
+            inpainter: completes the views.
+            size_px: width and height of all images.
+            cameras: cameras of the rig; about half and twice as many are measured, too.
+            repeats: frames that each figure is the median of; one more warms up.
+            seed: the scene.
+        """
+        self.inpainter, self.size_px, self.cameras, self.repeats, self.seed = inpainter, size_px, cameras, repeats, seed
+        self.studio = self._studio(cameras)
+
+    def stages(self) -> list[StageCost]:
+        """The time of each stage of the first view of a frame."""
+        target, stream, times = self._view(), Stream(self.inpainter, bounds=self.studio.bounds), list[StageTimes]()
+        for at in range(self.repeats + 1):
+            stream.add_frame(self.studio.read(at))
+            times.append(stream.view(target, time=at).times)
+        taken = {name: sorted(getattr(t, name) for t in times[1:]) for name in STAGES}
+        return [
+            StageCost(name, round(median(ms), 3), round(ms[min(len(ms) - 1, int(0.95 * len(ms)))], 3))
+            for name, ms in taken.items()
+        ]
+
+    def growth(self) -> list[Growth]:
+        """The time of a frame and its views against pixels, cameras, refined pixels and viewers."""
+        studio, target, found = self.studio, self._view(), list[Growth]()
+        sides = [max(32, round(self.size_px * scale / 4) * 4) for scale in SCALES]
+        by_pixels = [self._frame_ms(studio, [self._view(size_px=side)]) for side in sides]
+        found.append(fit_growth("pixels", [side * side for side in sides], by_pixels))
+        rigs = (max(3, self.cameras // 2), self.cameras, 2 * self.cameras)
+        by_cameras = [self._frame_ms(self._studio(count), [target]) for count in rigs]
+        found.append(fit_growth("cameras", rigs, by_cameras))
+        if self.inpainter.predicts_errors:
+            by_holes = [self._frame_ms(studio, [target], RenderQuality(refine_fraction=part)) for part in FRACTIONS]
+            found.append(fit_growth("holes", FRACTIONS, by_holes))
+        around = [self._view(2 * math.pi * n / max(VIEWERS)) for n in range(max(VIEWERS))]
+        by_viewers = [self._frame_ms(studio, around[:n]) for n in VIEWERS]
+        return [*found, fit_growth("viewers", VIEWERS, by_viewers)]
+
+    def _studio(self, cameras: int) -> Studio:
+        return Studio(StudioConfig(seed=self.seed, cameras=cameras, frames=self.repeats + 1, size_px=self.size_px))
+
+    def _view(self, azimuth_rad: float = 0.4, size_px: int | None = None) -> Cameras:
+        side = size_px or self.size_px
+        return orbit([azimuth_rad], (side, side), elevation_rad=0.2)
+
+    def _frame_ms(self, studio: Studio, views: Sequence[Cameras], quality: RenderQuality | None = None) -> float:
+        """Median milliseconds of a frame and these views of it."""
+        stream, took = Stream(self.inpainter, bounds=studio.bounds), list[float]()
+        for at in range(self.repeats + 1):
+            frame = studio.read(at)
+            start = time.perf_counter()
+            stream.add_frame(frame)
+            for view in views:
+                stream.view(view, time=at, quality=quality)
+            took.append(1000 * (time.perf_counter() - start))
+        return median(took[1:])

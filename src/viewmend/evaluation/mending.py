@@ -1,4 +1,4 @@
-"""One stream of mended views, judged where the truth is known, and the scores of a whole run."""
+"""One stream of completed views, shared by `mend`, `demo` and `evaluate`, and the scores of a run."""
 
 import math
 from collections.abc import Sequence
@@ -9,174 +9,200 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.backgrounds import Background, laid_upon
-from viewmend.baselines.classical import Telea
-from viewmend.evaluation.frame_scores import mean_similarity
+from viewmend.evaluation.scores import Scorers, ViewScores, mean_over_frames, score_view, true_view
+from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import FOREGROUND
-from viewmend.inpainting.protocol import ContextProvider, RenderQuality, State, ViewInpainter, shown_upon
-from viewmend.inpainting.upon_white import fill_upon
-from viewmend.metrics.image_quality import mask_iou
-from viewmend.metrics.view_scores import ViewScores, mean_over_frames, score_view
-from viewmend.observation import Observation
-from viewmend.rendering.view import RenderConfig
-from viewmend.stream import Stream, StreamConfig
-from viewmend.timing import StageTimes
-from viewmend.views import CompletedView, MultiViewFrame
+from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
+from viewmend.models.classical import Telea
+from viewmend.models.compositing import Background, composite
+from viewmend.stream import Stream, StreamConfig, StreamView
+from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame
+from viewmend.utils.timing import StageTimes
 
-Fill = Literal["unfilled", "telea", "unseen", "ours"]
-Metric = Literal["psnr_whole", "psnr_subject", "psnr_valid", "psnr_holes", "psnr_holes_fg"]
+Fill = Literal["unfilled", "telea", "holes_only", "ours"]
+SLOW_MS = 10_000.0
+"""A first step that takes longer is not repeated for its timing: compilation is a small part of it."""
+
+
+class Mender:
+    """Completes the views of one viewer, frame by frame.
+
+    The inpainter is calibrated to the rig with the first frame. The first view is computed twice, and the second is
+    timed, so that nothing is compiled in it.
+    """
+
+    def __init__(
+        self,
+        inpainter: Inpainter,
+        config: StreamConfig | None = None,
+        bounds: Bounds | None = None,
+        exclude: Sequence[str] = (),
+        quality: RenderQuality | None = None,
+        error_model: Inpainter | None = None,
+    ) -> None:
+        """Create a viewer of an empty stream.
+
+        Args:
+            inpainter: completes the views.
+            config: parameters of geometry, rendering and memory; by default frames are kept as long as windows reach.
+            bounds: the volume that may contain the subject; None to find it from the masks.
+            exclude: names of cameras whose images must not be used.
+            quality: how much work a view may cost.
+            error_model: predicts errors in place of `inpainter` (`registry.error_model_for`).
+        """
+        self.stream = Stream(inpainter, config or StreamConfig(memory_mb=None), bounds, error_model)
+        self.background: Background = inpainter.background or self.stream.config.background
+        """Background of the output, on which it is shown and scored."""
+        self.state: State | None = None
+        """The viewer's state; None before the first view."""
+        self._exclude, self._quality = exclude, quality
+        self._warm_up: Stream | None = None
+        self._holes_state: State | None = None
+
+    def add_frame(self, frame: MultiViewFrame | CachedFrame) -> CachedFrame:
+        """Add a frame, with its proxy and depths if another stream computed them already."""
+        given = frame.frame if isinstance(frame, CachedFrame) else frame
+        if not self.stream.times:
+            self.stream.calibrate(given)
+            self._warm_up = Stream(
+                self.stream.inpainter, self.stream.config, self.stream.bounds, self.stream.error_model
+            )
+        for stream in (self._warm_up, self.stream):
+            if stream is not None and isinstance(frame, CachedFrame):
+                stream.add_frame(given, frame.proxy).depths.update(frame.depths)
+            elif stream is not None:
+                stream.add_frame(given)
+        return self.stream.cached_frame(given.time)
+
+    def view(self, target: Cameras, time: int, history_of: IncompleteView | None = None) -> StreamView:
+        """Complete a view of a frame that was added.
+
+        Args:
+            target: the novel view's camera (one view).
+            time: index of the frame.
+            history_of: the rendered view. Its context in frames that were added without a view is encoded first,
+                outside of the measured time.
+        """
+        for stream in (self._warm_up, self.stream):
+            if stream is None:
+                continue
+            if history_of is not None:
+                stream.inpainter.encode_history(history_of, _context(stream))
+            made = stream.view(target, self.state, time, self._quality, self._exclude)
+            if stream is self._warm_up and made.times.inpainting >= SLOW_MS:
+                self.stream = stream
+                break
+        self._warm_up, self.state = None, made.viewer
+        return made
+
+    def skip(self, target: Cameras, time: int) -> None:
+        """Advance the state past a frame whose view is not needed."""
+        if type(self.stream.viewer()) is State:
+            return  # nothing is carried from view to view
+        state = self.stream.advance(self.stream.render(target, time, self._exclude), self.state)
+        self.state = (
+            self.stream.view(target, self.state, time, self._quality, self._exclude).viewer if state is None else state
+        )
+
+    def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> "MendStep":
+        """Complete and score the next view; several views of the same frame may follow each other.
+
+        Args:
+            frame: the input cameras.
+            target: the novel view's camera.
+            truth: the image of a camera at that pose (one view), used for scores only; None if there is none.
+
+        Raises:
+            ValueError: the inpainter returns colours that are not finite.
+        """
+        cached = self.add_frame(frame)
+        made = self.view(target, frame.time)
+        iou = _input_iou(cached)
+        if truth is None:
+            return MendStep(frame, made.completed, self.background, None, None, iou, made.times)
+        true = true_view(truth, self.background)
+        with_ssim, psnr_only = Scorers(self.background), Scorers(self.background, ssim=None)
+        view = made.completed.view
+        holes = replace(view, error=view.holes.to(view.rgb))
+        telea, _ = Telea().step_on(self.background, holes, ContextProvider(lambda *_: None), State())
+        scores = FillScores(
+            unfilled=score_view(CompletedView(view, view.rgb), true, psnr_only),
+            telea=score_view(telea, true, psnr_only),
+            holes_only=score_view(self._fill_holes(made.completed, holes), true, psnr_only),
+            ours=score_view(made.completed, true, with_ssim),
+        )
+        if scores.ours.hull_iou is not None:
+            iou[truth.cameras.names[0]] = scores.ours.hull_iou
+        return MendStep(frame, made.completed, self.background, true.rgb, scores, iou, made.times)
+
+    def _fill_holes(self, completed: CompletedView, holes: IncompleteView) -> CompletedView:
+        """The same view with only its holes inpainted, as a stream of its own."""
+        if self.stream.error_rule == "holes":
+            return completed
+        made = self.stream.mend(holes, self._holes_state, self._quality, self._exclude)
+        self._holes_state = made.viewer
+        return made.completed
 
 
 @dataclass(frozen=True)
-class Scores:
-    """The same view filled in several ways, against the truth."""
+class FillScores:
+    """Scores of the same view, filled in several ways."""
 
     unfilled: ViewScores
     telea: ViewScores
-    unseen: ViewScores
-    """Only the holes are mended, by the method that mends `ours`; the same where the error rule asks for no more."""
+    holes_only: ViewScores
+    """Only the holes are inpainted, by the same inpainter as `ours`; equal for the error rule 'holes'."""
     ours: ViewScores
-    ssim_whole: float | None
-    """SSIM of `ours`."""
-    alpha_iou: float | None
-    """Overlap of alpha above one half, or of M where the method tells no alpha, with the true mask."""
 
 
 @dataclass(frozen=True)
 class MendStep:
-    """One mended view and what is known of it."""
+    """One completed view, with its input and scores."""
 
     frame: MultiViewFrame
     """The input cameras."""
     completed: CompletedView
     background: Background
-    """What the inpainter paints upon, and its views are shown and scored upon."""
     truth: Float[Tensor, "3 height width"] | None
-    """What the view should look like, upon the background; None where nobody knows."""
-    scores: Scores | None
+    """The target image on the background; None if there is none."""
+    scores: FillScores | None
     """None without truth."""
     hull_iou: dict[str, float]
-    """The hull's silhouette against the mask, for each input camera and the truth."""
+    """IoU of the hull's silhouette and the mask, for each input camera and the truth."""
     times: StageTimes
 
     @property
     def mended(self) -> Float[Tensor, "3 height width"]:
-        """Fhat upon the background."""
-        return laid_upon(self.background, self.completed.rgb, self.completed.opacity)
+        """The completed view on the background."""
+        return composite(self.background, self.completed.rgb, self.completed.opacity)
 
     @property
     def rendered(self) -> Float[Tensor, "3 height width"]:
-        """F upon the background; holes are black."""
-        return laid_upon(self.background, self.completed.view.rgb, self.completed.view.mask)
-
-
-class Mender:
-    """Runs one viewer's stream over frames, and judges what comes out."""
-
-    def __init__(
-        self,
-        inpainter: ViewInpainter,
-        render: RenderConfig | None = None,
-        bounds: Bounds | None = None,
-        exclude: Sequence[str] = (),
-        quality: RenderQuality | None = None,
-    ):
-        self._config = StreamConfig(render=render or RenderConfig(), memory_mb=None)
-        self._stream = Stream(inpainter, self._config, bounds)
-        self._background: Background = shown_upon(inpainter)
-        self._exclude = exclude
-        self._quality = quality
-        self._viewer: State | None = None
-        self._viewer_of_holes: State | None = None
-
-    def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> MendStep:
-        """The next view of the stream; the same frame may be looked at many times.
-
-        Args:
-            frame: the input cameras.
-            target: the novel view's camera.
-            truth: what a camera there saw (one view), used for scores alone.
-
-        Raises:
-            ValueError: the inpainter gives colours that are not finite.
-        """
-        if self._viewer is None:
-            # Once unseen, so that what is compiled at first use is in no time that is shown.
-            warm = Stream(self._stream.inpainter, replace(self._config, fit_rig=False), self._stream.bounds)
-            warm.push(frame)
-            warm.view(target, quality=self._quality, exclude=self._exclude)
-        observation = self._stream.push(frame)
-        mended = self._stream.view(target, self._viewer, frame.time, self._quality, self._exclude)
-        self._viewer = mended.viewer
-        iou = _hull_iou(observation)
-        if truth is None:
-            return MendStep(frame, mended.completed, self._background, None, None, iou, mended.times)
-        image, scores = _judge(mended.completed, self._holes_mended(mended.completed), truth, self._background)
-        if scores.ours.hull_iou is not None:
-            iou[truth.cameras.names[0]] = scores.ours.hull_iou
-        return MendStep(frame, mended.completed, self._background, image, scores, iou, mended.times)
-
-    def _holes_mended(self, completed: CompletedView) -> CompletedView:
-        """The same view with nothing but its holes mended, as a stream of its own."""
-        if self._stream.error_rule == "unseen":
-            return completed
-        view = replace(completed.view, error=completed.view.holes.to(completed.rgb))
-        mended = self._stream.mend(view, self._viewer_of_holes, self._quality, self._exclude)
-        self._viewer_of_holes = mended.viewer
-        return mended.completed
-
-
-def _judge(
-    completed: CompletedView, holes_mended: CompletedView, truth: MultiViewFrame, background: Background
-) -> tuple[Float[Tensor, "3 height width"], Scores]:
-    """The true image upon this background, and the scores against it."""
-    view = completed.view
-    height, width = view.mask.shape
-    assert truth.mask is not None, "frames without masks are refused"
-    mask = truth.mask[0, :height, :width]
-    image, subject = truth.rgb[0, :, :height, :width] / 255 * (mask / 255), mask > FOREGROUND
-    image = laid_upon(background, image, mask / 255)
-    baseline = fill_upon(Telea(), background)
-    filled, _ = baseline.step(
-        replace(view, error=view.holes.to(view.rgb)), ContextProvider(lambda *_: None), baseline.initial_state()
-    )
-    fills = [laid_upon(background, view.rgb, view.mask)]
-    fills += [laid_upon(background, made.rgb, made.opacity) for made in (filled, holes_mended, completed)]
-    unfilled, telea, unseen, ours = (score_view(view, rgb, image, subject) for rgb in fills)
-    ssim = mean_similarity(fills[-1], image)
-    return image, Scores(unfilled, telea, unseen, ours, ssim, mask_iou(completed.opacity > 0.5, subject))
-
-
-def _hull_iou(observation: Observation) -> dict[str, float]:
-    frame = observation.frame
-    assert frame.mask is not None, "frames without masks are refused"
-    iou = silhouette_iou(observation.depth(frame.cameras.names) > 0, frame.mask).tolist()
-    return {name: score for name, score in zip(frame.cameras.names, iou, strict=True) if not math.isnan(score)}
+        """The rendered view on the background; holes are black."""
+        return composite(self.background, self.completed.view.rgb, self.completed.view.mask)
 
 
 class MendSummary:
-    """Gathers the steps of a run, without their images."""
+    """Collects scores and times of a run, without images."""
 
     def __init__(self) -> None:
         self.frames = 0
         self.background: Background = "black"
-        """What was scored upon."""
         self.hull_iou: dict[str, list[float]] = {}
-        """The IoU of each camera, frame by frame."""
-        self._hull_px = self._holes_px = self._mended_px = 0
-        self._scores: list[Scores] = []
+        """IoU of each camera, frame by frame."""
+        self._hull_px = self._hole_px = self._mended_px = 0
+        self._scores: list[FillScores] = []
         self._times: list[StageTimes] = []
 
     def add(self, step: MendStep) -> None:
-        """Count one more view."""
+        """Add one view."""
         view = step.completed.view
         self.frames, self.background = self.frames + 1, step.background
         self._hull_px += int((view.mask > 0.5).sum())
-        self._holes_px += int(view.holes.sum())
-        self._mended_px += int(((view.mask > 0.5) & view.read).sum())
+        self._hole_px += int(view.holes.sum())
+        self._mended_px += int(((view.mask > 0.5) & view.refine_mask).sum())
         if step.scores is not None:
             self._scores.append(step.scores)
         for name, iou in step.hull_iou.items():
@@ -185,16 +211,16 @@ class MendSummary:
 
     @property
     def hole_fraction(self) -> float | None:
-        """The holes' share of the hull's pixels; None without a hull."""
-        return self._holes_px / self._hull_px if self._hull_px else None
+        """Fraction of the hull's pixels that are holes; None without a hull."""
+        return self._hole_px / self._hull_px if self._hull_px else None
 
     @property
     def mended_fraction(self) -> float | None:
-        """The share of the hull's pixels with E > 0; None without a hull."""
+        """Fraction of the hull's pixels that are inpainted; None without a hull."""
         return self._mended_px / self._hull_px if self._hull_px else None
 
     def as_json(self) -> dict[str, object]:
-        """The scores; null where there are no such pixels, or no truth. Times are medians, milliseconds."""
+        """The scores of `mend --json`; None where there are no such pixels, or no truth. Times are medians in ms."""
         return {
             "frames": self.frames,
             "background": self.background,
@@ -202,10 +228,10 @@ class MendSummary:
             "mended_fraction": self.mended_fraction,
             "psnr_whole": self.mean("ours", "psnr_whole"),
             "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
-            "psnr_whole_unseen": self.mean("unseen", "psnr_whole"),
-            "ssim_whole": mean_over_frames([s.ssim_whole for s in self._scores]),
+            "psnr_whole_unseen": self.mean("holes_only", "psnr_whole"),
+            "ssim_whole": self.mean("ours", "ssim_whole"),
             "psnr_subject": self.mean("ours", "psnr_subject"),
-            "alpha_iou": mean_over_frames([s.alpha_iou for s in self._scores]),
+            "alpha_iou": self.mean("ours", "alpha_iou"),
             "psnr_valid": self.mean("ours", "psnr_valid"),
             "psnr_holes": self.mean("ours", "psnr_holes"),
             "psnr_holes_telea": self.mean("telea", "psnr_holes"),
@@ -215,13 +241,29 @@ class MendSummary:
             "stage_ms": self.stage_ms(),
         }
 
-    def mean(self, fill: Fill, metric: Metric) -> float | None:
-        """Mean over frames of one metric of one way to fill the holes; None where there are no such pixels."""
+    def mean(self, fill: Fill, metric: str) -> float | None:
+        """Mean over frames of a field of `ViewScores`, for one way to fill the holes; None without any value."""
         scores: list[ViewScores] = [getattr(s, fill) for s in self._scores]
-        pixels = {"psnr_holes": [s.holes_px for s in scores], "psnr_holes_fg": [s.holes_fg_px for s in scores]}
+        pixels = {"psnr_holes": [s.hole_px for s in scores], "psnr_holes_fg": [s.hole_fg_px for s in scores]}
         return mean_over_frames([getattr(s, metric) for s in scores], pixels.get(metric))
 
     def stage_ms(self) -> dict[str, float]:
         """Median milliseconds of each stage."""
         times = [asdict(stages) for stages in self._times]
         return {stage: median(t[stage] for t in times) for stage in times[0]} if times else {}
+
+
+def _context(stream: Stream) -> ContextProvider:
+    """All frames of a stream, and its memory of them."""
+
+    def views(time: int, names: tuple[str, ...]) -> ContextViews | None:
+        return stream.cached_frame(time).context(names) if time in stream.times else None
+
+    return ContextProvider(views, memory=lambda time: stream.cached_frame(time).encoded if time in stream.times else {})
+
+
+def _input_iou(cached: CachedFrame) -> dict[str, float]:
+    frame = cached.frame
+    assert frame.mask is not None, "frames without masks are refused"
+    iou = silhouette_iou(cached.depth(frame.cameras.names) > 0, frame.mask).tolist()
+    return {name: score for name, score in zip(frame.cameras.names, iou, strict=True) if not math.isnan(score)}

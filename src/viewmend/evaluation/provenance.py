@@ -1,4 +1,4 @@
-"""Where figures come from: machine, versions, commit."""
+"""Where measured figures come from: machine, versions, commit."""
 
 import os
 import platform
@@ -13,7 +13,7 @@ from viewmend import __version__
 
 @dataclass(frozen=True)
 class Provenance:
-    """What figures depend on besides their definition."""
+    """What measured figures depend on besides their definition."""
 
     viewmend: str
     commit: str
@@ -21,13 +21,13 @@ class Provenance:
     python: str
     torch: str
     device: str
-    """The processor's or the GPU's name."""
+    """Name of the processor or the GPU."""
     threads: int
     """Threads of torch in each process."""
     jobs: int
-    """Processes at work at the same time, which slow each other down."""
+    """Number of processes running at once; they slow each other down."""
     load: float
-    """Load of the machine, a minute's average at the start: other work slows this one down, too."""
+    """One-minute load average of the machine at the start."""
 
 
 def provenance(device: str, threads: int, jobs: int) -> Provenance:
@@ -45,15 +45,15 @@ def _processor() -> str:
 
 
 def _commit() -> str:
-    def git(*words: str) -> str:
-        command = ["git", *words]
-        try:
-            done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-        except OSError:
-            return ""
-        return done.stdout.strip()
+    head = _git("rev-parse", "--short", "HEAD")
+    changed = head and _git("status", "--porcelain", "--untracked-files=no", "--", ".")
+    return head + ("+" if changed else "") if head else "unknown"
 
-    head = git("rev-parse", "--short", "HEAD")
-    return (
-        head + ("+" if git("status", "--porcelain", "--untracked-files=no", "--", ".") else "") if head else "unknown"
-    )
+
+def _git(*arguments: str) -> str:
+    folder = Path(__file__).parent
+    try:
+        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip()

@@ -1,76 +1,110 @@
-"""What an evaluation found, ready to be written in any form."""
+"""The results of an evaluation as tables, Markdown, JSON and CSV."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, astuple, dataclass, fields
 
-from viewmend.evaluation.averages import Table, tables, tables_by_kind
-from viewmend.evaluation.cells import PROTOCOL, Cell
+from viewmend.evaluation.averages import (
+    Record,
+    Records,
+    Row,
+    Table,
+    frames_with_holes,
+    records,
+    speed,
+    tables,
+    tables_by_kind,
+)
 from viewmend.evaluation.provenance import Provenance
-from viewmend.evaluation.records import Records, records
+from viewmend.evaluation.result_cache import PROTOCOL, Cell
 from viewmend.evaluation.scene_run import SLOW_MS, RunSettings
-from viewmend.methods import REFERENCE
-from viewmend.metrics.view_scores import ENOUGH_HOLE_PX
+from viewmend.evaluation.scores import MIN_HOLE_PX
+from viewmend.models.registry import PRIVILEGED, REFERENCE
+from viewmend.utils.logging import printable
 
 RULES = (
-    "One camera is left out, with its mask; its view is carved and rendered from the others, and completed as a "
-    "stream: one frame at a time, from past frames only. All methods complete the same rendered views.",
-    "Holes are the proxy's pixels that no camera in use colours, not dilated: E by the rule 'unseen', and the same for "
-    "scores whatever the methods were asked to mend. The truth is the left-out camera's image on black, or on white "
-    "where the setting says so: then classical fills and published networks are shown the view on white, too, and a "
-    "model of ours what it was trained on, its result laid on white by its alpha, or M.",
-    'Each score has four readings: "whole", over all pixels; "holes", over the holes alone (a); "in mask", over '
-    'those of them inside the true mask; "masked", of both images blackened outside the holes, over all pixels (b). '
-    'SSIM and LPIPS in "holes" and "in mask" are means of their maps there, of unmasked images.',
-    '"Rendered" is the PSNR over all pixels before anything is mended, "subject" that inside the true mask; "alpha '
-    "IoU\" is the overlap of alpha above one half (without alpha: of the proxy's mask) with the true mask.",
-    '"Only past" is the PSNR over the holes whose true surface none of the cameras that colour the view sees now, and '
-    "one of them saw 1, 2, 3, 10, 20 or 30 frames ago, by true depth; known for P-long, Q-long and P-turn alone, whose "
-    "last frames are scored, with a whole past.",
-    "SSIM: Gaussian window of 11 x 11 pixels, sigma 1.5, unless the setting says another; mean of the channels; only "
-    "windows that lie in the image.",
-    "LPIPS 0.1 of AlexNet and VGG16. VFID: I3D's Mixed_5c, a mean vector for each video of up to 16 frames in [0, 1], "
-    "Frechet distance over all videos of the table; I3D in evaluation mode, and as published scripts run it, in "
-    'training mode ("train"). Networks without their weights are n/a.',
-    f"Frames with fewer than {ENOUGH_HOLE_PX} pixels of the kind are left out of scores in the holes, and counted.",
-    "Means are over the frames of a scene, then over the scenes of a set, then over sets.",
-    "Methods see the cameras' past and their own results, never the left-out camera; rgvi alone sees its truth of past "
-    "frames, as in the paper, and is no fair rival.",
-    f"The gain over {REFERENCE} is the mean over the scenes in which both have a score.",
-    '"Flicker" is how much the error, completed view minus truth, differs from that of the frame before, warped by the '
-    "true motion of the surface: mean absolute difference over the holes, in 255ths; the truth has 0.",
-    '"Warp" is the mean absolute difference from the frame before, warped in the same way, over the holes '
-    '(in 255ths); "change" is that in place, over the holes of now or then. The truth is not 0 in '
-    "either: see its row.",
-    "Milliseconds are the inpainter's step alone (not hull and rendering), with its caches as in production, over the "
-    "frames with holes: FPS by their mean, median, 95th percentile. Each stream's first step is run twice and the "
-    f"second is timed, so that nothing is compiled in it; what takes {SLOW_MS / 1000:.0f} s is not run again.",
+    "One camera is held out, image and mask. Its view is rendered from the other cameras and completed frame by frame, "
+    "using past frames only. All methods complete the same views.",
+    'Holes are the pixels of the geometry proxy that no source camera colours, not dilated: the error rule "holes". '
+    "Scores use these pixels whatever a method is asked to inpaint. The truth is the held-out image on black or white, "
+    "as the settings say. On white, classical fills and published networks receive the view on white, too; our models "
+    "receive the background that they were trained on, and their output is composited on white by its alpha.",
+    'PSNR, SSIM and LPIPS have four readings: "whole", over all pixels; "holes", over the holes only (a); "in mask", '
+    'over the holes inside the true mask; "masked", over all pixels of images blackened outside the holes (b). SSIM '
+    'and LPIPS in "holes" and "in mask" are means of the maps of the unmasked images.',
+    '"Rendered" is the PSNR over all pixels before inpainting, "subject" the PSNR inside the true mask, "alpha IoU" '
+    "the overlap of the true mask with alpha above one half (without alpha: with the proxy's mask).",
+    '"Only past" is the PSNR over the holes whose true surface none of the source cameras sees now and at least one '
+    "saw 1, 2, 3, 10, 20 or 30 frames ago, by true depth. It exists for P-long, Q-long and P-turn, whose last frames "
+    "are scored after a full window.",
+    "SSIM uses a Gaussian window of 11 x 11 pixels with sigma 1.5 unless the settings say otherwise: mean over the "
+    "channels and over the windows inside the image.",
+    "LPIPS is version 0.1 with AlexNet and VGG16. VFID uses I3D's Mixed_5c: a mean vector for each video of up to 16 "
+    "frames in [0, 1], Frechet distance over all videos of the table, with I3D in evaluation mode and, as published "
+    'scripts run it, in training mode ("train"). Networks without weights are n/a.',
+    f"Frames with fewer than {MIN_HOLE_PX} pixels of a kind are left out of the scores over them, and counted.",
+    "Means are taken over the frames of a scene, then over the scenes of a set, then over sets.",
+    "Methods use the past frames of the source cameras and their own results, never the held-out camera. Only rgvi is "
+    "given the true past frames, as in the paper, and is not comparable.",
+    f"The gain over {REFERENCE} is the mean over the scenes where both have a score.",
+    '"Flicker" is the change of the error (completed view minus truth) since the previous frame, warped by the true '
+    "motion of the surface: mean absolute difference over the holes, in 255ths. The truth has 0.",
+    '"Warp" is the mean absolute difference from the previous frame warped in the same way, over the holes, in 255ths; '
+    '"change" is the difference in place, over the holes of both frames. The truth is not 0 in either: see its row.',
+    "Milliseconds are the inpainter's step without hull and rendering, with its caches as in production, over the "
+    "frames with holes: mean (as FPS), median, 95th percentile. The first step is run twice and the second is timed, "
+    f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
 )
-"""What the figures mean; every report says so."""
+"""Definitions of the figures, printed with every report."""
+COLUMNS = (
+    ("holes, dB", "psnr", "holes", 1, 2),
+    ("in mask", "psnr", "holes_fg", 1, 2),
+    ("only past", "psnr", "past", 1, 2),
+    ("masked", "psnr", "masked", 1, 2),
+    ("SSIM masked", "ssim", "masked", 1, 5),
+    ("whole, dB", "psnr", "whole", 1, 2),
+    ("rendered", "psnr_rendered", "whole", 1, 2),
+    ("SSIM whole", "ssim", "whole", 1, 4),
+    ("subject, dB", "psnr", "subject", 1, 2),
+    ("alpha IoU", "alpha_iou", "whole", 1, 4),
+    ("flicker", "flicker", "holes", 255, 2),
+    ("flicker whole", "flicker", "whole", 255, 2),
+    ("still", "change", "still", 255, 2),
+    ("warp", "warp_error", "holes", 255, 2),
+    ("change", "change", "holes", 255, 2),
+)
+"""Columns of the main table: heading, metric, region, factor, decimals."""
+READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
+"""Readings of each score: heading, region."""
+SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 5), ("LPIPS Alex", "lpips_alex", 4), ("LPIPS VGG", "lpips_vgg", 4))
+"""Heading, metric, decimals."""
+VFIDS = ("VFID whole", "VFID masked", "VFID whole, train", "VFID masked, train")
 
 
 @dataclass(frozen=True)
 class Report:
-    """All figures of an evaluation."""
+    """All results of an evaluation."""
 
     protocol: int
     settings: RunSettings
     methods: tuple[str, ...]
     identities: dict[str, str]
-    """What each method is: class, parameters, hash of its weights."""
+    """Class, parameters and hash of the weights of each method."""
     tables: tuple[Table, ...]
-    """Over all sets if there are several, then each set."""
+    """One per set; with several sets, first one over all."""
     kinds: tuple[Table, ...]
     """Each set's rigs and styles."""
     scores: Records
-    """Every figure of every method and scene."""
     cells: tuple[Cell, ...]
-    """All of them, also those that failed."""
+    """All cells, including failed ones."""
     missing: dict[str, str]
-    """Methods without what they need here, which have no cells, and the reason: their rows are n/a."""
+    """Methods that cannot be made here, with the reason: they have no cells, and their rows are n/a."""
     missing_networks: dict[str, str]
-    """Networks of metrics without their weights, and the reason: their scores are n/a."""
+    """Networks of metrics without weights, with the reason: their scores are n/a."""
     origins: tuple[Provenance, ...]
-    """Where the cells were computed: several if runs were resumed."""
+    """Where the cells were computed: several if a run was resumed."""
 
 
 def make_report(
@@ -80,19 +114,237 @@ def make_report(
     missing: dict[str, str] | None = None,
     missing_networks: dict[str, str] | None = None,
 ) -> Report:
-    """Average the cells, in the order of scenes and methods in which they come."""
-    identities = {cell.key.method: cell.identity for cell in cells}
-    origins = tuple(dict.fromkeys(cell.provenance for cell in cells))
+    """Average the cells; rows and scenes keep the order of `methods` and `cells`."""
     return Report(
         protocol=PROTOCOL,
         settings=settings,
         methods=methods,
-        identities=identities,
+        identities={cell.key.method: cell.identity for cell in cells},
         tables=tuple(tables(cells, methods)),
         kinds=tuple(tables_by_kind(cells, methods)),
         scores=records(cells),
         cells=tuple(cells),
         missing=missing or {},
         missing_networks=missing_networks or {},
-        origins=origins,
+        origins=tuple(dict.fromkeys(cell.provenance for cell in cells)),
     )
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table of text, with `**bold**` and `*italic*` as in Markdown."""
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def setting_lines(report: Report) -> list[str]:
+    """The settings and the origin of the figures."""
+    settings = report.settings
+    rule = settings.stream.render.error_rule or "of each method"
+    lines = [
+        f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
+        f"{settings.stream.render.cameras} source cameras; error rule {rule}; "
+        f"SSIM {settings.ssim}; scored on {settings.background}."
+    ]
+    return lines + [
+        f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "
+        f"{o.jobs} process{'es' if o.jobs > 1 else ''} of {o.threads} threads, load {o.load}."
+        for o in report.origins
+    ]
+
+
+def holes_line(table: Table) -> str:
+    """The number of frames, and the size of their holes."""
+    sizes = " and ".join(f"{width} x {height}" for width, height in table.sizes_px)
+    of_hull, of_image, of_surface = (
+        next((v for row in table.rows if (v := row.scores.mean("hole_fraction", of)) is not None), None)
+        for of in ("hull", "image", "only_past")
+    )
+    past = f"; {number(of_surface, 100, 2)} % of the missing surface is visible only in the past" if of_surface else ""
+    return (
+        f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
+        f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames with too few hole pixels left "
+        f"out, {table.empty_frames} of them without holes."
+    )
+
+
+def main_grid(table: Table) -> Grid:
+    """The main scores, speed and failures; the last row is the truth's own change."""
+    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "FPS", "ms", "ms p95", "scenes", "failed")
+    rows = [_method_row(row, len(heads)) for row in table.rows]
+    return Grid(heads, (*rows, _truth_row(table.rows, len(heads))))
+
+
+def readings_grid(table: Table) -> Grid:
+    """All scores in all readings, and VFID."""
+    heads = ("method", *(f"{score} {reading}" for score, _, _ in SCORES for reading, _ in READINGS), *VFIDS)
+    rows = []
+    for row in table.rows:
+        cells = [
+            number(row.scores.mean(metric, region), 1, digits, "n/a")
+            for _, metric, digits in SCORES
+            for _, region in READINGS
+        ]
+        rows.append((row.method, *cells, *(number(value, 1, 4, "n/a") for value in row.vfid.values())))
+    return Grid(heads, tuple(rows))
+
+
+def kinds_grid(report: Report) -> Grid:
+    """PSNR in the holes by rig and style, and the gain over the reference."""
+    rows = []
+    for table in report.kinds:
+        cells = (f"{number(r.scores.mean('psnr', 'holes'), 1, 2)} ({_signed(r.over_reference)})" for r in table.rows)
+        rows.append((table.title, *cells))
+    return Grid(("kind", *report.methods), tuple(rows))
+
+
+def scenes_grid(report: Report) -> Grid:
+    """PSNR in the holes of each scene."""
+    holes = {(r.scene, r.method): number(r.value, 1, 2) for r in report.scores.where(metric="psnr", region="holes")}
+    cells = {(c.key.scene, c.key.method): "-" if c.error is None else "**failed**" for c in report.cells} | holes
+    shares = report.scores.by_scene("hole_fraction", "hull")
+    rows = [
+        (scene, number(shares.get(scene), 100, 2), *(cells.get((scene, method), "n/a") for method in report.methods))
+        for scene in dict.fromkeys(scene for scene, _ in cells)
+    ]
+    return Grid(("scene", "holes, % of the hull", *report.methods), tuple(rows))
+
+
+def not_available(report: Report) -> list[str]:
+    """Missing methods and networks, one line per reason."""
+    missing = report.missing | report.missing_networks
+    of = {reason: [name for name in missing if missing[name] == reason] for reason in missing.values()}
+    return [f"{', '.join(names)}: {reason}" for reason, names in of.items()]
+
+
+def number(value: float | None, factor: int, digits: int, none: str = "-") -> str:
+    """The product with this many decimals; `none` for None."""
+    return none if value is None else f"{factor * value:.{digits}f}"
+
+
+def markdown(report: Report) -> str:
+    """The whole report as Markdown."""
+    parts = ["# Evaluation", "\n".join(setting_lines(report))]
+    for table in report.tables:
+        parts += [_main(table), markdown_table(readings_grid(table))]
+    if missing := not_available(report):
+        parts += ["## Not available", bullets(missing)]
+    if report.kinds:
+        by_kind = markdown_table(kinds_grid(report))
+        parts += ["## By rig and style", f"PSNR in the holes, dB; gain over {REFERENCE}.", by_kind]
+    parts += ["## Scenes", "PSNR in the holes, dB.", markdown_table(scenes_grid(report))]
+    failed = [cell for cell in report.cells if cell.error is not None]
+    if failed:
+        parts += ["## Failed", bullets(printable(f"{c.key.scene}, {c.key.method}: {c.error}") for c in failed)]
+    parts += ["## What the figures mean", bullets(RULES)]
+    parts += ["## Methods", bullets(f"{name}: `{report.identities.get(name, '?')}`" for name in report.methods)]
+    return "\n\n".join(parts) + "\n"
+
+
+def summary(report: Report) -> str:
+    """The main tables only, as Markdown."""
+    return "\n\n".join(_main(table) for table in report.tables) + "\n"
+
+
+def markdown_table(grid: Grid) -> str:
+    """A grid as a Markdown table."""
+    lines = [grid.heads, ["---"] * len(grid.heads), *grid.rows]
+    return "\n".join("| " + " | ".join(printable(cell).replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def report_json(report: Report) -> str:
+    """Settings, tables, and the means of each cell as JSON; the frames are in the cell's own file."""
+    value = {
+        "protocol": report.protocol,
+        "rules": RULES,
+        "settings": asdict(report.settings),
+        "methods": report.methods,
+        "identities": report.identities,
+        "missing": report.missing,
+        "missing_networks": report.missing_networks,
+        "origins": [asdict(origin) for origin in report.origins],
+        "tables": [_table_values(table) for table in report.tables],
+        "kinds": [_table_values(table) for table in report.kinds],
+        "cells": [_cell_values(cell, report.scores) for cell in report.cells],
+    }
+    return json.dumps(value, indent=1, allow_nan=False) + "\n"
+
+
+def report_csv(report: Report) -> str:
+    """One line per record."""
+    return csv_text([f.name for f in fields(Record)], (astuple(record) for record in report.scores))
+
+
+def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Rows as CSV."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(heads)
+    writer.writerows(rows)
+    return file.getvalue()
+
+
+def _table_values(table: Table) -> dict[str, object]:
+    rows = [asdict(row) | {"scores": _means(row.scores)} for row in table.rows]
+    return {**asdict(table), "rows": rows}
+
+
+def _means(scores: Records) -> dict[str, float | None]:
+    """The means of one method by METRIC_REGION."""
+    return {f"{r.metric}_{r.region}": scores.mean(r.metric, r.region) for r in scores}
+
+
+def _cell_values(cell: Cell, scores: Records) -> dict[str, object]:
+    taken = speed([cell])
+    return {
+        "scene": cell.key.scene,
+        "set": cell.set,
+        "rig": cell.rig,
+        "style": cell.style,
+        "method": cell.key.method,
+        "error": cell.error,
+        **_means(scores.where(scene=cell.key.scene, method=cell.key.method)),
+        **{name: getattr(taken, name, None) for name in ("fps", "ms_p50", "ms_p95")},
+        "frames": len(cell.frames),
+        "thin_frames": len(cell.frames) - len(frames_with_holes(cell.frames)),
+        "empty_frames": sum(frame.hole_px == 0 for frame in cell.frames),
+        "commit": cell.provenance.commit,
+        "file": f"{cell.key.stem}.json",
+    }
+
+
+def _main(table: Table) -> str:
+    return f"## {printable(table.title)}\n\n{holes_line(table)}\n\n{markdown_table(main_grid(table))}"
+
+
+def bullets(lines: Iterable[str]) -> str:
+    """Lines as a Markdown list."""
+    return "\n".join(f"* {line}" for line in lines)
+
+
+def _method_row(row: Row, width: int) -> tuple[str, ...]:
+    if not row.scenes:
+        return (row.method, *["n/a"] * (width - 1))
+    name = f"{row.method} (given the true past)" if row.method in PRIVILEGED else row.method
+    return (
+        name,
+        _signed(row.over_reference),
+        *(number(row.scores.mean(metric, of), factor, digits) for _, metric, of, factor, digits in COLUMNS),
+        *(number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
+        str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
+        f"**{row.failed}**" if row.failed else "0",
+    )
+
+
+def _truth_row(rows: Sequence[Row], width: int) -> tuple[str, ...]:
+    """The truth's own change, which a perfect method would have."""
+    shown = []
+    for _, metric, region, factor, digits in COLUMNS:
+        means = (row.scores.mean(f"{metric}_truth", region) for row in rows)
+        shown.append(number(next((value for value in means if value is not None), None), factor, digits, ""))
+    return ("*truth*", "", *shown, *[""] * (width - 2 - len(shown)))
+
+
+def _signed(value: float | None) -> str:
+    return "-" if value is None else f"{value:+.2f}"

@@ -1,23 +1,40 @@
-"""Runs scenes x methods, here, in processes or on a cluster, and goes on where an earlier run stopped."""
+"""Runs scenes x methods in this process, in several, or on a cluster, and resumes interrupted runs."""
 
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
-from viewmend.evaluation.cells import Cell, CellKey, CellStore, cell_keys, method_identities, to_cells
+from viewmend.data.holdout.scenes import LeaveOneOutScene
 from viewmend.evaluation.provenance import provenance
-from viewmend.evaluation.ray_cluster import run_on_ray
+from viewmend.evaluation.result_cache import Cell, CellStore, cell_keys, method_identities, to_cells
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
-from viewmend.evaluation.tasks import Task
-from viewmend.leave_one_out.scenes import LeaveOneOutScene
-from viewmend.terminal import log_to_terminal
+from viewmend.utils.logging import log_to_terminal
+from viewmend.utils.plugins import import_object
+
+CLUSTER = "viewmend.contrib.ray.evaluation:run_on_ray"
+"""MODULE:NAME of the function that runs tasks on a Ray cluster; imported on demand."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The methods that a scene lacks: one call of `evaluate_scene`."""
+
+    scene: LeaveOneOutScene
+    methods: tuple[str, ...]
+
+    def failed(self, reason: str) -> SceneRun:
+        """The result of a task whose process died."""
+        return SceneRun(self.scene.name, tuple(MethodRun(name, error=reason) for name in self.methods))
+
+
+Runs = Iterator[tuple[Task, SceneRun]]
 
 
 def run_evaluation(
@@ -28,17 +45,17 @@ def run_evaluation(
     jobs: int = 1,
     ray: str | None = None,
 ) -> Iterator[list[Cell]]:
-    """The cells of one scene after another, as they are there: remembered ones first, the others once computed.
+    """The cells of one scene after another: stored ones first, then the others as they are computed.
 
-    Cells are remembered as soon as their scene is done; those that failed are tried again by the next run.
+    Cells are stored as soon as their scene is done. Failed cells are computed again by the next run.
 
     Args:
         scenes: with different names.
         methods: names for `make_method`.
-        store: where cells are remembered.
+        store: the folder of stored cells.
         settings: device, precision, hull and renderer.
-        jobs: processes; 1 works in this one.
-        ray: address of a Ray cluster that does the work instead (`ray_cluster`).
+        jobs: number of processes; 1 works in this one.
+        ray: address of a Ray cluster that does the work instead.
 
     Raises:
         ValueError: a method cannot be made, two scenes have one name, `jobs` is not positive, or there is no cluster.
@@ -59,14 +76,24 @@ def run_evaluation(
     jobs = min(jobs, max(1, len(tasks)))
     threads = torch.get_num_threads() if jobs == 1 else max(1, (os.cpu_count() or 1) // jobs)
     origin = provenance(settings.device, threads, jobs)
-    runs = _run(tasks, settings, jobs, threads)
-    if ray is not None:
+    if ray is None:
+        runs = _run(tasks, settings, jobs, threads)
+    else:
         origin = replace(origin, device=f"the Ray cluster {ray}", threads=1)
-        runs = run_on_ray(tasks, settings, ray)
+        runs = import_object(CLUSTER)(tasks, settings, ray)
     for task, run in runs:
         cells = to_cells(task.scene, run, keys[task.scene.name], identities, origin)
-        _remember(store, cells, run, keys[task.scene.name][0])
+        store.save_scene(keys[task.scene.name][0], run)
+        for cell, one in cells:
+            store.save(cell, one)
         yield [cell for cell, _ in cells]
+
+
+def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
+    """A pool of `jobs` processes with `threads` threads each; they end with this process, even if it is killed."""
+    # Not forked: threads of torch and numba do not survive that.
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(jobs, context, _start_worker, (threads,))
 
 
 def _check(names: list[str], jobs: int) -> None:
@@ -76,13 +103,7 @@ def _check(names: list[str], jobs: int) -> None:
         raise ValueError(f"expected scenes of different names, got {', '.join(twice[:3])} twice; rename a folder")
 
 
-def _remember(store: CellStore, cells: list[tuple[Cell, MethodRun]], run: SceneRun, key: CellKey) -> None:
-    store.save_scene(key, run)
-    for cell, one in cells:
-        store.save(cell, one)
-
-
-def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) -> Iterator[tuple[Task, SceneRun]]:
+def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) -> Runs:
     if jobs == 1:
         for task in tasks:
             yield task, evaluate_scene(task.scene, task.methods, settings)
@@ -93,51 +114,38 @@ def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) 
             futures = {pool.submit(evaluate_scene, t.scene, t.methods, settings): t for t in tasks}
             try:
                 for future in as_completed(futures):
-                    yield futures[future], _result(future)
+                    yield futures[future], future.result()
                     left.remove(futures[future])
             except BaseException:
-                # What the workers have begun nobody will hear of: an interrupted run ends now.
+                # The run was interrupted: end at once, without waiting for the tasks in progress.
                 for worker in list((pool._processes or {}).values()):
                     worker.terminate()
                 raise
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
     except BrokenProcessPool:
-        # A process died (out of memory, say), and took the pool with it. One scene in a pool then finds the culprit.
+        # A process died (out of memory, say) and broke the pool. Run the rest one by one: only the culprit fails.
         for task in left:
-            yield task, _alone(task, settings, threads)
+            yield task, _run_alone(task, settings, threads)
 
 
-def _alone(task: Task, settings: RunSettings, threads: int) -> SceneRun:
+def _run_alone(task: Task, settings: RunSettings, threads: int) -> SceneRun:
     with process_pool(1, threads) as pool:
         try:
-            return _result(pool.submit(evaluate_scene, task.scene, task.methods, settings))
+            return pool.submit(evaluate_scene, task.scene, task.methods, settings).result()
         except BrokenProcessPool as error:
-            said = f"the process died ({error}); is there enough memory?"
-            return SceneRun(task.scene.name, tuple(MethodRun(name, (), said) for name in task.methods))
+            return task.failed(f"the process died ({error}); is there enough memory?")
 
 
-def _result(future: Future[SceneRun]) -> SceneRun:
-    return future.result()
-
-
-def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
-    """So many worker processes, each with so many threads, that end when this process does, however it does."""
-    # Not forked: threads of torch and numba do not survive that.
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(jobs, context, _begin, (threads,))
-
-
-def _begin(threads: int) -> None:
-    """What a worker does first."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent says what it means
+def _start_worker(threads: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent handles it
     log_to_terminal()
     torch.set_num_threads(threads)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
 
 
-def _leave_with_parent() -> None:
-    """A worker whose parent was killed would wait for work forever."""
+def _exit_with_parent() -> None:
+    """Without this, a worker whose parent was killed would wait for work forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

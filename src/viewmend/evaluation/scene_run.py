@@ -1,32 +1,36 @@
-"""One scene through many methods: each frame is carved and rendered once, and all complete the same views."""
+"""One scene through many methods: the hull of each frame is computed once, and all methods complete the same views."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
-from viewmend.backgrounds import Background, laid_upon
-from viewmend.baselines.classical import Unfilled
-from viewmend.baselines.rgvi import SeesTruth
-from viewmend.contact_sheet import picture
-from viewmend.evaluation.film import FILM_FRAMES, Box, Picture, film, subject_box
-from viewmend.evaluation.frame_scores import Before, FrameScores, TrueView, score_frame, true_view
-from viewmend.evaluation.own_stream import all_of, push_again
-from viewmend.evaluation.scorers import Features, Scorers, VideoFeatures, load_scorers
-from viewmend.inpainting.protocol import State, ViewInpainter, encode_past, own_background, state_after
-from viewmend.inpainting.upon_white import UponWhite, fill_upon
-from viewmend.leave_one_out.scenes import LeaveOneOutScene
-from viewmend.methods import make_method
+from viewmend.data.holdout.scenes import LeaveOneOutScene
+from viewmend.evaluation.mending import SLOW_MS, Mender
+from viewmend.evaluation.scores import (
+    Features,
+    PreviousView,
+    Scorers,
+    TrueView,
+    VideoFeatures,
+    ViewScores,
+    load_scorers,
+    score_view,
+    true_view,
+)
+from viewmend.evaluation.video_strip import STRIP_FRAMES, Box, Picture, make_strip, subject_box
+from viewmend.frame_cache import CachedFrame
+from viewmend.geometry.bounds import Bounds
 from viewmend.metrics.image_quality import SsimWindow
-from viewmend.observation import Observation
-from viewmend.stream import Stream, StreamConfig, StreamView
-from viewmend.views import IncompleteView
+from viewmend.models.classical import Unfilled
+from viewmend.models.compositing import Background, composite
+from viewmend.models.registry import error_model_for, make_method
+from viewmend.stream import Stream, StreamConfig
+from viewmend.types import CompletedView, IncompleteView
+from viewmend.utils.contact_sheet import picture
 
-SLOW_MS = 10_000.0
-"""A stream's first step that takes so long is not run again: what is compiled in it is little of that."""
+__all__ = ["SLOW_MS", "MethodRun", "RunSettings", "SceneRun", "evaluate_scene"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,16 +38,16 @@ class RunSettings:
     """How scenes are run."""
 
     device: str = "cpu"
-    precision: str = "float32"
-    """What our networks compute with: float32, or bfloat16 by autocast."""
+    precision: str = "auto"
+    """Precision of our networks: float32, bfloat16, or auto for the one that suits the device."""
     stream: StreamConfig = field(default_factory=lambda: StreamConfig(memory_mb=None))
     """Hull and renderer, the same for every method."""
     ssim: SsimWindow = "gaussian"
-    """Over which windows SSIM is taken."""
+    """Window of SSIM."""
     background: Background = "black"
-    """What views and truth are laid upon; what fills by what it is shown is shown views upon it."""
+    """Background of views and truth, and of the input of methods that have none of their own."""
     networks: tuple[str, ...] = ()
-    """The networks of `scorers.NETWORKS` to compare with."""
+    """Networks of metrics (`scores.NETWORKS`) to use."""
 
 
 @dataclass(frozen=True)
@@ -51,244 +55,191 @@ class MethodRun:
     """One method on one scene."""
 
     method: str
-    frames: tuple[FrameScores, ...]
+    frames: tuple[ViewScores, ...] = ()
     """Empty if it failed."""
-    error: str | None
+    step_ms: tuple[float, ...] = ()
+    """Milliseconds of the inpainter's step, for each frame."""
+    error: str | None = None
     """Why it failed."""
-    picture: Picture | None = None
-    """The completed view at the time of the largest hole."""
-    film: Picture | None = None
-    """The first frames (`film.film`)."""
+    image: Picture | None = None
+    """The completed view of the frame with the largest hole."""
+    strip: Picture | None = None
+    """The first frames (`make_strip`)."""
     features: Features | None = None
-    """Features of the mended videos, for VFID; None without I3D."""
+    """Features of the completed videos, for VFID; None without I3D."""
 
 
 @dataclass(frozen=True)
 class SceneRun:
-    """All that came out of one scene: what a worker sends back."""
+    """All results of one scene; picklable."""
 
     scene: str
     runs: tuple[MethodRun, ...]
-    pictures: tuple[Picture, Picture, Picture] | None = None
-    """Rendered view, E, truth at the time of the largest hole; None if the scene could not be read or rendered."""
-    film: Picture | None = None
-    """The first frames: as rendered, and beside them the truth."""
+    images: tuple[Picture, Picture, Picture] | None = None
+    """Rendered view, E and truth of the frame with the largest hole; None if the scene could not be rendered."""
+    strip: Picture | None = None
+    """The first frames: rendered on the left, the truth on the right."""
     features: Features | None = None
     """Features of the true videos."""
 
 
 @dataclass(frozen=True)
-class _Moment:
-    """One time of a scene, as all methods are shown it."""
+class _Frame:
+    """One frame of a scene, as all methods get it."""
 
-    scored: bool
-    """Or only there for who carries something from one view to the next."""
-
-    observation: Observation
+    cached: CachedFrame
+    bounds: Bounds | None
     view: IncompleteView
     truth: TrueView
-    before: "_Moment | None"
+    scored: bool
+    """False for the frames before `scored_from`: they are history only."""
+    previous: "_Frame | None"
     largest: bool
     """Whether no earlier hole was as large."""
 
 
 def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: RunSettings) -> SceneRun:
-    """Stream the held camera's view through the methods, one frame at a time, past frames only.
+    """Stream the held-out camera's view through the methods, one frame at a time, using past frames only.
 
-    A function of its arguments alone, which can all be pickled: processes and clusters call it. What goes wrong becomes
-    the `error` of the method that it went wrong with, or of all if it is the scene's.
+    The result depends on the arguments only, and everything can be pickled: processes and clusters call it. An
+    exception becomes the `error` of the method that raised it, or of all methods if the scene cannot be read.
     """
-    scorers = load_scorers(settings.ssim, settings.networks, settings.device, settings.background)
-    shown = _Shown(VideoFeatures(scorers.i3d), settings.background)
-    streams = [_Stream(name, settings, scorers) for name in methods]
+    scorers = load_scorers(settings.background, settings.ssim, settings.networks, settings.device)
+    shared = _SharedImages(scorers)
+    streams = [_MethodStream(name, settings, scorers) for name in methods]
     try:
         with torch.no_grad():
-            every = any(stream.carries for stream in streams)
-            for moment in _moments(scene, settings, every):
-                if isinstance(moment, _Moment) and moment.scored:
-                    shown.add(moment)
+            for frame in _frames(scene, settings):
+                if frame.scored:
+                    shared.add(frame)
                 for stream in streams:
-                    stream.show(moment)
-        if shown.pictures is None:
-            raise ValueError(f"{scene.name}: expected frames of the camera that is left out, got none")
+                    stream.add(frame)
+        if shared.images is None:
+            raise ValueError(f"{scene.name}: expected frames of the held-out camera, got none")
     except Exception as error:
-        return SceneRun(scene.name, tuple(MethodRun(name, (), _said(error)) for name in methods))
-    runs = tuple(stream.run(shown.box) for stream in streams)
-    return SceneRun(scene.name, runs, shown.pictures, shown.film(), shown.videos.features())
+        return SceneRun(scene.name, tuple(MethodRun(name, error=_message(error)) for name in methods))
+    runs = tuple(stream.result(shared.box) for stream in streams)
+    return SceneRun(scene.name, runs, shared.images, shared.strip(), shared.videos.features())
 
 
-def _moments(scene: LeaveOneOutScene, settings: RunSettings, every: bool) -> Iterator[_Moment | Observation]:
-    """The times of a scene; the observation alone of those that are not scored, unless `every` is wanted."""
-    most, last, stream = -1, None, Stream(Unfilled(), settings.stream)
+def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
+    most, last = -1, None
+    config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
     for frame in scene.frames(settings.device):
-        stream.bounds = frame.bounds
-        observation = stream.push(frame.inputs)
-        scored = frame.inputs.time >= scene.scored_from
-        if not scored and not every:
-            yield observation
-            continue
+        stream = Stream(Unfilled(), config, frame.bounds)
+        cached = stream.add_frame(frame.inputs)
         view = stream.render(frame.truth.cameras)
-        holes = int(view.holes.sum())
-        truth = true_view(frame.truth, frame.backward_flow_px, settings.background)
-        if frame.seen is not None:
-            truth = replace(truth, by_past_alone=frame.seen.by_past_alone(view.source_views))
-        last = _Moment(scored, observation, view, truth, last, scored and holes > most)
+        holes, scored = int(view.holes.sum()), frame.inputs.time >= scene.scored_from
+        past = None if frame.seen is None else frame.seen.by_past_alone(view.source_views)
+        truth = true_view(frame.truth, settings.background, frame.backward_flow_px, past)
+        last = _Frame(cached, frame.bounds, view, truth, scored, last, scored and holes > most)
         yield last
-        most, last = max(most, holes) if scored else most, replace(last, before=None)
+        most, last = max(most, holes) if scored else most, replace(last, previous=None)
 
 
-class _Shown:
-    """What is kept of a scene to be shown beside every method's."""
+class _SharedImages:
+    """Rendered views and truth of a scene, to be shown next to every method's."""
 
-    def __init__(self, videos: VideoFeatures, background: Background) -> None:
-        self.videos = videos
-        self._background: Background = background
-        self.pictures: tuple[Picture, Picture, Picture] | None = None
+    def __init__(self, scorers: Scorers) -> None:
+        self.videos = VideoFeatures(scorers.i3d)
+        self.images: tuple[Picture, Picture, Picture] | None = None
         self.box: Box | None = None
+        self._background: Background = scorers.background
         self._rendered: list[Picture] = []
         self._truth: list[Picture] = []
 
-    def add(self, moment: _Moment) -> None:
-        """One more time."""
-        view, truth = moment.view, moment.truth
-        rendered = laid_upon(self._background, view.rgb, view.mask)
+    def add(self, frame: _Frame) -> None:
+        view, truth = frame.view, frame.truth
+        rendered = composite(self._background, view.rgb, view.mask)
         self.videos.add(truth.rgb, view.holes)
-        if moment.largest:
-            self.pictures = picture(rendered), picture(view.error[None]), picture(truth.rgb)
-        if len(self._truth) < FILM_FRAMES:
+        if frame.largest:
+            self.images = picture(rendered), picture(view.error[None]), picture(truth.rgb)
+        if len(self._truth) < STRIP_FRAMES:
             box = subject_box((view.mask > 0) | truth.mask)
-            self.box = box if self.box is None else self.box if box is None else self.box.around(box)
+            self.box = box if self.box is None else self.box if box is None else self.box.union(box)
             self._rendered.append(picture(rendered))
             self._truth.append(picture(truth.rgb))
 
-    def film(self) -> Picture | None:
-        """The film as rendered, and beside it the truth."""
-        strips = [film(frames, self.box) for frames in (self._rendered, self._truth)]
+    def strip(self) -> Picture | None:
+        strips = [make_strip(frames, self.box) for frames in (self._rendered, self._truth)]
         return None if strips[0] is None or strips[1] is None else np.concatenate([strips[0], strips[1]], 1)
 
 
-class _Stream:
-    """One method's stream through the scene. Only its own work is in its milliseconds, and no first-use compilation."""
+class _MethodStream:
+    """One method's stream through the scene."""
 
     def __init__(self, method: str, settings: RunSettings, scorers: Scorers) -> None:
         self.method = method
-        self.settings = settings
-        self._scorers = scorers
+        self._settings, self._scorers = settings, scorers
+        self._mender: Mender | None = None
         self._error: str | None = None
-        self._inpainter: ViewInpainter | None = None
-        self._stream: Stream | None = None
-        self._viewer: State | None = None
-        self._past: list[Observation] = []
-        self._last: Float[Tensor, "3 height width"] | None = None
-        self._scores: list[FrameScores] = []
-        self._picture: Picture | None = None
+        self._previous: torch.Tensor | None = None
+        self._scores: list[ViewScores] = []
+        self._step_ms: list[float] = []
         self._videos = VideoFeatures(scorers.i3d)
-        self._frames: list[Picture] = []
+        self._image: Picture | None = None
+        self._strip: list[Picture] = []
 
-    @property
-    def carries(self) -> bool:
-        """Whether the method carries anything of its own from view to view, and must see every time."""
-        try:
-            return type(self._made().initial_state()) is not State
-        except Exception as error:
-            self._error = _said(error)
-            return False
-
-    def show(self, moment: _Moment | Observation) -> None:
-        """Complete and score the next view, or look at a time; nothing once something went wrong."""
+    def add(self, frame: _Frame) -> None:
+        """Complete and score the view of the next frame; do nothing after an error."""
         if self._error is not None:
             return
         try:
-            if isinstance(moment, Observation):
-                self._past.append(moment)
-            elif moment.scored:
-                self._step(moment)
+            mender = self._mender = self._mender or self._make(frame.bounds)
+            mender.add_frame(frame.cached)
+            if frame.scored:
+                self._score(mender, frame)
             else:
-                self._carry(moment)
+                mender.skip(frame.view.camera, frame.view.time)
+            if mender.state is not None:
+                mender.state = mender.stream.inpainter.reveal_truth(mender.state, frame.truth.rgb)
         except Exception as error:
-            self._error = _said(error)
+            self._error = _message(error)
 
-    def _carry(self, moment: _Moment) -> None:
-        """What a view that is not scored leaves to the next."""
-        self._past.append(moment.observation)
-        if not self.carries:
-            return
-        stream = self._stream = self._stream or Stream(self._made(), self.settings.stream)
-        push_again(stream, moment.observation)
-        view = self._asked(stream, moment.view)
-        state = state_after(stream.inpainter, view, self._viewer or stream.viewer())
-        if state is None:
-            self._go_on(stream.mend(view, self._viewer), moment)
-        else:
-            self._viewer = state
+    def _make(self, bounds: Bounds | None) -> Mender:
+        settings = self._settings
+        inpainter = make_method(self.method, settings.device, settings.precision)
+        predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
+        error_model = error_model_for(inpainter, settings.device) if predicted else None
+        config = replace(settings.stream, background=settings.background)
+        return Mender(inpainter, config, bounds, error_model=error_model)
 
-    def _go_on(self, mended: StreamView, moment: _Moment) -> None:
-        own = self._inpainter.inner if isinstance(self._inpainter, UponWhite) else self._inpainter
-        self._viewer = own.shown(mended.viewer, moment.truth.rgb) if isinstance(own, SeesTruth) else mended.viewer
+    def _score(self, mender: Mender, frame: _Frame) -> None:
+        made = mender.view(frame.view.camera, frame.view.time, frame.view)
+        completed = made.completed
+        _check(completed)
+        rgb = composite(self._settings.background, completed.rgb, completed.opacity)
+        previous = None
+        if frame.previous is not None and self._previous is not None:
+            previous = PreviousView(self._previous, frame.previous.truth.rgb, frame.previous.view.holes)
+        self._scores.append(score_view(completed, frame.truth, self._scorers, previous))
+        self._step_ms.append(made.times.context + made.times.inpainting)
+        self._videos.add(rgb, frame.view.holes)
+        self._previous = rgb
+        if len(self._strip) < STRIP_FRAMES:
+            self._strip.append(picture(rgb))
+        if frame.largest:
+            self._image = picture(rgb)
 
-    def _step(self, moment: _Moment) -> None:
-        mended = self._mend(moment)
-        if not self._scores and mended.times.inpainting < SLOW_MS:
-            mended = self._mend(moment)
-        view, before = mended.completed.view, None
-        _check(mended.completed.rgb, view)
-        rgb = laid_upon(self.settings.background, mended.completed.rgb, mended.completed.opacity)
-        if moment.before is not None and self._last is not None:
-            before = Before(self._last, moment.before.truth.rgb, moment.before.view.holes)
-        ms = mended.times.context + mended.times.inpainting
-        self._scores.append(score_frame(mended.completed, moment.truth, before, ms, self._scorers))
-        self._videos.add(rgb, view.holes)
-        if len(self._frames) < FILM_FRAMES:
-            self._frames.append(picture(rgb))
-        self._last = rgb
-        self._go_on(mended, moment)
-        if moment.largest:
-            self._picture = picture(rgb)
-
-    def _mend(self, moment: _Moment) -> StreamView:
-        """The view, by a stream of the method's own, so that it pays for what it asks for beyond the rendering.
-
-        What it encodes of the past it would have encoded then: that is done before, and not in its milliseconds.
-        """
-        if self._stream is None or not self._scores:
-            self._stream = Stream(self._made(), self.settings.stream)
-            for observation in self._past:
-                push_again(self._stream, observation)
-        stream = self._stream
-        push_again(stream, moment.observation)
-        view = self._asked(stream, moment.view)
-        encode_past(stream.inpainter, view, all_of(stream))
-        return stream.mend(view, self._viewer)
-
-    def _made(self) -> ViewInpainter:
-        if self._inpainter is None:
-            self._inpainter = make_method(self.method, self.settings.device, self.settings.precision)
-            if own_background(self._inpainter) is None:
-                self._inpainter = fill_upon(self._inpainter, self.settings.background)
-        return self._inpainter
-
-    def _asked(self, stream: Stream, view: IncompleteView) -> IncompleteView:
-        """The view by the stream's error rule."""
-        if stream.error_rule == (self.settings.stream.render.error_rule or "unseen"):
-            return view
-        return stream.render(view.camera, view.time)
-
-    def run(self, box: Box | None) -> MethodRun:
-        """What came out; `box` is what its film shows."""
+    def result(self, box: Box | None) -> MethodRun:
+        """The result; `box` is the part that its video shows."""
         if self._error is not None:
-            return MethodRun(self.method, (), self._error)
-        strip, features = film(self._frames, box), self._videos.features()
-        return MethodRun(self.method, tuple(self._scores), None, self._picture, strip, features)
+            return MethodRun(self.method, error=self._error)
+        strip, features = make_strip(self._strip, box), self._videos.features()
+        return MethodRun(
+            self.method, tuple(self._scores), tuple(self._step_ms), image=self._image, strip=strip, features=features
+        )
 
 
-def _check(rgb: Tensor, view: IncompleteView) -> None:
-    """What every method owes: an image of the view's size, untouched outside E."""
+def _check(completed: CompletedView) -> None:
+    """Check that a view is complete, and unchanged outside of E."""
+    rgb, view = completed.rgb, completed.view
     if rgb.shape != view.rgb.shape:
-        raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; complete it in full")
-    touched = int(((rgb != view.rgb).any(0) & (view.error == 0)).sum())
-    if touched:
-        raise ValueError(f"expected pixels with E = 0 as they were rendered, got {touched} changed; blend by E")
+        raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view")
+    changed = int(((rgb != view.rgb).any(0) & (view.error == 0)).sum())
+    if changed:
+        raise ValueError(f"expected pixels with E = 0 as they were rendered, got {changed} changed; blend by E")
 
 
-def _said(error: Exception) -> str:
+def _message(error: Exception) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

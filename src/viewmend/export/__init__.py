@@ -1,1 +1,1 @@
-"""Scenes and models in the formats of other people's systems."""
+"""Exports: models for other runtimes, and scenes for 3D engines."""

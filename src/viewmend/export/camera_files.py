@@ -1,27 +1,42 @@
-"""Cameras as a USD scene and as a script for Blender."""
+"""Cameras for 3D engines, as a USD scene and as a script for Blender."""
 
 import json
 import re
 from collections.abc import Mapping
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.export.engine_world import engine_from_cameras
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.orbit import horizontal_axes
 
 SENSOR_MM = 36.0
-"""Width of every camera's film: engines want one, and only its ratio to the focal length is known."""
+"""Sensor width of every camera: engines need one, but only its ratio to the focal length matters."""
+
+
+def engine_from_world(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The rotation of the capture's `up` to +y, and of azimuth 0 to +z: right-handed and y up, as in glTF."""
+    up = up / up.norm()
+    front, side = horizontal_axes(up)
+    return torch.stack([side, up, front])
+
+
+def engine_from_cameras(cameras: Cameras, rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "view 4 4"]:
+    """The cameras' poses in the engine's world, with OpenGL axes: x right, y up, looking along -z."""
+    poses = cameras.world_from_camera.clone()
+    poses[:, :3] = rotation @ poses[:, :3]
+    return poses * poses.new_tensor([1.0, -1.0, -1.0, 1.0])
 
 
 def usd_scene(groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int) -> str:
     """Cameras as ASCII USD (.usda), metres, y up; skew is left out.
 
     Args:
-        groups: cameras by the name of the scope that holds them.
-        rotation: `engine_from_world`'s.
-        fps: frames a second of the scene.
-        frames: how many times there are; they are counted from 0.
+        groups: cameras by the name of their scope.
+        rotation: `engine_from_world`.
+        fps: frames per second.
+        frames: number of frames; they are counted from 0.
     """
     lines = ["#usda 1.0", "(", '    defaultPrim = "scene"', "    metersPerUnit = 1", '    upAxis = "Y"']
     lines += [f"    timeCodesPerSecond = {fps:g}", "    startTimeCode = 0", f"    endTimeCode = {frames - 1}", ")", ""]
@@ -36,7 +51,7 @@ def usd_scene(groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps
 
 
 def _usd_camera(prim: str, camera: Cameras, pose: list[list[float]]) -> list[str]:
-    """One camera; lengths of its film are tenths of the scene's unit, as USD has them."""
+    """One camera; USD has lengths of its sensor in tenths of the scene's unit."""
     (width, height), K = camera.size_px[0].tolist(), camera.K[0].double()
     aperture = SENSOR_MM / 100
     per_x, per_y = aperture / width, aperture / width * float(K[0, 0] / K[1, 1])
@@ -60,7 +75,7 @@ def _usd_camera(prim: str, camera: Cameras, pose: list[list[float]]) -> list[str
 
 
 def _prim_names(names: tuple[str, ...]) -> list[str]:
-    """Identifiers as USD wants them, each once."""
+    """Unique identifiers that USD allows."""
     found: list[str] = []
     for n, name in enumerate(names):
         plain = re.sub(r"\W", "_", name, flags=re.ASCII)
@@ -70,33 +85,28 @@ def _prim_names(names: tuple[str, ...]) -> list[str]:
 
 
 def blender_script(
-    groups: Mapping[str, Cameras],
-    rotation: Float[Tensor, "3 3"],
-    fps: float,
-    frames: int,
-    pictures: Mapping[str, str],
+    groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int, images: Mapping[str, str]
 ) -> str:
-    """A script that opens the exported scene in Blender: its cameras, their pictures behind them, the hull over time.
+    """A script that opens the exported scene in Blender: cameras with background images, and the animated hull.
 
     Args:
         groups: cameras by the name of their collection.
-        rotation: `engine_from_world`'s; Blender's own world, z up, follows from it.
-        fps: frames a second.
-        frames: how many times there are.
-        pictures: the first picture of a camera, by the camera's name, as a path relative to the script.
+        rotation: `engine_from_world`; the script converts to Blender's world, z up.
+        fps: frames per second.
+        frames: number of frames.
+        images: path of the first image of a camera, by the camera's name, relative to the script.
     """
-    found = [
-        {"group": group, "picture": pictures.get(cameras.names[view]), "engine_from_camera": pose}
-        | _blender_lens(cameras[view])
-        for group, cameras in groups.items()
-        for view, pose in enumerate(engine_from_cameras(cameras, rotation).tolist())
+    cameras = [
+        _blender_camera(own[view]) | {"group": group, "image": images.get(own.names[view]), "engine_from_camera": pose}
+        for group, own in groups.items()
+        for view, pose in enumerate(engine_from_cameras(own, rotation).tolist())
     ]
-    scene = {"fps": fps, "frames": frames, "sensor_mm": SENSOR_MM, "cameras": found}
+    scene = {"fps": fps, "frames": frames, "sensor_mm": SENSOR_MM, "cameras": cameras}
     return BLENDER.replace("SCENE", json.dumps(json.dumps(scene)))
 
 
-def _blender_lens(camera: Cameras) -> dict[str, object]:
-    """Name, size and intrinsics; the film's shift is in widths."""
+def _blender_camera(camera: Cameras) -> dict[str, object]:
+    """Name, size and intrinsics; the sensor's shift is in image widths."""
     (width, height), K = camera.size_px[0].tolist(), camera.K[0]
     return {
         "name": camera.names[0],
@@ -117,7 +127,7 @@ from mathutils import Matrix
 
 HERE = Path(__file__).resolve().parent
 scene = json.loads(SCENE)
-z_up = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))  # from y up
+z_up = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))  # from +y up
 
 bpy.context.scene.render.fps = max(1, round(scene["fps"]))
 bpy.context.scene.frame_start, bpy.context.scene.frame_end = 0, scene["frames"] - 1
@@ -132,18 +142,18 @@ for given in scene["cameras"]:
     camera = bpy.data.objects.new(given["name"], data)
     camera.matrix_world = z_up @ Matrix(given["engine_from_camera"])
     collections[given["group"]].objects.link(camera)
-    if given["picture"]:
-        image = bpy.data.images.load(str(HERE / given["picture"]))
+    if given["image"]:
+        image = bpy.data.images.load(str(HERE / given["image"]))
         image.source = "SEQUENCE"
-        behind = data.background_images.new()
-        behind.image, data.show_background_images = image, True
-        behind.image_user.frame_start, behind.image_user.frame_offset = 0, -1
-        behind.image_user.frame_duration = scene["frames"]
+        background = data.background_images.new()
+        background.image, data.show_background_images = image, True
+        background.image_user.frame_start, background.image_user.frame_offset = 0, -1
+        background.image_user.frame_duration = scene["frames"]
         bpy.context.scene.camera = camera
         bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = given["size_px"]
 
 for frame, file in enumerate(sorted((HERE / "hull").glob("*.glb"))):
-    bpy.ops.import_scene.gltf(filepath=str(file))  # turns y up into z up itself
+    bpy.ops.import_scene.gltf(filepath=str(file))  # converts to +z up itself
     for hull in bpy.context.selected_objects:
         for hidden, at in ((True, frame - 1), (False, frame), (True, frame + 1)):
             hull.hide_viewport = hull.hide_render = hidden

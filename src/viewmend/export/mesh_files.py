@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from viewmend.atomic_writes import write_atomically
+from viewmend.utils.atomic_writes import write_atomically
 
 FLOAT, UINT16, UINT32 = 5126, 5123, 5125
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
-"""Component types and targets of glTF 2.0, section 3.6."""
+"""Component types and buffer targets of glTF 2.0, section 3.6."""
 
 
 def write_glb(
@@ -23,14 +23,14 @@ def write_glb(
     colours: Float[Tensor, "vertex 3"],
     normals: Float[Tensor, "vertex 3"],
 ) -> None:
-    """A mesh as binary glTF 2.0, y up; a scene without a mesh where there are no vertices.
+    """Writes a mesh as binary glTF 2.0; without vertices, a scene without a mesh.
 
     Args:
         path: the file.
         vertices: metres, y up.
         faces: counter-clockwise from outside.
-        colours: sRGB in [0, 1]. They are written linear in 16 bit, as glTF has vertex colours, on an unlit material,
-            since they hold the captured light already.
+        colours: sRGB in [0, 1]. They are written as linear 16-bit vertex colours, on an unlit material: they include
+            the captured light.
         normals: unit, outward.
 
     Raises:
@@ -50,7 +50,7 @@ def write_glb(
 
 
 def _gltf(parts: Mapping[str, tuple[np.ndarray, str, int]]) -> dict[str, object]:
-    """The JSON of a mesh whose attributes and, last, indices lie one after the other in the binary data."""
+    """The JSON of a mesh whose attributes and indices follow each other in the binary data, in the order of `parts`."""
     document: dict[str, object] = {"asset": {"version": "2.0", "generator": "viewmend"}, "scene": 0}
     document["scenes"] = [{"nodes": [0]}]
     position = parts["POSITION"][0]
@@ -77,13 +77,13 @@ def _gltf(parts: Mapping[str, tuple[np.ndarray, str, int]]) -> dict[str, object]
 
 
 def _write_chunks(path: Path, text: bytes, data: bytes) -> None:
-    """The container: a header, the JSON padded with blanks, the binary data (every part of it is a multiple of 4)."""
+    """Writes header, JSON padded with blanks, and binary data, whose parts are multiples of 4 bytes."""
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(data), b"BIN\0") + data if data else b""
     whole = struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda beside: beside.write_bytes(whole))
+    write_atomically(path, lambda draft: draft.write_bytes(whole))
 
 
 def write_ply(
@@ -92,12 +92,12 @@ def write_ply(
     colours: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"] | None = None,
 ) -> None:
-    """Points or a mesh as binary PLY: float positions, 8-bit colours.
+    """Writes points or a mesh as binary PLY: float positions, 8-bit colours.
 
     Args:
         path: the file.
         vertices: metres.
-        colours: sRGB in [0, 1], one a vertex.
+        colours: sRGB in [0, 1], one per vertex.
         faces: counter-clockwise from outside; None for points.
 
     Raises:
@@ -114,9 +114,9 @@ def write_ply(
         lines += [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
     head = "\n".join([*lines, "end_header", ""]).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda beside: beside.write_bytes(head + points.tobytes() + triangles.tobytes()))
+    write_atomically(path, lambda draft: draft.write_bytes(head + points.tobytes() + triangles.tobytes()))
 
 
 def _linear(srgb: Shaped[np.ndarray, "vertex 3"]) -> Shaped[np.ndarray, "vertex 3"]:
-    """Light from sRGB (IEC 61966-2-1), both in [0, 1]."""
+    """Linear values of sRGB (IEC 61966-2-1), both in [0, 1]."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)

@@ -75,7 +75,7 @@ def count_tiles(image, rows, columns, tile, sums):
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
 def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
-    """What one camera says about a ball: not in view, all background, all foreground, or mixed.
+    """Classify a ball in one camera: not in view, all background, all foreground, or mixed.
 
     The ball's image lies within radius |p1 - u p3| / (depth - radius) of its centre's u, likewise v, where p1 and p3
     are rows of P; with `lens` = (fx^2 + skew^2, cx, fy^2, cy), |p1 - u p3|^2 = fx^2 + skew^2 + (cx - u)^2.

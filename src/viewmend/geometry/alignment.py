@@ -19,19 +19,19 @@ from viewmend.geometry.proxy import reconstruct
 STEP_PX = 1.0
 """Shifts of this size are tried along each image axis."""
 LARGEST_PX = 1.5
-"""No larger shift is believed."""
+"""Largest shift that is accepted."""
 MARGIN = 0.05
 """How much larger than the first hull the box is in which the others are carved, to each side."""
 WORTH_MOVING = 0.003
 """A shift counts if hull and masks then agree better by this much (IoU): above the noise of exact calibrations."""
 
 LEAST_IOU = 0.8
-"""Hull and masks that agree less even then say nothing of pixels: a mask or a camera is wrong altogether."""
+"""Below this IoU a mask or a camera is wrong, and no shift is applied."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How all principal points should move, and what that is worth."""
+    """The shift of all principal points, and its effect."""
 
     offset_px: tuple[float, float]
     """To add to (cx, cy) of every camera; zeros where no shift is worth it."""

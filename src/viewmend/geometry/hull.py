@@ -1,4 +1,4 @@
-"""The visual hull: what the masks of all cameras leave of a volume, as soft occupancy on a grid."""
+"""The visual hull: soft occupancy on a grid, carved by the masks of all cameras."""
 
 import math
 from dataclasses import dataclass
@@ -7,14 +7,15 @@ from types import ModuleType
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.nn.functional import conv2d, pad
 
-from viewmend.geometry import _hull_torch
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
+from viewmend.geometry.sampling import in_view, sample_bilinear
 from viewmend.geometry.threads import parallel_for
 
 FOREGROUND = 127
-"""A mask above this is foreground where a yes or no is wanted."""
+"""Threshold for binary foreground."""
 
 TILES = 32
 """Tiles across a mask's shorter side, by which the search for the subject's box judges blocks of space."""
@@ -40,7 +41,7 @@ class HullConfig:
     coarse_passes: int = 3
     """Passes of that search; 0 carves the bounds as they are."""
     pixels_per_voxel: float = 2.0
-    """Mask pixels are pooled until a voxel spans about so many, and smoothed: else the surface shows their steps."""
+    """Masks are pooled until a voxel spans about this many pixels, then smoothed, to avoid staircase artefacts."""
     min_views: int = 2
     """Space that fewer cameras see is empty."""
     min_fraction: float = 0.5
@@ -62,7 +63,7 @@ def visual_hull(
 ) -> OccupancyGrid:
     """Occupancy of `bounds`: the smallest (softened) mask value over the cameras that see a point.
 
-    A camera says nothing about what is outside its image or behind it; space that too few cameras see is empty. The
+    Points outside a camera's image or behind it are not constrained by it; space that too few cameras see is empty. The
     minimum, unlike RIFTCast's product, does not thin the subject as cameras are added.
 
     Raises:
@@ -73,8 +74,8 @@ def visual_hull(
     pool = max(1, int(_footprint_px(cameras, bounds, voxel_m) / config.pixels_per_voxel))
     needed = needed_views(len(cameras), config)
     if (kernels := _kernels(mask)) is None:
-        soft = _hull_torch.soften(mask, cameras.size_px, pool)
-        values = _hull_torch.carve(soft, pool, cameras, bounds.low, voxel_m, shape, needed)
+        soft = soften(mask, cameras.size_px, pool)
+        values = carve(soft, pool, cameras, bounds.low, voxel_m, shape, needed)
     else:
         values = _carve_cpu(kernels, mask, pool, cameras, bounds.low, voxel_m, shape, needed)
     return OccupancyGrid(values, bounds.low, voxel_m)
@@ -91,7 +92,7 @@ def occupied_bounds(
     for _ in range(config.coarse_passes):
         block_m, shape = _divide(bounds, config.coarse_resolution)
         if kernels is None or tiles is None:
-            occupied = _hull_torch.occupied_blocks(mask, tile, cameras, bounds.low, block_m, shape, needed)
+            occupied = occupied_blocks(mask, tile, cameras, bounds.low, block_m, shape, needed)
         else:
             occupied = _occupied_cpu(kernels, tiles, tile, cameras, bounds.low, block_m, shape, needed)
         index = occupied.nonzero()
@@ -132,7 +133,7 @@ def _kernels(mask: Tensor) -> ModuleType | None:
 
 
 def _projections(cameras: Cameras) -> tuple[Float[Tensor, "view 3 4"], Float[Tensor, "view 4"]]:
-    """P = K [R t], and what `judge` wants of K."""
+    """P = K [R t], and the intrinsics that the `judge` kernel takes."""
     K = cameras.K.double()
     lens = torch.stack([K[:, 0, 0] ** 2 + K[:, 0, 1] ** 2, K[:, 0, 2], K[:, 1, 1] ** 2, K[:, 1, 2]], -1)
     return K @ cameras.camera_from_world[:, :3].double(), lens
@@ -207,7 +208,7 @@ def _occupied_cpu(
 
 
 def check_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> None:
-    """ValueError for what no hull can be made of."""
+    """Raise ValueError if no hull can be carved from these masks."""
     if len(cameras) < 2:
         raise ValueError(f"expected masks of at least two cameras, got {len(cameras)}; a hull needs several views")
     if not bool(mask.any()):
@@ -257,7 +258,7 @@ def _mask_box(mask: UInt8[Tensor, "height width"]) -> Float[Tensor, "4"]:
 
 
 def _half_view(cameras: Cameras) -> Float[Tensor, "view"]:
-    """Half of what each camera sees at distance 1, the narrower way."""
+    """Half of the narrower field of view of each camera, at distance 1."""
     focal = torch.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], -1)
     return (cameras.size_px / 2 / focal).amin(-1)
 
@@ -280,3 +281,100 @@ def _cube_around(
     reach = (half_at_1 * distance)[distance > 0]
     half = reach.amax() if largest else reach.median()
     return Bounds(middle - half, middle + half)
+
+
+NEAR_M = 1e-6
+
+
+def soften(
+    mask: UInt8[Tensor, "view height width"], size_px: Int[Tensor, "view 2"], pool: int
+) -> UInt8[Tensor, "view row column"]:
+    """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
+
+    Beyond each image's own size its border continues.
+    """
+    views, height, width = mask.shape
+    rows, columns = -(-height // pool), -(-width // pool)
+    y = torch.arange(rows * pool, device=mask.device).clamp(max=height - 1)
+    x = torch.arange(columns * pool, device=mask.device).clamp(max=width - 1)
+    own_y, own_x = y.minimum(size_px[:, 1:] - 1), x.minimum(size_px[:, :1] - 1)
+    view = torch.arange(views, device=mask.device)[:, None, None]
+    full = mask[view, own_y[:, :, None], own_x[:, None, :]].float()
+    sums = full.view(views, rows, pool, columns, pool).sum((2, 4))
+    kernel = torch.tensor([1.0, 2.0, 1.0], device=mask.device)
+    border = pad(sums[:, None], (1, 1, 1, 1), mode="replicate")
+    smooth = conv2d(border, (kernel[:, None] * kernel)[None, None])[:, 0]
+    return (smooth * (1.0 / (16 * pool * pool)) + 0.5).floor().to(torch.uint8)
+
+
+def carve(
+    soft: UInt8[Tensor, "view row column"],
+    pool: int,
+    cameras: Cameras,
+    low: Float[Tensor, "3"],
+    voxel_m: float,
+    shape: tuple[int, int, int],
+    needed: int,
+) -> Float[Tensor, "x y z"]:
+    """The smallest mask value over the cameras that see each voxel's middle; 0 where fewer than `needed` do."""
+    axes = [low[a] + (torch.arange(shape[a], device=low.device) + 0.5) * voxel_m for a in range(3)]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+    values = torch.ones(len(points), device=low.device)
+    seen = torch.zeros(len(points), dtype=torch.int32, device=low.device)
+    for view in range(len(cameras)):
+        uv, z = project(points, cameras[view])
+        sees = in_view(uv, z, cameras[view])[0]
+        value = sample_bilinear(soft[view].float()[None, None] / 255, uv / pool, "border")[0, :, 0]
+        values = torch.where(sees, values.minimum(value), values)
+        seen += sees
+    return torch.where(seen >= needed, values, 0.0).view(*shape)
+
+
+def occupied_blocks(
+    mask: UInt8[Tensor, "view height width"],
+    tile: int,
+    cameras: Cameras,
+    low: Float[Tensor, "3"],
+    block_m: float,
+    shape: tuple[int, int, int],
+    needed: int,
+) -> Bool[Tensor, "x y z"]:
+    """Blocks that project to some foreground in all cameras and are visible to enough cameras."""
+    axes = [low[a] + (torch.arange(shape[a], device=low.device) + 0.5) * block_m for a in range(3)]
+    centers = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+    radius = block_m * 3**0.5 / 2
+    P = cameras.K @ cameras.camera_from_world[:, :3]
+    empty = torch.zeros(len(centers), dtype=torch.bool, device=low.device)
+    seen = torch.zeros(len(centers), dtype=torch.int32, device=low.device)
+    for view in range(len(cameras)):
+        uv, z = project(centers, cameras[view])
+        uv, z, size = uv[0], z[0], cameras.size_px[view]
+        # How far from its centre's image the image of the ball around a block can reach.
+        slope = (P[view, None, :2, :3] - uv[:, :, None] * P[view, 2, :3]).norm(dim=-1)
+        reach = slope * (radius / (z - radius).clamp(min=NEAR_M))[:, None]
+        first, last = uv - reach, uv + reach
+        in_front = z - radius > NEAR_M
+        outside = ((last < 0) | (first >= size)).any(-1)
+        inside = ((first >= 0) & (last < size)).all(-1)
+        empty |= in_front & inside & (_foreground_tiles(mask[view], tile, first, last) == 0)
+        seen += (z + radius > NEAR_M) & ~(in_front & outside)
+    return (~empty & (seen >= needed)).view(*shape)
+
+
+def _foreground_tiles(
+    mask: UInt8[Tensor, "height width"],
+    tile: int,
+    first: Float[Tensor, "block 2"],
+    last: Float[Tensor, "block 2"],
+) -> Int[Tensor, "block"]:
+    """How many tiles with any foreground each window of pixels, and one and a half pixels around it, touches."""
+    height, width = mask.shape
+    rows, columns = -(-height // tile), -(-width // tile)
+    padded = pad(mask, (0, columns * tile - width, 0, rows * tile - height))
+    some = padded.view(rows, tile, columns, tile).amax((1, 3)) > 0
+    sums = pad(some.int().cumsum(0).cumsum(1), (1, 0, 1, 0))
+    end = torch.tensor([columns, rows], device=mask.device) - 1
+    from_tile = ((first - 1.5).clamp(0, max(width, height)) / tile).long().minimum(end)
+    to_tile = ((last + 1.5).clamp(0, max(width, height)) / tile).long().minimum(end) + 1
+    (left, top), (right, bottom) = from_tile.unbind(-1), to_tile.unbind(-1)
+    return sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]

@@ -25,12 +25,12 @@ WORTH_RECARVING = 0.85
 """A subject smaller than this fraction of the carved box is carved again in its own box."""
 
 RECARVINGS = 3
-"""A subject is carved again so often at most."""
+"""Maximum number of repeated carvings."""
 
 
 @dataclass(frozen=True)
 class GeometryProxy:
-    """The subject's approximate surface at one time."""
+    """The subject's approximate surface in one frame."""
 
     mesh: Mesh
     """Closed; without vertices where nothing was found."""
@@ -42,7 +42,7 @@ class GeometryProxy:
     def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
         """z-depth of the surface in each camera, metres; 0 where there is none.
 
-        Only the surface's outside is drawn: from inside it a camera sees nothing of the wall before it.
+        Back faces are culled: a camera inside the surface does not see it.
         """
         return rasterize(self.mesh, cameras, cull="back").depth
 

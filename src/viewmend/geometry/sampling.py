@@ -19,7 +19,7 @@ class BilinearTap(NamedTuple):
     column: Int[Tensor, "*point"]
     """Clamped to the image."""
     weight: Float[Tensor, "*point"]
-    """The weights of the four add up to 1. They do not know where the image ends."""
+    """The four weights sum to 1, also beyond the border of the image."""
     inside: Bool[Tensor, "*point"]
     """Whether the image has this pixel; where not, `row` and `column` name the nearest one at its border."""
 

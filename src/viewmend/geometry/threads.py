@@ -1,4 +1,4 @@
-"""Sharing work among threads on the CPU, where that is worth it."""
+"""Multithreading on the CPU where it pays off."""
 
 import itertools
 import os
@@ -14,9 +14,9 @@ import torch
 def parallel_for(work: Callable[[int], object], count: int) -> None:
     """Call `work(0)` to `work(count - 1)` on as many threads as torch may use; `work` must release the GIL to gain.
 
-    Plain threads and not numba's own: those abort the process when two of our callers run at once, and may not be
-    forked. The caller works, too, and waits for none of them to begin: started anew each time, threads cost a
-    millisecond where the cores are busy.
+    Uses plain threads instead of numba's, which abort the process when two callers run at once and do not survive a
+    fork. The calling thread takes part and does not wait for the others to start; the pool is reused, because starting
+    threads costs a millisecond on busy cores.
     """
     items = itertools.count()
 
@@ -39,10 +39,9 @@ _torch = threading.local()
 
 @contextmanager
 def light_operations() -> Iterator[None]:
-    """Within, torch's operations stay on the calling thread, but for `heavy_operations`; `parallel_for` shares as ever.
+    """Run torch operations on the calling thread only, except in `heavy_operations`; `parallel_for` is unaffected.
 
-    An operation on the pixels of one view takes less time than to wake another thread for it. For with, or to decorate
-    a function.
+    Operations on the pixels of one view take less time than waking another thread. Context manager and decorator.
     """
     with _torch_threads(1):
         yield
@@ -50,7 +49,7 @@ def light_operations() -> Iterator[None]:
 
 @contextmanager
 def heavy_operations() -> Iterator[None]:
-    """Within, torch's operations share their work as they do outside of `light_operations`: convolutions, networks."""
+    """Run torch operations on all threads again inside `light_operations`, for convolutions and networks."""
     with _torch_threads(_most_threads()):
         yield
 
@@ -77,5 +76,5 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="share")
 
 
-if hasattr(os, "register_at_fork"):  # a child has none of its parent's threads
+if hasattr(os, "register_at_fork"):  # a forked child does not have its parent's threads
     os.register_at_fork(after_in_child=_pool.cache_clear)

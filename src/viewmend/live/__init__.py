@@ -1,1 +1,1 @@
-"""Walking around the subject while it happens: render service, server, protocol, and the page."""
+"""The live server, its protocol, its page and its Python clients."""

@@ -1,28 +1,23 @@
-"""Holding a frame time: the quality of the next view is chosen by what the last views took.
+"""Frame time: the quality of a viewer's next view, and the resolution that all viewers together have time for.
 
-The control law, docs/live.md in code:
+docs/live.md describes the ladders of quality levels. The control law of `Budget`:
 
-* The ladder has quality levels from a small picture without context up to all that the model can do. Going down,
-  older context is given up first, then context tokens, then all context, then resolution. With a model that tells
-  where most is to be gained, it is the part of the subject that is read, then resolution.
-* The time that a level will take is predicted from the medians of the last `MEMORY_FRAMES` frames. Each stage is scaled
-  to the level: geometry stays, rendering and encoding grow with the pixels, inpainting grows with pixels, tokens and
-  times. The context stage counts at levels with context only.
-* The level goes down at once when its own prediction is above the target. It goes to the highest level that is
-  predicted to take at most `HEADROOM` of the target. One slow frame moves no median; three of five do.
-* The level goes up by one when the next level is predicted to take at most `HEADROOM` of the target for several frames
-  in a row: `UP_AFTER_FRAMES`, to begin with.
-* A step up that is taken back within `PROBATION_FRAMES` doubles this number, up to `MAX_UP_AFTER_FRAMES`. A step that
-  lasts resets it. Where a prediction is wrong, the level settles below and does not swing.
+* The time of a level is predicted from the medians of the last `MEMORY_FRAMES` frames, each stage scaled to the level.
+* The level goes down as soon as its own prediction is above the target: to the highest level that is predicted to take
+  at most `HEADROOM` of the target.
+* It goes up by one when the next level is predicted to take at most `HEADROOM` of the target for several frames in a
+  row, at first `UP_AFTER_FRAMES`. A step up that is undone within `PROBATION_FRAMES` doubles this number, up to
+  `MAX_UP_AFTER_FRAMES`; a step that lasts resets it. So the level settles below a wrong prediction.
 """
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf, sqrt
 from statistics import median
 
-from viewmend.inpainting.protocol import ViewInpainter
 from viewmend.live.protocol import FrameTimes
+from viewmend.models.base import Inpainter
 
 MEMORY_FRAMES = 5
 HEADROOM = 0.85
@@ -30,34 +25,42 @@ UP_AFTER_FRAMES = 4
 MAX_UP_AFTER_FRAMES = 256
 PROBATION_FRAMES = 12
 COARSE_FILL_COST = 0.15
-"""Cost of a fill without the transformer, relative to the full level's."""
-READING_FIXED, READING_COST = 0.1, 0.3
-"""Costs of what no resolution changes, and of reading however little, relative to reading all."""
-FADING_FIXED, FADING_COST = 0.05, 0.13
-"""The same costs of finding out what is background, where nothing is read."""
+"""Cost of a fill without context, relative to the full level."""
+REFINE_FIXED, REFINE_COST = 0.1, 0.3
+"""Cost that does not depend on resolution, and cost of inpainting an arbitrarily small part, relative to all of it."""
+FADE_FIXED, FADE_COST = 0.05, 0.13
+"""The same costs if nothing is inpainted and background is only faded."""
+MAX_WAIT_S = 2.5
+"""All viewers that wait for an image are predicted to be served within this time, one after the other."""
+IDLE_WAIT_S = 1.0
+"""Time limit for an image when other viewers are connected but idle."""
+MIN_MEASURED_PX = 20_000
+"""Smaller images are not measured: most of their time does not depend on resolution."""
+DEFAULT_S_PER_PX = 6e-6
+"""Seconds per pixel at full quality before any measurement, as on a slow machine."""
 
 
 @dataclass(frozen=True)
 class QualityLevel:
-    """What one view is made with."""
+    """Quality settings of one view."""
 
     scale: float
     """Factor of width and height."""
     context_times: int
-    """How many times of the window are context, the latest first; 0: no camera image is encoded."""
+    """Number of context frames, the latest first; 0: no camera image is encoded."""
     top_k: int | None
     """Context tokens that survive pruning; None for all."""
-    read_fraction: float | None = None
-    """The part of the subject that is read; None for all that the error rule asks. With 0 background fades alone."""
+    refine_fraction: float | None = None
+    """Part of the subject that is inpainted; None for all that the error rule selects, 0 fades background only."""
 
     @property
     def relative_cost(self) -> float:
-        """Cost of inpainting, relative to the full level's."""
-        if self.read_fraction == 0:
-            return FADING_FIXED + self.scale**2 * FADING_COST
-        if self.read_fraction is not None:
-            read = (1 - READING_FIXED - READING_COST) * self.read_fraction
-            return READING_FIXED + self.scale**2 * (READING_COST + read)
+        """Cost of inpainting, relative to the full level."""
+        if self.refine_fraction == 0:
+            return FADE_FIXED + self.scale**2 * FADE_COST
+        if self.refine_fraction is not None:
+            refined = (1 - REFINE_FIXED - REFINE_COST) * self.refine_fraction
+            return REFINE_FIXED + self.scale**2 * (REFINE_COST + refined)
         tokens = min(self.top_k or 2048, 2048) / 2048
         if self.context_times == 0:
             return self.scale**2 * COARSE_FILL_COST
@@ -69,14 +72,14 @@ FULL = QualityLevel(1.0, 7, None)
 
 @dataclass(frozen=True)
 class Ladder:
-    """What views may be made with, for one kind of model."""
+    """The quality levels for one kind of model."""
 
     levels: tuple[QualityLevel, ...]
-    """The cheapest first; the last is `FULL`."""
+    """From the cheapest to `FULL`."""
     moving: QualityLevel
-    """What a moving view is made with where there is no budget."""
+    """For a moving view if there is no budget."""
     still: QualityLevel
-    """What a view that has been still for a moment is made with: sharp, but soon there."""
+    """For a view that has just come to rest: sharp and quickly rendered."""
 
 
 SCALES = (0.25, 0.3, 0.36, 0.42, 0.5, 0.6, 0.7, 0.84, 1.0)
@@ -91,7 +94,7 @@ CONTEXT_LADDER = Ladder(
     moving=QualityLevel(0.5, 0, 256),
     still=QualityLevel(1.0, 0, None),
 )
-READING_LADDER = Ladder(
+REFINE_LADDER = Ladder(
     (
         *(QualityLevel(scale, 7, None, 0.0) for scale in SCALES),
         *(QualityLevel(1.0, 7, None, fraction) for fraction in (0.1, 0.25, 0.5)),
@@ -102,19 +105,19 @@ READING_LADDER = Ladder(
 )
 
 
-def ladder_for(inpainter: ViewInpainter) -> Ladder:
-    """The ladder of a model; one that has `tells_errors` reads a part of the subject, others use less context."""
-    return READING_LADDER if getattr(inpainter, "tells_errors", False) else CONTEXT_LADDER
+def ladder_for(inpainter: Inpainter) -> Ladder:
+    """The ladder of a model: smaller parts of the subject if it predicts errors, less context otherwise."""
+    return REFINE_LADDER if inpainter.predicts_errors else CONTEXT_LADDER
 
 
 class Budget:
-    """Chooses one viewer's quality level, frame by frame."""
+    """Chooses the quality level of one viewer, frame by frame."""
 
     def __init__(self, target_ms: float, levels: Sequence[QualityLevel] = CONTEXT_LADDER.levels) -> None:
-        """Begin in the middle of the ladder.
+        """Start in the middle of the ladder.
 
         Raises:
-            ValueError: a target that is not positive, or no levels.
+            ValueError: the target is not positive, or there are no levels.
         """
         if not target_ms > 0 or not levels:
             raise ValueError(f"expected a positive budget and levels, got {target_ms} ms and {len(levels)} levels")
@@ -122,7 +125,7 @@ class Budget:
         self.levels = tuple(levels)
         self.index = len(levels) // 2
         self.measured_ms = 0.0
-        # Each is scaled to the full level, as far as it depends on the level.
+        # Stage times, scaled to the full level where they depend on the level.
         self._geometry, self._pixels, self._inpainting, self._context = (
             deque[float](maxlen=MEMORY_FRAMES) for _ in range(4)
         )
@@ -130,32 +133,33 @@ class Budget:
 
     @property
     def level(self) -> QualityLevel:
-        """What the next view is made with."""
+        """The quality level of the next view."""
         return self.levels[self.index]
 
-    def predicted_ms(self, level: QualityLevel) -> float:
-        """What a view of this level would take; 0 before the first frame."""
+    def predict_ms(self, level: QualityLevel) -> float:
+        """The predicted time of a view at this level; 0 before the first frame."""
         inpainting = level.relative_cost + (_median(self._context) if level.context_times else 0.0)
         return _median(self._geometry) + _median(self._pixels) * level.scale**2 + _median(self._inpainting) * inpainting
 
     def record(self, level: QualityLevel, times: FrameTimes) -> None:
-        """Learn from a frame, and choose the next one's level."""
+        """Add the measured times of a frame, and choose the level of the next one."""
         self.measured_ms = times.total - times.wait
         self._geometry.append(times.geometry)
         self._pixels.append((times.rendering + times.encode) / level.scale**2)
-        if times.inpainting > 0:  # else nothing was to be filled
+        if times.inpainting > 0:  # 0 if the view had no holes
             inpainting = times.inpainting / level.relative_cost
             self._inpainting.append(inpainting)
             if level.context_times:
-                # Relative to inpainting, which all levels measure: so a level without context learns of a slow device.
+                # Relative to inpainting, which every level measures, so that a level without context follows a device
+                # that has become slower.
                 self._context.append(times.context / inpainting)
         self._frames_since_up += 1
         if self._frames_since_up == PROBATION_FRAMES:
             self._up_after = UP_AFTER_FRAMES
-        if self.predicted_ms(self.level) > self.target_ms and self.index > 0:
-            self._down()
+        if self.predict_ms(self.level) > self.target_ms and self.index > 0:
+            self._go_down()
         elif self.index + 1 < len(self.levels):
-            fits = self.predicted_ms(self.levels[self.index + 1]) <= HEADROOM * self.target_ms
+            fits = self.predict_ms(self.levels[self.index + 1]) <= HEADROOM * self.target_ms
             self._frames_with_room = self._frames_with_room + 1 if fits else 0
             if self._frames_with_room >= self._up_after:
                 self.index, self._frames_with_room, self._frames_since_up = self.index + 1, 0, 0
@@ -164,22 +168,54 @@ class Budget:
         """The part `budget` of the message `stats`."""
         return {
             "target_ms": round(self.target_ms, 1),
-            "predicted_ms": round(self.predicted_ms(self.level), 1),
+            "predicted_ms": round(self.predict_ms(self.level), 1),
             "measured_ms": round(self.measured_ms, 1),
             "scale": self.level.scale,
             "top_k": self.level.top_k,
             "context_times": self.level.context_times,
-            "read_fraction": self.level.read_fraction,
+            "refine_fraction": self.level.refine_fraction,
             "level": self.index,
             "levels": len(self.levels),
         }
 
-    def _down(self) -> None:
+    def _go_down(self) -> None:
         if self._frames_since_up < PROBATION_FRAMES:
             self._up_after = min(MAX_UP_AFTER_FRAMES, 2 * self._up_after)
-        good = [n for n in range(self.index) if self.predicted_ms(self.levels[n]) <= HEADROOM * self.target_ms]
+        good = [n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms]
         self.index, self._frames_with_room, self._frames_since_up = max(good, default=0), 0, PROBATION_FRAMES
 
 
 def _median(values: Sequence[float]) -> float:
     return median(values) if values else 0.0
+
+
+class ResolutionLimit:
+    """Lowers the resolution of views so that no viewer of a server waits too long for another one's image.
+
+    It uses the slowest of the last large images, in seconds per pixel.
+    """
+
+    def __init__(self) -> None:
+        self._seconds_per_px: deque[float] = deque(maxlen=16)
+
+    def record(self, pixels: float | int, level: QualityLevel, seconds: float) -> None:
+        """Add the time of an image of this many pixels at this level."""
+        if pixels >= MIN_MEASURED_PX:
+            self._seconds_per_px.append(seconds / (pixels * _cost_per_px(level)))
+
+    def apply(
+        self, level: QualityLevel, pixels: float | int, num_waiting: int, has_company: bool = False
+    ) -> QualityLevel:
+        """The level, with a lower resolution if images of this many pixels for all waiting viewers would take too long.
+
+        `num_waiting` includes this viewer; `has_company` is whether others are connected, waiting or not.
+        """
+        seconds_per_px = max(self._seconds_per_px, default=DEFAULT_S_PER_PX) * _cost_per_px(level)
+        image_s = seconds_per_px * pixels * level.scale**2
+        limit_s = MAX_WAIT_S / num_waiting if num_waiting > 1 else IDLE_WAIT_S if has_company else inf
+        return level if image_s <= limit_s else replace(level, scale=level.scale * sqrt(limit_s / image_s))
+
+
+def _cost_per_px(level: QualityLevel) -> float:
+    """Cost of a pixel, relative to one at the full level."""
+    return level.relative_cost / level.scale**2

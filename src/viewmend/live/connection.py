@@ -1,26 +1,27 @@
-"""One viewer's WebSocket: one task reads, one writes, one sends states and statistics."""
+"""One viewer's WebSocket: a task that reads, one that writes, and one that sends states and statistics."""
 
 import asyncio
 import contextlib
 import itertools
 import json
-import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+from starlette.requests import Request
+from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from viewmend.live.broadcast import Broadcast
-from viewmend.live.guard import FaultLimit, RateLimit
+from viewmend.live.auth import RateLimit
 from viewmend.live.protocol import (
     MODES,
     VERSION,
     Ack,
+    ClockChange,
     Hello,
     Limits,
     Look,
     Message,
-    OnAir,
     Ping,
     ProtocolError,
     error_json,
@@ -28,11 +29,49 @@ from viewmend.live.protocol import (
 )
 from viewmend.live.service import RenderService
 from viewmend.live.sessions import ViewerSession
-from viewmend.rendering.error_rules import ERROR_RULES
+from viewmend.rendering.error_mask import ERROR_RULES
 
 HELLO_S = 10.0
+"""Time for a client's first message."""
 ACK_S = 30.0
+"""Time for the acknowledgement of a frame."""
+FAULTS = (1.0, 19.0)
+"""Malformed messages per second, and at once, that do not end a connection."""
 TICK_S = 0.1
+
+
+class Extension:
+    """An optional part of the live server; by default, every method does nothing."""
+
+    notice: str | None = None
+    """What `viewmend serve` prints after the address; {address} and {query} are replaced."""
+
+    def routes(self) -> Mapping[str, Callable[[Request], Awaitable[Response]]]:
+        """Handlers of GET requests by path; the server checks token and origin."""
+        return {}
+
+    def running(self) -> contextlib.AbstractAsyncContextManager[None]:
+        """A context that the server holds while it serves."""
+        return contextlib.nullcontext()
+
+    def welcome_json(self) -> dict[str, Any]:
+        """Fields of the message `welcome`."""
+        return {}
+
+    def state_json(self, session: ViewerSession) -> dict[str, Any]:
+        """Fields of a viewer's message `state`."""
+        return {}
+
+    def handle(self, session: ViewerSession, message: Message) -> bool:
+        """Use a viewer's message, under the service's lock; False if it is of no use."""
+        return False
+
+    def leave(self, session: ViewerSession) -> None:
+        """Note that a viewer has left, under the service's lock."""
+
+    def metrics(self) -> list[str]:
+        """Lines for /metrics."""
+        return []
 
 
 @dataclass
@@ -43,21 +82,18 @@ class SessionRegistry:
     limits: Limits
     budget_ms: float | None
     about: dict[str, Any]
-    """Fields of the message `welcome`: model, codecs, export, token_needed, server."""
+    """Fields of the message `welcome` that are the same for all viewers."""
+    extensions: Sequence[Extension] = ()
     sessions: list[ViewerSession] = field(default_factory=list)
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
-    broadcast: Broadcast | None = None
-    """The view for many, where there is one."""
 
     def source_json(self) -> dict[str, Any]:
-        """The part of the message `state` that is the same for all."""
-        service = self.service
-        span, status, renderer = service.supply.span, service.supply.status, service.renderer
-        waits = status.state == "ready" and not service.ready
+        """The part of the message `state` that is the same for all viewers."""
+        service, span, status = self.service, self.service.source.span, self.service.source.status
         return {
-            "source": "loading" if waits else status.state,
+            "source": "loading" if status.state == "ready" and not service.is_ready else status.state,
             "error": status.error or service.error,
-            "model_error": renderer.model_error,
+            "model_error": service.renderer.model_error,
             "first": span.first,
             "end": span.end,
             "total": span.total,
@@ -66,16 +102,16 @@ class SessionRegistry:
         }
 
 
+@dataclass
 class ClosingError(Exception):
-    """Ends a connection with this close code."""
+    """Ends a connection."""
 
-    def __init__(self, code: int, message: str) -> None:
-        super().__init__(message)
-        self.code = code
+    code: int
+    message: str
 
 
 async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
-    """Say why a socket ends, and end it."""
+    """Send an error message and close a socket."""
     await socket.send_text(json.dumps(error_json(code, message, fatal=True)))
     await socket.close(code)
 
@@ -84,43 +120,42 @@ class ViewerConnection:
     """Reads a viewer's messages, and sends it frames, states and errors."""
 
     def __init__(self, socket: WebSocket, registry: SessionRegistry) -> None:
-        self._socket = socket
-        self._registry = registry
-        self._service = registry.service
-        self._loop = asyncio.get_running_loop()
+        self._socket, self._registry, self._service = socket, registry, registry.service
+        self._now, self._loop = registry.service.now, asyncio.get_running_loop()
         self._wake_writer = asyncio.Event()
         self._pending: dict[str, dict[str, Any]] = {}
         self._frame: bytes | None = None
-        self._faults = FaultLimit()
-        self._rate = RateLimit(registry.limits.messages_per_s)
+        rate = registry.limits.messages_per_s
+        self._rate, self._faults = RateLimit(rate, 2 * rate, self._now), RateLimit(*FAULTS, self._now)
         self._rig: dict[str, Any] | None = None
-        self._session = ViewerSession(
-            self._deliver, self._report_error, registry.budget_ms, registry.service.renderer.ladder
-        )
+        ladder = registry.service.renderer.ladder
+        self._session = ViewerSession(self._send_frame, self._report_error, registry.budget_ms, ladder, self._now)
 
     async def run(self) -> None:
         """Serve an accepted socket until it ends."""
+        sessions, limit = self._registry.sessions, self._registry.limits.viewers
         try:
-            if len(self._registry.sessions) >= self._registry.limits.viewers:
-                raise ClosingError(4503, f"expected at most {self._registry.limits.viewers} viewers; try again later")
-            self._registry.sessions.append(self._session)
-            await self._handshake()
+            if len(sessions) >= limit:
+                raise ClosingError(4503, f"expected at most {limit} viewers; try again later")
+            sessions.append(self._session)
+            await self._shake_hands()
             self._service.join(self._session)
             await self._serve()
-        except ClosingError as closed:
+        except ClosingError as closing:
             with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
                 async with asyncio.timeout(2):
-                    await close_with_error(self._socket, closed.code, str(closed))
-        except (WebSocketDisconnect, RuntimeError):  # gone, maybe in the middle of a frame
+                    await close_with_error(self._socket, closing.code, closing.message)
+        except (WebSocketDisconnect, RuntimeError):  # the client has gone, maybe in the middle of a frame
             pass
         finally:
             self._service.leave(self._session)
             with self._service.lock:
-                self._go_on_air(False)
-            if self._session in self._registry.sessions:
-                self._registry.sessions.remove(self._session)
+                for extension in self._registry.extensions:
+                    extension.leave(self._session)
+            if self._session in sessions:
+                sessions.remove(self._session)
 
-    async def _handshake(self) -> None:
+    async def _shake_hands(self) -> None:
         try:
             async with asyncio.timeout(HELLO_S):
                 hello = parse(await self._receive(), self._registry.limits)
@@ -132,7 +167,8 @@ class ViewerConnection:
             raise ClosingError(4400, "expected 'hello' as the first message; see docs/live-protocol.md")
         if hello.version != VERSION:
             raise ClosingError(4426, f"expected version {VERSION}, got {hello.version}; reload the page")
-        welcome = {
+        about = self._registry.about
+        welcome = about | {
             "type": "welcome",
             "version": VERSION,
             "viewer": next(self._registry.numbers),
@@ -140,11 +176,8 @@ class ViewerConnection:
             "error_rules": tuple(ERROR_RULES),
             "error_rule": self._service.renderer.error_rule,
             "background": self._service.renderer.background,
-            "budget_ms": self._registry.budget_ms,
-            "limits": asdict(self._registry.limits),
-            **self._registry.about,
+            "codecs": [codec for codec in about["codecs"] if codec in ("jpeg", *hello.codecs)],
         }
-        welcome["codecs"] = [codec for codec in self._registry.about["codecs"] if codec in ("jpeg", *hello.codecs)]
         await self._socket.send_text(json.dumps(welcome))
 
     async def _serve(self) -> None:
@@ -163,54 +196,50 @@ class ViewerConnection:
         message = await self._socket.receive()
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message.get("code", 1000))
-        text = message.get("text")
-        if text is None:
+        if message.get("text") is None:
             raise ProtocolError("expected text, got a binary message")
-        return text
+        return message["text"]
 
     async def _read(self) -> None:
         while True:
             try:
                 text = await self._receive()
-                if not self._rate.allows():
-                    await asyncio.sleep(0.05)  # reads no further: the flood dams itself up
-                    self._fault(4429, f"expected at most {self._registry.limits.messages_per_s} messages a second")
+                if not self._rate.allow():
+                    await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
+                    self._count_fault(
+                        4429, f"expected at most {self._registry.limits.messages_per_s} messages a second"
+                    )
                     continue
                 self._handle(parse(text, self._registry.limits))
             except ProtocolError as error:
-                self._fault(4400, str(error))
+                self._count_fault(4400, str(error))
 
-    def _fault(self, code: int, message: str) -> None:
-        if self._faults.exceeded():
+    def _count_fault(self, code: int, message: str) -> None:
+        if not self._faults.allow():
             raise ClosingError(code, message)
         self._send_soon(error_json(code, message, fatal=False))
 
-    def _go_on_air(self, on: bool) -> None:
-        if self._registry.broadcast is not None:
-            self._registry.broadcast.go_on_air(self._session, on)
-
     def _handle(self, message: Message) -> None:
         if isinstance(message, Ping):
-            now_ms = round(1000 * time.monotonic(), 2)
+            now_ms = round(1000 * self._now(), 2)
             self._send_soon({"type": "pong", "sent_ms": message.sent_ms, "server_ms": now_ms})
             return
         if isinstance(message, Hello):
             raise ProtocolError("expected one hello, got another")
         if isinstance(message, Look) and message.codec not in self._registry.about["codecs"]:
             raise ProtocolError(f"expected a codec among {self._registry.about['codecs']}, got '{message.codec}'")
-        if isinstance(message, OnAir) and self._registry.broadcast is None:
-            raise ProtocolError("expected a server that broadcasts, got one that does not; start it with --broadcast")
         with self._service.lock:
             if isinstance(message, Look):
                 self._session.look(message)
-                if self._registry.broadcast is not None:
-                    self._registry.broadcast.look(self._session)
-            elif isinstance(message, OnAir):
-                self._go_on_air(message.on)
             elif isinstance(message, Ack):
                 self._session.ack(message.frame)
-            else:
-                self._session.change(message, self._service.supply.span)
+            elif isinstance(message, ClockChange):
+                self._session.change_clock(message, self._service.source.span)
+            used = [extension.handle(self._session, message) for extension in self._registry.extensions]
+            if not any(used) and not isinstance(message, Look | Ack | ClockChange):
+                raise ProtocolError(
+                    "expected a server that broadcasts, got one that does not; start it with --broadcast"
+                )
             self._service.lock.notify_all()
 
     async def _write(self) -> None:
@@ -225,20 +254,20 @@ class ViewerConnection:
                     await self._socket.send_bytes(frame)
 
     async def _send_status(self) -> None:
-        """Send rig, state and statistics when they are due, and end a connection that does not answer."""
-        last, state_at, stats_at = None, 0.0, time.monotonic()
+        """Send rig, state and statistics when they are due, and end a connection that acknowledges no frames."""
+        last, state_at, stats_at = None, 0.0, self._now()
         while True:
-            now = time.monotonic()
-            if self._service.ready:
+            now = self._now()
+            if self._service.is_ready:
                 self._send_new_rig()
-            source = self._registry.source_json()
-            own = self._session.state_json(self._service.supply.span, self._service.edge)
-            if (broadcast := self._registry.broadcast) is not None:
-                own |= {"on_air": broadcast.is_on_air(self._session), "watched": broadcast.watched}
-            shown = (source, {key: own[key] for key in own if key not in ("time", "behind")})
-            if shown != last or now - state_at >= 0.5:
-                last, state_at = shown, now
-                self._send_soon({"type": "state"} | source | own)
+            shared = self._registry.source_json()
+            own = self._session.state_json(self._service.source.span, self._service.source.edge)
+            for extension in self._registry.extensions:
+                own |= extension.state_json(self._session)
+            state = (shared, {key: own[key] for key in own if key not in ("time", "behind")})
+            if state != last or now - state_at >= 0.5:
+                last, state_at = state, now
+                self._send_soon({"type": "state"} | shared | own)
             if now - stats_at >= 1:
                 stats_at = now
                 self._send_soon(self._session.stats_json(len(self._registry.sessions)))
@@ -252,17 +281,17 @@ class ViewerConnection:
             self._send_soon({"type": "rig"} | rig)
 
     def _send_soon(self, message: dict[str, Any]) -> None:
-        """Queue a message, in place of one of its type that is still waiting."""
+        """Queue a message; it replaces one of the same type that is still waiting."""
         self._pending[message["type"]] = message
         self._wake_writer.set()
 
-    def _deliver(self, message: bytes) -> None:
+    def _send_frame(self, message: bytes) -> None:
         def put() -> None:
             self._send_new_rig()  # which is written before the frame
             self._frame = message
             self._wake_writer.set()
 
-        with contextlib.suppress(RuntimeError):  # the loop has ended
+        with contextlib.suppress(RuntimeError):  # the event loop has ended
             self._loop.call_soon_threadsafe(put)
 
     def _report_error(self, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Viewers' cameras: around the subject by angles, or anywhere by a matrix."""
+"""Cameras of viewers: on an orbit around the subject by angles, or anywhere by a matrix."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,49 +10,46 @@ from torch import Tensor
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, pinhole
+from viewmend.geometry.orbit import horizontal_axes, upright
 from viewmend.geometry.rigid import look_at, rigid
-from viewmend.geometry.upright import horizontal_axes, upright
 from viewmend.live.protocol import Camera
 
 ARC_GAP = 1.5
-"""Cameras stand in an arc where the widest gap between neighbours is so many times the next one."""
+"""Cameras form an arc if the widest gap between neighbours is at least this multiple of the second widest."""
 
 
 @dataclass(frozen=True)
-class RigFrame:
-    """The subject's place in the world, and the view to begin with."""
+class HomeView:
+    """Axes of the orbit around the subject, and the initial view."""
 
     center: Float[Tensor, "3"]
-    """The middle of the subject, metres."""
+    """Centre of the subject, metres."""
     up: Float[Tensor, "3"]
     front: Float[Tensor, "3"]
     """Horizontal unit vector to azimuth 0."""
     side: Float[Tensor, "3"]
     """Horizontal unit vector to azimuth 90 degrees."""
     azimuth: float
-    """Azimuth and elevation are those of the first view, in degrees."""
+    """Azimuth and elevation of the initial view, degrees."""
     elevation: float
     distance_m: float
     fov_y: float
-    """Vertical field of view, degrees, for square pictures and wide ones; the shorter side's in tall ones."""
+    """Field of view of the shorter side, degrees."""
 
     def as_json(self) -> dict[str, Any]:
-        """What the message `rig` says of it."""
+        """Its part of the message `rig`."""
         axes = {key: _list(getattr(self, key)) for key in ("center", "up", "front", "side")}
         names = {"azimuth": self.azimuth, "elevation": self.elevation, "distance": self.distance_m, "fov_y": self.fov_y}
         return axes | {"home": {name: round(value, 4) for name, value in names.items()}}
 
 
-def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> RigFrame:
-    """Axes about the subject: as `geometry.orbit` counts azimuths.
+def home_view(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3"] | None) -> HomeView:
+    """Find the axes of the orbit, with azimuths as in `geometry.orbit`, and the initial view.
 
-    The first view is in the middle of the cameras' arc, or halfway between the first camera and its neighbour where
-    they stand all around; as far and as high as the cameras on average, and it shows as much as they do.
+    The initial view is in the middle of the cameras' arc or, if they stand all around, halfway between the first
+    camera and its neighbour; distance, elevation and field of view are those of the cameras.
 
-    Args:
-        cameras: the rig.
-        center: the subject's middle, metres.
-        up: the world's; None for what the images agree on.
+    `center` is the subject's, in metres; `up` the up axis of the world, None to estimate it from the cameras.
     """
     cameras = cameras.to("cpu")
     center, up = center.cpu().float(), upright(cameras) if up is None else (up / up.norm()).cpu().float()
@@ -64,42 +61,38 @@ def rig_frame(cameras: Cameras, center: Float[Tensor, "3"], up: Float[Tensor, "3
     gaps = torch.cat([after, after.new_tensor([360.0])]).diff()
     widest, others = int(gaps.argmax()), gaps.sort().values[:-1]
     if not len(others) or float(gaps[widest]) >= ARC_GAP * float(others[-1]):
-        ahead = float(after[widest] + gaps[widest] / 2) + 180  # of the first camera: opposite to where none stands
+        ahead = float(after[widest] + gaps[widest] / 2) + 180  # opposite to the widest gap, relative to camera 0
     else:
         ahead = float(after[after > 1][0]) / 2
     elevation = float(torch.rad2deg(torch.asin((offsets @ up / distance).clamp(-1, 1))).mean())
     width, height = cameras.size_px[0].tolist()
     fov_y = 2 * math.degrees(math.atan(min(width, height) / 2 / float(cameras.K[0, 1, 1])))
     azimuth = round((float(azimuths[0]) + ahead + 180) % 360 - 180, 2)
-    return RigFrame(center, up, front, side, azimuth, max(-80.0, min(80.0, elevation)), float(distance.mean()), fov_y)
+    return HomeView(center, up, front, side, azimuth, max(-80.0, min(80.0, elevation)), float(distance.mean()), fov_y)
 
 
-def view_camera(asked: Camera, frame: RigFrame, size_px: tuple[int, int], scale: float = 1.0) -> Cameras:
-    """The camera that was asked for, its image resampled by `scale` (sides rounded to even numbers, at least 16).
+def view_camera(asked: Camera, home: HomeView, size_px: tuple[int, int], scale: float = 1.0) -> Cameras:
+    """The requested camera, with its image resized by `scale` (sides rounded to even numbers, at least 16).
 
-    Args:
-        asked: pose and lens.
-        frame: fills in what was not said.
-        size_px: width and height that the lens speaks of.
-        scale: at most 1.
+    `home` has the default pose and field of view; the lens is given in pixels of an image of `size_px`.
     """
     width, height = size_px
     if asked.R is not None and asked.T is not None:
         pose = rigid(torch.tensor(asked.R).view(3, 3), torch.tensor(asked.T))
     else:
-        center = frame.center if asked.target is None else torch.tensor(asked.target)
+        center = home.center if asked.target is None else torch.tensor(asked.target)
         azimuth, elevation = math.radians(asked.azimuth), math.radians(asked.elevation)
-        flat = math.cos(azimuth) * frame.front + math.sin(azimuth) * frame.side
-        distance_m = frame.distance_m if asked.distance is None else asked.distance
-        eye = center + distance_m * (math.cos(elevation) * flat + math.sin(elevation) * frame.up)
-        pose = look_at(eye, center, frame.up)
+        flat = math.cos(azimuth) * home.front + math.sin(azimuth) * home.side
+        distance_m = home.distance_m if asked.distance is None else asked.distance
+        eye = center + distance_m * (math.cos(elevation) * flat + math.sin(elevation) * home.up)
+        pose = look_at(eye, center, home.up)
     if asked.fx is not None:
         cx, cy = width / 2 if asked.cx is None else asked.cx, height / 2 if asked.cy is None else asked.cy
         K = [[asked.fx, 0.0, cx], [0.0, asked.fy or asked.fx, cy], [0.0, 0.0, 1.0]]
         camera = Cameras(("view",), torch.tensor([K]), pose[None], torch.tensor([[width, height]]))
     else:
-        fov_rad = math.radians(frame.fov_y if asked.fov_y is None else asked.fov_y)
-        if asked.fov_y is None and height > width:  # what the shorter side shows stays
+        fov_rad = math.radians(home.fov_y if asked.fov_y is None else asked.fov_y)
+        if asked.fov_y is None and height > width:  # the field of view is that of the shorter side
             fov_rad = 2 * math.atan(math.tan(fov_rad / 2) * height / width)
         camera = pinhole(fov_rad, width, height, pose)
     if scale < 1:
@@ -108,15 +101,12 @@ def view_camera(asked: Camera, frame: RigFrame, size_px: tuple[int, int], scale:
 
 
 def stereo_pair(camera: Cameras, apart_m: float, center: Float[Tensor, "3"]) -> tuple[Cameras, Cameras]:
-    """The left and the right eye about a camera, side by side and parallel.
+    """The parallel left and right eye of a stereo camera.
 
-    Their principal points are moved so that both show `center`'s depth at the same place: that is how far away a
-    screen seems to be.
+    Their principal points are shifted so that both show the depth of `center` at the same pixel, which is the distance
+    at which a screen appears.
 
-    Args:
-        camera: one view.
-        apart_m: the eyes' distance, metres.
-        center: the subject's middle, metres; behind the camera, what is infinitely far is at the same place.
+    If `center`, in metres, is behind the camera, the eyes converge at infinity.
     """
     z = float(camera.camera_from_world[0, 2, :3] @ center.to(camera.K) + camera.camera_from_world[0, 2, 3])
     eyes = []
@@ -129,7 +119,7 @@ def stereo_pair(camera: Cameras, apart_m: float, center: Float[Tensor, "3"]) -> 
 
 
 def cameras_json(cameras: Cameras) -> list[dict[str, Any]]:
-    """Each camera as the protocol says it."""
+    """Cameras in the protocol's form."""
     poses, centers = cameras.camera_from_world.cpu(), cameras.centers.cpu()
     return [
         {
@@ -146,7 +136,7 @@ def cameras_json(cameras: Cameras) -> list[dict[str, Any]]:
 
 
 def bounds_json(bounds: Bounds) -> dict[str, list[float]]:
-    """A box as the protocol says it."""
+    """Bounds in the protocol's form."""
     return {"low": _list(bounds.low), "high": _list(bounds.high)}
 
 

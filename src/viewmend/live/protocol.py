@@ -1,4 +1,4 @@
-"""What client and server say to each other, typed and versioned: docs/live-protocol.md in code."""
+"""The messages between server and clients as types; docs/live-protocol.md describes them."""
 
 import json
 import struct
@@ -11,25 +11,24 @@ import torch
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
-from viewmend.foreign_input import InputError
 from viewmend.geometry.rigid import is_rotation
-from viewmend.json_input import LARGEST_INTEGER, one_of, read_json, typed
-from viewmend.rendering.error_rules import ERROR_RULES
-from viewmend.timing import StageTimes
+from viewmend.rendering.error_mask import ERROR_RULES
+from viewmend.utils.timing import StageTimes
+from viewmend.utils.untrusted_input import LARGEST_INTEGER, InputError, one_of, read_json, typed
 
 VERSION = 1
 MODES = ("rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points")
 MENDED_MODES = frozenset({"mended", "confidence"})
-"""Modes that need the model."""
+"""Modes that need the model's output."""
 HULL_MODES = frozenset({"hull", "points"})
-"""Modes that show the geometry proxy by itself."""
+"""Modes that show the geometry proxy alone."""
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
 MAX_PARTS = 512
 HEADER_BYTES = 1_000_000
-"""The largest JSON of a rig, or at the beginning of a binary message."""
+"""Largest JSON text of a rig, or header of a binary message."""
 MAX_NESTED = 10_000
-"""Lists and objects in one JSON: a megabyte of empty ones takes seconds, in which nothing else runs."""
+"""Lists and objects in one JSON text: parsing a megabyte of empty ones would block the server for seconds."""
 
 Kind = TypeVar("Kind")
 Integer = Annotated[int, Meta(ge=-LARGEST_INTEGER, le=LARGEST_INTEGER)]
@@ -38,7 +37,7 @@ ClientMs = Annotated[float, Meta(ge=-1e15, le=1e15)]
 Metres = Annotated[float, Meta(ge=-1e4, le=1e4)]
 Point = tuple[Metres, Metres, Metres]
 Rotation = Annotated[tuple[Annotated[float, Meta(ge=-1.001, le=1.001)], ...], Meta(min_length=9, max_length=9)]
-"""Row by row, world to camera."""
+"""camera_from_world, row by row."""
 Degrees = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Elevation = Annotated[float, Meta(ge=-89.9, le=89.9)]
 Distance = Annotated[float, Meta(ge=0.02, le=1e3)]
@@ -57,12 +56,12 @@ ShortText = Annotated[str, Meta(max_length=40)]
 
 
 class ProtocolError(InputError):
-    """A message that is not of the protocol. It says what was expected, what came, and the next step."""
+    """A malformed message. Its text states what was expected, what was found, and what to do next."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What a client may ask for."""
+    """Limits for clients, as the message `welcome` reports them."""
 
     max_side_px: int = 2048
     max_pixels: int = 2_100_000
@@ -71,19 +70,16 @@ class Limits:
     viewers: int = 8
 
     def check_size(self, width: int, height: int, views: int = 1) -> None:
-        """Refuse pictures that are too large.
-
-        Raises:
-            ProtocolError: a side, or all views together, have too many pixels.
-        """
+        """Raise a ProtocolError if a side, or all views together, have too many pixels."""
+        size = f"{width} x {height}"
         if max(width, height) > self.max_side_px:
-            raise ProtocolError(f"expected sides from 16 to {self.max_side_px}, got {width} x {height}; ask for fewer")
+            raise ProtocolError(f"expected sides from 16 to {self.max_side_px} pixels, got {size}; request less")
         if width * height * views > self.max_pixels:
-            raise ProtocolError(f"expected at most {self.max_pixels} pixels, got {width} x {height}; ask for fewer")
+            raise ProtocolError(f"expected at most {self.max_pixels} pixels, got {size}; request less")
 
 
 class Camera(Struct, frozen=True, kw_only=True):
-    """A viewer's camera as it was asked for: a matrix or an orbit, and a lens."""
+    """A requested camera: a pose (a matrix or a position on an orbit) and a lens."""
 
     R: Rotation | None = None
     T: Point | None = None
@@ -93,59 +89,59 @@ class Camera(Struct, frozen=True, kw_only=True):
     target: Point | None = None
     fov_y: FieldOfView | None = None
     fx: FocalLength | None = None
-    """Pixels of the size that was asked for, as fy, cx and cy are; by default fy is fx, and cx, cy the middle."""
+    """fx, fy, cx and cy are in pixels of the requested size; defaults: fy = fx, and cx, cy at the centre."""
     fy: FocalLength | None = None
     cx: PrincipalPoint | None = None
     cy: PrincipalPoint | None = None
 
     def __post_init__(self) -> None:
         if (self.R is None) != (self.T is None):
-            raise ProtocolError("expected 'R' and 'T', got one of them; give both or an orbit")
+            raise ProtocolError("expected 'R' and 'T', got one of them; give both, or an orbit")
         if self.R is not None:
             check_rotation(self.R)
 
 
 class Look(Struct, frozen=True, kw_only=True, tag="look"):
-    """What to show from now on."""
+    """The view to show from now on."""
 
     id: Integer = 0
     sent_ms: ClientMs = 0.0
     camera: Camera = Camera()
     eyes: Annotated[tuple[Camera, ...], Meta(min_length=1, max_length=2)] | None = None
-    """Left and right, instead of `camera`."""
+    """Left and right eye, instead of `camera`."""
     width: Side = 320
     height: Side = 320
     modes: Annotated[tuple[Mode, ...], Meta(min_length=1, max_length=2)] = ("mended",)
     top_k: TopK | None = None
     error_rule: Rule | None = None
-    """What is mended; None for what the server was started with."""
+    """Which pixels are inpainted; None for the server's default."""
     scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
     moving: bool = False
     adaptive: bool = True
     depth: bool = False
     codec: Annotated[str, one_of(*CODECS)] = "jpeg"
     key: bool = False
-    """Begin video streams anew: the decoder has lost them."""
+    """Start video streams again with a key frame, because the decoder has lost them."""
     quality: Quality = 85
     background: Colour | None = None
-    """What the pictures lie upon; None for what the model paints upon."""
+    """Background colour; None for the model's own."""
 
     def __post_init__(self) -> None:
         force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))
 
     @property
     def pixels(self) -> float:
-        """How many all of its pictures have."""
+        """Pixels of all eyes together."""
         return len(self.cameras) * self.width * self.height * self.scale**2
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """One for each eye."""
+        """One camera per eye."""
         return self.eyes or (self.camera,)
 
 
 class Hello(Struct, frozen=True, tag="hello"):
-    """A client's first words."""
+    """A client's first message."""
 
     version: Count
     codecs: Annotated[tuple[ShortText, ...], Meta(max_length=8)] = ("jpeg",)
@@ -158,7 +154,7 @@ class Ack(Struct, frozen=True, tag="ack"):
 
 
 class ClockChange(Struct, frozen=True, tag="clock"):
-    """What to do with a viewer's clock; None leaves it."""
+    """A change of the viewer's clock; None leaves a value as it is."""
 
     playing: bool | None = None
     speed: Annotated[float, Meta(ge=0.05, le=4)] | None = None
@@ -167,13 +163,13 @@ class ClockChange(Struct, frozen=True, tag="clock"):
 
 
 class OnAir(Struct, frozen=True, tag="on_air"):
-    """Whether this viewer's looks are what all who watch see."""
+    """Whether this viewer controls the broadcast view."""
 
     on: bool
 
 
 class Ping(Struct, frozen=True, tag="ping"):
-    """Answered by a pong."""
+    """A message that is answered by `pong`."""
 
     sent_ms: ClientMs = 0.0
 
@@ -182,11 +178,7 @@ Message = Hello | Look | Ack | ClockChange | OnAir | Ping
 
 
 def parse(text: str, limits: Limits) -> Message:
-    """A client's message.
-
-    Raises:
-        ProtocolError: it is none, or asks for more than the limits.
-    """
+    """Parse a client's message; ProtocolError if it is malformed or exceeds the limits."""
     if len(text) > limits.max_message_bytes:
         raise ProtocolError(f"expected at most {limits.max_message_bytes} bytes, got {len(text)}; send less")
     message: Message = read_message(text, Message)
@@ -196,11 +188,7 @@ def parse(text: str, limits: Limits) -> Message:
 
 
 def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -> Kind:
-    """JSON text, or what was parsed of it, as `kind`; `strict` as in `json_input.typed`.
-
-    Raises:
-        ProtocolError: it does not fit.
-    """
+    """Convert JSON text, or parsed JSON, to `kind`, as `untrusted_input.typed`; ProtocolError if it does not match."""
     if isinstance(message, str | bytes):
         opening = ("[", "{") if isinstance(message, str) else (b"[", b"{")
         if (nested := sum(map(message.count, opening))) > MAX_NESTED:  # pyright: ignore[reportArgumentType]
@@ -214,35 +202,31 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTimes(StageTimes):
-    """Milliseconds of a frame that is sent: the stages of its views, and what the server adds."""
+    """Milliseconds per stage of a frame that is sent, including the server's own stages."""
 
     encode: float = 0.0
-    """Views to JPEG or video."""
+    """Encoding as JPEG or video."""
     wait: float = 0.0
-    """Time from the look to the start of its first frame."""
+    """From the arrival of a look to the start of its first frame."""
 
     def as_json(self, frames: int = 1) -> dict[str, float]:
-        """The wire's `stage_ms`, means where this is the sum of several frames."""
+        """The protocol's `stage_ms`; means if this is the sum of several frames."""
         return {name: round(ms / frames, 2) for name, ms in (vars(self) | {"total": self.total}).items()}
 
 
 def error_json(code: int | str, message: str, fatal: bool) -> dict[str, Any]:
-    """The message `error`; `fatal` where the socket is closed next."""
+    """The message `error`; `fatal` if the socket is closed next."""
     return {"type": "error", "code": code, "message": message, "fatal": fatal}
 
 
 def check_rotation(R: Sequence[float]) -> None:
-    """Refuse nine numbers that are no rotation, row by row.
-
-    Raises:
-        ProtocolError: they are none.
-    """
+    """Raise a ProtocolError if nine numbers, row by row, are not a rotation matrix."""
     if not bool(is_rotation(torch.tensor(R, dtype=torch.float64).view(3, 3))):
         raise ProtocolError("expected 'R' as a rotation, world to camera, row by row, got another matrix; check signs")
 
 
 def pack(header: dict[str, Any], parts: Sequence[bytes]) -> bytes:
-    """A binary message; `header["parts"]` or `header["images"]` say what the parts are, `bytes` how long each is."""
+    """Build a binary message; `header["parts"]` or `header["images"]` list the parts with their length `bytes`."""
     text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
     return b"".join([MAGIC, struct.pack("<I", len(text)), text, *parts])
 
@@ -252,11 +236,7 @@ class _Part(Struct, frozen=True):
 
 
 def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tuple[dict[str, Any], list[bytes]]:
-    """Inverse of `pack`.
-
-    Raises:
-        ProtocolError: lengths that do not add up, or no header.
-    """
+    """Split a binary message into header and parts; ProtocolError if its header is malformed or its length wrong."""
     if len(message) < 8 or message[:4] != MAGIC:
         raise ProtocolError(f"expected a message that begins with {MAGIC.decode()}, got {message[:4]!r}")
     start = 8 + struct.unpack("<I", message[4:8])[0]
@@ -272,5 +252,5 @@ def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tupl
 
 
 def token_query(token: str | None) -> str:
-    """The query that carries the token; empty without one."""
+    """The query string that carries the token; empty without a token."""
     return f"?token={quote(token, safe='')}" if token else ""

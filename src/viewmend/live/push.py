@@ -1,22 +1,26 @@
-"""Receiving a rig's frames over a WebSocket."""
+"""Live rigs: sources of frames that arrive as they happen, and the WebSocket by which a rig pushes them."""
 
 import asyncio
 import json
+import threading
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from msgspec import Meta, Struct
 from starlette.websockets import WebSocket
+from torch import Tensor
 
-from viewmend.capture.images import decoded, told_size
+from viewmend.data.images import decode_image, size_from_header
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import rigid
-from viewmend.json_input import one_of
 from viewmend.live.connection import close_with_error
-from viewmend.live.door import Visitor, admit, visitor_of
+from viewmend.live.connection_limits import authenticate, is_gone
+from viewmend.live.frame_source import FrameCache, FrameSource, RigInfo, SourceStatus, Span
 from viewmend.live.protocol import (
     HEADER_BYTES,
     VERSION,
@@ -27,20 +31,69 @@ from viewmend.live.protocol import (
     read_message,
     unpack,
 )
-from viewmend.live.pushed import PushedFrames
-from viewmend.views import MultiViewFrame
+from viewmend.types import MultiViewFrame
+from viewmend.utils.untrusted_input import one_of
 
 MAX_CAMERAS = 128
 MAX_PIXELS = 64_000_000
-"""Cameras x widest x highest: a frame's images lie in one tensor."""
+"""Cameras x widest x highest: the images of a frame share one tensor."""
 IMAGE_BYTES = 65_536
-"""What an image may take besides four bytes a pixel: no JPEG and PNG of a camera need more."""
+"""Bytes of an encoded image in addition to four per pixel."""
+MAX_FRAME_BYTES = 8 + HEADER_BYTES + 4 * MAX_PIXELS + MAX_CAMERAS * IMAGE_BYTES
+"""Of any rig; `_max_frame_bytes` is a rig's own limit."""
 SILENT_S = 30.0
+"""A rig that sends nothing for this long is disconnected."""
 ImageSide = Annotated[int, Meta(ge=8, le=16384)]
 
 
-async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
-    """Receive a rig and its frames, until it disconnects."""
+class LiveSource(FrameSource):
+    """Frames as they happen, numbered in order of arrival; the oldest are dropped."""
+
+    def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
+        super().__init__(Span(live=True, fps=fps or 15.0))
+        self._fps = fps
+        self._cache = FrameCache(memory_mb, by_last_use=False)
+        self._lock = threading.Lock()
+
+    def read(self, index: int) -> MultiViewFrame | None:
+        """The frame, or None once it has been dropped."""
+        with self._lock:
+            return self._cache.get(index)
+
+    def begin(self, name: str, fps: float, bounds: Bounds | None, up: Float[Tensor, "3"] | None) -> None:
+        """Start a rig; the frames of an earlier one can no longer be requested."""
+        with self._lock:
+            self.span = replace(self.span, first=self.span.end, fps=self._fps or fps)
+            self.status = SourceStatus()
+            self.rig = RigInfo(name, bounds, up, 1 if self.rig is None else self.rig.number + 1)
+        self.changed()
+
+    def add(self, frame: MultiViewFrame) -> int:
+        """Append a frame; returns its index."""
+        with self._lock:
+            index = self.span.end
+            self._cache.put(index, frame)
+            self.span = replace(self.span, first=max(self.span.first, self._cache.oldest), end=index + 1)
+            self.status = replace(self.status, state="ready", error=None)
+        self.changed()
+        return index
+
+
+class PushSource(LiveSource):
+    """The source of `viewmend serve live`: a rig pushes its frames."""
+
+    def __init__(self, fps: float | None = None, memory_mb: float = 500.0) -> None:
+        super().__init__(fps, memory_mb)
+        self.status = SourceStatus(error="waiting for a rig to push frames")
+
+    def disconnect(self) -> None:
+        """Note that the rig has disconnected."""
+        self.status = replace(self.status, state="failing", error="the rig has disconnected; waiting for it")
+        self.changed()
+
+
+async def receive_rig(socket: WebSocket, source: PushSource) -> None:
+    """Receive a rig and its frames until it disconnects."""
     cameras: Cameras | None = None
     while True:
         try:
@@ -52,23 +105,23 @@ async def receive_rig(socket: WebSocket, supply: PushedFrames) -> None:
         if message["type"] == "websocket.disconnect":
             return
         try:
+            index = None
             if cameras is None or message.get("text"):  # a rig may change while it pushes
-                cameras = await asyncio.to_thread(_begin, message.get("text") or "", supply)
-                admit(socket, _frame_bytes(cameras))
-                await socket.send_text(json.dumps({"type": "taken", "frame": None}))
-                continue
-            # On a thread: other viewers' messages need not wait while images are decoded.
-            frame = await asyncio.to_thread(_frame, message.get("bytes") or b"", cameras, visitor_of(socket))
-            if frame is None:
-                return
-            number = supply.push(frame)
+                cameras = await asyncio.to_thread(_begin_rig, message.get("text") or "", source)
+                authenticate(socket, _max_frame_bytes(cameras))
+            else:  # decoded on a thread, so that other messages need not wait
+                data = message.get("bytes") or b""
+                frame = await asyncio.to_thread(_decode_frame, data, cameras, lambda: is_gone(socket))
+                if frame is None:
+                    return
+                index = source.add(frame)
         except ValueError as error:
             await close_with_error(socket, 4400, str(error))
             return
-        await socket.send_text(json.dumps({"type": "taken", "frame": number}))
+        await socket.send_text(json.dumps({"type": "taken", "frame": index}))
 
 
-class CameraEntry(Struct, frozen=True, kw_only=True):
+class PushedCamera(Struct, frozen=True, kw_only=True):
     """One camera of the message `rig`."""
 
     name: Annotated[str, Meta(max_length=200)]
@@ -82,7 +135,7 @@ class CameraEntry(Struct, frozen=True, kw_only=True):
         check_rotation(self.R)
         if not bool(is_intrinsics(torch.tensor(self.K).view(3, 3))):
             raise ProtocolError(
-                "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with fx and fy above 0, got another"
+                "expected 'K' as [fx, skew, cx, 0, fy, cy, 0, 0, 1] with positive fx and fy, got another matrix"
             )
 
 
@@ -94,16 +147,16 @@ class Box(Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
-            raise ProtocolError("expected low below high on every axis, got another order; swap them")
+            raise ProtocolError("expected low < high on every axis of the bounds, got another order; swap them")
 
 
 class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
-    """The first message of a rig, and whenever its cameras change."""
+    """The first message of a rig, also sent when its cameras change."""
 
     version: int
     name: Annotated[str, Meta(max_length=200)] = "live rig"
     fps: Annotated[float, Meta(ge=0.1, le=240)] = 15.0
-    cameras: Annotated[tuple[CameraEntry, ...], Meta(min_length=1, max_length=MAX_CAMERAS)]
+    cameras: Annotated[tuple[PushedCamera, ...], Meta(min_length=1, max_length=MAX_CAMERAS)]
     bounds: Box | None = None
     up: Point | None = None
 
@@ -111,9 +164,9 @@ class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
         if self.version != VERSION:
             raise ProtocolError(f"expected version {VERSION}, got {self.version}; update the client")
         if len({camera.name for camera in self.cameras}) < len(self.cameras):
-            raise ProtocolError("expected cameras of different names, got one twice; rename it")
+            raise ProtocolError("expected unique camera names, got one twice; rename it")
         if self.up is not None and sum(x * x for x in self.up) < 1e-12:
-            raise ProtocolError("expected 'up' as a direction, got no length; leave it away")
+            raise ProtocolError("expected 'up' as a direction, got a zero vector; leave it out")
         widest, highest = max(camera.width for camera in self.cameras), max(camera.height for camera in self.cameras)
         if (pixels := len(self.cameras) * widest * highest) > MAX_PIXELS:
             raise ProtocolError(
@@ -122,39 +175,31 @@ class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
 
 
 class ImagePart(Struct, frozen=True):
-    """One image of a frame's header."""
+    """One image in the header of a frame."""
 
     camera: str
     kind: Annotated[str, one_of("rgb", "mask")]
 
 
-def _begin(text: str, supply: PushedFrames) -> Cameras:
-    """The rig's cameras, from its first message.
-
-    Raises:
-        ProtocolError: it is none.
-    """
+def _begin_rig(text: str, source: PushSource) -> Cameras:
+    """Start the rig of a message `rig`; returns its cameras. ProtocolError if the message is malformed."""
     rig: RigMessage = read_message(text, RigMessage)
     bounds = None if rig.bounds is None else Bounds(torch.tensor(rig.bounds.low), torch.tensor(rig.bounds.high))
-    supply.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up))
+    source.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up))
     K, R, T = (torch.tensor([getattr(camera, key) for camera in rig.cameras]) for key in ("K", "R", "T"))
     size_px = torch.tensor([(camera.width, camera.height) for camera in rig.cameras])
     return Cameras(tuple(c.name for c in rig.cameras), K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
 
 
-def _frame_bytes(cameras: Cameras) -> int:
+def _max_frame_bytes(cameras: Cameras) -> int:
     """The largest message that a frame of this rig may be."""
-    images = 4 * int(cameras.size_px.prod(1).sum()) + IMAGE_BYTES * len(cameras)
-    return 8 + HEADER_BYTES + images
+    return 8 + HEADER_BYTES + 4 * int(cameras.size_px.prod(1).sum()) + IMAGE_BYTES * len(cameras)
 
 
-def _frame(message: bytes, cameras: Cameras, rig: Visitor) -> MultiViewFrame | None:
-    """One time from its JPEGs and PNGs; cameras of which one of the two is missing are left out.
+def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], bool]) -> MultiViewFrame | None:
+    """One frame from its JPEGs and PNGs; cameras that lack the image or the mask are left out. None if cancelled.
 
-    None once the rig is gone, whose work is dropped.
-
-    Raises:
-        ProtocolError: an image of an unknown camera, of another size, or none at all.
+    ProtocolError if an image is malformed or unexpected, or if fewer than two cameras are complete.
     """
     header, parts = unpack(message, "images")
     images: dict[tuple[str, str], np.ndarray] = {}
@@ -162,36 +207,38 @@ def _frame(message: bytes, cameras: Cameras, rig: Visitor) -> MultiViewFrame | N
     if len({(entry.camera, entry.kind) for entry in listed}) < len(listed):
         raise ProtocolError("expected one image of each camera and kind, got one twice; send it once")
     for entry, data in zip(listed, parts, strict=True):
-        if rig.gone:
+        if is_cancelled():
             return None
         if entry.camera not in cameras.names:
             raise ProtocolError(f"expected a camera among {list(cameras.names)}, got '{entry.camera[:40]}'")
-        images[entry.camera, entry.kind] = _decoded(data, entry.camera, entry.kind, cameras)
-    there = [n for n in cameras.names if (n, "rgb") in images and (n, "mask") in images]
-    if len(there) < 2:
-        raise ProtocolError(f"expected image and mask of two cameras or more, got {len(there)}")
-    seen = cameras.select(there)
-    width, height = seen.max_size_px
-    rgb = torch.zeros(len(there), 3, height, width, dtype=torch.uint8)
-    mask = torch.zeros(len(there), height, width, dtype=torch.uint8)
-    for view, name in enumerate(there):
+        images[entry.camera, entry.kind] = _decode_image(data, entry.camera, entry.kind, cameras)
+    complete = [n for n in cameras.names if (n, "rgb") in images and (n, "mask") in images]
+    if len(complete) < 2:
+        raise ProtocolError(f"expected image and mask of two cameras or more, got {len(complete)}")
+    selected = cameras.select(complete)
+    width, height = selected.max_size_px
+    rgb = torch.zeros(len(complete), 3, height, width, dtype=torch.uint8)
+    mask = torch.zeros(len(complete), height, width, dtype=torch.uint8)
+    for view, name in enumerate(complete):
         h, w = images[name, "mask"].shape
         rgb[view, :, :h, :w] = torch.from_numpy(images[name, "rgb"]).movedim(-1, 0)
         mask[view, :h, :w] = torch.from_numpy(images[name, "mask"])
-    return MultiViewFrame(seen, rgb, mask, 0)
+    return MultiViewFrame(selected, rgb, mask, 0)
 
 
-def _decoded(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.ndarray, "height width *channel"]:
+def _decode_image(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.ndarray, "height width *channel"]:
     import cv2
 
     width, height = cameras.size_px[cameras.names.index(name)].tolist()
+    expected = f"camera '{name}': expected {kind} of {width} x {height} pixels"
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
         raise ProtocolError(f"camera '{name}': expected JPEG or PNG as {kind}, got {data[:4]!r}")
-    if (told := told_size(data)) is not None and told != (width, height):
-        raise ProtocolError(f"camera '{name}': expected {kind} of {width} x {height} pixels, got {told[0]} x {told[1]}")
+    if (size_px := size_from_header(data)) is not None and size_px != (width, height):  # checked before decoding
+        raise ProtocolError(f"{expected}, got {size_px[0]} x {size_px[1]}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
-    image = decoded(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.shape[:2] != (height, width):
-        got = "no image" if image is None else f"{image.shape[1]} x {image.shape[0]}"
-        raise ProtocolError(f"camera '{name}': expected {kind} of {width} x {height} pixels, got {got}")
+        raise ProtocolError(
+            f"{expected}, got {'no image' if image is None else f'{image.shape[1]} x {image.shape[0]}'}"
+        )
     return image

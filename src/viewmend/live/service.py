@@ -1,21 +1,21 @@
-"""One thread that renders for all sessions, in turn."""
+"""The render service: one thread that renders for all sessions in turn."""
 
 import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 
-from viewmend.live.clock import Span, edge_of
-from viewmend.live.frames import FrameSupply
-from viewmend.live.memory import HeapTrimmer
-from viewmend.live.pace import Pace
-from viewmend.live.poses import RigFrame
+from viewmend.live.budget import ResolutionLimit
+from viewmend.live.frame_source import FrameSource, Span
+from viewmend.live.poses import HomeView
 from viewmend.live.protocol import FrameTimes
 from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
-from viewmend.live.sessions import Playback, Session, ViewerSession
+from viewmend.live.sessions import PlaybackState, Session, ViewerSession
+from viewmend.utils.heap import HeapTrimmer
 
 TICK_S = 0.004
-"""Seconds between looks at the sessions' clocks."""
+"""Seconds between checks of the sessions' clocks."""
 IDLE_S = 0.05
 AFTER_ERROR_S = 0.5
 
@@ -23,41 +23,39 @@ log = logging.getLogger("viewmend.live")
 
 
 class RenderService:
-    """Owns the renderer and its thread. Sessions speak to it under `lock`."""
+    """Owns the renderer and its thread. Sessions are changed while holding `lock`; `now` is the clock of all."""
 
-    def __init__(self, renderer: Renderer, supply: FrameSupply) -> None:
-        self.renderer = renderer
-        self.supply = supply
+    def __init__(self, renderer: Renderer, source: FrameSource, now: Callable[[], float] = time.monotonic) -> None:
+        self.renderer, self.source, self.now = renderer, source, now
         self.lock = threading.Condition()
         self.error: str | None = None
-        """What went wrong with the last view, or with the rig's first frame."""
+        """The error of the last view, or of the rig's first frame."""
         self.counts = Counter(frames=0, shared=0, errors=0)
-        """Counts for /metrics."""
         self.times = FrameTimes()
-        """Times of all frames together, for /metrics."""
+        """Times of all frames together; like the counts, for /metrics."""
         self._sessions: list[Session] = []
-        self._pace = Pace()
+        self._resolution_limit = ResolutionLimit()
         self._stopped = False
-        self._last = time.monotonic()
+        self._advanced_at = now()
         self._thread = threading.Thread(target=self._run, name="render", daemon=True)
-        supply.changed = self.wake
+        source.changed = self.wake
 
     def start(self) -> None:
-        """Begin."""
-        self.supply.start()
+        """Start reading and rendering."""
+        self.source.start()
         self._thread.start()
 
     def stop(self) -> None:
-        """End after the view that is being rendered."""
+        """Stop after the view that is being rendered."""
         with self.lock:
             self._stopped = True
             self.lock.notify_all()
-        self.supply.stop()
+        self.source.stop()
         if self._thread.is_alive():
             self._thread.join(timeout=5)
 
     def wake(self) -> None:
-        """Something has changed."""
+        """Check at once whether a session needs a view."""
         with self.lock:
             self.lock.notify_all()
 
@@ -68,39 +66,35 @@ class RenderService:
             self.lock.notify_all()
 
     def leave(self, session: Session) -> None:
-        """End serving a session."""
+        """Stop serving a session; a view that is being rendered for it is still delivered."""
         with self.lock:
             if session in self._sessions:
                 self._sessions.remove(session)
 
     @property
-    def edge(self) -> float:
-        """The position of the viewers who follow the edge."""
-        return edge_of(self.supply.span, self.supply.recording)
-
-    @property
-    def ready(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether views can be rendered."""
-        return self.renderer.frame is not None and self.renderer.is_of(self.supply.rig)
+        return self.renderer.home is not None and self.renderer.is_prepared_for(self.source.rig)
 
     def _run(self) -> None:
         trimmer = HeapTrimmer()
         while not self._stopped:
             try:
-                worked = self._prepare() or self._serve_next()
-            except Exception as error:  # nothing may end the thread
+                worked = self._prepare() or self.serve_next()
+            except Exception as error:  # the thread goes on
                 log.warning("while preparing: %s", error)
                 self.error, worked = f"{type(error).__name__}: {error}"[:400], False
-                time.sleep(AFTER_ERROR_S)
-            trimmer.when_due(idle=not worked)
+                with self.lock:
+                    self.lock.wait_for(lambda: self._stopped, AFTER_ERROR_S)
+            trimmer.trim_if_due(idle=not worked)
             with self.lock:
                 if not worked and not self._stopped:
                     self.lock.wait(TICK_S if self._sessions else IDLE_S)
 
     def _prepare(self) -> bool:
-        """See a new rig's first frame."""
-        span = self.supply.span
-        if self.ready or span.end <= span.first:
+        """Prepare the renderer for a new rig."""
+        span = self.source.span
+        if self.is_ready or span.end <= span.first:
             return False
         try:
             done = self.renderer.prepare(span.newest if span.live else span.first)
@@ -109,25 +103,25 @@ class RenderService:
         self.error = None
         return done
 
-    def _serve_next(self) -> bool:
-        """Render and show one view, if any session wants one."""
-        now, span = time.monotonic(), self.supply.span
-        self.supply.recording.advance(now - self._last, span)
-        self._last = now
-        if not self.ready or self.renderer.frame is None:
+    def serve_next(self) -> bool:
+        """Render and deliver one view; False if no session needs one. Called on the render thread."""
+        now, span = self.now(), self.source.span
+        self.source.recording.advance(now - self._advanced_at, span)
+        self._advanced_at = now
+        if not self.is_ready or self.renderer.home is None:
             return False
         with self.lock:
-            found = self._next_request(now, span, self.renderer.frame)
+            found = self._next_request(now, span, self.renderer.home)
         if found is None:
             return False
         session, request = found
         try:
             result = self.renderer.render(request, session.viewer)
-            times = session.show(request, result)
+            times = session.deliver(request, result)
             if isinstance(session, ViewerSession):
                 pixels = sum(int(camera.size_px.prod()) for camera in request.cameras)
-                self._pace.record(pixels, session.drawn, time.monotonic() - now)
-        except Exception as error:  # one viewer's, who is told; the others go on
+                self._resolution_limit.record(pixels, session.rendered_level, self.now() - now)
+        except Exception as error:  # reported to this session only
             log.exception("while rendering a view")
             self.error = f"{type(error).__name__}: {error}"[:400]
             self.counts["errors"] += 1
@@ -138,16 +132,22 @@ class RenderService:
         self.times += times
         return True
 
-    def _next_request(self, now: float, span: Span, rig_frame: RigFrame) -> tuple[Session, RenderRequest] | None:
-        """The request of the session that has waited longest, which then is the last in turn."""
+    def _next_request(self, now: float, span: Span, home: HomeView) -> tuple[Session, RenderRequest] | None:
+        """The request of the session that has waited longest, which goes to the end of the queue."""
         viewers = [session for session in self._sessions if isinstance(session, ViewerSession)]
-        active = max(1, sum(viewer.is_active(now) for viewer in viewers))
-        has_frame = lambda at: self.supply.read(at) is not None  # noqa: E731
-        playback = Playback(span, self.edge, rig_frame, has_frame, active, self._pace, len(viewers) > 1)
+        playback = PlaybackState(
+            span,
+            self.source.edge,
+            home,
+            has_frame=lambda index: self.source.read(index) is not None,
+            active_viewers=max(1, sum(viewer.is_active(now) for viewer in viewers)),
+            resolution_limit=self._resolution_limit,
+            has_company=len(viewers) > 1,
+        )
         for session in list(self._sessions):
             try:
                 request = session.next_request(now, playback)
-            except Exception as error:  # whatever one viewer asks for, the others are served
+            except Exception as error:  # reported to this session only
                 session.fail(str(error)[:400])
                 continue
             if request is not None:

@@ -1,32 +1,32 @@
-"""Frames as video streams that a browser decodes (WebCodecs), encoded with PyAV (the extra `viewmend[video]`)."""
+"""Video streams for browsers (WebCodecs), encoded with PyAV."""
 
 from fractions import Fraction
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import UInt8
 
-from viewmend.capture.video_writer import say_colours
-from viewmend.live.pictures import Picture
+from viewmend.data.videos import tag_colours
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
 ENCODERS = {"vp9": "libvpx-vp9", "h264": "libx264"}
 STRINGS = {"vp9": "vp09.00.41.08.01.01.01.06.00", "h264": "avc1.42E02A"}
-"""What VideoDecoder.configure is told: profile and level hold every size that the limits allow. Of VP9 browsers believe
-this, not the stream, about how colours are to be read (`say_colours`)."""
+"""Codec strings for VideoDecoder.configure, with profiles and levels for every size within the limits. For VP9,
+browsers take the colour space from this string, not from the stream."""
 OPTIONS = {
     "vp9": {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0", "row-mt": "1", "crf": "24", "b": "0"},
     "h264": {"preset": "ultrafast", "tune": "zerolatency", "crf": "21", "profile": "baseline", "level": "4.2"},
 }
-KEY_EVERY = 240
-"""Frames between key frames, at most."""
+MAX_KEY_INTERVAL = 240
+"""Frames from one key frame to the next."""
 
 
 @cache
 def video_codecs() -> tuple[str, ...]:
-    """Codecs that can be encoded here."""
+    """The codecs that can be encoded here."""
     try:
         import av
     except ImportError:
@@ -35,17 +35,20 @@ def video_codecs() -> tuple[str, ...]:
 
 
 class VideoStream:
-    """One eye's and mode's stream; every frame comes out at once. Another size, or another codec, begins anew."""
+    """The stream of one eye and mode, without delay. Another size or codec starts a new stream."""
 
     def __init__(self) -> None:
         self._context: VideoCodecContext | None = None
         self._kind: tuple[str, int, int] | None = None
         self._count = 0
 
-    def encode(self, image: Picture, codec: str, key: bool) -> tuple[bytes, bool]:
-        """A frame as one chunk, and whether it is a key frame; `key` asks for one.
+    def encode(self, image: UInt8[np.ndarray, "height width 3"], codec: str, key: bool) -> tuple[bytes, bool]:
+        """Encode an RGB image, as a key frame if `key`.
 
-        Odd sizes are padded right and below by their last row and column.
+        Images with odd sides are padded to the right and below by their last column and row.
+
+        Returns:
+            The frame as one chunk, and whether it is a key frame.
         """
         from av import VideoFrame
         from av.video.frame import PictureType
@@ -56,10 +59,10 @@ class VideoStream:
             self._context, self._kind, self._count = _open(*kind), kind, 0
         frame = VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24").reformat(format="yuv420p")
         frame.pts = self._count
-        frame.pict_type = PictureType.I if key or self._count % KEY_EVERY == 0 else PictureType.NONE
+        frame.pict_type = PictureType.I if key or self._count % MAX_KEY_INTERVAL == 0 else PictureType.NONE
         self._count += 1
         packets = self._context.encode(frame)
-        assert packets, "streams without lookahead give a frame for a frame"
+        assert packets, "encoders without lookahead return a packet per frame"
         return b"".join(bytes(packet) for packet in packets), any(packet.is_keyframe for packet in packets)
 
 
@@ -70,9 +73,9 @@ def _open(codec: str, width: int, height: int) -> "VideoCodecContext":
     assert isinstance(context, av.VideoCodecContext)
     context.width, context.height = width, height
     context.pix_fmt = "yuv420p"
-    say_colours(context)
+    tag_colours(context)
     context.time_base = Fraction(1, 30)
-    context.gop_size = KEY_EVERY
+    context.gop_size = MAX_KEY_INTERVAL
     context.thread_count = 1
     context.options = OPTIONS[codec]
     return context

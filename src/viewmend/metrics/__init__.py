@@ -1,1 +1,1 @@
-"""Image quality, whole image and holes."""
+"""Image quality: PSNR, SSIM, LPIPS and VFID."""

@@ -1,6 +1,6 @@
-"""PSNR, SSIM and mask overlap of images in [0, 1], whole or over some of their pixels.
+"""PSNR, SSIM, mask overlap and temporal stability of images in [0, 1], over all or some of their pixels.
 
-One contract: a metric over no pixels is None (not a number that could be averaged), and higher is better.
+A metric over no pixels is None, so that it cannot be averaged by mistake.
 """
 
 import math
@@ -11,12 +11,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
+from viewmend.geometry.sampling import sample_bilinear
+
 SsimWindow = Literal["gaussian", "uniform7"]
-"""Wang et al.'s Gaussian (11 x 11, sigma 1.5), or means over 7 x 7 pixels (scikit-image's default)."""
+"""Gaussian window of Wang et al. (11 x 11 pixels, sigma 1.5), or mean over 7 x 7 pixels (scikit-image's default)."""
 SSIM_SIZE_PX: dict[str, int] = {"gaussian": 11, "uniform7": 7}
 SSIM_SIGMA_PX = 1.5
 MAX_PSNR_DB = 100.0
-"""What equal pixels score, so that means stay finite."""
+"""PSNR of equal images; it keeps means finite."""
 
 
 def psnr(
@@ -24,10 +26,10 @@ def psnr(
     truth: Float[Tensor, "channel height width"],
     pixels: Bool[Tensor, "height width"] | None = None,
 ) -> float | None:
-    """Peak signal to noise ratio in dB over all pixels, or over `pixels` alone (the paper's PSNR in the holes).
+    """Peak signal-to-noise ratio in dB over all pixels, or over `pixels` only (the paper's PSNR of inpainted regions).
 
-    The squared error is averaged over pixels and channels, the peak is 1. Equal pixels give `MAX_PSNR_DB`, no pixels
-    None, and a colour that is not a number gives NaN.
+    The squared error is averaged over pixels and channels; the peak is 1. Returns `MAX_PSNR_DB` for equal pixels, None
+    for no pixels, and NaN if a colour is NaN.
     """
     squared = (image - truth).double().square().mean(0)
     chosen = squared if pixels is None else squared[pixels]
@@ -41,16 +43,77 @@ def ssim_map(
     image: Float[Tensor, "channel height width"],
     truth: Float[Tensor, "channel height width"],
     window: SsimWindow = "gaussian",
-) -> Float[Tensor, "inner_height inner_width"] | None:
-    """The similarity of each window that lies in the image, mean of the channels; None where the image is smaller.
+) -> Float[Tensor, "height width"] | None:
+    """SSIM of the window around each pixel, averaged over channels.
 
-    The first is centred half a window (5 or 3 pixels) from the top and from the left. As published, the Gaussian
-    window takes the variances of the population, the uniform one (scikit-image's) those of a sample.
+    Pixels whose window extends beyond the image are NaN. None if the image is smaller than the window. As published,
+    the Gaussian window uses population variances and the uniform one (scikit-image) sample variances. Only the part in
+    which the images differ is computed: equal windows have an SSIM of exactly 1.
     """
-    size = SSIM_SIZE_PX[window]
-    if min(image.shape[1:]) < size:
+    size, (height, width) = SSIM_SIZE_PX[window], image.shape[1:]
+    if min(height, width) < size:
         return None
-    x, y = image.double(), truth.double()
+    found = torch.full((height, width), torch.nan, dtype=torch.float64, device=image.device)
+    half = size // 2
+    inner = found[half : height - half, half : width - half]
+    inner.fill_(1.0)
+    differ = (image != truth).any(0)
+    if bool(differ.any()):
+        rows, columns = (
+            _affected_windows(torch.nonzero(differ.any(axis)), length, size)
+            for axis, length in ((1, height), (0, width))
+        )
+        part = _ssim_of_windows(image[:, rows, columns].double(), truth[:, rows, columns].double(), window)
+        inner[rows.start : rows.stop - 2 * half, columns.start : columns.stop - 2 * half] = part
+    return found
+
+
+def mask_iou(a: Bool[Tensor, "height width"], b: Bool[Tensor, "height width"]) -> float | None:
+    """Intersection over union of two masks; None if both are empty."""
+    union = int((a | b).sum())
+    return int((a & b).sum()) / union if union else None
+
+
+def change(
+    image: Float[Tensor, "channel height width"],
+    previous: Float[Tensor, "channel height width"],
+    pixels: Bool[Tensor, "height width"],
+    min_px: int = 1,
+) -> float | None:
+    """Mean absolute difference between an image and the previous one at `pixels`; None for fewer than `min_px`."""
+    return float((image - previous)[:, pixels].abs().mean()) if int(pixels.sum()) >= min_px else None
+
+
+def warp_error(
+    image: Float[Tensor, "channel height width"],
+    previous: Float[Tensor, "channel height width"],
+    backward_flow_px: Float[Tensor, "height width 2"],
+    pixels: Bool[Tensor, "height width"],
+    min_px: int = 1,
+) -> float | None:
+    """Mean absolute difference between an image and the previous one warped by the true motion, over `pixels`.
+
+    `backward_flow_px` is the position of each pixel's surface point in the previous image, not finite where it was not
+    visible; such pixels are skipped. None if fewer than `min_px` are left. Bilinear sampling gives the true images an
+    error above 0, too: compare with theirs.
+    """
+    counted = pixels & backward_flow_px.isfinite().all(-1)
+    if int(counted.sum()) < min_px:
+        return None
+    warped = sample_bilinear(previous[None], backward_flow_px[counted][None], "border")[0]
+    return float((image[:, counted] - warped.T).abs().mean())
+
+
+def _affected_windows(positions: Tensor, length: int, size: int) -> slice:
+    """The range along one axis that is covered by all windows containing one of these positions."""
+    start, stop = max(0, int(positions.min()) - size + 1), min(length, int(positions.max()) + size)
+    return slice(min(start, length - size), max(stop, size))
+
+
+def _ssim_of_windows(
+    x: Float[Tensor, "channel height width"], y: Float[Tensor, "channel height width"], window: SsimWindow
+) -> Float[Tensor, "inner_height inner_width"]:
+    size = SSIM_SIZE_PX[window]
     mean_x, mean_y, square_x, square_y, product = _windowed(torch.cat([x, y, x * x, y * y, x * y]), window).chunk(5)
     sample = 1.0 if window == "gaussian" else size**2 / (size**2 - 1)
     variance_x = sample * (square_x - mean_x**2)
@@ -61,16 +124,10 @@ def ssim_map(
     return (similarity / ((mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2))).mean(0)
 
 
-def mask_iou(a: Bool[Tensor, "height width"], b: Bool[Tensor, "height width"]) -> float | None:
-    """Pixels in both masks as a share of those in either; None where both are empty."""
-    either = int((a | b).sum())
-    return int((a & b).sum()) / either if either else None
-
-
 def _windowed(
     image: Float[Tensor, "channel height width"], window: SsimWindow
 ) -> Float[Tensor, "channel inner_height inner_width"]:
-    """Means over the windows that lie in the image."""
+    """Weighted means over all windows that lie inside the image."""
     size = SSIM_SIZE_PX[window]
     offset = torch.arange(size, device=image.device, dtype=image.dtype) - size // 2
     kernel = torch.exp(-0.5 * (offset / SSIM_SIGMA_PX) ** 2) if window == "gaussian" else torch.ones_like(offset)

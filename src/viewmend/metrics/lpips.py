@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018), version 0.1: how far apart two images are in a network's features. Lower is better.
+"""LPIPS (Zhang et al. 2018), version 0.1: distance between two images in the features of a network. Lower is better.
 
 Keys of the networks are those of torchvision's `alexnet` and `vgg16`, and of the `lpips` package's own small files.
 """
@@ -11,15 +11,15 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from viewmend.metrics.weights import checked_weights, known_weights
-from viewmend.weight_files import load_weights
+from viewmend.utils.weight_files import load_weights
 
 Backbone = Literal["alex", "vgg"]
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""ImageNet's mean and deviation of RGB in [0, 1]; LPIPS' own shift and scale of [-1, 1] are the same."""
+"""ImageNet's mean and deviation of RGB in [0, 1]; equivalent to LPIPS' shift and scale of [-1, 1]."""
 TAPS: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
 """The ReLUs whose features are compared."""
 CHANNELS: dict[Backbone, tuple[int, ...]] = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
-LEAST_PX: dict[Backbone, int] = {"alex": 63, "vgg": 16}
+MIN_PX: dict[Backbone, int] = {"alex": 63, "vgg": 16}
 """Smaller images have no features in the last layer."""
 FILES: dict[Backbone, tuple[str, str]] = {"alex": ("alexnet", "lpips-alex"), "vgg": ("vgg16", "lpips-vgg")}
 
@@ -30,21 +30,21 @@ class Features(nn.Module):
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
         self.taps = TAPS[backbone]
-        self.features = _alexnet() if backbone == "alex" else vgg16_layers()
+        self.features = _alexnet() if backbone == "alex" else _vgg16()
 
     def forward(self, rgb: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _channel _rows _cols"]]:
-        """Features of images in [0, 1], with channels of length 1."""
+        """Features of images in [0, 1], normalised to length 1 over channels."""
         mean, deviation = rgb.new_tensor((MEAN, DEVIATION))[:, :, None, None]
         x, found = (rgb - mean) / deviation, []
-        for place, layer in enumerate(self.features):
+        for index, layer in enumerate(self.features):
             x = layer(x)
-            if place in self.taps:
+            if index in self.taps:
                 found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
         return found
 
 
 class Heads(nn.Module):
-    """How much each channel counts; named as in the published files."""
+    """The weight of each channel; named as in the published files."""
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
@@ -55,7 +55,7 @@ class Heads(nn.Module):
 
 
 class Lpips(nn.Module):
-    """LPIPS as a map; `load_lpips` makes one with weights, and there is no use for one without."""
+    """LPIPS as a map; `load_lpips` makes one with the published weights."""
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class Lpips(nn.Module):
     ) -> Float[Tensor, "height width"] | None:
         """The distance around each pixel of images in [0, 1]; None for images that are too small.
 
-        Its mean is LPIPS as published, but for the layers' maps being resampled first: less than 1e-5.
+        Its mean is LPIPS as published to within 1e-5; the layers' maps are resampled before they are averaged.
         """
         layers = self.layers(image, truth)
         if layers is None:
@@ -79,8 +79,8 @@ class Lpips(nn.Module):
     def layers(
         self, image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"]
     ) -> list[Float[Tensor, "_rows _cols"]] | None:
-        """The distance in each layer; the sum of their means is LPIPS as published."""
-        if min(image.shape[1:]) < LEAST_PX[self.backbone]:
+        """The distance map of each layer; the sum of their means is LPIPS as published."""
+        if min(image.shape[1:]) < MIN_PX[self.backbone]:
             return None
         pairs = self.network(torch.stack([image, truth]).float())
         weights = self.heads.state_dict().values()
@@ -91,8 +91,8 @@ def load_lpips(backbone: Backbone, device: torch.device | str = "cpu") -> Lpips:
     """LPIPS with the published weights.
 
     Raises:
-        MissingWeightsError: one of its two files is nowhere.
-        WeightsError: a file is damaged or another than it should be.
+        MissingWeightsError: one of its two files is not installed.
+        WeightsError: a file is damaged or a different one.
     """
     metric = Lpips(backbone)
     layers, heads = (checked_weights(known_weights(name)) for name in FILES[backbone])
@@ -102,24 +102,15 @@ def load_lpips(backbone: Backbone, device: torch.device | str = "cpu") -> Lpips:
 
 
 def _alexnet() -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 11, 4, 2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, 1, 2),
-        nn.ReLU(),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, 1, 1),
-        nn.ReLU(),
-        nn.Conv2d(384, 256, 3, 1, 1),
-        nn.ReLU(),
-        nn.Conv2d(256, 256, 3, 1, 1),
-        nn.ReLU(),
-    )
+    layers: list[nn.Module] = [nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2)]
+    layers += [nn.Conv2d(64, 192, 5, 1, 2), nn.ReLU(), nn.MaxPool2d(3, 2)]
+    for before, after in ((192, 384), (384, 256), (256, 256)):
+        layers += [nn.Conv2d(before, after, 3, 1, 1), nn.ReLU()]
+    return nn.Sequential(*layers)
 
 
-def vgg16_layers() -> nn.Sequential:
-    """The convolutions of VGG16 (Simonyan & Zisserman 2015) with what is between them, as torchvision numbers them."""
+def _vgg16() -> nn.Sequential:
+    """The convolutional part of VGG16 (Simonyan & Zisserman 2015), with torchvision's layer numbers."""
     layers: list[nn.Module] = []
     before = 3
     for block, channels in enumerate(CHANNELS["vgg"]):

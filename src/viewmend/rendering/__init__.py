@@ -1,1 +1,1 @@
-"""Frame and target camera to IncompleteView: view selection, blending, error map."""
+"""Frame and target camera to `IncompleteView`: camera selection, blending, error mask."""

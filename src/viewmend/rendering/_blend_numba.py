@@ -1,4 +1,4 @@
-"""Image-based blending in numba, for the CPU; `_blend_torch` is its twin for any device."""
+"""Image-based blending in numba, for the CPU; `_blend_torch` is the implementation for any device."""
 
 from math import floor, sqrt
 from typing import no_type_check
@@ -12,12 +12,12 @@ from torch import Tensor
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.threads import parallel_for
 from viewmend.rendering.blending import GRAZING, Blend, BlendConfig
-from viewmend.views import ContextViews
+from viewmend.types import ContextViews
 
 ROWS = 16
-"""Rows of the novel view that one thread takes at a time: the subject fills some and not others."""
+"""Rows of the novel view per task of a thread; few, because the subject fills only some of them."""
 
-# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+# No type checks: numba cannot compile functions that a type checker has wrapped.
 
 
 def blend_numba(
@@ -98,7 +98,7 @@ def _average(colour, weights, total, row, column, rgb, disagreement):
     disagreement[row, column] = sqrt(variance / (3 * total))
 
 
-# Inlined: handing over so many arrays costs as much as the work.
+# Inlined: passing these arrays costs as much as the computation.
 @njit(nogil=True, cache=True, error_model="numpy", inline="always")
 @no_type_check
 def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour):
@@ -107,7 +107,7 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     to_camera = _unit(centers[view, 0] - x, centers[view, 1] - y, centers[view, 2] - w)
     facing = min(_dot(normal, to_camera), 1.0)
     agreeing = min(_dot(to_viewer, to_camera), 1.0)
-    # Entries one by one here and below: a slice of an array costs an atomic count of its owners.
+    # Single entries here and below: slicing an array costs an atomic reference count.
     z = P[view, 2, 0] * x + P[view, 2, 1] * y + P[view, 2, 2] * w + P[view, 2, 3]
     if facing <= 0 or agreeing <= 0 or z <= 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""Image-based blending in torch, for any device; `_blend_numba` is its twin for the CPU."""
+"""Image-based blending in torch, for any device; `_blend_numba` is the implementation for the CPU."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 from viewmend.geometry.cameras import Cameras, project, unproject
 from viewmend.geometry.sampling import bilinear_taps, in_view
 from viewmend.rendering.blending import GRAZING, Blend, BlendConfig
-from viewmend.views import ContextViews
+from viewmend.types import ContextViews
 
 
 def blend_torch(
@@ -63,7 +63,7 @@ def _sample(
     facing = (normal * to_camera).sum(-1).clamp(0, 1)
     agreeing = (to_viewer * to_camera).sum(-1).clamp(0, 1)
 
-    # Surface at this angle changes its depth by so much from one of the camera's pixels to the next.
+    # Change of depth of a surface at this angle from one pixel of the camera to the next.
     per_pixel = z / camera.K[0, 0, 0] * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
     usable, colour = torch.zeros_like(z), z.new_zeros(3, len(z))
     for row, column, weight, _ in bilinear_taps(uv, width, height):

@@ -1,4 +1,4 @@
-"""Image-based blending: the colour that a few cameras give to each surface point of a novel view (RIFTCast, 3.3)."""
+"""Image-based blending of a few cameras on the surface of a novel view (RIFTCast, section 3.3)."""
 
 from dataclasses import dataclass
 
@@ -6,19 +6,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras
-from viewmend.views import ContextViews
+from viewmend.types import ContextViews
 
 GRAZING = 0.1
-"""Cosine below which the slope of the depth test grows no more."""
+"""Cosine below which the slope term of the depth test stays constant."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlendConfig:
-    """How a camera's colour counts at a surface point.
+    """Weight of a camera's colour at a surface point.
 
     weight = usable * (n . v)^normal_power * (cosine between camera and viewer)^view_power
 
-    where `usable` is the bilinear share of the four pixels around the sample that are foreground and not hidden.
+    where `usable` is the bilinear weight of those of the four pixels around the sample that are foreground and visible.
     """
 
     normal_power: int = 2
@@ -26,21 +26,21 @@ class BlendConfig:
     view_power: int = 16
     """Exponent of the cosine between the directions to the camera and to the viewer."""
     depth_bias: float = 0.005
-    """A point is hidden if it lies this much behind the proxy's depth, as a share of the subject's size."""
+    """A point is hidden if it lies this far behind the proxy's depth, as a fraction of the subject's size."""
     slope_px: float = 1.0
-    """What oblique surface adds to the bias: its change of depth over this many of the camera's pixels."""
+    """Added to the bias on oblique surfaces: the change of depth over this many pixels of the camera."""
 
 
 @dataclass(frozen=True)
 class Blend:
-    """What the cameras say about each pixel of the novel view."""
+    """Blended colour, weights and disagreement of the source cameras in each pixel of a novel view."""
 
     rgb: Float[Tensor, "3 height width"]
-    """The weighted mean of the samples, in [0, 1]; black where no camera has weight."""
+    """Weighted mean of the samples, in [0, 1]; black where no camera has weight."""
     weights: Float[Tensor, "source height width"]
     """Raw weights, not normalised."""
     disagreement: Float[Tensor, "height width"]
-    """Weighted standard deviation of the samples about `rgb`, mean of the channels; 0 for a single camera."""
+    """Weighted standard deviation of the samples, mean of the channels; 0 for a single camera."""
 
 
 def blend(
@@ -51,19 +51,19 @@ def blend(
     bias_m: float,
     config: BlendConfig,
 ) -> Blend:
-    """Colour the surface that `camera` sees from the images of `sources`.
+    """Colour the surface visible in `camera` from the images of `sources`.
 
-    Samples are bilinear, and of the four pixels only those count that are foreground (by the soft mask) and that
-    nothing hides the point from: neither background nor an occluder's rim bleeds in. A point behind a camera or
-    outside its image gets nothing from it, nor where it faces away.
+    Samples are bilinear. Of the four pixels only those count that are foreground (by the soft mask) and from which the
+    point is visible, so that neither background nor an occluder's rim bleeds in. A camera does not contribute to points
+    behind it, outside its image, or facing away from it.
 
     Args:
         camera: the novel view (one).
-        depth: z-depth of the surface in it, metres, 0 where there is none.
+        depth: z-depth of its surface, metres, 0 where there is none.
         normals: outward, of any length, world axes.
-        sources: the cameras that colour it, with the proxy's depth in each.
+        sources: the source cameras, with the proxy's depth in each.
         bias_m: tolerance of the depth test, metres.
-        config: exponents and slope.
+        config: exponents and tolerances.
     """
     if depth.device.type == "cpu":
         from viewmend.rendering._blend_numba import blend_numba as implementation

@@ -1,4 +1,4 @@
-"""The part of a view that shows the subject: only there is anything to render and to fill, the rest is black."""
+"""The part of a view that shows the subject. Only that part is rendered and inpainted; the rest is black."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,12 +9,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.types import CompletedView, IncompleteView
 
 BORDER_PX = 2
-"""What a rendered crop has around the subject's vertices."""
+"""Margin of a rendered crop around the subject's vertices."""
 PATCH_STEP_PX = 16
-"""Patches of a crop lie as in the whole view if it begins at a multiple of this."""
+"""Patches of a crop lie as in the whole view if the crop begins at a multiple of this."""
 NEAR_M = 1e-3
 
 
@@ -27,38 +27,47 @@ class Crop:
     right: int
     bottom: int
 
+    @classmethod
+    def all_of(cls, camera: Cameras) -> "Crop":
+        """The whole image of a camera."""
+        return cls(0, 0, *camera.max_size_px)
+
     def of_camera(self, camera: Cameras) -> Cameras:
         """The camera whose image is this part of `camera`'s."""
+        if self == Crop.all_of(camera):
+            return camera
         return camera.cropped(self.left, self.top, self.right - self.left, self.bottom - self.top)
 
     def of_image(self, image: Shaped[Tensor, "*channel height width"]) -> Shaped[Tensor, "*channel _rows _columns"]:
-        """This part of an image, a view of its memory."""
+        """This part of an image, without copying."""
         return image[..., self.top : self.bottom, self.left : self.right]
 
     def of_view(self, view: IncompleteView) -> IncompleteView:
         """This part of a view."""
+        if self == Crop.all_of(view.camera):
+            return view
         parts = {name: self.of_image(image).contiguous() for name, image in _images(view).items()}
         return replace(view, camera=self.of_camera(view.camera), **parts)
 
     def uncropped(self, part: IncompleteView, camera: Cameras) -> IncompleteView:
-        """The whole view of `camera` again: black, and without subject, around this part."""
+        """The whole view of `camera`: black, and without subject, around this part."""
+        if self == Crop.all_of(camera):
+            return part
         whole = {name: self._padded(image, camera) for name, image in _images(part).items()}
         return replace(part, camera=camera, **whole)
 
-    def uncropped_completed(self, part: CompletedView, camera: Cameras) -> CompletedView:
-        """The same of a completed part."""
-        view = self.uncropped(part.view, camera)
-        images = {name: self._padded(image, camera) for name, image in part.images.items()}
-        return CompletedView(view, **images | ({"rgb": view.rgb} if part.rgb is part.view.rgb else {}))
-
     def pasted(self, part: CompletedView, view: IncompleteView) -> CompletedView:
-        """`view` completed by this part of it; around it, colours stay, and there is no subject."""
-        images = {name: self._padded(image, view.camera) for name, image in part.images.items()}
-        rgb = view.rgb
+        """`view` completed by this part of it, whose error mask becomes the view's. Other pixels keep their colour."""
+        if self == Crop.all_of(view.camera):
+            return part
+        camera, images = view.camera, part.images
+        images = {name: self._padded(image, camera) for name, image in images.items() if name != "rgb"}
+        fade = None if part.view.fade is None else self._padded(part.view.fade, camera)
+        whole, rgb = replace(view, error=self._padded(part.view.error, camera), fade=fade), view.rgb
         if part.rgb is not part.view.rgb:
             rgb = view.rgb.clone()
             self.of_image(rgb).copy_(part.rgb)
-        return CompletedView(view, **images | {"rgb": rgb})
+        return CompletedView(whole, rgb, **images)
 
     def _padded(self, image: Tensor, camera: Cameras) -> Tensor:
         width, height = camera.max_size_px
@@ -66,48 +75,48 @@ class Crop:
 
 
 def _images(view: IncompleteView) -> dict[str, Tensor]:
-    """The fields of a view that are images, as far as it has them."""
+    """The image fields of a view that are not None."""
     fields = ("rgb", "mask", "error", "depth", "weights", "fade")
     return {name: image for name in fields if (image := getattr(view, name)) is not None}
 
 
 def mesh_crop(
     vertices: Float[Tensor, "vertex 3"], camera: Cameras, margin_px: int = BORDER_PX, grid_px: int = 1
-) -> Crop | None:
-    """What a surface of these vertices (metres, world) may cover of the camera's image, and this margin around it.
+) -> Crop:
+    """The part of the camera's image that a mesh of these vertices (metres, world axes) may cover, and a margin.
 
-    None where that is the whole image, or cannot be told: there are no vertices, or some are not in front.
+    The whole image if there are no vertices, or some are not in front of the camera.
     """
     if not len(vertices):
-        return None
+        return Crop.all_of(camera)
     uv, z = project(vertices, camera)
     if bool((z < NEAR_M).any()):
-        return None
+        return Crop.all_of(camera)
     width, height = camera.max_size_px
     (u0, v0), (u1, v1) = (corner[0].tolist() for corner in (uv.amin(1), uv.amax(1)))
     left, right = _side(u0 - margin_px, u1 + margin_px, width, grid_px)
     top, bottom = _side(v0 - margin_px, v1 + margin_px, height, grid_px)
-    return _or_none(Crop(left, top, right, bottom), width, height)
+    return Crop(left, top, right, bottom)
 
 
-def subject_crop(view: IncompleteView, margin_px: int) -> Crop | None:
-    """What shows the subject or is missing, and at least this margin around it; None where that is the whole view."""
+def subject_crop(view: IncompleteView, margin_px: int) -> Crop:
+    """The part of a view with M or E above 0, and at least this margin; the whole view if there is no such pixel."""
     height, width = view.mask.shape
-    shown = (view.mask > 0) | (view.error > 0)
-    rows, columns = (torch.nonzero(shown.any(axis))[:, 0] for axis in (1, 0))
+    subject = (view.mask > 0) | (view.error > 0)
+    rows, columns = (torch.nonzero(subject.any(axis))[:, 0] for axis in (1, 0))
     if not len(rows):
-        return None
+        return Crop.all_of(view.camera)
     grid = grid_px(margin_px)
     left, right = _side(float(columns[0]) - margin_px, float(columns[-1]) + 1 + margin_px, width, grid)
     top, bottom = _side(float(rows[0]) - margin_px, float(rows[-1]) + 1 + margin_px, height, grid)
-    return _or_none(Crop(left, top, right, bottom), width, height)
+    return Crop(left, top, right, bottom)
 
 
 def grid_px(margin_px: int) -> int:
-    """What crops that are filled begin and end at multiples of.
+    """Crops that are inpainted begin and end at multiples of this.
 
-    The first power of two, from a patch's step on, that holds the margin: smooth fills halve the resolution again and
-    again, and then mostly halve the same pixels as in the whole view.
+    It is the first power of two, from a patch's step on, that is not less than the margin: smooth fills halve the
+    resolution several times, and so mostly average the same pixels as in the whole view.
     """
     return max(PATCH_STEP_PX, 1 << (margin_px - 1).bit_length())
 
@@ -116,7 +125,3 @@ def _side(first: float, end: float, size: int, grid: int) -> tuple[int, int]:
     """First pixel and the one after the last, on the grid and within the image; at least one pixel."""
     start = max(0, min(size - 1, math.floor(first))) // grid * grid
     return start, max(start + 1, min(size, -(-math.ceil(end) // grid) * grid))
-
-
-def _or_none(crop: Crop, width: int, height: int) -> Crop | None:
-    return None if crop == Crop(0, 0, width, height) else crop

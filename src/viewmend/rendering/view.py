@@ -1,4 +1,4 @@
-"""From the images of one time to an incomplete novel view: select, blend, mark what is missing."""
+"""From the images of one frame to an incomplete novel view: select source cameras, blend them, find the holes."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.geometry.threads import light_operations
 from viewmend.rendering.blending import BlendConfig, blend
-from viewmend.rendering.error_rules import MIN_WEIGHT, Evidence, error_map, error_rule
-from viewmend.rendering.selection import select_closest
-from viewmend.views import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.rendering.error_mask import MIN_WEIGHT, Evidence, error_rule, holes
+from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
 SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 """The proxy's depth in the frame's cameras of these names."""
@@ -22,7 +22,7 @@ SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """How a novel view is rendered from the cameras' images.
+    """How a novel view is rendered from the cameras' images, and which of its pixels are to be inpainted.
 
     Examples:
         >>> from viewmend import RenderConfig, StreamConfig
@@ -31,19 +31,19 @@ class RenderConfig:
     """
 
     cameras: int = 3
-    """How many cameras colour a view: those closest to it in angle (the paper: 3)."""
+    """Number of source cameras that colour a view: those closest to it in angle (the paper: 3)."""
     blend: BlendConfig = field(default_factory=BlendConfig)
-    """How the source views' colours are weighted."""
+    """How the source cameras' colours are weighted."""
     error_rule: str | None = None
-    """What must be mended: 'unseen', the pixels that no source view colours, 'all' of the subject, or what a model
-    takes for 'wrong'. None is for what the stream's inpainter is made for."""
-    wrong_fraction: float = 0.15
-    """Rule 'wrong': at most this part of the proxy's pixels is mended, where most is to be gained; holes are always."""
+    """Pixels to inpaint: 'holes', which no source camera colours; 'all' of the subject; 'predicted', those that a model
+    predicts to be wrong; or FILE.py:NAME. None: the rule that the inpainter is made for."""
+    refine_fraction: float = 0.15
+    """Rule 'predicted': largest fraction of the subject's pixels to inpaint in addition to the holes."""
 
     def __post_init__(self) -> None:
-        error_rule(self.error_rule or "unseen")
-        if not 0 < self.wrong_fraction <= 1:
-            raise ValueError(f"expected a wrong_fraction above 0 and up to 1, got {self.wrong_fraction}")
+        error_rule(self.error_rule or "holes")
+        if not 0 < self.refine_fraction <= 1:
+            raise ValueError(f"expected a refine_fraction above 0 and up to 1, got {self.refine_fraction}")
 
 
 @light_operations()
@@ -54,19 +54,19 @@ def render_view(
     config: RenderConfig,
     exclude: Sequence[str] = (),
     source_depth: SourceDepth | None = None,
-) -> IncompleteView:
-    """F[t], M[t] and E[t] of section 1 for one novel view.
+) -> tuple[IncompleteView, Evidence]:
+    """F[t] and M[t] of section 1 for one novel view, with the holes as E[t], and the evidence for other error rules.
 
     Args:
-        frame: what the cameras saw.
+        frame: the cameras' images.
         proxy: G[t], on the frame's device.
         target: the novel view's camera (one view), on the same device.
-        config: which cameras, how blended.
-        exclude: names of cameras that must not be used, whatever else holds.
-        source_depth: the proxy's depth in cameras, for callers that remember it; by default it is rendered here.
+        config: number of source cameras and weights.
+        exclude: names of cameras that must not be used.
+        source_depth: returns the proxy's depth in cameras; by default it is rendered here.
 
     Raises:
-        ValueError: no camera is left to colour the view, or an error rule of one's own does not give E.
+        ValueError: no camera is left to colour the view.
     """
     usable = _without(frame.cameras, exclude)
     source_depth = source_depth or (lambda names: proxy.depth(frame.cameras.select(names)))
@@ -82,15 +82,41 @@ def render_view(
     bias_m = config.blend.depth_bias * float(proxy.bounds.size_m.norm())
     blended = blend(target, depth, normals, sources, bias_m, config.blend)
 
-    error = error_map(config.error_rule or "unseen", Evidence(mask, depth, blended))
+    evidence = Evidence(mask, depth, blended)
     coloured = mask * (blended.weights.sum(0) >= MIN_WEIGHT)
     weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
-    seen = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)
-    silhouettes = None if seen.mask is None else Silhouettes(seen.mask, seen.cameras)
-    rgb = blended.rgb * coloured
-    return IncompleteView(
+    used = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)
+    silhouettes = None if used.mask is None else Silhouettes(used.mask, used.cameras)
+    rgb, error = blended.rgb * coloured, holes(evidence)
+    view = IncompleteView(
         target, rgb, mask, error, depth, source_views, weights, frame.time, candidate_views, silhouettes
     )
+    return view, evidence
+
+
+def select_closest(
+    target: Cameras,
+    cameras: Cameras,
+    subject_center: Float[Tensor, "3"],
+    k: int = 3,
+) -> tuple[str, ...]:
+    """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
+
+    The paper does not define closeness. Here it is the angle at the subject's centre between the directions to the two
+    cameras: the angle decides how similar the images are, the distance only changes their scale. Returns fewer than k
+    names if there are fewer cameras.
+    """
+    angle = angles_to(target, cameras, subject_center).tolist()
+    return tuple(cameras.names[view] for view in sorted(range(len(cameras)), key=lambda view: angle[view])[:k])
+
+
+def angles_to(target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"]) -> Float[Tensor, "view"]:
+    """Angle at the subject's centre between the target's centre and each camera's, radians in [0, pi]."""
+    to_target = normalize(target.centers[0] - subject_center, dim=-1)
+    to_cameras = normalize(cameras.centers - subject_center, dim=-1)
+    # atan2 of the cross and the dot product: acos would lose precision at the small angles that matter.
+    sine = torch.linalg.cross(to_cameras, to_target.expand_as(to_cameras)).norm(dim=-1)
+    return torch.atan2(sine, to_cameras @ to_target)
 
 
 def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:

@@ -1,1 +1,1 @@
-"""Samples, losses, recipes and the loop."""
+"""Training configurations, data, losses and the loop."""

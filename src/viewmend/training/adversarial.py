@@ -1,96 +1,161 @@
-"""The adversarial term of section 8, L_adv = E log D(F*) + E log(1 - D(Fhat)), on Fhat, after the blend.
+"""The adversarial loss of section 8, with its patch discriminators.
 
-D is the sigmoid of a discriminator's logits. It maximises L_adv, the inpainter minimises it; here each gets a number
-that it minimises. The mean is over the logits of an image, then over the images of the batch. A view in which nothing
-is missing counts 0, as in L_in, and teaches neither of the two anything.
+L_adv = E log D(F*) + E log(1 - D(Fhat)), on Fhat, after the blend. D maximises it and the inpainter minimises it; the
+functions here return what each of the two minimises. The mean is over the logits of an image, then over the images of
+the batch. A view without a hole contributes 0, as in L_in, and trains neither network.
+
+The paper does not state the discriminator. Here it is T-PatchGAN (Chang et al. 2019) for clips, and the same network
+without the time axis for images: strided convolutions with spectral normalisation (Miyato et al. 2018).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import softplus
+from torch.nn.utils import parametrize
+from torch.nn.utils.parametrizations import spectral_norm
 
-from viewmend.training.discriminator import Discriminator
-
-Objective = Literal["gan", "hinge"]
-"""The paper's, and the hinge (Miyato et al. 2018), with which the baselines were trained."""
-
-
-def discriminator_loss(
-    real_logits: Sequence[Float[Tensor, "..."]],
-    fake_logits: Sequence[Float[Tensor, "..."]],
-    objective: Objective = "gan",
-    counted: Float[Tensor, "image"] | None = None,
-) -> Float[Tensor, ""]:
-    """What the discriminator minimises: -E log D(F*) - E log(1 - D(Fhat)), or the hinge's two halves.
-
-    counted: a weight for each image; None counts each as 1.
-    """
-    pairs = [(real.float(), fake.float()) for real, fake in zip(real_logits, fake_logits, strict=True)]
-    if objective == "hinge":
-        parts = [(1 - real).relu().mean() + (1 + fake).relu().mean() for real, fake in pairs]
-    else:
-        # log sigmoid(x) = -softplus(-x) and log(1 - sigmoid(x)) = -softplus(x), finite for any logit.
-        parts = [softplus(-real).mean() + softplus(fake).mean() for real, fake in pairs]
-    return _mean(parts, counted)
+SLOPE = 0.2
+"""Negative slope of the LeakyReLU between the convolutions."""
+MIN_SIZE_PX = 3
+"""Smallest image side: the first convolution of a clip is padded by only 1."""
+BETAS = (0.0, 0.99)
+"""Adam's betas for the discriminator, as in the training of the baselines."""
 
 
-def generator_loss(
-    fake_logits: Sequence[Float[Tensor, "..."]],
-    objective: Objective = "gan",
-    counted: Float[Tensor, "image"] | None = None,
-) -> Float[Tensor, ""]:
-    """What the inpainter minimises: E log(1 - D(Fhat)), or the hinge's -E of the logits.
+class Discriminator(nn.Module):
+    """Convolutions from images in [0, 1] to a map of logits, without any layer that mixes images of a batch."""
 
-    counted: a weight for each image; None counts each as 1.
-    """
-    if objective == "hinge":
-        parts = [-f.float().mean() for f in fake_logits]
-    else:
-        parts = [-softplus(f.float()).mean() for f in fake_logits]
-    return _mean(parts, counted)
+    def __init__(self, kind: Literal["image", "clip"] = "image", width: int = 32, layers: int = 4) -> None:
+        """Make a discriminator.
+
+        Args:
+            kind: single images, with 5 x 5 kernels; or clips of consecutive frames, with T-PatchGAN's 3 x 5 x 5.
+            width: channels after the first convolution; doubled twice by later ones.
+            layers: convolutions, each halving height and width; the receptive field of a logit is 61 pixels with 4,
+                253 with 6.
+        """
+        super().__init__()
+        C, last = (3, *(width * 2 ** min(layer, 2) for layer in range(layers))), layers - 1
+        if kind == "image":
+            convolutions = [nn.Conv2d(C[i], C[i + 1], 5, 2, 2, bias=i == last) for i in range(layers)]
+        else:
+            # The first is padded by 1 in every dimension, as in the published network.
+            padding = [(1, 1, 1), *[(1, 2, 2)] * last]
+            convolutions = [
+                nn.Conv3d(C[i], C[i + 1], (3, 5, 5), (1, 2, 2), padding[i], bias=i == last) for i in range(layers)
+            ]
+        self.convolutions = nn.ModuleList([*(spectral_norm(layer) for layer in convolutions[:-1]), convolutions[-1]])
+
+    def forward(self, images: Sequence[Float[Tensor, "3 ... _h _w"]]) -> list[Float[Tensor, "logit ..."]]:
+        """Logits of images, or of clips of any length, with values in [0, 1] and any size from 3 x 3 pixels.
+
+        Images of one size are processed as one batch. In training mode each call makes one step of power iteration, so
+        pass real and completed images in the same call.
+
+        Raises:
+            ValueError: an image is too small.
+        """
+        if small := [tuple(image.shape) for image in images if min(image.shape[-2:]) < MIN_SIZE_PX]:
+            raise ValueError(
+                f"expected images of at least {MIN_SIZE_PX} x {MIN_SIZE_PX} pixels, got shapes {small}; leave them out"
+            )
+        maps: list[Tensor] = [images[0]] * len(images)
+        # Weights are normalised once per call, and outside autocast: power iteration needs float32.
+        with parametrize.cached():
+            with torch.autocast(images[0].device.type, enabled=False):
+                [layer.weight for layer in self.convolutions]
+            for shape in dict.fromkeys(image.shape for image in images):
+                indices = [index for index, image in enumerate(images) if image.shape == shape]
+                logits = self._convolve(torch.stack([images[index] for index in indices]))
+                for index, own in zip(indices, logits, strict=True):
+                    maps[index] = own
+        return maps
+
+    def _convolve(self, batch: Tensor) -> Tensor:
+        x = 2 * batch - 1
+        for number, layer in enumerate(self.convolutions):
+            x = layer(x if number == 0 else nn.functional.leaky_relu(x, SLOPE))
+        return x
 
 
-def discriminator_objective(
-    discriminator: Discriminator,
-    truth: Sequence[Float[Tensor, "3 ..."]],
-    completed: Sequence[Float[Tensor, "3 ..."]],
-    error: Sequence[Float[Tensor, "..."]],
-    objective: Objective = "gan",
-) -> Float[Tensor, ""]:
-    """`discriminator_loss` of a batch of F* and Fhat, images or clips; nothing of it reaches the inpainter.
+@dataclass(frozen=True)
+class AdversarialLoss:
+    """The terms that the two networks minimise, as functions of logits."""
 
-    error: E of each image (height width) or clip (time height width).
-    """
-    judged = discriminator([*truth, *(image.detach() for image in completed)])
-    return discriminator_loss(judged[: len(truth)], judged[len(truth) :], objective, _missing(error))
+    real: Callable[[Tensor], Tensor]
+    """The discriminator's term for F*."""
+    fake: Callable[[Tensor], Tensor]
+    """The discriminator's term for Fhat."""
+    generator: Callable[[Tensor], Tensor]
+    """The inpainter's term for Fhat."""
 
 
-def inpainter_objective(
-    discriminator: Discriminator,
-    completed: Sequence[Float[Tensor, "3 ..."]],
-    error: Sequence[Float[Tensor, "..."]],
-    objective: Objective = "gan",
-) -> Float[Tensor, ""]:
-    """`generator_loss` of a batch of Fhat, images or clips; the discriminator's weights get no gradient from it.
-
-    error: E of each image (height width) or clip (time height width).
-    """
-    fixed = {name: weight.detach() for name, weight in discriminator.named_parameters()}
-    judged = functional_call(discriminator, fixed, (completed,))
-    return generator_loss(judged, objective, _missing(error))
+# log sigmoid(x) = -softplus(-x) and log(1 - sigmoid(x)) = -softplus(x), finite for any logit.
+GAN = AdversarialLoss(lambda x: softplus(-x), softplus, lambda x: -softplus(x))
+"""The paper's loss."""
+HINGE = AdversarialLoss(lambda x: (1 - x).relu(), lambda x: (1 + x).relu(), torch.neg)
+"""The hinge loss (Miyato et al. 2018), with which the baselines were trained."""
 
 
-def _missing(error: Sequence[Tensor]) -> Float[Tensor, "image"]:
-    """1 for each image in which anything is missing, else 0. A weight, not a choice: no wait for the device."""
-    return torch.stack([(E > 0).any() for E in error]).float()
+@dataclass(frozen=True)
+class Judged:
+    """A batch as the discriminator receives it: images (3 height width), or clips (3 time height width)."""
+
+    truth: Sequence[Float[Tensor, "3 ..."]]
+    """F*."""
+    completed: Sequence[Float[Tensor, "3 ..."]]
+    """Fhat."""
+    error: Sequence[Float[Tensor, "..."]]
+    """E, without the channel axis."""
 
 
-def _mean(parts: Sequence[Tensor], counted: Tensor | None) -> Float[Tensor, ""]:
-    """Mean over the whole batch, also over images that count nothing: so halves of a batch average to the batch."""
-    losses = torch.stack(list(parts))
-    return (losses if counted is None else losses * counted).mean()
+def discriminator_objective(net: Discriminator, batch: Judged, loss: AdversarialLoss = GAN) -> Float[Tensor, ""]:
+    """The discriminator's loss; no gradient reaches the inpainter."""
+    logits = [own.float() for own in net([*batch.truth, *(image.detach() for image in batch.completed)])]
+    pairs = zip(logits[: len(batch.truth)], logits[len(batch.truth) :], strict=True)
+    return _mean([loss.real(real).mean() + loss.fake(fake).mean() for real, fake in pairs], batch)
+
+
+def inpainter_objective(net: Discriminator, batch: Judged, loss: AdversarialLoss = GAN) -> Float[Tensor, ""]:
+    """The inpainter's loss; the discriminator's weights get no gradient from it."""
+    fixed = {name: weight.detach() for name, weight in net.named_parameters()}
+    logits = functional_call(net, fixed, (list(batch.completed),))
+    return _mean([loss.generator(own.float()).mean() for own in logits], batch)
+
+
+def _mean(losses: list[Tensor], batch: Judged) -> Float[Tensor, ""]:
+    """Mean over all images, where those without a hole count as 0, so halves of a batch average to the whole."""
+    # A weight for each image, since a choice of images would have to wait for the device.
+    return (torch.stack(losses) * torch.stack([(E > 0).any() for E in batch.error]).float()).mean()
+
+
+class Adversary:
+    """A discriminator with its loss and optimiser, trained alongside the model."""
+
+    def __init__(self, net: Discriminator, loss: AdversarialLoss, weight: float, learning_rate: float) -> None:
+        """`weight` is lambda_adv, the weight of the loss in the model's total."""
+        self.discriminator, self.loss, self.weight = net, loss, weight
+        self.optimizer = torch.optim.Adam(self.discriminator.parameters(), lr=learning_rate, betas=BETAS)
+
+    def losses(self, batch: Judged, share: float) -> tuple[Float[Tensor, ""], float]:
+        """L_adv for the inpainter, and the value of the discriminator's own loss.
+
+        The gradients of the latter, times `share`, are accumulated in the discriminator.
+        """
+        own_loss = discriminator_objective(self.discriminator, batch, self.loss)
+        (own_loss * share).backward()
+        return inpainter_objective(self.discriminator, batch, self.loss), float(own_loss.detach())
+
+    def step(self, mean: Callable[[Tensor], Tensor]) -> None:
+        """Update the discriminator by its accumulated gradients, averaged over all processes by `mean`."""
+        for parameter in self.discriminator.parameters():
+            if parameter.grad is not None:
+                parameter.grad = mean(parameter.grad)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)

@@ -1,80 +1,73 @@
-"""The training loop: batches, steps, averaged weights, logs, checkpoints."""
+"""The training loop: batches, steps, averaged weights, checkpoints, and the processes that share a run."""
 
+import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel
 
-from viewmend.atomic_writes import write_atomically
-from viewmend.inpainting.chain import Chain, build
-from viewmend.inpainting.checkpoint import save_inpainter
-from viewmend.inpainting.network import set_compute_dtype
-from viewmend.inpainting.patch_transformer import PatchTransformer
-from viewmend.inpainting.protocol import shown_upon
-from viewmend.output_folder import OutputFolder
-from viewmend.training.adversary import Adversary
-from viewmend.training.autoencoder import AutoencoderObjective
-from viewmend.training.copies import CopyingObjective
-from viewmend.training.from_tokens import TokensObjective
-from viewmend.training.logs import Log, LossTerms, Progress
-from viewmend.training.model_card import model_card
-from viewmend.training.objective import Objective, StepOutput
-from viewmend.training.plan import TAUGHT, Recipe
-from viewmend.training.processes import Processes, processes
-from viewmend.training.ray_batches import RaysObjective
+from viewmend.training.config import TrainConfig
+from viewmend.training.objective import StepOutput
 from viewmend.training.replay import ReplayPosition, SampleReplay
-from viewmend.training.run_files import FILE, PREVIOUS, RunState, last_checkpoint, load_run, save_run
-from viewmend.training.sample_files import Trained, sample_to_bytes
-from viewmend.training.schedule import Schedule, averaging, learning_rate_factor
-from viewmend.training.sources import training_source
-from viewmend.training.validation import Validation
+from viewmend.training.run_files import (
+    FILE,
+    PREVIOUS,
+    Log,
+    Progress,
+    RunState,
+    last_checkpoint,
+    load_run,
+    model_card,
+    save_run,
+)
+from viewmend.training.samples import to_device
+from viewmend.training.shards import sample_to_bytes
+from viewmend.utils.atomic_writes import write_atomically
+from viewmend.utils.output_folder import OutputFolder
 
-NETWORKS = (Chain, PatchTransformer)
-MADE = ("model.safetensors", "config.json", "README.md", "log.jsonl", "validation-*.png", "not-finite-*", "tensorboard")
-"""What a run writes besides itself, and another may have lying there."""
-OBJECTIVES: dict[str, Callable[..., nn.Module]] = {
-    "rays": RaysObjective,
-    "autoencoder": AutoencoderObjective,
-    "copies": CopyingObjective,
-    "tokens": TokensObjective,
-}
-"""What teaches parts otherwise than by the paper's objective."""
+WRITTEN = (
+    *("model.safetensors", "config.json", "README.md", "log.jsonl"),
+    *("validation-*.png", "not-finite-*", "tensorboard"),
+)
+"""Files and folders that a run writes, apart from its checkpoints."""
 
 
 def train(
-    recipe: Recipe,
+    config: TrainConfig,
     out: Path,
     start: nn.Module | None = None,
     report: Callable[[Progress], None] | None = None,
-    kind: "type[Run] | None" = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Path:
-    """Run a recipe, or go on with the run that `out` holds; under torchrun, with all of its processes.
+    """Train, or resume the run in `out`; under torchrun, with all of its processes.
 
-    In `out`: the averaged weights (model.safetensors, config.json, README.md), run.safetensors to go on from,
-    log.jsonl, and pictures of the validation. A run that goes on makes the very steps that it would have made.
+    `out` gets the averaged weights (model.safetensors, config.json, README.md), run.safetensors to resume from,
+    log.jsonl, and images of the validation. A resumed run makes exactly the steps it would have made uninterrupted.
 
     Args:
-        recipe: what to do.
-        out: folder for all that is written.
-        start: a model to begin with: its weights, wherever the recipe's model has one of the same name and shape.
-        report: told of each step, in the first process.
-        kind: what runs; a subclass trains something else than our model.
-        stopped: asked after each step in every process; once it is true anywhere, the run ends with a checkpoint.
+        config: what to train, and how; its objective may come from outside of the package.
+        out: folder for all files.
+        start: the model to start from, instead of the one that `config.start` names.
+        report: called after each step in the first process.
+        stopped: called after each step in every process; once any returns True, the run ends with a checkpoint.
+
+    Returns:
+        `out`.
 
     Raises:
-        RunError: `out` holds a run of another recipe, or a damaged one.
-        ValueError: another run writes there, or files lie there that no run made, and no run to go on with.
-        FloatingPointError: a loss is not finite, and the batch is saved in `out`; or a weight is not, and the last
-            checkpoint stays.
+        RunError: `out` holds a run with another config, or a damaged one.
+        ValueError: another run is writing there, or `out` holds files that no run wrote.
+        FloatingPointError: a loss is not finite, and the batch was saved in `out`; or a weight is not, and the last
+            checkpoint was kept.
     """
-    with processes() as own, _claimed(out) if own.first else nullcontext():
-        run = (kind or Run)(recipe, out, start, own)
+    with join_processes() as own, _claim(out) if own.first else nullcontext():
+        run = Run(config, out, start, own)
         for progress in run.steps(stopped):
             if report is not None and own.first:
                 report(progress)
@@ -82,146 +75,229 @@ def train(
 
 
 @contextmanager
-def _claimed(out: Path) -> Iterator[None]:
-    """The folder of a run, for this one alone.
+def _claim(out: Path) -> Iterator[None]:
+    """Lock the folder for this run.
 
     Raises:
-        ValueError: another run writes there, or somebody else's files lie there and no run to go on with.
+        ValueError: another run is writing there, or it holds other files and no run to resume.
     """
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
-            folder.demand_own(*MADE)
-        folder.made(FILE, PREVIOUS, *MADE, *(f"{pattern}/*" for pattern in MADE[-2:]), changing=True)
+            folder.check_own_files(*WRITTEN)
+        folder.made(FILE, PREVIOUS, *WRITTEN, *(f"{pattern}/*" for pattern in WRITTEN[-2:]), changing=True)
         yield
 
 
+@dataclass(frozen=True)
+class Processes:
+    """This process and the others of the run."""
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def first(self) -> bool:
+        """Whether this process writes files and reports."""
+        return self.rank == 0
+
+    def wrap_ddp(self, module: nn.Module) -> nn.Module:
+        """The module with gradients averaged over all processes; the module itself if there is only one process."""
+        if self.count == 1 or not any(p.requires_grad for p in module.parameters()):
+            return module
+        devices = [self.device.index] if self.device.type == "cuda" else None
+        return Ddp(module, device_ids=devices, find_unused_parameters=True)
+
+    def gather(self, positions: list[ReplayPosition]) -> tuple[ReplayPosition, ...]:
+        """The positions of all streams, in their order: stream n belongs to process n % count."""
+        own = torch.tensor([[p.scene, p.sample, p.buffered] for p in positions], device=self.device)
+        if self.count == 1:
+            gathered = [own]
+        else:
+            gathered = [torch.empty_like(own) for _ in range(self.count)]
+            torch.distributed.all_gather(gathered, own)
+        return tuple(ReplayPosition(*row.tolist()) for rows in zip(*gathered, strict=True) for row in rows)
+
+    def mean(self, value: Tensor) -> Tensor:
+        """The mean over the processes."""
+        if self.count == 1:
+            return value
+        value = value.clone()
+        torch.distributed.all_reduce(value)
+        return value / self.count
+
+    def maximum(self, *values: float) -> list[float]:
+        """The maximum of each value over the processes, whose clocks may differ."""
+        if self.count == 1:
+            return list(values)
+        own = torch.tensor(values, dtype=torch.float64, device=self.device)
+        torch.distributed.all_reduce(own, torch.distributed.ReduceOp.MAX)
+        return own.tolist()
+
+
+@contextmanager
+def join_processes() -> Iterator[Processes]:
+    """Join the other processes if torchrun started this one, and leave when all are done."""
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    rank, local = int(os.environ.get("RANK", "0")), int(os.environ.get("LOCAL_RANK", "0"))
+    device = torch.device("cuda", local) if torch.cuda.is_available() else torch.device("cpu")
+    if count == 1:
+        yield Processes(0, 1, device)
+        return
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    try:
+        yield Processes(rank, count, device)
+        # gloo's threads may still hold the last tensors, and abort a process that exits before the others.
+        torch.distributed.barrier()
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+class Clock:
+    """The times of a run: how far it is, how fast, and when the next checkpoint is due."""
+
+    def __init__(self, config: TrainConfig, step: int, elapsed_s: float) -> None:
+        """`step` steps were done before, in `elapsed_s`."""
+        self.config, self.first_step, self.before_s = config, step, elapsed_s
+        self._began = self._saved = time.monotonic()
+        self._samples, self._waited_s = 0, 0.0
+
+    def elapsed_s(self) -> float:
+        """Seconds that the run has taken, including its earlier parts."""
+        return self.before_s + time.monotonic() - self._began
+
+    def progress(self, step: int) -> float:
+        """Fraction of the run that is done before `step`, by steps or by time, whichever is further."""
+        minutes = self.config.minutes
+        return max(step / self.config.steps, self.elapsed_s() / 60 / minutes if minutes else 0.0)
+
+    def checkpoint_due(self) -> bool:
+        """Whether `checkpoint_minutes` have passed since the last checkpoint."""
+        return time.monotonic() - self._saved >= 60 * self.config.checkpoint_minutes
+
+    def saved(self) -> None:
+        """A checkpoint was written."""
+        self._saved = time.monotonic()
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Count the time within as waiting for samples."""
+        began = time.monotonic()
+        yield
+        self._waited_s += time.monotonic() - began
+
+    def pace(self, step: int, samples: int) -> tuple[float, float, float]:
+        """Samples per second, fraction of time waited, and seconds left, after `step` steps.
+
+        `samples` is the number of samples of the last step.
+        """
+        self._samples += samples
+        span_s = max(time.monotonic() - self._began, 1e-9)
+        left_s = (self.config.steps - step) * span_s / (step - self.first_step)
+        if self.config.minutes:
+            left_s = min(left_s, 60 * self.config.minutes - self.elapsed_s())
+        return self._samples / span_s, self._waited_s / span_s, max(0.0, left_s)
+
+
 class Run:
-    """A run in this process: model, averages, optimizers and streams of samples.
+    """A run in this process: model, averages, optimisers and streams of samples."""
 
-    Subclasses that train another network override the methods from `_make_model` on.
-    """
-
-    def __init__(self, recipe: Recipe, out: Path, start: nn.Module | None, own: Processes) -> None:
+    def __init__(self, config: TrainConfig, out: Path, start: nn.Module | None, own: Processes) -> None:
         out.mkdir(parents=True, exist_ok=True)
-        torch.manual_seed(recipe.seed)
-        self.recipe, self.out, self.own = recipe, out, own
-        self.model = self._make_model(start).to(own.device)
-        self.objective = self._make_objective(start).to(own.device)
-        self.average = AveragedModel(self.model, multi_avg_fn=averaging(recipe.ema))
-        self.learned = [p for p in self.model.parameters() if p.requires_grad]
-        self.optimizer = self._make_optimizer()
-        self.adversary = None
-        if recipe.loss.adversarial:
-            self.adversary = Adversary(recipe.loss, recipe.discriminator_rate, own, shown_upon(self.model))
+        torch.manual_seed(config.seed)
+        if start is None and config.start is not None:
+            start = config.objective.load_start(config.start)
+        self.config, self.out, self.own = config, out, own
+        self.objective = config.objective.objective(config, config.objective, start).to(own.device)
+        self.model = self.objective.model
+        self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
+        self.trained = [p for p in self.model.parameters() if p.requires_grad]
+        self.optimizer = self.objective.make_optimizer(self.trained, config.learning_rate)
+        self.adversary = self.objective.adversary
         self.state = RunState(0, 0.0, ())
         self._modules: dict[str, nn.Module] = {"model": self.model, "average": self.average}
         self._optimizers: dict[str, torch.optim.Optimizer] = {"optimizer": self.optimizer}
         if self.adversary is not None:
-            self._modules["discriminator"] = self.adversary.discriminator
+            self._modules["discriminator"] = self.adversary.discriminator.to(own.device)
             self._optimizers["discriminator_optimizer"] = self.adversary.optimizer
         if last := last_checkpoint(out):
-            self.state = load_run(last, recipe, self._modules, self._optimizers)
+            self.state = load_run(last, config, self._modules, self._optimizers)
         self.shared = own.wrap_ddp(self.objective)
-        self.streams = self._streams()
-        self.validation = self._make_validation() if recipe.validate_every and own.first else None
+        self.streams = self._make_streams()
+        self.validation = self.objective.validation if config.validate_every and own.first else None
 
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
-        """Make all steps that are left, or those until `stopped`; yields after each."""
-        schedule = Schedule(self.recipe, self.state.elapsed_s)
+        """Make the remaining steps, or those until `stopped` returns True; yields after each."""
+        config, clock = self.config, Clock(self.config, self.state.step, self.state.elapsed_s)
         with Log(self.out, self.state.step, self.own.first) as log:
-            step = begun = self.state.step
+            step = first = self.state.step
             while True:
-                at = self.own.furthest(1.0 if stopped() else schedule.progress(step))
-                if at >= 1:
+                progress = 1.0 if stopped() else clock.progress(step)
+                progress, due = self.own.maximum(progress, float(step > self.state.step and clock.checkpoint_due()))
+                if due:
+                    self._save(step, clock)
+                if progress >= 1:
                     break
-                schedule.wait()
-                batches = [stream.batch(step, self.recipe.batch) for stream in self.streams]
-                schedule.got()
-                rate = self.recipe.learning_rate * self._rate_factor(step, at)
+                with clock.waiting():
+                    batches = [stream.batch(step, config.batch) for stream in self.streams]
+                rate = config.learning_rate * self.objective.learning_rate_factor(step, progress, config.warmup)
                 for group in self.optimizer.param_groups:
                     group["lr"] = rate
-                if isinstance(self.objective, Objective):
-                    self.objective.progress = at
+                self.objective.progress = progress
                 losses = self._step(step, batches)
                 step += 1
-                pace = schedule.made(step, sum(map(len, batches)) * self.own.count)
-                progress = Progress(step, at, rate, losses, schedule.elapsed_s(), pace)
-                log.add(progress)
-                if step % self.recipe.checkpoint_every == 0:
-                    self._save(step, schedule)
-                if self.validation is not None and step % self.recipe.validate_every == 0:
-                    log.validated(self.validation.judge(self.averaged, step))
-                yield progress
+                pace = clock.pace(step, sum(map(len, batches)) * self.own.count)
+                entry = Progress(step, progress, rate, losses, clock.elapsed_s(), *pace)
+                log.add(entry)
+                if self.validation is not None and step % config.validate_every == 0:
+                    log.add_validation(step, self.validation(self.averaged, self._image(step)))
+                yield entry
             if step > self.state.step:
-                self._save(step, schedule)
+                self._save(step, clock)
             elif self.own.first:
-                self._write_model()  # which may be lost or damaged, where nothing else is to do
-            if self.validation is not None and step > begun and step % self.recipe.validate_every:
-                log.validated(self.validation.judge(self.averaged, step))
+                self._write_model()  # it may be lost or damaged, and a finished run does nothing else
+            if self.validation is not None and step > first and step % config.validate_every:
+                log.add_validation(step, self.validation(self.averaged, self._image(step)))
 
     @property
     def averaged(self) -> nn.Module:
-        """The averaged weights, which are the result."""
+        """The model with averaged weights, which is the result."""
         return self.average.module
 
-    def _make_model(self, start: nn.Module | None) -> nn.Module:
-        assert start is None or isinstance(start, NETWORKS)
-        return _model(self.recipe, start)
-
-    def _make_objective(self, start: nn.Module | None) -> nn.Module:
-        """A module whose call on a batch of samples is an `StepOutput`."""
-        assert isinstance(self.model, NETWORKS)
-        return OBJECTIVES.get(self.recipe.part, Objective)(self.model, self.recipe)
-
-    def _make_optimizer(self) -> torch.optim.Optimizer:
-        recipe = self.recipe
-        return torch.optim.AdamW(self.learned, lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
-
-    def _make_validation(self) -> Validation | None:
-        return Validation(self.recipe, self.out)
-
-    def _rate_factor(self, step: int, progress: float) -> float:
-        return learning_rate_factor(step, progress, self.recipe.warmup)
-
-    def _judge(self, adversary: Adversary, batch: list[Any], output: StepOutput, weight: float):
-        """See `Adversary.judge`."""
-        return adversary.judge(batch, output.completed, weight)
-
-    def _write_model(self) -> None:
-        assert isinstance(self.averaged, NETWORKS)
-        save_inpainter(self.averaged, self.out, model_card(self.recipe, self.state))
-
-    def _step(self, step: int, batches: list[list[Trained]]) -> LossTerms:
-        """One step of all weights, with the mean of the streams' gradients."""
+    def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
+        """One step of all weights, by the mean gradient of the streams."""
         self.optimizer.zero_grad(set_to_none=True)
         losses = []
         for number, batch in enumerate(batches):
-            batch = [sample.to(self.own.device) for sample in batch]
-            # Each stream draws from its own seed at each step: who computes it does not matter.
+            batch = [to_device(sample, self.own.device) for sample in batch]
+            # Random numbers depend on the stream and the step, not on the process that computes them.
             stream = number * self.own.count + self.own.rank
-            torch.manual_seed((self.recipe.seed * 1_000_003 + step) * 1_009 + stream)
+            torch.manual_seed((self.config.seed * 1_000_003 + step) * 1_009 + stream)
             last = number + 1 == len(batches)
-            # Gradients but the last add up here, and meet those of other processes in its backward pass.
+            # All gradients but the last accumulate here; they meet those of other processes in the last backward pass.
             with self.shared.no_sync() if isinstance(self.shared, Ddp) and not last else nullcontext():
                 output = self.shared(batch)
                 assert isinstance(output, StepOutput)
-                total, adversarial, judged = output.total, 0.0, 0.0
+                total, adversarial, discriminator = output.total, 0.0, 0.0
                 if self.adversary is not None:
-                    term, judged = self._judge(self.adversary, batch, output, 1 / len(batches))
-                    total, adversarial = total + self.recipe.loss.adversarial * term, float(term.detach())
-                self._demand_finite(total.detach(), step, batch)
+                    assert output.judged is not None, "objectives with an adversary return what it judges"
+                    term, discriminator = self.adversary.losses(output.judged, 1 / len(batches))
+                    total, adversarial = total + self.adversary.weight * term, float(term.detach())
+                self._check_finite(total.detach(), step, batch)
                 (total / len(batches)).backward()
-            image = output.image
-            terms = [float(term.detach()) for term in (image.inside, image.outside, total)]
-            losses.append([*terms, adversarial, judged])
-        torch.nn.utils.clip_grad_norm_(self.learned, self.recipe.max_grad_norm)
+            terms = [float(term.detach()) for term in (output.image.inside, output.image.outside, total)]
+            losses.append([*terms, adversarial, discriminator])
+        torch.nn.utils.clip_grad_norm_(self.trained, self.objective.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
-            self.adversary.step()
-        return LossTerms(*self.own.mean(torch.tensor(losses, device=self.own.device).mean(0)).tolist())
+            self.adversary.step(self.own.mean)
+        means = self.own.mean(torch.tensor(losses, device=self.own.device).mean(0)).tolist()
+        return dict(zip(("inside", "outside", "total", "adversarial", "discriminator"), means, strict=True))
 
-    def _demand_finite(self, total: torch.Tensor, step: int, batch: list[Trained]) -> None:
+    def _check_finite(self, total: Tensor, step: int, batch: list[object]) -> None:
         if torch.isfinite(total):
             return
         folder = self.out / f"not-finite-{step:06d}"
@@ -230,17 +306,17 @@ class Run:
             data = sample_to_bytes(sample)
             write_atomically(folder / f"{number:02d}.safetensors", lambda path, data=data: path.write_bytes(data))
         raise FloatingPointError(
-            f"expected a finite loss, got {float(total)} at step {step}; its batch is in {folder}: look at it, or "
-            "lower the learning rate and begin with the last checkpoint"
+            f"expected a finite loss, got {float(total)} at step {step}; inspect its batch in {folder}, or lower the "
+            "learning rate and resume from the last checkpoint"
         )
 
-    def _streams(self) -> list[SampleReplay[Trained]]:
-        """This process's streams: numbers rank, rank + count and so on."""
-        recipe, own = self.recipe, self.own
-        count = max(recipe.streams, own.count)
+    def _make_streams(self) -> list[SampleReplay[object]]:
+        """The streams of this process: numbers rank, rank + count and so on."""
+        config, own = self.config, self.own
+        count = max(config.streams, own.count)
         if count % own.count:
             raise ValueError(
-                f"expected as many streams for each process, got {count} for {own.count}; change either number"
+                f"expected the same number of streams for each process, got {count} for {own.count}; change either"
             )
         if self.state.positions and len(self.state.positions) != count:
             raise ValueError(
@@ -249,49 +325,35 @@ class Run:
             )
         streams = []
         for number in range(own.rank, count, own.count):
-            seed = f"{recipe.seed}/{number}"
-            at: ReplayPosition | None = self.state.positions[number] if self.state.positions else None
-            source = training_source(recipe, seed)
-            streams.append(SampleReplay(source, seed, recipe.new_per_batch, recipe.replay_size, recipe.workers, at))
+            seed = f"{config.seed}/{number}"
+            at = self.state.positions[number] if self.state.positions else None
+            scenes = self.objective.training_scenes(seed)
+            streams.append(SampleReplay(scenes, seed, config.new_per_batch, config.replay_size, config.workers, at))
         return streams
 
-    def _save(self, step: int, schedule: Schedule) -> None:
+    def _save(self, step: int, clock: Clock) -> None:
         positions = self.own.gather([stream.position for stream in self.streams])
-        self.state = RunState(step, schedule.elapsed_s(), positions)
+        self.state = RunState(step, clock.elapsed_s(), positions)
         if self.own.first:
-            save_run(self.out, self.recipe, self.state, self._modules, self._optimizers)
+            save_run(self.out, self.config, self.state, self._modules, self._optimizers)
             self._write_model()
+        clock.saved()
+
+    def _image(self, step: int) -> Path:
+        return self.out / f"validation-{step:06d}.png"
+
+    def _write_model(self) -> None:
+        card = model_card(self.config, self.state, self.objective.loss_summary)
+        self.objective.save(self.averaged, self.out, card)
 
 
-def _model(recipe: Recipe, start: Chain | PatchTransformer | None) -> Chain | PatchTransformer:
-    """The recipe's model with those weights of `start` whose name and shape it has; its part is ready to learn."""
-    model = build(recipe.model).train()
-    if start is not None:
-        fitting = fitting_weights(model, start, recipe.anew)
-        if not fitting:
-            raise ValueError(
-                f"expected a model to begin with of which anything fits {recipe.name}, got none that does: its sizes "
-                "are others; begin without, or choose another recipe"
-            )
-        model.load_state_dict(model.state_dict() | fitting)
-    for name, parameter in model.named_parameters():
-        of_part = recipe.part == "all" or name.startswith("coarse.") == (recipe.part == "rays")
-        parameter.requires_grad_(_module(name) in TAUGHT.get(recipe.part, (_module(name),)) and of_part)
-    set_compute_dtype(model, torch.bfloat16 if recipe.bfloat16 else torch.float32)
-    return model
+def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
+    """Moves averages towards the weights by 1 - decay, faster at first, so that the initial weights are forgotten."""
 
+    @torch.no_grad()
+    def update(averages: Sequence[Tensor], weights: Sequence[Tensor], count: Tensor | int) -> None:
+        kept = min(decay, (1 + int(count)) / (10 + int(count)))
+        for average, weight in zip(averages, weights, strict=True):
+            average.lerp_(weight, 1 - kept)
 
-def _module(weight: str) -> str:
-    """Which part of a `PatchTransformer`, with or without a coarse fill before it, a weight is of."""
-    return weight.removeprefix("patches.").split(".")[0]
-
-
-def fitting_weights(model: nn.Module, start: nn.Module, anew: Sequence[str] = ()) -> dict[str, torch.Tensor]:
-    """The weights of `start` whose name and shape `model` has, with or without a coarse fill before the patches.
-
-    Those of the modules `anew` are not among them.
-    """
-    own, theirs = model.state_dict(), start.state_dict()
-    inner = {name.removeprefix("patches."): weight for name, weight in theirs.items()}
-    found = {f"patches.{name}": weight for name, weight in theirs.items()} | inner | theirs
-    return {n: w for n, w in found.items() if n in own and own[n].shape == w.shape and _module(n) not in anew}
+    return update

@@ -1,107 +1,217 @@
-"""The objective of section 8 as a module, so that gradients of many processes meet in its backward pass."""
+"""What a run trains: a model with its loss, data, optimiser and validation. The loop is in `viewmend.training.loop`."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
+from pathlib import Path
+from typing import Any, Generic, Literal, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from viewmend.inpainting.chain import Chain
-from viewmend.inpainting.context import ContextFrame
-from viewmend.inpainting.patch_transformer import PatchTransformer
-from viewmend.training.losses import ImageLoss, image_loss, slivers
-from viewmend.training.plan import Recipe
-from viewmend.training.samples import Sample
-from viewmend.training.through_tokens import encode_and_decode
-from viewmend.training.true_images import true_image
-from viewmend.views import ContextViews
+from viewmend.data.images import write_image
+from viewmend.metrics.image_quality import psnr
+from viewmend.models.base import ContextProvider
+from viewmend.models.checkpoint import save_inpainter
+from viewmend.models.classical import Telea
+from viewmend.models.compositing import Background, composite
+from viewmend.models.network import set_compute_dtype
+from viewmend.training.adversarial import Adversary, Judged
+from viewmend.training.config import SceneSource, TrainConfig
+from viewmend.training.samples import Sample, to_device, true_image
+from viewmend.training.shards import ShardScenes
+
+MIN_SQUARE = 1e-4
+"""Added to squared errors before the logarithm: no gain beyond 40 dB."""
+WEIGHT_DECAY = 0.01
+TILE_PX = 256
+SHOWN_VIEWS = 8
+"""Views in the image of a validation."""
+Model = TypeVar("Model", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class ImageLoss:
+    """The image terms of a batch; each is 0 if it has no pixels."""
+
+    inside: Float[Tensor, ""]
+    """L_in of section 8: L1 in the holes."""
+    outside: Float[Tensor, ""]
+    """L_out of section 8: L1 outside the holes."""
+    log_error: Float[Tensor, ""]
+    """log10 of the mean squared error in the holes, a tenth of -PSNR. Where a pixel may be subject or background, L1
+    settles for one of the two; squares do not."""
 
 
 @dataclass(frozen=True)
 class StepOutput:
-    """What a model made of a batch, and its loss."""
+    """The loss of one batch."""
 
     image: ImageLoss
     total: Float[Tensor, ""]
-    """The weighted sum, without L_adv."""
-    completed: tuple[Float[Tensor, "3 _h _w"], ...]
-    """Fhat of each view, upon the model's background; samples one after the other, each as a clip. Empty where only
-    rays are trained."""
+    """The weighted sum of all terms except L_adv."""
+    judged: Judged | None = None
+    """The batch for the discriminator, if the objective has one."""
 
 
-class Objective(nn.Module):
-    """L without L_adv, of a batch of samples of any sizes."""
+Validation = Callable[[nn.Module, Path], dict[str, float | None]]
+"""From the averaged model to its mean scores in dB, on fixed views that a run never trains on; writes an image of the
+first views to the path."""
 
-    def __init__(self, model: Chain | PatchTransformer, recipe: Recipe) -> None:
+
+class Objective(nn.Module, Generic[Model]):
+    """A model and its loss; subclasses implement `forward`. The other methods have defaults."""
+
+    loss_summary = ""
+    """The loss in words, for the model card."""
+    max_grad_norm = 1.0
+    """Norm to which gradients are clipped."""
+    adversary: Adversary | None = None
+    """The discriminator, for objectives with an adversarial term."""
+    validation: Validation | None = None
+    progress = 0.0
+    """Fraction of the run that is done, in [0, 1]; set by the loop before each step, for terms that are annealed."""
+
+    def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()
-        self.model = model
-        self.recipe = recipe
-        self.progress = 0.0
-        """How much of the run is over: what is annealed, is by this."""
-        self.patches.context_gradients = recipe.context_gradients
+        self.config = config
+        self.model = model.train()
+        set_compute_dtype(model, torch.bfloat16 if config.precision == "bfloat16" else torch.float32)
 
-    @property
-    def patches(self) -> PatchTransformer:
-        """What attends and decodes."""
-        return self.model.patches if isinstance(self.model, Chain) else self.model
+    def forward(self, batch: Sequence[Any]) -> StepOutput:
+        """All terms of a batch, except L_adv."""
+        raise NotImplementedError
 
-    def contexts(self, samples: Sequence[Sample]) -> Sequence[Sequence[ContextFrame | ContextViews]]:
-        """What each sample's view is completed from.
+    def training_scenes(self, seed: str) -> SceneSource[Any]:
+        """The scenes of one stream of batches: those of shards if given, else generated ones.
 
         Raises:
-            ValueError: a sample's context is encoded already, by what would not learn with it.
+            CaptureError, ShardError, WeightsError: the data cannot be used.
+            ValueError: data reserved for tests is requested.
         """
-        if any(sample.encoded is not None for sample in samples):
-            raise ValueError(
-                "expected samples with the images of their context, got encoded ones; train `tokens` on them, or give "
-                "the shards that they were encoded from"
-            )
-        return [sample.context for sample in samples]
+        options, shards = self.config.objective, self.config.shards
+        if shards is None:
+            return options.make_scenes(self.config.scenes, seed)
+        return ShardScenes(shards, seed, options.item, options.whole_shards, options.sampling.clip_length)
 
-    def forward(self, batch: list[Sample]) -> StepOutput:
-        """All terms of `batch`.
+    def make_optimizer(self, parameters: list[nn.Parameter], learning_rate: float) -> torch.optim.Optimizer:
+        """The optimiser of the model's trained parameters."""
+        return torch.optim.AdamW(parameters, lr=learning_rate, weight_decay=WEIGHT_DECAY)
 
-        Raises:
-            ValueError: attention is to be taught, and a sample does not say by what; or a sample is of another kind
-                than what is trained.
-        """
-        weights = self.recipe.loss
-        views = [sample for last in batch for sample in last.clip]
-        if weights.attention and any(sample.matches is None for sample in views):
-            raise ValueError(
-                "expected samples that say where their context shows what they miss, got one that does not; make "
-                "samples with --matches, or train without --attention"
-            )
-        contexts = self.contexts(views)
-        kept = None
-        if weights.autoencoder:
-            looked_at = [self.patches.looked_at(s.view, s.context) for s in views]
-            contexts, kept = encode_and_decode(self.patches, looked_at, weights.channels)
-        predictions = self.model(
-            [s.view for s in views],
-            contexts,
-            ray_views=[s.ray_views for s in views],
-            matches=[s.matches for s in views] if weights.attention else (),
+    def learning_rate_factor(self, step: int, progress: float, warmup: int) -> float:
+        """Factor of the peak learning rate: linear warm-up, then a cosine to 0 as `progress` goes from 0 to 1."""
+        return min((step + 1) / warmup, 1.0) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+    def save(self, model: nn.Module, folder: Path, card: str) -> None:
+        """Write a model of this objective, usually the averaged one, with its card."""
+        save_inpainter(model, folder, card)  # pyright: ignore[reportArgumentType]
+
+
+def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", optional: str = "") -> None:
+    """Copy the weights of a model to start from, if there is one.
+
+    Args:
+        model: gets the weights.
+        start: has them.
+        kept: prefix of weights that the model keeps.
+        optional: prefix of weights that `start` may lack.
+
+    Raises:
+        ValueError: `start` lacks other weights, or has them in other sizes.
+    """
+    if start is None:
+        return
+    own, found = model.state_dict(), start.state_dict()
+    own = {name: weight for name, weight in own.items() if not (kept and name.startswith(kept))}
+    fitting = {name: found[name] for name, weight in own.items() if name in found and found[name].shape == weight.shape}
+    missing = [name for name in own if name not in fitting and not (optional and name.startswith(optional))]
+    if missing:
+        raise ValueError(
+            f"expected a {type(model).__name__} of the recipe's sizes to start from, got a {type(start).__name__} "
+            f"without a fitting {missing[0]}; start from another model, or without --from"
         )
-        made, counted = [p.inpainted for p in predictions], [p.coverage for p in predictions]
-        if weights.outside == "image":
-            pairs = zip(predictions, made, strict=True)
-            made = [torch.where(p.coverage > 0, image, p.upon_own.detach()) for p, image in pairs]
-            counted = [torch.ones_like(coverage) for coverage in counted]
-        truth = [true_image(s, self.model.background) for s in views]
-        error = [s.view.error for s in views]
-        for n, part in enumerate(s.view.part for s in views):
-            if part is not None:
-                error[n], counted[n] = error[n] * part.inner[0], counted[n] * part.inner[0]
-        if self.progress < weights.wide_first:
-            counts = [(~slivers(E)).float() for E in error]
-            error, counted = ([x * own for x, own in zip(many, counts, strict=True)] for many in (error, counted))
-        image = image_loss(made, counted, error, truth, weights.channels)
-        total = weights.image * (image.inside + image.outside) + weights.log_error * image.log_error
-        missed = [p.missed for p in predictions if p.missed is not None]
-        if missed:
-            total = total + weights.attention * (1 - self.progress) * torch.stack(missed).mean()
-        if kept is not None:
-            total = total + weights.autoencoder * kept
-        return StepOutput(image, total, tuple(p.upon_own for p in predictions))
+    model.load_state_dict(model.state_dict() | fitting)
+
+
+def image_loss(
+    predicted: Sequence[Float[Tensor, "3 _h _w"]],
+    counted: Sequence[Float[Tensor, "_h _w"]],
+    error: Sequence[Float[Tensor, "_h _w"]],
+    truth: Sequence[Float[Tensor, "3 _h _w"]],
+    channels: Literal["mean", "sum"] = "mean",
+) -> ImageLoss:
+    """The mean losses of a batch of images of any sizes.
+
+    Args:
+        predicted: Ftilde of each image.
+        counted: above 0 at the pixels that L_out includes.
+        error: E.
+        truth: F*, on the same background as Ftilde.
+        channels: whether L_in and L_out take the mean over the channels or, as in the paper, the sum.
+    """
+    losses = []
+    for image, included, E, target in zip(predicted, counted, error, truth, strict=True):
+        off = image.float() - target
+        l1 = off.abs().sum(0) if channels == "sum" else off.abs().mean(0)
+        inside, outside = (_weighted_mean(l1, weight) for weight in (E, (1 - E) * (included > 0)))
+        losses.append(ImageLoss(inside, outside, (_weighted_mean(off.square().mean(0), E) + MIN_SQUARE).log10()))
+    return mean_loss(losses)
+
+
+def _weighted_mean(values: Float[Tensor, "height width"], weight: Float[Tensor, "height width"]) -> Float[Tensor, ""]:
+    """0 if the weight is 0 everywhere."""
+    return (weight * values).sum() / weight.sum().clamp_min(1e-6)
+
+
+def mean_loss(losses: Sequence[ImageLoss]) -> ImageLoss:
+    """The mean of each term."""
+    terms = zip(*((loss.inside, loss.outside, loss.log_error) for loss in losses), strict=True)
+    return ImageLoss(*(torch.stack(term).mean() for term in terms))
+
+
+def write_rows(rows: Sequence[Float[Tensor, "3 _h _w"]], path: Path) -> None:
+    """Write the first rows of input, output and ground truth as one image, all scaled to one size."""
+    size = (TILE_PX, 3 * TILE_PX)
+    scaled = [F.interpolate(row[None], size, mode="bilinear", antialias=True)[0] for row in rows[:SHOWN_VIEWS]]
+    image = (torch.cat(scaled, 1).clamp(0, 1) * 255).round().to(torch.uint8)
+    write_image(path, image.permute(1, 2, 0).contiguous().numpy())
+
+
+@dataclass
+class HoleValidation:
+    """PSNR in the holes of fixed views, of the model ("holes") and of OpenCV's Telea ("telea").
+
+    The views are made at the first validation.
+    """
+
+    scenes: SceneSource[Sample]
+    num_views: int
+    complete: Callable[[nn.Module, Sample], Float[Tensor, "3 _h _w"]]
+    """The model's completed view of a sample, on `background`."""
+    background: Background
+    _samples: list[Sample] = field(default_factory=list)
+
+    @torch.no_grad()
+    def __call__(self, model: nn.Module, image: Path) -> dict[str, float | None]:
+        """Score a model."""
+        if not self._samples:
+            samples = (sample for number in count() for sample in self.scenes.scene(number))
+            self._samples = list(islice(samples, self.num_views))
+        training, device = model.training, next(model.parameters()).device
+        model.eval()
+        scores, rows, telea = [], [], Telea()
+        for sample in self._samples:
+            truth, holes = true_image(sample, self.background), sample.view.error > 0
+            completed = self.complete(model, to_device(sample, device)).float().clamp(0, 1).cpu()
+            filled, _ = telea.step_on(
+                self.background, sample.view, ContextProvider(lambda *_: None), telea.initial_state()
+            )
+            classical = composite(self.background, filled.rgb, filled.opacity)
+            scores.append([psnr(rgb, truth, holes) for rgb in (completed, classical)])
+            rows.append(torch.cat([sample.view.rgb, completed, truth], 2))
+        model.train(training)
+        write_rows(rows, image)
+        return dict(zip(("holes", "telea"), torch.tensor(scores).mean(0).tolist(), strict=True))

@@ -1,41 +1,39 @@
-"""Batches that follow from the recipe, the seed and the step alone, so that a run can go on where it was."""
+"""Batches that depend only on the config, the seed and the step, so that a resumed run makes the same steps."""
 
 import signal
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, islice
 from random import Random
 from typing import Generic, TypeVar
 
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from viewmend.training.scenes import SceneSource
+from viewmend.training.config import SceneSource
 
-MOST_EMPTY_SCENES = 100
-"""So many scenes in a row without a sample mean that there never will be one."""
+MAX_EMPTY_SCENES = 100
+"""Scenes in a row without a sample after which the data is considered empty."""
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
 class ReplayPosition:
-    """Where a stream of samples is: all that it takes to go on."""
+    """Position of a stream of batches, from which it can be resumed."""
 
     scene: int
     """Scene of the oldest sample in the buffer."""
     sample: int
-    """Number of the oldest sample among that scene's."""
+    """Index of that sample within its scene."""
     buffered: int
     """Samples in the buffer."""
 
 
-Item = TypeVar("Item")
-
-
 class SampleReplay(Generic[Item]):
-    """One stream of batches: new samples, and others from the buffer of the last ones.
+    """A stream of batches: new samples, and others from a buffer of recent ones.
 
-    Scenes are made ahead by worker processes, and used in the order of their numbers whoever made them.
+    Worker processes make scenes ahead of time; they are used in the order of their numbers, whichever worker made them.
     """
 
     def __init__(
@@ -47,25 +45,20 @@ class SampleReplay(Generic[Item]):
         workers: int,
         start: ReplayPosition | None = None,
     ) -> None:
-        """`start` takes up a stream: the samples that it replays are made again."""
+        """Begin at the first scene, or resume at `start`, whose buffered samples are made again."""
         start = start or ReplayPosition(0, 0, 0)
-        self.seed = seed
-        self.new_per_batch = new_per_batch
-        self._new = samples_in_order(scenes, start.scene, workers)
-        for _ in range(start.sample):
-            next(self._new)
-        self._buffer: deque[tuple[int, int, Item]] = deque(maxlen=max(1, replay_size))
-        for _ in range(start.buffered):
-            self._buffer.append(next(self._new))
+        self.seed, self.new_per_batch = seed, new_per_batch
+        self._new = islice(samples_in_order(scenes, start.scene, workers), start.sample, None)
+        self._buffer = deque(islice(self._new, start.buffered), maxlen=max(1, replay_size))
 
     def batch(self, step: int, size: int) -> list[Item]:
-        """The batch of `step`; steps follow one another. Smaller than `size` until the buffer holds enough."""
-        count = min(self.new_per_batch, size)
-        again = min(size - count, len(self._buffer))
-        seen = Random(f"{self.seed}/{step}").sample([sample for _, _, sample in self._buffer], again)
-        new = [next(self._new) for _ in range(count)]
+        """The batch of `step`, to be called for consecutive steps; smaller than `size` until the buffer has filled."""
+        num_new = min(self.new_per_batch, size)
+        num_replayed = min(size - num_new, len(self._buffer))
+        replayed = Random(f"{self.seed}/{step}").sample([sample for _, _, sample in self._buffer], num_replayed)
+        new = [next(self._new) for _ in range(num_new)]
         self._buffer.extend(new)
-        return [sample for _, _, sample in new] + seen
+        return [sample for _, _, sample in new] + replayed
 
     @property
     def position(self) -> ReplayPosition:
@@ -74,11 +67,11 @@ class SampleReplay(Generic[Item]):
         return ReplayPosition(scene, sample, len(self._buffer))
 
 
+@dataclass(frozen=True)
 class _Numbered(Dataset[tuple[int, Sequence[Item] | Exception]]):
-    """Scenes by number; what a user can get wrong is handed on, so that it is not wrapped in a worker's traceback."""
+    """Scenes by number. Errors in the data are returned, so that they do not end in a worker's traceback."""
 
-    def __init__(self, scenes: SceneSource[Item]) -> None:
-        self.scenes = scenes
+    scenes: SceneSource[Item]
 
     def __getitem__(self, index: int) -> tuple[int, Sequence[Item] | Exception]:
         try:
@@ -87,38 +80,43 @@ class _Numbered(Dataset[tuple[int, Sequence[Item] | Exception]]):
             return index, error
 
 
-def _ignore_interrupts(_: int) -> None:
-    """Ctrl-C reaches all processes of a terminal; the first says what it means."""
+def _ignore_signals(_: int) -> None:
+    """Let the main process alone handle Ctrl-C and SIGTERM, which reach the whole process group."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Iterator[tuple[int, int, Item]]:
-    """(scene, number, sample) of all scenes from `first` on."""
+    """(scene, index, sample) of all scenes from number `first`.
+
+    Raises:
+        ValueError, OSError: a scene cannot be made; or many in a row are empty.
+    """
     numbered = _Numbered(scenes)
     if workers:
-        # Through files, not descriptors: a buffer of samples would run out of these.
+        # Through files: descriptors would run out with a buffer of samples.
         torch.multiprocessing.set_sharing_strategy("file_system")
-        made = iter(
+        loaded = iter(
             DataLoader(
                 numbered,
                 batch_size=None,
                 sampler=count(first),  # pyright: ignore[reportArgumentType]
                 num_workers=workers,
                 prefetch_factor=2,
-                worker_init_fn=_ignore_interrupts,
+                worker_init_fn=_ignore_signals,
             )
         )
     else:
-        made = (numbered[number] for number in count(first))
+        loaded = (numbered[number] for number in count(first))
     empty = 0
-    for number, samples in made:
+    for number, samples in loaded:
         if isinstance(samples, Exception):
             raise samples
         empty = 0 if samples else empty + 1
-        if empty == MOST_EMPTY_SCENES:
+        if empty == MAX_EMPTY_SCENES:
             raise ValueError(
-                f"expected views with holes to learn from, got none in {empty} scenes; use fewer cameras, or lower "
-                "min_hole_px"
+                f"expected views with holes to train on, got none in {empty} scenes; use rigs of fewer cameras, or "
+                "larger images"
             )
-        for i, sample in enumerate(samples):
-            yield number, i, sample
+        for index, sample in enumerate(samples):
+            yield number, index, sample

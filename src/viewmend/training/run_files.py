@@ -1,6 +1,7 @@
-"""A run on disk: what it takes to go on (run.safetensors), whole or not there."""
+"""The files of a run: its checkpoint (run.safetensors), its log (log.jsonl, TensorBoard) and the model card."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,94 +11,115 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from viewmend.atomic_writes import HALF, write_tensors
-from viewmend.foreign_input import InputError
-from viewmend.training.plan import Recipe
+from viewmend.training.config import TrainConfig
 from viewmend.training.replay import ReplayPosition
+from viewmend.utils.atomic_writes import TEMPORARY, name_path_in_errors, write_tensors, write_text
+from viewmend.utils.untrusted_input import InputError
 
 FILE, PREVIOUS = "run.safetensors", "run.previous.safetensors"
-"""The last checkpoint, and the one before it."""
-MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_every", "validate_every", "validation_views")
-"""Parts of a recipe that a run may go on with another value of."""
+"""The last checkpoint and the one before it."""
+MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_minutes", "validate_every", "validation_views")
+"""Fields of the config that may differ when a run is resumed."""
 
 
 class RunError(InputError):
-    """A run that cannot go on: which file, what was expected, what came, the next step."""
+    """A run cannot be resumed."""
 
 
 @dataclass(frozen=True)
 class RunState:
-    """Where a run is."""
+    """Progress of a run, as stored in a checkpoint."""
 
     step: int
-    """Steps that were made."""
+    """Steps done."""
     elapsed_s: float
     positions: tuple[ReplayPosition, ...]
-    """Where all streams are, in their order."""
+    """Positions of all streams, in their order."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One step of a run, as logged."""
+
+    step: int
+    """Steps done."""
+    progress: float
+    """Fraction of the run that was done before this step, in [0, 1]."""
+    learning_rate: float
+    losses: dict[str, float]
+    """Losses by name: inside (L_in), outside (L_out), total, adversarial (L_adv), discriminator; streams averaged."""
+    elapsed_s: float
+    samples_per_s: float
+    waiting: float
+    """Fraction of the time that was spent waiting for samples."""
+    eta_s: float
+    """Estimated time to the end."""
 
 
 def save_run(
-    folder: Path, recipe: Recipe, state: RunState, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
+    folder: Path, config: TrainConfig, state: RunState, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
 ) -> None:
-    """Write the run; the checkpoint that was there becomes the previous one."""
+    """Write a checkpoint; the one that was there becomes the previous one."""
     tensors = {f"{name}/{key}": value for name, m in modules.items() for key, value in m.state_dict().items()}
     for name, optimizer in optimizers.items():
         for number, values in optimizer.state_dict()["state"].items():
             tensors |= {f"{name}/{number}/{key}": torch.as_tensor(value) for key, value in values.items()}
-    metadata = {"state": json.dumps(asdict(state)), "recipe": json.dumps(_plain(recipe))}
-    next_one = folder / f"{HALF}{FILE}"
-    write_tensors(next_one, tensors, metadata)
+    metadata = {"state": json.dumps(asdict(state)), "config": json.dumps(_flat(config))}
+    unfinished = folder / f"{TEMPORARY}{FILE}"
+    write_tensors(unfinished, tensors, metadata)
     if (folder / FILE).exists():
         (folder / FILE).replace(folder / PREVIOUS)
-    next_one.replace(folder / FILE)
+    unfinished.replace(folder / FILE)
 
 
 def last_checkpoint(folder: Path) -> Path | None:
-    """The newest checkpoint that a run left; None where there is none."""
+    """The newest checkpoint in a run's folder; None if there is none."""
     return next((folder / name for name in (FILE, PREVIOUS) if (folder / name).exists()), None)
 
 
-def load_run(path: Path, recipe: Recipe, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]) -> RunState:
-    """Put a run's values into the modules and optimizers that its recipe makes.
+def load_run(
+    path: Path, config: TrainConfig, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
+) -> RunState:
+    """Load a checkpoint into the modules and optimisers that its config makes.
 
     Raises:
-        RunError: the file is damaged, or another recipe wrote it.
+        RunError: the file is damaged, or the run has another config.
     """
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata()
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-        wrote, values = json.loads(metadata["recipe"]), json.loads(metadata["state"])
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise RunError(f"{path}: expected a run to go on with, got {error}; {_way_on(path)}") from error
-    mine = _plain(recipe)
-    other = [key for key in mine if key not in MAY_CHANGE and mine[key] != wrote.get(key)]
-    if other:
+        stored, own = json.loads(metadata["config"]), _flat(config)
+        values = json.loads(metadata["state"])
+        different = [key for key in {**own, **stored} if key not in MAY_CHANGE and own.get(key) != stored.get(key)]
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise RunError(f"{path}: expected a run to resume, got {error}; {_advice(path)}") from error
+    if different:
         raise RunError(
-            f"{path}: expected a run of this recipe, got one that differs in {', '.join(other)}; write to another "
-            "folder, or give the options that it was started with"
+            f"{path}: expected a run with this config, got one that differs in {', '.join(different)}; choose another "
+            "folder, or pass the options that the run was started with"
         )
     try:
         for name, module in modules.items():
-            module.load_state_dict(_under(name, tensors))
+            module.load_state_dict(_with_prefix(name, tensors))
         for name, optimizer in optimizers.items():
-            _load_optimizer(optimizer, _under(name, tensors))
+            _load_optimizer(optimizer, _with_prefix(name, tensors))
         positions = tuple(ReplayPosition(**position) for position in values["positions"])
         return RunState(values["step"], values["elapsed_s"], positions)
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
-        said = " ".join(str(error).split())[:200]
+        reason = " ".join(str(error).split())[:200]
         raise RunError(
-            f"{path}: expected a run of this version, got one whose values do not fit ({said}); {_way_on(path)}"
+            f"{path}: expected a run of this version, got one whose values do not fit ({reason}); {_advice(path)}"
         ) from error
 
 
-def _way_on(path: Path) -> str:
+def _advice(path: Path) -> str:
     if path.name == FILE and path.with_name(PREVIOUS).exists():
-        return f"remove the file to start anew, or put {PREVIOUS} in its place to go on from the checkpoint before"
-    return "remove the file to start anew"
+        return f"remove the file to start again, or rename {PREVIOUS} to it to resume from the checkpoint before"
+    return "remove the file to start again"
 
 
-def _under(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def _with_prefix(name: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     prefix = f"{name}/"
     return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
 
@@ -114,6 +136,102 @@ def _load_optimizer(optimizer: Optimizer, tensors: dict[str, Tensor]) -> None:
     optimizer.load_state_dict({"state": states, "param_groups": groups})
 
 
-def _plain(recipe: Recipe) -> dict[str, Any]:
-    """The recipe as JSON has it."""
-    return json.loads(json.dumps(asdict(recipe), default=str))
+def _flat(config: TrainConfig) -> dict[str, Any]:
+    """The config's values as JSON has them, by dotted names."""
+
+    def flat(values: dict[str, Any], prefix: str) -> dict[str, Any]:
+        found = {}
+        for key, value in values.items():
+            found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        return found
+
+    return flat(json.loads(json.dumps(asdict(config), default=str)), "")
+
+
+class Log:
+    """The log of a run: a line of JSON per step, and TensorBoard files if it is installed.
+
+    Opened at a step, it drops the entries of later ones.
+    """
+
+    def __init__(self, out: Path, step: int, writes: bool) -> None:
+        """`writes` is False in all processes but the first, which write nothing."""
+        self._file = self._board = None
+        if not writes:
+            return
+        self._path = path = out / "log.jsonl"
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        write_text(path, "".join(line for line in lines if line.endswith("\n") and not _is_later(line, step)))
+        self._file = path.open("a")
+        try:
+            from torch.utils.tensorboard import SummaryWriter  # type: ignore[attr-defined]
+        except ImportError:
+            return
+        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step)
+
+    def __enter__(self) -> "Log":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for sink in (self._file, self._board):
+            if sink is not None:
+                sink.close()
+
+    def add(self, progress: Progress) -> None:
+        """Log a step."""
+        self._write(asdict(progress))
+        rates = {name: getattr(progress, name) for name in ("learning_rate", "samples_per_s", "waiting")}
+        self._plot(progress.step, "loss", progress.losses)
+        self._plot(progress.step, "rate", rates)
+
+    def add_validation(self, step: int, scores: Mapping[str, float | None]) -> None:
+        """Log the scores of the averaged weights after a step."""
+        self._write({"step": step, "validation": dict(scores)})
+        self._plot(step, "validation", {name: score for name, score in scores.items() if score is not None})
+
+    def _write(self, values: Mapping[str, object]) -> None:
+        if self._file is not None:
+            with name_path_in_errors(self._path):
+                self._file.write(json.dumps(values) + "\n")
+                self._file.flush()
+
+    def _plot(self, step: int, group: str, values: Mapping[str, float]) -> None:
+        if self._board is not None:
+            for name, value in values.items():
+                self._board.add_scalar(f"{group}/{name}", value, step)
+
+
+def _is_later(line: str, step: int) -> bool:
+    """Whether a line of the log belongs to a later step; lines without a step do not."""
+    try:
+        return json.loads(line)["step"] > step
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return False
+
+
+def model_card(config: TrainConfig, state: RunState, loss_summary: str) -> str:
+    """The README.md of trained weights, in Markdown: how they were trained; scores are added by hand."""
+    hardware = torch.cuda.get_device_name() if torch.cuda.is_available() else f"{torch.get_num_threads()} CPU threads"
+    averaged = "; averaged weights" if config.ema else ""
+    start = "random weights" if config.start is None else f"`{config.start}`"
+    return f"""# {config.name}
+
+Trained by `viewmend train {config.name}` from {start}: {state.step} steps of {config.batch} samples
+x {len(state.positions)} streams in {state.elapsed_s / 60:.0f} minutes, learning rate {config.learning_rate:g},
+seed {config.seed}, torch {torch.__version__}, {hardware}.
+Loss: {loss_summary}{averaged}.
+Data: {_data_summary(config)}; no test seeds, performers or motions.
+"""
+
+
+def _data_summary(config: TrainConfig) -> str:
+    scenes = config.scenes
+    if config.shards is not None:
+        return f"a data set written by `viewmend make-dataset` ({config.shards.name})"
+    studio = "studio scenes generated during training"
+    if scenes.performers is not None:
+        studio += f", {scenes.performers_fraction:.0%} of them with glTF performers"
+    if not scenes.captures:
+        return studio
+    names = ", ".join(place.stem for place in scenes.captures)
+    return f"{scenes.captures_fraction:.0%} of the scenes from captures ({names}), the others {studio}"

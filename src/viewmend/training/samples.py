@@ -1,60 +1,68 @@
-"""Training pairs of the leave-one-out data set, by the stream that everybody drives (section 8)."""
+"""Training samples: a view rendered without one camera of a rig, and what that camera saw (section 8)."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from random import Random
 from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from torch.nn import functional as F
 
-from viewmend.baselines.classical import Unfilled
+from viewmend.data.holdout.scenes import LeaveOneOut
+from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.hull import HullConfig
-from viewmend.inpainting.correspondences import Correspondences
-from viewmend.leave_one_out.scenes import LeaveOneOut
-from viewmend.observation import Observation
+from viewmend.models.classical import Unfilled
+from viewmend.models.compositing import Background, composite
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
-from viewmend.training.encoded import EncodedContext
-from viewmend.views import ContextViews, IncompleteView
+from viewmend.training.config import SamplingConfig, SceneConfig
+from viewmend.types import ContextViews, IncompleteView
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A rendered view, what the cameras saw, and what a camera that was left out saw in its place (F*)."""
+    """A rendered view, the camera images around it, and the image of the held-out camera in its place (F*)."""
 
     view: IncompleteView
     context: tuple[ContextViews, ...]
-    """The source views, one element a time, the view's own time first."""
+    """The source views, one element per frame, the view's own frame first."""
     ray_views: ContextViews | None
-    """What the cameras near the view, the chosen ones first, saw at its time: for an inpainter that reads rays."""
+    """Cameras near the view at its own frame, the source views first, for models that sample along rays."""
     truth: UInt8[Tensor, "3 height width"]
-    """F*, background black."""
+    """F*, on black."""
     previous: "Sample | None" = None
-    """The same camera one frame before, for losses over time."""
+    """The same camera one frame before, in clips."""
     alpha: UInt8[Tensor, "height width"] | None = None
-    """How much of each pixel the subject truly covers, in 255ths; None where nobody knows."""
+    """True coverage of each pixel by the subject, in 255ths; None if unavailable."""
     depth: Float[Tensor, "height width"] | None = None
-    """True z-depth, metres, 0 where there is no surface; None where nobody knows."""
-    matches: Correspondences | None = None
-    """Where the context truly shows what the view misses; None where nobody knows."""
-
-    encoded: EncodedContext | None = None
-    """The context as an encoder made it, instead of `context`; None where the images are there."""
+    """True z-depth in metres, 0 where there is no surface; None if unavailable."""
 
     @property
     def clip(self) -> tuple["Sample", ...]:
-        """This sample after those before it, the oldest first."""
+        """The samples of the clip that ends here, oldest first."""
         return (self,) if self.previous is None else (*self.previous.clip, self)
 
-    def to(self, device: torch.device | str) -> "Sample":
-        """The same sample on `device`."""
-        return to_device(self, device)
+
+def true_image(sample: Sample, background: Background) -> Float[Tensor, "3 height width"]:
+    """F* in [0, 1], composited on the background that the model paints.
+
+    Raises:
+        ValueError: the background is white, and the sample has no alpha.
+    """
+    rgb = sample.truth.float() / 255
+    if background == "black":
+        return rgb
+    if sample.alpha is None:
+        raise ValueError(
+            "expected samples with alpha for a model that paints a white background, got some without; write them "
+            "again with `viewmend make-dataset`"
+        )
+    return composite(background, rgb, sample.alpha.float() / 255)
 
 
 def to_device(value: Any, device: torch.device | str) -> Any:
-    """The tensor, or the tuple or dataclass with all of its tensors, on `device`; anything else as it is."""
+    """The tensor, or the tuple or dataclass with all of its tensors, on `device`; other values as they are."""
     if isinstance(value, Tensor):
         return value.to(device)
     if isinstance(value, tuple):
@@ -65,58 +73,79 @@ def to_device(value: Any, device: torch.device | str) -> Any:
 
 
 class HeldOutCamera:
-    """One camera of a rig left out, and the stream of what the others see; hulls are carved once a time."""
+    """A rig without one of its cameras; the hull of each frame is computed once."""
 
-    def __init__(
-        self, rig: LeaveOneOut, held: str, hull: HullConfig, dropped: Mapping[int, Collection[str]] | None = None
-    ) -> None:
-        """`dropped` are names of cameras without a frame at a time."""
+    def __init__(self, rig: LeaveOneOut, held: str, hull: HullConfig) -> None:
         self.rig = rig
         self.held = held
-        self.dropped = dropped or {}
         self.stream = Stream(Unfilled(), StreamConfig(hull=hull, memory_mb=None), rig.bounds)
 
-    def observation(self, time: int) -> Observation:
-        """What the others saw at a time, and the hull that they carve."""
-        return self.stream.push(self.rig.inputs(self.held, time, self.dropped.get(time, ())))
+    def frame(self, time: int) -> CachedFrame:
+        """The other cameras at a frame, with their hull."""
+        return self.stream.add_frame(self.rig.inputs(self.held, time))
 
     def sample(
         self,
         time: int,
-        times: Sequence[int],
+        context_times: Sequence[int],
         render: RenderConfig,
-        min_hole_px: int,
-        cameras: tuple[int, int] = (0, 0),
-        widened_px: int = 0,
+        sampling: SamplingConfig,
+        min_hole_px: int = 0,
     ) -> Sample | None:
-        """The pair at `time` with context from these `times`, its own first; None if fewer pixels are missing.
-
-        cameras: how many are context at least, and how many `ray_views`.
-        widened_px: by how much its holes are larger than what the source views do not see.
-        """
-        now = self.observation(time)
+        """The sample at frame `time` with context of these frames, its own first; None if its holes are too small."""
+        now = self.frame(time)
         target = self.rig.calibration(self.held, time).select([self.held])
-        view = self.stream.rendered_by(render).render(target, time)
+        view = self.stream.with_render_config(render).render(target, time)
         if float(view.error.sum()) < min_hole_px:
             return None
-        view = widened(view, widened_px)
-        wanted = view.closest_views(max(len(view.source_views), cameras[0]))
-        context = [self.observation(tau).context(wanted) for tau in times]
-        ray_views, truth = now.context(view.closest_views(cameras[1])), self.rig.truth(self.held, time)
-        assert truth.mask is not None, "what trains has masks"
+        names = view.closest_views(max(len(view.source_views), sampling.min_context_views))
+        context = [self.frame(past).context(names) for past in context_times]
+        ray_views = now.context(view.closest_views(sampling.num_ray_views))
+        truth = self.rig.truth(self.held, time)
+        assert truth.mask is not None, "scenes for training have masks"
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
-        seen = tuple(c for c in context if c is not None)
-        matches = None
-        if self.rig.correspondences is not None and times:
-            matches = self.rig.correspondences(self.held, times, wanted, view.error > 0)
-        return Sample(view, seen, ray_views, black.round().to(torch.uint8), alpha=truth.mask[0], matches=matches)
+        seen = tuple(views for views in context if views is not None)
+        return Sample(view, seen, ray_views, black.round().to(torch.uint8), alpha=truth.mask[0])
 
 
-def widened(view: IncompleteView, reach_px: int) -> IncompleteView:
-    """The view with everything on the subject missing that is at most so far, along rows and columns, from a hole."""
-    if not reach_px:
-        return view
-    near = F.max_pool2d((view.error[None, None] > 0).float(), 2 * reach_px + 1, 1, reach_px)[0, 0] > 0
-    missing = near & (view.mask > 0)
-    kept = ~missing
-    return replace(view, rgb=view.rgb * kept, error=view.error.masked_fill(missing, 1.0), weights=view.weights * kept)
+def rig_samples(
+    rig: LeaveOneOut, scenes: SceneConfig, sampling: SamplingConfig, random: Random, held_out: str | None = None
+) -> list[Sample]:
+    """Hold out some cameras of a rig in turn, each at some of its frames.
+
+    Args:
+        rig: the images of all cameras.
+        scenes: number of held-out cameras, and resolution of the hull.
+        sampling: number of frames and context of a sample.
+        random: draws cameras, frames and source views.
+        held_out: the only camera to hold out, if it is there; None for any.
+
+    Raises:
+        ValueError: the rig has too few frames.
+    """
+    times = sorted(rig.frames)
+    ends = [t for t in times if all(t - back in rig.frames for back in range(sampling.clip_length))]
+    ends = [t for t in ends if times.index(t) >= sampling.min_history]
+    if not ends:
+        raise ValueError(
+            f"expected clips of {sampling.clip_length} consecutive frames with {sampling.min_history} frames before, "
+            f"got the frames {times}; use captures of {max(sampling.frames) + 1} frames or more"
+        )
+    names = [n for n in rig.frames[times[-1]].cameras.names if held_out in (None, n)]
+    samples = []
+    for held in random.sample(names, min(scenes.num_holdout_views, len(names))):
+        others = HeldOutCamera(rig, held, HullConfig(resolution=scenes.hull_resolution))
+        for end in random.sample(ends, min(sampling.num_target_frames, len(ends))):
+            render, sample = RenderConfig(cameras=draw_source_views(sampling, random)), None
+            for time in range(end - sampling.clip_length + 1, end + 1):
+                context = tuple(t for t in reversed(times) if t <= time) if sampling.with_context else ()
+                new = others.sample(time, context, render, sampling, sampling.min_hole_px if time == end else 0)
+                sample = new and replace(new, previous=sample)
+            if sample is not None:
+                samples.append(sample)
+    return samples
+
+
+def draw_source_views(sampling: SamplingConfig, random: Random) -> int:
+    """The number of cameras that colour a view."""
+    return random.choices(sampling.num_source_views, weights=sampling.source_view_weights)[0]

@@ -1,98 +1,86 @@
-"""Scenes, each a list of samples that follows from the plan, the seed and the scene's number alone."""
+"""Scenes to train on: rigs of the synthetic studio, and captures; each follows from the config, seed and number."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from random import Random
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
-from jaxtyping import Bool
-from torch import Tensor
+from viewmend.data.holdout.capture_scenes import is_splits, training_captures
+from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS, LeaveOneOut, Split, recordings
+from viewmend.data.native_capture import NativeCapture
+from viewmend.data.prepare import PreparedCapture, open_masked, prepare
+from viewmend.data.resize import limit_size
+from viewmend.data.source import CaptureSource
+from viewmend.data.synthetic.imperfections import Imperfections
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.geometry.cameras import Cameras
+from viewmend.training.config import SamplingConfig, SceneConfig
+from viewmend.training.samples import Sample, rig_samples
+from viewmend.types import MultiViewFrame
 
-from viewmend.geometry.hull import HullConfig
-from viewmend.inpainting.correspondences import Correspondences
-from viewmend.leave_one_out.scenes import LeaveOneOut
-from viewmend.leave_one_out.splits import PROCEDURAL_SEEDS, Split, recordings
-from viewmend.leave_one_out.true_visibility import TrueSurface, true_correspondences
-from viewmend.rendering.view import RenderConfig
-from viewmend.studio.imperfections import Imperfections
-from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.training.plan import DataPlan
-from viewmend.training.samples import HeldOutCamera, Sample
-from viewmend.views import MultiViewFrame
+HARD_CALIBRATION, HARD_MASKS = 2.5, 2.0
+"""Largest factors of the calibration and silhouette errors of hard scenes."""
 
-ROUGHEST = 2.5
-"""Calibration of a rough stage is so many times as wrong at most."""
-WIDEST_PX = 10
-"""Holes are widened by at most so much."""
-FEWEST_CAMERAS = 5
-"""A rig of so many never misses one."""
 
-Item = TypeVar("Item", covariant=True)
+@dataclass(frozen=True)
+class Scene:
+    """Some frames of a rig whose cameras can be held out."""
+
+    rig: LeaveOneOut
+    random: Random
+    """Draws everything else about the scene."""
+    held_out: str | None = None
+    """The only camera that may be held out; None for any."""
 
 
 @runtime_checkable
-class SceneSource(Protocol[Item]):
-    """Endless numbered scenes; a number always gives the same samples."""
+class RigSource(Protocol):
+    """An endless sequence of numbered rigs; the same number always gives the same rig."""
 
-    def scene(self, number: int) -> Sequence[Item]:
-        """The samples of scene `number`, in the order in which they are used; there may be none."""
+    def rig(self, number: int) -> Scene:
+        """The rig of scene `number`."""
         ...
 
 
-class StudioScenes:
-    """Scenes of the studio, made on the fly."""
+class StudioRigs:
+    """Rigs of the synthetic studio, rendered on request."""
 
-    def __init__(self, plan: DataPlan, seed: str, split: Split = "training") -> None:
-        """`seed` is of everything that is random but the performers, whose seeds are the split's.
+    def __init__(self, config: SceneConfig, frames: Sequence[int], seed: str, split: Split = "training") -> None:
+        """`seed` determines everything random except the people, whose seeds belong to the split.
 
         Raises:
-            ValueError: the split, or the plan's people or motions, are kept for tests.
+            ValueError: the split, or the config's characters or motions, are reserved for tests.
         """
         if split == "test":
-            raise ValueError("expected scenes for training or validation, got those for tests; take procedural_set")
-        people = [place for place in (plan.performers, plan.motions) if place is not None]
-        self.plan = plan if recordings(split, people) else replace(plan, performers=None, motions=None)
+            raise ValueError("expected the split training or validation, got test; use procedural_set")
+        people = [place for place in (config.performers, config.motions) if place is not None]
+        self.config = config if recordings(split, people) else replace(config, performers=None, motions=None)
+        self.frames = frames
         self.seed = seed
         self.split: Split = split
 
-    def scene(self, number: int) -> list[Sample]:
-        """At each time some cameras of a random stage are left out in turn, and see the truth."""
-        rig, random = self.rig(number)
-        return rig_samples(rig, self.plan, random)
-
-    def rig(self, number: int) -> tuple[LeaveOneOut, Random]:
-        """What the stage of scene `number` saw, and what draws anything else about the scene."""
+    def rig(self, number: int) -> Scene:
+        """A random rig with random people."""
         random = Random(f"{self.seed}/{number}")
-        studio = Studio(random_stage(self.plan, random, self.split))
+        studio = Studio(random_studio(self.config, max(self.frames) + 1, random, self.split))
 
         def truth(held: str, time: int) -> MultiViewFrame:
             return studio.truth(studio.true_cameras.select([held]), time)
 
-        frames = {time: studio.read(time) for time in self.plan.times}
-        if not self.plan.matches:
-            return LeaveOneOut(frames, true_view=truth), random
-        meshes = {time: studio.scene(time).mesh for time in self.plan.times}
-
-        def correspondences(
-            held: str, times: Sequence[int], names: Sequence[str], missing: Bool[Tensor, "height width"]
-        ) -> Correspondences:
-            seen = {t: replace(frames[t], cameras=studio.true_cameras).select(names) for t in times}
-            surfaces = {t: TrueSurface.of(frame, meshes[t]) for t, frame in seen.items()}
-            return true_correspondences(surfaces, meshes[times[0]], studio.true_cameras.select([held]), missing)
-
-        return LeaveOneOut(frames, true_view=truth, correspondences=correspondences), random
+        return Scene(LeaveOneOut({time: studio.read(time) for time in self.frames}, true_view=truth), random)
 
 
-def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> StudioConfig:
-    """A stage as real ones differ: who performs, how many cameras in which rig, and what is wrong with them."""
-    flawed = random.random() < plan.imperfect_fraction
+def random_studio(config: SceneConfig, frames: int, random: Random, split: Split = "training") -> StudioConfig:
+    """A studio with random people, rig and imperfections, distributed as real studios differ."""
+    flawed = random.random() < config.imperfect_fraction
     strength = random.random() if flawed else 0.0
-    config = StudioConfig(
+    studio = StudioConfig(
         seed=random.choice(PROCEDURAL_SEEDS[split]),
-        cameras=random.randint(*plan.cameras),
+        cameras=random.randint(*config.cameras),
         rig=random.choice(("ring", "dome")),
-        frames=max(plan.times) + 1,
-        size_px=random.choice(plan.sizes_px),
+        frames=frames,
+        size_px=random.choice(config.sizes_px),
         background=random.choice(("black", "stage")) if flawed else "black",
         imperfections=Imperfections(
             exposure_stops=0.1 * strength,
@@ -108,78 +96,111 @@ def random_stage(plan: DataPlan, random: Random, split: Split = "training") -> S
             calibration_m=0.003 * strength * random.random(),
             jpeg_quality=random.randint(70, 95) if flawed and random.random() < 0.5 else None,
         ),
-        device=plan.data_device,
+        device=config.data_device,
     )
-    if plan.rough_fraction and random.random() < plan.rough_fraction:
-        config = replace(config, imperfections=_rougher(config.imperfections, random))
-    if plan.staged:
-        config = replace(config, background="stage")
-    if plan.performers is not None and plan.motions is not None and random.random() < plan.performers_fraction:
-        variety = random.uniform(*plan.cloth_variety)
-        config = replace(config, performers=plan.performers, motions=plan.motions, cloth_variety=variety)
-    return config
+    if config.hard_fraction and random.random() < config.hard_fraction:
+        it, factor = studio.imperfections, random.uniform(1, HARD_CALIBRATION)
+        it = replace(it, calibration_px=factor * it.calibration_px, calibration_m=factor * it.calibration_m)
+        it = replace(it, mask_edge_px=random.uniform(1, HARD_MASKS) * it.mask_edge_px)
+        studio = replace(studio, imperfections=it)
+    if config.with_backdrop:
+        studio = replace(studio, background="stage")
+    if config.performers is not None and config.motions is not None and random.random() < config.performers_fraction:
+        variety = random.uniform(0.0, 1.0)
+        studio = replace(studio, performers=config.performers, motions=config.motions, cloth_variety=variety)
+    return studio
 
 
-def _rougher(it: Imperfections, random: Random) -> Imperfections:
-    """Calibration up to `ROUGHEST` times as wrong, outlines up to twice."""
-    worse = random.uniform(1, ROUGHEST)
-    return replace(
-        it,
-        calibration_px=worse * it.calibration_px,
-        calibration_m=worse * it.calibration_m,
-        mask_edge_px=random.uniform(1, 2) * it.mask_edge_px,
-    )
+@dataclass(frozen=True)
+class CaptureRigs:
+    """Frames of captures, resized to the config's sizes and aligned on the cameras that are not held out."""
+
+    captures: Sequence[tuple[CaptureSource, str | None]]
+    """Each with the one camera that is held out, or None for all in turn."""
+    config: SceneConfig
+    frames: Sequence[int]
+    seed: str
+    _prepared: dict[tuple[int, str], PreparedCapture] = field(default_factory=dict)
+
+    def rig(self, number: int) -> Scene:
+        """Some frames of a random capture."""
+        random = Random(f"{self.seed}/{number}")
+        which = random.randrange(len(self.captures))
+        capture, held_out = self.captures[which]
+        last = len(capture.frame_ids) - 1
+        first = random.randint(0, max(0, last - max(self.frames)))
+        size_px, device = random.choice(self.config.sizes_px), self.config.data_device
+        times = sorted({min(first + offset, last) for offset in self.frames})
+        frames = {time: limit_size(capture.read(time), size_px).to(device) for time in times}
+        # A camera without an image at some of these frames cannot be held out there.
+        complete = [n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())]
+        frames = {time: frame.select(complete) for time, frame in frames.items()}
+
+        def cameras(held: str) -> Cameras:
+            if (which, held) not in self._prepared:  # aligned when this camera is first held out
+                others = [n for n in capture.cameras.names if n != held]
+                self._prepared[which, held] = prepare(capture, others, match_colours=False)
+            return replace(self._prepared[which, held], longest_px=size_px).cameras.to(device)
+
+        return Scene(LeaveOneOut(frames, capture.bounds, cameras), random, held_out)
 
 
-def rig_samples(rig: LeaveOneOut, plan: DataPlan, random: Random, left_out: str | None = None) -> list[Sample]:
-    """Some cameras of a rig are left out in turn, each at some of the times.
+@dataclass(frozen=True)
+class MixedRigs:
+    """Two sources; a fixed fraction of the rigs comes from the first."""
 
-    Args:
-        rig: what it saw.
-        plan: how many cameras and times, and how views are rendered.
-        random: which.
-        left_out: the only camera that is left out, where it is there; None for any.
+    first: RigSource
+    second: RigSource
+    fraction: float
+    seed: str
+
+    def rig(self, number: int) -> Scene:
+        """A rig of either source."""
+        use_first = Random(f"{self.seed}/which/{number}").random() < self.fraction
+        return (self.first if use_first else self.second).rig(number)
+
+
+def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Split = "training") -> RigSource:
+    """Captures and studio in the proportions of the config; for validation, the studio's procedural people alone.
+
+    Raises:
+        CaptureError: a capture cannot be used.
+        ValueError: data reserved for tests is requested.
     """
-    dropped = _dropouts(rig.frames, plan.dropped_fraction, random)
-    times = sorted(rig.frames)
-    ends = [t for t in times if all(t - back in rig.frames for back in range(plan.clip_length))]
-    ends = [t for t in ends if times.index(t) >= plan.least_past]
-    if not ends and plan.least_past:
-        raise ValueError(
-            f"expected more than {plan.least_past} times for a past of as many, got {times}; lower --least-past, or "
-            f"use captures of {max(plan.times) + 1} frames or more"
-        )
-    if not ends:
-        raise ValueError(
-            f"expected {plan.clip_length} consecutive times for clips, got {times}; leave --clip-length away, give so "
-            f"many consecutive --times, or use captures of {max(plan.times) + 1} frames or more"
-        )
-    names = [n for n in rig.frames[times[-1]].cameras.names if n not in dropped.get(times[-1], ())]
-    names = names if left_out is None else [name for name in names if name == left_out]
-    samples = []
-    for held in random.sample(names, min(plan.held_cameras, len(names))):
-        others = HeldOutCamera(rig, held, HullConfig(resolution=plan.hull_resolution), dropped)
-        for end in random.sample(ends, min(plan.targets_per_camera, len(ends))):
-            reach = random.choice(plan.past)
-            render = RenderConfig(cameras=random.choices(plan.context_cameras, weights=plan.context_weights)[0])
-            sample, cameras = None, (plan.least_context, plan.ray_views)
-            wider_px = random.randint(1, WIDEST_PX) if random.random() < plan.widened_fraction else 0
-            for time in range(end - plan.clip_length + 1, end + 1):
-                past = [t for t in reversed(times) if t < time][:reach]
-                context = (time, *past) if plan.context else ()
-                least_px = plan.min_hole_px if time == end else 0
-                new = others.sample(time, context, render, least_px, cameras, wider_px)
-                sample = new and replace(new, previous=sample)
-            if sample is not None:
-                samples.append(sample)
-    return samples
+    studio = StudioRigs(config, frames, seed, split)
+    if not (folders := recordings(split, config.captures)):
+        return studio
+    opened = [own for folder in folders for own in _open_captures(folder)]
+    # Only for its checks: each held-out camera has its own alignment.
+    captures = [(prepare(capture, align=False, match_colours=False), held) for capture, held in opened]
+    return MixedRigs(CaptureRigs(captures, config, frames, seed), studio, config.captures_fraction, seed)
 
 
-def _dropouts(frames: Mapping[int, MultiViewFrame], fraction: float, random: Random) -> dict[int, list[str]]:
-    """One or two cameras that have no frame, at a fraction of the times."""
-    dropped = {}
-    for time, frame in frames.items() if fraction else ():
-        names = frame.cameras.names
-        count = min(random.randint(1, 2), len(names) - FEWEST_CAMERAS) if random.random() < fraction else 0
-        dropped[time] = random.sample(names, count) if count > 0 else []
-    return dropped
+def _open_captures(place: Path) -> Sequence[tuple[NativeCapture, str | None]]:
+    """A capture; or the training captures of a splits file, each with the camera that it holds out."""
+    return training_captures(place) if is_splits(place) else [(open_masked(place, held=1), None)]
+
+
+@dataclass(frozen=True)
+class SampleScenes:
+    """The samples of rigs."""
+
+    rigs: RigSource
+    config: SceneConfig
+    sampling: SamplingConfig
+
+    def scene(self, number: int) -> list[Sample]:
+        """The samples of rig `number`, for some held-out cameras at some frames."""
+        scene = self.rigs.rig(number)
+        return rig_samples(scene.rig, self.config, self.sampling, scene.random, scene.held_out)
+
+
+def sample_scenes(config: SceneConfig, sampling: SamplingConfig, seed: str) -> SampleScenes:
+    """The training samples of `rig_source`; raises as it does."""
+    return SampleScenes(rig_source(config, sampling.frames, seed), config, sampling)
+
+
+def validation_scenes(config: SceneConfig, sampling: SamplingConfig) -> SampleScenes:
+    """The samples of procedural people reserved for validation, one held-out view per scene."""
+    config = replace(config, num_holdout_views=1, performers=None, motions=None, data_device="cpu")
+    return SampleScenes(StudioRigs(config, sampling.frames, "validation", "validation"), config, sampling)

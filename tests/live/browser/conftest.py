@@ -20,7 +20,7 @@ def find_chromium() -> str | None:
 
 @pytest.fixture(scope="session")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra: pip install 'viewmend[browser]'")
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra: pip install 'viewmend[dev]'")
     executable = find_chromium()
     if executable is None:
         pytest.skip("no Chromium: install the system's package, or name one in VIEWMEND_CHROMIUM")

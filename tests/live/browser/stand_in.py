@@ -20,7 +20,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from viewmend.live.page_files import HEADERS, page_files
+from viewmend.live.responses import HEADERS, page_files
 
 MODES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"]
 LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
@@ -151,7 +151,7 @@ class StandIn:
             self.hellos.append(message)
             codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
             about = {"version": 1, "viewer": 1, "server": "stand-in", "model": "none", "modes": MODES, "codecs": codecs}
-            about |= {"error_rules": ["unseen", "all", "yours"], "error_rule": "all", "background": self.ground}
+            about |= {"error_rules": ["holes", "all", "yours"], "error_rule": "all", "background": self.ground}
             more = {"export": True, "budget_ms": None, "limits": LIMITS, "token_needed": False}
             await viewer.socket.send_json({"type": "welcome", **about, **more})
             await viewer.socket.send_json(scene.rig())

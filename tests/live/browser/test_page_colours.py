@@ -5,7 +5,7 @@ import base64
 import numpy as np
 import pytest
 
-from viewmend.capture.video_writer import write_mp4, write_webm
+from viewmend.data.videos import write_mp4, write_webm
 from viewmend.live.video import ENCODERS, STRINGS, VideoStream, video_codecs
 
 pytest.importorskip("av")

@@ -21,17 +21,17 @@ def choose(view, name: str) -> None:
 
 def test_modes_show_their_pictures(view):
     seen = {}
-    for name in ("Mended", "Rendered", "Holes", "Depth", "Coverage"):
+    for name in ("Output", "Rendered", "Holes", "Depth", "Source cameras"):
         choose(view, name)
         assert view.server.looks[-1]["modes"] == [name.lower()]
         seen[name] = view.picture()
-    assert share(seen["Holes"], scene.PINK) > 0.004 > share(seen["Mended"], scene.PINK)
+    assert share(seen["Holes"], scene.PINK) > 0.004 > share(seen["Output"], scene.PINK)
     black = {name: (pixels.max(-1) < 20).mean() for name, pixels in seen.items()}
-    assert black["Rendered"] > black["Mended"] + 0.004
+    assert black["Rendered"] > black["Output"] + 0.004
     depth = seen["Depth"][seen["Depth"].max(-1) > 60]
     assert np.abs(depth[:, 0] - depth[:, 2]).max() < 30
     for colour in scene.COLOURS:
-        assert share(seen["Coverage"], tuple(colour)) > 0.01
+        assert share(seen["Source cameras"], tuple(colour)) > 0.01
 
 
 DIGITS = ["rendered", "holes", "mended", None, "depth", "coverage", "confidence", "hull", "points"]
@@ -77,10 +77,10 @@ def test_the_error_rule_is_one_of_the_servers(view):
     assert view.server.looks[-1]["error_rule"] == "all", "the one that the server was started with"
     view.tab("quality")
     rules = view.page.locator("#error-rule")
-    assert rules.locator("option").all_inner_texts() == ["holes alone", "the whole subject", "yours"]
-    rules.select_option("unseen")
+    assert rules.locator("option").all_inner_texts() == ["only holes", "the whole subject", "yours"]
+    rules.select_option("holes")
     view.settle()
-    assert view.server.looks[-1]["error_rule"] == "unseen"
+    assert view.server.looks[-1]["error_rule"] == "holes"
 
 
 def test_a_model_that_tells_no_confidence_is_named(desktop):
@@ -209,7 +209,7 @@ def test_the_rig_is_drawn_and_the_cameras_in_use_stand_out(view):
     view.tab("cameras")
     used = view.page.locator("#cameras button[data-used]").all_inner_texts()
     assert used == scene.SOURCES
-    assert view.page.locator("#camera-count").inner_text() == "2 of 4 in use"
+    assert view.page.locator("#camera-count").inner_text() == "2 of 4 used for this view"
     view.page.locator("#rig").set_checked(False)
     view.settle()
     assert view.page.locator("#labels").is_hidden()
@@ -260,7 +260,7 @@ def test_help_opens_and_closes(view):
     view.page.get_by_role("button", name="Help").click()
     help_ = view.page.get_by_role("dialog")
     assert help_.is_visible()
-    assert "turn around the subject" in help_.inner_text()
+    assert "orbit around the subject" in help_.inner_text()
     view.page.get_by_role("button", name="Close the help").click()
     assert help_.is_hidden()
     view.page.locator("#picture").focus()

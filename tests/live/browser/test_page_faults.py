@@ -41,7 +41,7 @@ def test_who_comes_back_while_a_try_is_due_has_one_connection(desktop):
     look_away += "document.dispatchEvent(new Event('visibilitychange'))"
     desktop.server.refuse = 4503
     desktop.server.drop()
-    desktop.until(lambda: "Trying again in 4" in cover(desktop), 20)
+    desktop.until(lambda: "Retrying in 4" in cover(desktop), 20)
     desktop.server.refuse = None
     count = len(desktop.server.hellos)
     for hidden in ("true", "false"):
@@ -54,8 +54,8 @@ def test_who_comes_back_while_a_try_is_due_has_one_connection(desktop):
 def test_while_it_is_lost_there_is_a_button(desktop):
     desktop.server.refuse = 4503
     desktop.server.drop()
-    desktop.until(lambda: "All places are taken" in cover(desktop))
-    assert "Trying again in" in cover(desktop)
+    desktop.until(lambda: "The maximum number of viewers is reached" in cover(desktop))
+    assert "Retrying in" in cover(desktop)
     desktop.server.refuse = None
     desktop.until(lambda: not cover(desktop) or (desktop.page.locator("#cover-retry").click() or False), 20)
 
@@ -84,10 +84,10 @@ def test_the_token_of_the_address_is_passed_on(browser, server):
 def test_a_failing_source_and_model_are_said_beside_the_picture(desktop):
     pill = desktop.page.locator("#pill")
     desktop.server.source, desktop.server.error = "failing", "camera cam01 is gone"
-    desktop.until(lambda: pill.is_visible() and "The source fails" in pill.inner_text())
+    desktop.until(lambda: pill.is_visible() and "Source error" in pill.inner_text())
     assert pill.get_attribute("title") == "camera cam01 is gone"
     desktop.server.source, desktop.server.model_error = "ready", "out of memory"
-    desktop.until(lambda: "Shown without mending" in pill.inner_text())
+    desktop.until(lambda: "Model failed; showing the rendered view" in pill.inner_text())
     desktop.server.model_error = None
     desktop.until(pill.is_hidden)
 
@@ -104,7 +104,7 @@ def test_a_stall_is_said(desktop):
 def test_broken_pictures_do_not_stop_the_page(desktop):
     desktop.server.broken = True
     desktop.drag(60, 0)
-    desktop.until(lambda: "A picture is broken" in desktop.page.locator("#toasts").inner_text())
+    desktop.until(lambda: "An image could not be decoded" in desktop.page.locator("#toasts").inner_text())
     desktop.server.broken = False
     desktop.drag(60, 0)
     desktop.settle()

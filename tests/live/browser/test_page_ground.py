@@ -72,7 +72,7 @@ def test_the_cameras_own_image_is_beside_ours_until_the_view_moves(view):
     view.settle()
     view.until(card.is_visible)
     assert view.server.originals[-1] == {"name": "cam02", "time": "0"}
-    assert view.page.locator("#original-name").inner_text() == "cam02, as it was taken"
+    assert view.page.locator("#original-name").inner_text() == "cam02, original"
     box = view.page.locator("#original-image").bounding_box()
     x, y, w, h = (int(box[side]) for side in ("x", "y", "width", "height"))
     green = np.abs(view.pixels()[y : y + h, x : x + w] - (20, 160, 60)).max(-1) < 30

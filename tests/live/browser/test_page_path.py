@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from live.browser import scene
 
-from viewmend.capture.camera_path import read_path
-from viewmend.studio.rigs import orbit
+from viewmend.data.camera_path import read_camera_path
+from viewmend.data.synthetic.rigs import orbit
 
 pytestmark = pytest.mark.slow
 
@@ -125,7 +125,7 @@ def test_a_film_says_how_far_it_is_and_is_called_off(desktop):
     assert 0.4 < page.evaluate("document.querySelector('#path-progress').value") < 0.6
     assert (server.paths[-1]["width"], server.paths[-1]["height"]) == (1920, 1080)
     page.get_by_role("button", name="Cancel").click()
-    desktop.until(lambda: "called off" in page.locator("#toasts").inner_text())
+    desktop.until(lambda: "Export cancelled" in page.locator("#toasts").inner_text())
     desktop.until(lambda: server.film == (None, None))  # the server has noticed
     assert page.locator("#path-film").is_hidden()
     assert page.get_by_role("button", name="Export MP4").is_enabled()
@@ -138,7 +138,7 @@ def test_a_path_goes_out_as_json_for_mend_and_comes_back(desktop, tmp_path):
         page.get_by_role("button", name="Save JSON").click()
     path = tmp_path / waiting.value.suggested_filename
     waiting.value.save_as(path)
-    cameras = read_path(path, orbit([0.0], (32, 32)))
+    cameras = read_camera_path(path, orbit([0.0], (32, 32)))
     assert len(cameras) == 61
     start = eye(desktop.server.looks[0]["camera"])
     np.testing.assert_allclose(cameras.centers[0].numpy(), start, atol=1e-4)

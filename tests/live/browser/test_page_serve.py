@@ -74,12 +74,12 @@ def test_pictures_answer_to_pose_mode_and_time(view):
     turned = view.picture()
     assert np.abs(first - turned).mean() > 0.3
     shown = {}
-    for name in ("Rendered", "Holes", "Depth", "Coverage", "Mended"):
+    for name in ("Rendered", "Holes", "Depth", "Source cameras", "Output"):
         view.page.locator("#modes").get_by_role("radio", name=name).click()
         rest(view)
         shown[name] = view.picture()
-    np.testing.assert_allclose(np.abs(shown["Mended"] - turned).mean(), 0, atol=0.1)
-    for name in ("Rendered", "Holes", "Depth", "Coverage"):
+    np.testing.assert_allclose(np.abs(shown["Output"] - turned).mean(), 0, atol=0.1)
+    for name in ("Rendered", "Holes", "Depth", "Source cameras"):
         assert np.abs(shown[name] - turned).mean() > 0.005, name
     now = int(view.data("time"))
     view.page.locator("#seek").fill(str((now + 2) % 5))

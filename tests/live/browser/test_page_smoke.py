@@ -100,7 +100,7 @@ def test_a_track_passes_its_views_and_takes_the_short_way_round(page):
     poses = [pose, pose | {"azimuth": 10, "distance": 2}, pose | {"azimuth": 40}]
     body = """const t = new m.Track(); for (const p of x) t.add(p, 7);
               return [t.at(0), t.at(2), t.at(4), t.at(1), t.moments.length, t.timeAt(3, 10, {first: 0, end: 20})]"""
-    start, middle, end, between, count, time = call(page, "view/track.js", body, poses)
+    start, middle, end, between, count, time = call(page, "view/camera_path.js", body, poses)
     assert [start["azimuth"] % 360, middle["azimuth"] % 360, end["azimuth"] % 360] == pytest.approx([350, 10, 40])
     assert middle["distance"] == pytest.approx(2)
     assert -10 < (between["azimuth"] + 180) % 360 - 180 < 10
@@ -112,7 +112,7 @@ def test_a_track_through_high_views_does_not_tip_over(page):
     pose = {"target": [0, 1, 0], "azimuth": 0, "elevation": 0, "roll": 0, "distance": 3, "fov": 45}
     poses = [pose, pose | {"elevation": 89}, pose | {"elevation": 89, "azimuth": 40}]
     body = "const t = new m.Track(); for (const p of x) t.add(p, 7); return t.moments.map((s) => t.at(s).elevation)"
-    assert max(call(page, "view/track.js", body, poses)) <= 89
+    assert max(call(page, "view/camera_path.js", body, poses)) <= 89
 
 
 def test_a_surface_is_cut_at_jumps_in_depth_and_whole_elsewhere(page):

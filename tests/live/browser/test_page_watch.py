@@ -4,15 +4,12 @@ import cv2
 import numpy as np
 import pytest
 from live.browser.conftest import View
-from live_servers import running
+from live.live_servers import running
 
 from viewmend.live.client import Client
 from viewmend.live.video import video_codecs
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif("h264" not in video_codecs(), reason="PyAV has no x264 here"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif("h264" not in video_codecs(), reason="PyAV has no x264 here")]
 SIZE = (160, 120)
 NO_SEGMENTS = "delete window.MediaSource"
 MOVES = "document.querySelector('#film').currentTime > {}"

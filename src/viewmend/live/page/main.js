@@ -24,7 +24,7 @@ import { Keys } from "./view/keys.js";
 import { contained, lensOf, resize, sharpSide, sizeFor } from "./view/lens.js";
 import { degrees } from "./view/matrix.js";
 import { Motion } from "./view/motion.js";
-import { Place, poseOf, poseText, timeOf } from "./view/place.js";
+import { Place, poseOf, poseText, timeOf } from "./view/url_state.js";
 import { extrinsicsOf } from "./view/pose.js";
 import { Pace, Resolution } from "./draw/resolution.js";
 
@@ -151,10 +151,10 @@ class Page {
   /** A picture that cannot be decoded: video falls back to JPEG. @param {string} text */
   trouble(text) {
     if (this.settings.get("codec") === "jpeg") {
-      this.notices.toast(`A picture is broken: ${text}`, "error");
+      this.notices.toast(`An image could not be decoded: ${text}`, "error");
       return;
     }
-    this.notices.toast("This browser cannot decode the video; JPEG it is.", "error");
+    this.notices.toast("This browser cannot decode the video; using JPEG.", "error");
     this.settings.set("codec", "jpeg", false);
     byId("codec").value = "jpeg";
   }
@@ -229,7 +229,7 @@ class Page {
   tell() {
     const { motion, settings, transport } = this;
     const split = settings.get("mode") === "split";
-    this.place.tell({
+    this.place.update({
       pose: motion.atHome || !motion.goal ? null : poseText(motion.goal),
       time: transport.still < 0 ? null : String(transport.still),
       mode: settings.get("mode") === "mended" ? null : settings.get("mode"),
@@ -306,6 +306,6 @@ try {
   void new Page().start();
 } catch (error) {
   byId("cover").dataset.kind = "error";
-  byId("cover-title").textContent = "This does not work here";
+  byId("cover-title").textContent = "This browser is not supported";
   byId("cover-text").textContent = /** @type {Error} */ (error).message;
 }

@@ -1,4 +1,4 @@
-// What the person has chosen. Whoever wants to know of a change listens for "change".
+// User settings; dispatches "change".
 
 /**
  * @typedef {object} Choices
@@ -14,10 +14,10 @@
  * @property {boolean} sharp whether a view at rest has as many pixels as the canvas
  * @property {boolean} adaptive whether a moving view may cost resolution
  * @property {boolean} reproject
- * @property {boolean} originals whether what a camera took is shown beside the view from its place
+ * @property {boolean} originals whether the original image is shown next to a view at a camera
  * @property {"dark" | "light"} theme
- * @property {string} background of the pictures, hexadecimal RGB; "" for the theme's, or what the model paints upon
- * @property {string} modelGround what the model paints upon, hexadecimal RGB; not kept
+ * @property {string} background of the images, hexadecimal RGB; "" for the theme's or the model's
+ * @property {string} modelGround background colour of the model, hexadecimal RGB; not stored
  * @property {boolean} rig
  * @property {boolean} panel
  */
@@ -55,7 +55,7 @@ const SENSIBLE = {
   size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
 };
 
-/** The name under which a browser keeps choices; those that the address tells are not among them. */
+/** Storage key of the settings; those in the URL are not stored. */
 const KEPT = "viewmend.settings";
 const IN_ADDRESS = ["mode", "left", "right", "size"];
 
@@ -107,7 +107,7 @@ export class Settings extends EventTarget {
     }
   }
 
-  /** What the pictures lie upon. @returns {string} hexadecimal RGB */
+  /** Background of the images. @returns {string} hexadecimal RGB */
   get ground() {
     const { background, modelGround, theme } = this.values;
     if (background) return background;

@@ -6,12 +6,12 @@ import { SegmentPlayer } from "./link/segments.js";
 import { byId } from "./ui/dom.js";
 
 const HLS = "application/vnd.apple.mpegurl";
-/** A film that stands still for so long is begun anew. */
+/** Restart playback after it has stalled for this long. */
 const STALLED_MS = 8000;
 const AGAIN_MS = 2000;
 const REASONS = {
-  401: "This server asks for a token: open the address that you were given.",
-  404: "Nothing is broadcast here: the server was started without --broadcast.",
+  401: "This server needs a token: open the full address that you received.",
+  404: "No broadcast: the server was started without --broadcast.",
 };
 
 const token = new URLSearchParams(location.search).get("token");
@@ -37,18 +37,18 @@ async function begin() {
   const final = /** @type {any} */ (REASONS)[answer?.status ?? 0];
   if (final) return say(final);
   if (!answer?.ok) {
-    say("The film has not begun, or the server is not there. Trying again.");
+    say("The broadcast has not started, or the server is unreachable. Retrying.");
     setTimeout(() => void begin(), AGAIN_MS);
     return;
   }
   if ("MediaSource" in window) player = new SegmentPlayer(film, playlist);
   else if (film.canPlayType(HLS)) film.src = playlist;
-  else return say("This browser plays no HLS.");
+  else return say("This browser cannot play HLS.");
   [playing, movedAt] = [true, performance.now()];
   void film.play().catch(() => say("Press play."));
 }
 
-/** Begin anew where nothing moves, unless the person has paused. */
+/** Restart a stalled video unless it is paused. */
 function check() {
   if (film.currentTime !== shownAt || film.paused) [shownAt, movedAt] = [film.currentTime, performance.now()];
   else if (playing && performance.now() - movedAt > STALLED_MS) void begin();

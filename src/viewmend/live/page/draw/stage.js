@@ -46,7 +46,7 @@ void main() {
   float something = smoothstep(0.015, 0.055, max(off.r, max(off.g, off.b)));
   colour = vec4(mix(ground, seen * tone, something), 1.0);
 }`;
-/** What was hidden when the picture was taken shows the colours beside it, dimmed. */
+/** Brightness of disoccluded areas, which show the colours next to them. */
 const STRETCHED_TONE = 0.6;
 
 export class Stage {
@@ -94,7 +94,7 @@ export class Stage {
     this.header = shown.header;
   }
 
-  /** Empty the whole canvas. @param {string} ground what the pictures lie upon, hexadecimal RGB */
+  /** Empty the whole canvas. @param {string} ground background colour, hexadecimal RGB */
   clear(ground) {
     const { gl } = this;
     this.ground = [0, 2, 4].map((place) => parseInt(ground.slice(place, place + 2), 16) / 255);

@@ -4,10 +4,10 @@ const VERSION = 1;
 const LONGEST_WAIT_MS = 15000;
 /** Close codes after which another try is pointless. */
 const FINAL = {
-  4401: "This server asks for a token. Open the address that it printed when it started.",
-  4426: "This page and the server are of different versions. Reload the page.",
+  4401: "This server needs a token. Open the address that it printed at start.",
+  4426: "The page and the server have different versions. Reload the page.",
 };
-const REASONS = { 4429: "Too many messages.", 4503: "All places are taken.", 1012: "The server has stopped." };
+const REASONS = { 4429: "Too many messages.", 4503: "The maximum number of viewers is reached.", 1012: "The server has stopped." };
 
 /** @param {string} path @param {string | null} token */
 export function address(path, token) {
@@ -59,7 +59,7 @@ export class Connection extends EventTarget {
     this.worker.postMessage(order);
   }
 
-  /** @param {any} news what the worker tells */
+  /** @param {any} news message of the worker */
   #hear(news) {
     if ("picture" in news) this.dispatchEvent(new CustomEvent("picture", { detail: news.picture }));
     else if ("text" in news) this.#receive(JSON.parse(news.text));
@@ -98,7 +98,7 @@ export class Connection extends EventTarget {
     }
     this.failures += 1;
     const wait = Math.min(LONGEST_WAIT_MS, 500 * 2 ** (this.failures - 1));
-    const why = /** @type {any} */ (REASONS)[code] ?? (reason || "The connection is lost.");
+    const why = /** @type {any} */ (REASONS)[code] ?? (reason || "Connection lost.");
     this.#status("lost", why, wait / 1000);
     if (!document.hidden) this.timer = setTimeout(() => this.open(), wait);
   }

@@ -62,7 +62,7 @@ export class SegmentPlayer {
   /** @param {Uint8Array} init */
   async #begin(init) {
     this.buffer = this.source.addSourceBuffer(`video/mp4; codecs="${codecOf(init)}"`);
-    this.buffer.mode = "sequence"; // a film that began anew is appended to the former
+    this.buffer.mode = "sequence"; // a restarted broadcast is appended to the previous one
     await this.#append(init);
   }
 

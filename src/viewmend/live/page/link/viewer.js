@@ -1,4 +1,4 @@
-// What this page tells the server about its view, and what it hears: the protocol, without pixels on a screen.
+// The protocol between page and server, without display.
 
 /**
  * Events, with the message as detail: "welcome", "rig", "state", "stats", "error"; "picture" (detail: worker.js's Picture) in

@@ -41,7 +41,7 @@ function open(url) {
   };
 }
 
-/** Pictures are decoded side by side and told in order. @param {WebSocket} from @param {ArrayBuffer} message */
+/** Images are decoded in parallel and delivered in order. @param {WebSocket} from @param {ArrayBuffer} message */
 function take(from, message) {
   const frame = parseFrame(message);
   if (from.readyState === WebSocket.OPEN) from.send(JSON.stringify({ type: "ack", frame: frame.header.frame }));

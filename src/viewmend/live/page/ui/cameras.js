@@ -21,7 +21,7 @@ export class CameraList {
     this.cameras = rig.cameras;
     this.used = "";
     const make = (/** @type {any} */ camera, /** @type {number} */ index) => {
-      const button = element("button", { type: "button", textContent: camera.name, title: `To ${camera.name}'s place` });
+      const button = element("button", { type: "button", textContent: camera.name, title: `Go to ${camera.name}` });
       button.addEventListener("click", () => this.to(index));
       return button;
     };
@@ -57,7 +57,7 @@ export class CameraList {
         else button.style.removeProperty("--colour");
       }
     });
-    byId("camera-count").textContent = `${sources.length} of ${this.cameras.length} in use`;
+    byId("camera-count").textContent = `${sources.length} of ${this.cameras.length} used for this view`;
     return true;
   }
 

@@ -3,12 +3,12 @@
 import { byId, element, radioGroup, setSlider } from "./dom.js";
 
 const TOKENS = [64, 128, 256, 512, 1024, 2048, null];
-const RULES = { unseen: "holes alone", all: "the whole subject", wrong: "what seems wrong" };
+const RULES = { holes: "only holes", all: "the whole subject", predicted: "pixels predicted to be wrong" };
 const CODECS = { jpeg: "JPEG", vp9: "VP9 video", h264: "H.264 video" };
 
 /** @typedef {import("../settings.js").Settings} Settings */
 
-/** The page's theme, and what the pictures lie upon: the theme's own until somebody chooses. @param {Settings} settings */
+/** The page's theme and the background of images; the theme's own until one is chosen. @param {Settings} settings */
 function buildGround(settings) {
   byId("theme").addEventListener("change", () => {
     settings.set("background", "");

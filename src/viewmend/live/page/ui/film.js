@@ -5,10 +5,10 @@ import { address } from "../link/connection.js";
 const ASK_MS = 500;
 
 export class Film {
-  /** @param {string | null} token @param {(progress: {part: number, text: string}) => void} told while it is rendered */
-  constructor(token, told) {
+  /** @param {string | null} token @param {(progress: {part: number, text: string}) => void} onProgress called while it is rendered */
+  constructor(token, onProgress) {
     this.token = token;
-    this.told = told;
+    this.onProgress = onProgress;
     this.since = performance.now();
     this.stopped = new AbortController();
   }
@@ -44,6 +44,6 @@ export class Film {
     if (!of) return;
     const seconds = (performance.now() - this.since) / 1000;
     const left = done > 0 ? `, about ${Math.ceil((seconds / done) * (of - done))} s left` : "";
-    this.told({ part: done / of, text: `${done} of ${of} views${left}` });
+    this.onProgress({ part: done / of, text: `${done} of ${of} views${left}` });
   }
 }

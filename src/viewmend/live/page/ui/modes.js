@@ -8,10 +8,10 @@ import { byId, element, radioGroup } from "./dom.js";
 export const MODES = {
   rendered: "Rendered",
   holes: "Holes",
-  mended: "Mended",
+  mended: "Output",
   split: "Side by side",
   depth: "Depth",
-  coverage: "Coverage",
+  coverage: "Source cameras",
   confidence: "Confidence",
   hull: "Hull",
   points: "Points",

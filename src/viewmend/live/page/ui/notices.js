@@ -77,21 +77,21 @@ export class Notices {
   /** @returns {{kind: "fine" | "wait" | "warning" | "lost" | "error", title: string, text: string, retry?: boolean}} */
   #situation() {
     const { status, text, wait_s, since } = this.connection;
-    if (status === "refused") return { kind: "error", title: "No entry", text };
+    if (status === "refused") return { kind: "error", title: "Access denied", text };
     if (status === "lost") {
       const left = Math.max(0, Math.ceil(wait_s - (performance.now() - since) / 1000));
-      return { kind: "lost", title: text, text: `Trying again in ${left} s.`, retry: true };
+      return { kind: "lost", title: text, text: `Retrying in ${left} s.`, retry: true };
     }
     if (status === "connecting") return { kind: this.pictured ? "lost" : "wait", title: "Connecting", text: "" };
     if (!this.state || this.state.source === "loading") {
-      return { kind: "wait", title: "Loading", text: this.state?.error ?? "The first frame is on its way." };
+      return { kind: "wait", title: "Loading", text: this.state?.error ?? "Waiting for the first frame." };
     }
     if (this.state.source === "failing") {
-      const reason = this.state.error ?? "The source sends nothing.";
-      return { kind: this.pictured ? "warning" : "error", title: "The source fails", text: reason };
+      const reason = this.state.error ?? "No frames from the source.";
+      return { kind: this.pictured ? "warning" : "error", title: "Source error", text: reason };
     }
-    if (this.state.model_error) return { kind: "warning", title: "Shown without mending", text: this.state.model_error };
-    if (this.untold) return { kind: "warning", title: "No confidence", text: "This model does not tell how sure it is; --model views does." };
+    if (this.state.model_error) return { kind: "warning", title: "Model failed; showing the rendered view", text: this.state.model_error };
+    if (this.untold) return { kind: "warning", title: "No confidence", text: "This model predicts no confidence; --model views does." };
     if (!this.pictured) return { kind: "wait", title: "Rendering the first view", text: "This takes a moment." };
     const late = this.waitingSince && performance.now() - this.waitingSince > STALLED_MS;
     if (late || this.state.buffering) return { kind: "wait", title: "Waiting for the server", text: "" };

@@ -23,7 +23,7 @@ export class OnAir {
     this.wanted = on;
     this.link.onAir(on);
     const where = address("/watch", this.token).href;
-    this.notices.toast(on ? `What you see is on air: ${where}` : "You are off air; the last view stays.");
+    this.notices.toast(on ? `Broadcasting your view: ${where}` : "Broadcast stopped; spectators keep the last view.");
   }
 
   /** A server that was left may have forgotten it. @param {any} welcome */
@@ -37,7 +37,7 @@ export class OnAir {
   #state(state) {
     if (this.on && !state.on_air && this.wanted) {
       this.wanted = false;
-      this.notices.toast("Another viewer is on air now.");
+      this.notices.toast("Another viewer is broadcasting now.");
     }
     this.on = Boolean(state.on_air);
     this.button.setAttribute("aria-pressed", String(this.on));

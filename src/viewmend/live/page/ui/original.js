@@ -1,4 +1,4 @@
-// What a camera took itself, beside ours, while the view stands at its very place.
+// The original image of a camera, next to the view, while the view is at that camera.
 
 import { address } from "../link/connection.js";
 import { byId } from "./dom.js";
@@ -32,8 +32,8 @@ export class Original {
     if (url.href === this.asked || busy) return;
     this.asked = url.href;
     this.askedAt = performance.now();
-    image.alt = `What ${camera.name} took`;
-    byId("original-name").textContent = `${camera.name}, as it was taken`;
+    image.alt = `Image of ${camera.name}`;
+    byId("original-name").textContent = `${camera.name}, original`;
     image.src = url.href;
   }
 }

@@ -1,9 +1,9 @@
 // The section "Camera path": record, add views, play, and export as MP4 by the server.
 
 import { lensOf } from "../view/lens.js";
-import { FPS, Track } from "../view/track.js";
+import { FPS, Track } from "../view/camera_path.js";
 import { extrinsicsOf } from "../view/pose.js";
-import { pathFile, pointsOf } from "../view/track_file.js";
+import { pathFile, pointsOf } from "../view/camera_path_file.js";
 import { byId, download } from "./dom.js";
 import { Film } from "./film.js";
 
@@ -30,7 +30,7 @@ export class PathPanel {
     this.playing = null;
     /** The film that is being rendered. @type {Film | null} */
     this.film = null;
-    this.told = "";
+    this.progressText = "";
     this.canExport = true;
     byId("path-record").addEventListener("click", () => this.toggleRecording());
     byId("path-add").addEventListener("click", () => this.#add());
@@ -109,13 +109,13 @@ export class PathPanel {
     const button = byId("path-export");
     button.disabled = !ready || !this.canExport || this.film !== null;
     button.classList.toggle("busy", this.film !== null);
-    button.textContent = this.film ? "Rendering the film" : "Export MP4";
+    button.textContent = this.film ? "Rendering" : "Export MP4";
     byId("path-save").disabled = !ready;
     byId("path-film").hidden = this.film === null;
-    let text = "Record your own movement, or add views: the film goes through them.";
-    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s${room ? "" : ": as long as a film can be"}`;
-    if (!this.canExport) text = "The server cannot write MP4. There, install viewmend[video].";
-    if (this.film && this.told) text = this.told;
+    let text = "Record a movement, or add views to fly through.";
+    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s${room ? "" : ", the maximum length"}`;
+    if (!this.canExport) text = "The server cannot write MP4; install PyAV there: pip install av";
+    if (this.film && this.progressText) text = this.progressText;
     byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
   }
@@ -146,20 +146,20 @@ export class PathPanel {
     const { notices, token } = this.around;
     const film = new Film(token, ({ part, text }) => {
       byId("path-progress").value = part;
-      this.told = text;
+      this.progressText = text;
       this.#show();
     });
     const stereo = byId("path-stereo").checked;
     this.film = film;
-    this.told = "";
+    this.progressText = "";
     byId("path-progress").value = 0;
     this.#show();
     try {
       const made = await film.make(this.#request(stereo));
       if (made) download(made, stereo ? "viewmend-path_SBS.mp4" : "viewmend-path.mp4");
-      notices.toast(made ? `The film is ready (${((performance.now() - film.since) / 1000).toFixed(0)} s)` : "No film: it was called off");
+      notices.toast(made ? `Video exported (${((performance.now() - film.since) / 1000).toFixed(0)} s)` : "Export cancelled");
     } catch (error) {
-      notices.toast(`No film: ${/** @type {Error} */ (error).message}`, "error");
+      notices.toast(`Export failed: ${/** @type {Error} */ (error).message}`, "error");
     } finally {
       this.film = null;
       this.#show();
@@ -183,7 +183,7 @@ export class PathPanel {
       this.playing = null;
       this.#show();
     } catch (error) {
-      notices.toast(`${file.name} is no camera path: ${/** @type {Error} */ (error).message}`, "error");
+      notices.toast(`${file.name} is not a camera path: ${/** @type {Error} */ (error).message}`, "error");
     } finally {
       byId("path-file").value = "";
     }

@@ -61,8 +61,8 @@ export class Statistics {
 
   #build() {
     for (const [name, text] of [
-      ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "pose to pixel"],
-      ["holes", "holes"], ["size", "picture"], ["kb", "a frame"],
+      ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "latency"],
+      ["holes", "holes"], ["size", "picture"], ["kb", "per frame"],
       ["dropped", "dropped"], ["viewers", "viewers"], ["budget", "budget"],
     ]) {
       const value = element("dd", { id: `figure-${name}`, textContent: "–" });

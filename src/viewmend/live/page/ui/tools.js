@@ -19,7 +19,7 @@ export function buildTools({ settings, reset, shot, headset, notices }) {
   byId("tool-shot").addEventListener("click", shot);
   byId("tool-panel").addEventListener("click", () => settings.set("panel", !settings.get("panel")));
   byId("tool-headset").addEventListener("click", () => {
-    headset().catch((error) => notices.toast(`The headset does not answer: ${error.message}`, "error"));
+    headset().catch((error) => notices.toast(`Cannot start VR: ${error.message}`, "error"));
   });
   const full = byId("tool-full");
   full.hidden = !document.fullscreenEnabled;

@@ -1,9 +1,9 @@
-// Time: play and pause, seek, speed, and the way back to the live edge.
+// Playback: play and pause, seek, speed, and jump to live.
 
 import { byId, setIcon, setSlider } from "./dom.js";
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
-/** So long what was asked for counts, whatever the server said meanwhile: it may have spoken before it heard. */
+/** How long a request overrides states of the server, which may have been sent before the request arrived. */
 const HEARD_MS = 1000;
 
 export class Transport {
@@ -14,17 +14,17 @@ export class Transport {
     /** @type {any} */
     this.state = null;
     /** @type {Record<string, {value: any, at: number}>} */
-    this.told = {};
+    this.requested = {};
     this.seeking = false;
     this.shown = -1;
-    /** What was asked for last and is not yet shown; -1 when nothing is. */
+    /** The requested frame while it is not shown yet; -1 if none. */
     this.sought = -1;
     const seek = byId("seek");
     seek.addEventListener("input", () => {
       this.seeking = true;
       this.seek(Number(seek.value));
     });
-    // Not every browser says "change" of a slider that was drawn away and back.
+    // Not every browser fires "change" for a slider that is dragged away and back.
     for (const end of ["change", "pointerup"]) {
       seek.addEventListener(end, () => {
         this.seeking = false;
@@ -38,12 +38,12 @@ export class Transport {
     link.addEventListener("welcome", () => this.#again());
   }
 
-  /** Whether times follow each other by themselves. */
+  /** Whether playback is running. */
   get playing() {
     return !this.state || (this.state.playing && this.state.total !== 1);
   }
 
-  /** The frame that the page stands still at, or is to begin at; -1 while it plays. */
+  /** The paused or initial frame; -1 while playing. */
   get still() {
     return this.first >= 0 ? this.first : this.playing || this.state.total === 1 ? -1 : Math.max(this.sought, this.shown);
   }
@@ -86,10 +86,10 @@ export class Transport {
     this.speed(SPEEDS[Math.min(SPEEDS.length - 1, Math.max(0, place + steps))]);
   }
 
-  /** What was asked for last, or what the server says. @param {string} name @param {any} otherwise */
+  /** The last request, or the state of the server. @param {string} name @param {any} otherwise */
   #current(name, otherwise) {
-    const told = this.told[name];
-    return told && performance.now() - told.at < HEARD_MS ? told.value : (this.state?.[name] ?? otherwise);
+    const requested = this.requested[name];
+    return requested && performance.now() - requested.at < HEARD_MS ? requested.value : (this.state?.[name] ?? otherwise);
   }
 
   /** @param {any} clock */
@@ -97,11 +97,11 @@ export class Transport {
     this.link.clock(clock);
     const parted = clock.seek !== undefined || (clock.speed ?? 1) !== 1 || clock.playing === false;
     const meant = { ...clock, ...(clock.live ? { playing: true } : parted ? { live: false } : {}) };
-    for (const [name, value] of Object.entries(meant)) this.told[name] = { value, at: performance.now() };
+    for (const [name, value] of Object.entries(meant)) this.requested[name] = { value, at: performance.now() };
     if (this.state) this.#state({ ...this.state, ...meant });
   }
 
-  /** After a lost connection the clock is put back to where it was. */
+  /** Restore the clock after a lost connection. */
   #again() {
     const last = this.state;
     if (last && !last.live) this.link.clock({ playing: last.playing, speed: last.speed, seek: this.shown });
@@ -117,7 +117,7 @@ export class Transport {
       this.#tell({ playing: false, seek });
       return;
     }
-    byId("transport").hidden = recording && state.total === 1; // nothing moves
+    byId("transport").hidden = recording && state.total === 1; // a single frame
     const seek = byId("seek");
     seek.min = state.first;
     seek.max = Math.max(state.first, (state.total ?? state.end) - 1);
@@ -130,13 +130,13 @@ export class Transport {
     live.setAttribute("aria-pressed", String(state.live));
     const behind = !state.live && state.behind > 0 ? ` −${state.behind}` : "";
     live.lastElementChild.textContent = `Live${recording ? "" : behind}`;
-    live.title = recording ? "Return to where all viewers are (L)" : "Return to the live edge (L)";
+    live.title = recording ? "Rejoin the shared playback (L)" : "Jump to live (L)";
     byId("speed").disabled = !recording;
     byId("speed").value = String(state.speed);
     this.picture(this.shown);
   }
 
-  /** The time of the picture that is shown. @param {number} time */
+  /** Show the index of the displayed frame. @param {number} time */
   picture(time) {
     this.shown = time;
     if (time === this.sought && !this.seeking) this.sought = -1;

@@ -54,7 +54,7 @@ export function extrinsicsOf(basis, pose) {
 export const handedness = (basis) => Math.sign(dot(basis.side, cross(basis.up, basis.front))) || 1;
 
 /**
- * The pose of a camera: the same eye and axes, its target beside the subject's centre.
+ * The pose of a camera: the same eye and axes, its target next to the subject's centre.
  * @param {Basis} basis @param {Extrinsics} camera @param {number[]} center @param {number} fov
  * @returns {Pose}
  */
@@ -91,7 +91,7 @@ export function between(from, to, part) {
   };
 }
 
-/** Whether nobody would see the difference. @param {Pose} a @param {Pose} b */
+/** Whether the difference is invisible. @param {Pose} a @param {Pose} b */
 export function alike(a, b) {
   return (
     length(sub(a.target, b.target)) < 2e-4 * b.distance &&

@@ -1,1 +1,0 @@
-"""Where frames come from: plain capture folders and the software studio."""

@@ -1,1 +1,0 @@
-"""Cameras found: from a board that is moved about before them, and refined by silhouettes."""

@@ -1,1 +1,0 @@
-"""A live rig: cameras that this machine reads itself, by a `rig.toml`; their pictures masked, straightened, aligned."""

@@ -1,0 +1,220 @@
+"""`viewmend check`: checks and describes a capture or a model."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+if TYPE_CHECKING:
+    from viewmend.data.checks.calibration import CalibrationCheck
+    from viewmend.data.native_capture import NativeCapture
+
+MAX_CARD_BYTES = 100_000
+"""Bytes of a model card that are read."""
+TRIAL_PX = 64
+"""Width and height of the view that a model inpaints as a trial."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Check and describe a capture or a model.
+
+    For a capture: checks that all files exist, and that masks, calibration and images of one frame agree. For a model:
+    runs it once on a small view, and fails if the result is not finite.
+    """
+
+    target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|MODEL")]
+    """A capture of any supported format, or a model: a name or a folder with config.json and model.safetensors."""
+    format: str | None = None
+    """Format of the capture, see docs/formats.md; by default it is recognised."""
+    out: Path | None = None
+    """Write a picture of the calibration check to this file (.png or .jpg)."""
+    time: int = 0
+    """Index of the frame to check."""
+    json: bool = False
+    """Write one JSON object to standard output."""
+
+
+def run(options: Options) -> int:
+    """Run the command and return the exit code."""
+    from viewmend.cli.console import print_json, show
+
+    if _is_model(options.target):
+        if options.out is not None:
+            raise ValueError(f"expected --out with a capture, got the model {options.target}; remove --out")
+        description = _describe_model(options.target)
+        _try_model(options.target)
+        lines = _model_as_text(description)
+    else:
+        capture, check = _check_capture(options)
+        description = describe_capture(capture, check)
+        lines = _capture_as_text(description)
+    if options.json:
+        print_json(description)
+    else:
+        show(*lines)
+    return 0
+
+
+def _is_model(target: str) -> bool:
+    from viewmend.models.checkpoint import CONFIG, WEIGHTS, shipped_models
+
+    folder = Path(target)
+    if not folder.exists() and target not in shipped_models():
+        raise ValueError(
+            f"expected a capture folder (with cameras.json), a model folder or one of the models "
+            f"{list(shipped_models())}, got '{target}'; check the path"
+        )
+    if (folder / "cameras.json").exists():
+        return False
+    return not folder.exists() or any((folder / name).exists() for name in (CONFIG, WEIGHTS))
+
+
+def _describe_model(name_or_path: str) -> dict[str, Any]:
+    """Load a model and describe it; raises a ValueError if it is damaged."""
+    from viewmend.models.checkpoint import CARD, load_network, model_folder
+
+    network, folder = load_network(name_or_path), model_folder(name_or_path)
+    card = None
+    if (folder / CARD).is_file():
+        with (folder / CARD).open("rb") as file:
+            card = file.read(MAX_CARD_BYTES).decode(errors="replace")
+    parameters = sum(parameter.numel() for parameter in network.parameters())
+    config = network.config.to_dict()
+    return {"kind": "model", "path": str(folder), "parameters": parameters, "config": config, "card": card}
+
+
+def _try_model(model: str) -> None:
+    """Inpaint a small view; raises a ValueError if the result is not finite."""
+    from viewmend.cli.console import busy
+    from viewmend.data.synthetic.rigs import orbit
+    from viewmend.data.synthetic.stage import Studio, StudioConfig
+    from viewmend.models.checkpoint import load_inpainter
+    from viewmend.stream import Stream
+
+    with busy("running the model"):
+        stream = Stream(load_inpainter(model))
+        stream.add_frame(Studio(StudioConfig(cameras=4, frames=1, size_px=TRIAL_PX)).read(0))
+        stream.view(orbit([0.4], (TRIAL_PX, TRIAL_PX), elevation_rad=0.2))
+
+
+def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck]":
+    from viewmend.cli.console import busy, say
+    from viewmend.data.checks.calibration import check_calibration, draw_check
+    from viewmend.data.images import write_image
+    from viewmend.data.native_capture import open_capture
+    from viewmend.utils.atomic_writes import remove_partial_file
+
+    capture = open_capture(options.target, format=options.format)
+    if not 0 <= options.time < len(capture.frame_ids):
+        last = len(capture.frame_ids) - 1
+        raise ValueError(f"{options.target}: expected --time of 0 to {last}, got {options.time}; choose again")
+    with busy("computing the hull"):
+        check = check_calibration(capture.read(options.time), capture.bounds)
+    if options.out is not None:
+        remove_partial_file(options.out)
+        with busy("drawing the picture"):
+            write_image(options.out, draw_check(check, capture.up))
+        say(f"wrote {options.out}")
+    return capture, check
+
+
+def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dict[str, Any]:
+    """The `--json` output: properties of a capture and the results of the check. Lengths are in metres."""
+    cameras, bounds, iou = capture.cameras, capture.bounds, list(check.iou.values())
+    distance = (cameras.centers - check.bounds.center).norm(dim=-1)
+    hull = None if check.proxy is None or not len(check.proxy.mesh.vertices) else check.proxy.mesh.vertices
+    return {
+        "kind": "capture",
+        "name": capture.name,
+        "path": str(capture.folder),
+        "frames": len(capture.frame_ids),
+        "first_frame": capture.frame_ids[0],
+        "last_frame": capture.frame_ids[-1],
+        "fps": capture.fps,
+        "metres_per_unit": capture.metres_per_unit,
+        "up": None if capture.up is None else capture.up.tolist(),
+        "bounds_m": None if bounds is None else [bounds.low.tolist(), bounds.high.tolist()],
+        "rig_extent_m": (cameras.centers.amax(0) - cameras.centers.amin(0)).tolist(),
+        "camera_distance_m": [float(distance.min()), float(distance.max())],
+        "masks": capture.has_masks,
+        "depth": capture.has_depth,
+        "gaps": capture.gaps,
+        "checked_frame": capture.frame_ids[check.frame.time],
+        "subject_extent_m": None if hull is None else (hull.amax(0) - hull.amin(0)).tolist(),
+        "hull_iou_mean": sum(iou) / len(iou) if iou else None,
+        "hull_iou_min": min(iou, default=None),
+        "cameras": [_describe_camera(capture, check, view) for view in range(len(cameras))],
+        "findings": [issue.text for issue in check.issues],
+    }
+
+
+def _describe_camera(capture: "NativeCapture", check: "CalibrationCheck", view: int) -> dict[str, Any]:
+    """A camera after undistortion. Its hull IoU is None without masks, and if it is absent from the checked frame."""
+    camera = capture.cameras[view]
+    (name,), (width, height), K = camera.names, camera.max_size_px, camera.K[0]
+    return {
+        "name": name,
+        "width": width,
+        "height": height,
+        "focal_px": [float(K[0, 0]), float(K[1, 1])],
+        "fov_x_deg": math.degrees(2 * math.atan(width / (2 * float(K[0, 0])))),
+        "center_m": camera.centers[0].tolist(),
+        "hull_iou": check.iou.get(name),
+    }
+
+
+def _model_as_text(model: dict[str, Any]) -> list[str]:
+    width = max(len(key) for key in model["config"])
+    lines = [f"{model['path']}: an inpainting model of {model['parameters'] / 1e6:.2f} million parameters", ""]
+    lines += [f"  {key:<{width}}  {value}" for key, value in model["config"].items()]
+    card = model["card"].strip() if model["card"] else "It has no model card, so its training is not documented."
+    return [*lines, "", *card.split("\n")]
+
+
+def _capture_as_text(capture: dict[str, Any]) -> list[str]:
+    sizes = sorted({(camera["width"], camera["height"]) for camera in capture["cameras"]})
+    fps = "unknown fps" if capture["fps"] is None else f"{capture['fps']:g} fps"
+    bounds, iou, (near, far) = capture["bounds_m"], capture["hull_iou_mean"], capture["camera_distance_m"]
+    frames = f"{capture['frames']}, '{capture['first_frame']}' to '{capture['last_frame']}', {fps}"
+    if capture["frames"] == 1:
+        frames = f"1 ('{capture['first_frame']}'), static"
+    gaps = [f"{camera} at '{frame}'" for camera, frame in capture["gaps"]]
+    lines = [
+        f"{capture['name']}: a capture with {len(capture['cameras'])} cameras",
+        f"  images    {', '.join(f'{w} x {h}' for w, h in sizes)}",
+        f"  frames    {frames}",
+        f"  masks     {'yes' if capture['masks'] else 'none (viewmend masks makes them)'}",
+        f"  depth     {'yes' if capture['depth'] else 'none'}",
+        f"  gaps      {f'{len(gaps)}: ' if gaps else 'none'}{', '.join(gaps[:3])}{', ...' if len(gaps) > 3 else ''}",
+        f"  unit      {capture['metres_per_unit']:g} m; all lengths below are in metres",
+        f"  up        {'unknown' if capture['up'] is None else _vector(capture['up'], 3)}",
+        f"  bounds    {'none' if bounds is None else f'{_vector(bounds[0])} to {_vector(bounds[1])}'}",
+        f"  rig       {_extent(capture['rig_extent_m'])}; cameras {near:.3g} to {far:.3g} from the centre",
+    ]
+    if iou is not None:
+        subject = capture["subject_extent_m"]
+        extent = "none: the masks have no point in common" if subject is None else _extent(subject)
+        lines.append(f"  subject   {extent} (visual hull of frame '{capture['checked_frame']}')")
+        lines.append(f"  hull IoU  mean {iou:.3f}, lowest {capture['hull_iou_min']:.3f}")
+    lines.append("")
+    width = max(len(camera["name"]) for camera in capture["cameras"])
+    for camera in capture["cameras"]:
+        iou = "" if camera["hull_iou"] is None else f"  IoU {camera['hull_iou']:.3f}"
+        size = f"{camera['width']} x {camera['height']}"
+        lens = f"{size:<12} focal {camera['focal_px'][0]:7.1f} px  {camera['fov_x_deg']:5.1f} deg wide"
+        lines.append(f"  {camera['name']:<{width}}  {lens}{iou}")
+    if capture["findings"]:
+        lines += ["", "  issues:", *(f"  - {text}" for text in capture["findings"])]
+    return lines
+
+
+def _vector(values: Sequence[float], digits: int = 2) -> str:
+    return f"({', '.join(f'{value:.{digits}f}' for value in values)})"
+
+
+def _extent(values: Sequence[float]) -> str:
+    return " x ".join(f"{value:.3g}" for value in values)

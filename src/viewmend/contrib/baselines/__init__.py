@@ -1,0 +1,1 @@
+"""Published video inpainting networks, implemented from their papers; they load the authors' weights."""

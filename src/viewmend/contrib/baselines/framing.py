@@ -1,0 +1,113 @@
+"""How a view of any size meets a network of one size: resized whole, or cut into overlapping windows."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float, Shaped
+from torch import Tensor
+from torch.nn.functional import interpolate, max_pool2d, pad
+
+Image = Float[Tensor, "3 height width"]
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A view as a network is shown it: in [-1, 1], 0 in the holes, which are dilated."""
+
+    image: Image
+    holes: Bool[Tensor, "height width"]
+    """What must be filled, before dilation."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """Where on a canvas the network looks; its size is the network's."""
+
+    top: int
+    left: int
+
+    def of(self, picture: Shaped[Tensor, "*stack height width"], size: tuple[int, int]) -> Tensor:
+        """What the picture shows there."""
+        return picture[..., self.top : self.top + size[0], self.left : self.left + size[1]]
+
+
+def resized_canvas(
+    rgb: Image, missing: Bool[Tensor, "height width"], size: tuple[int, int], dilation_px: int
+) -> Canvas:
+    """The whole view at this (height, width): colours bicubic, holes by the nearest pixel, as the authors do."""
+    small = interpolate(missing[None, None].float(), size=size, mode="nearest-exact")[0, 0] > 0
+    return _canvas(resized(rgb, size), small, dilation_px)
+
+
+def window_canvas(rgb: Image, missing: Bool[Tensor, "height width"], size: tuple[int, int], dilation_px: int) -> Canvas:
+    """The view in its own resolution; one smaller than `size` gets black right and below."""
+    below, right = (max(0, least - side) for least, side in zip(size, rgb.shape[1:], strict=True))
+    return _canvas(pad(rgb, (0, right, 0, below)), pad(missing, (0, right, 0, below)), dilation_px)
+
+
+def windows_over(holes: Bool[Tensor, "height width"], size: tuple[int, int], overlap_px: int) -> tuple[Window, ...]:
+    """The windows of a grid that are needed for the holes.
+
+    The grid is the fewest windows of a size, evenly spread, that cover the canvas and overlap by so much at least: it
+    depends on sizes alone, so a stream finds the same windows at each time. A hole needs the window in whose middle it
+    is most, so both where it crosses the middle of their overlap.
+    """
+    tops, lefts = (_starts(length, side, overlap_px) for length, side in zip(holes.shape, size, strict=True))
+    rows, cols = _middles(tops, size[0], holes.shape[0]), _middles(lefts, size[1], holes.shape[1])
+    return tuple(
+        Window(top, left)
+        for top, (above, below) in zip(tops, pairwise(rows), strict=True)
+        for left, (before, behind) in zip(lefts, pairwise(cols), strict=True)
+        if bool(holes[above:below, before:behind].any())
+    )
+
+
+def stitch(
+    pieces: Sequence[Image], windows: Sequence[Window], canvas: tuple[int, int], overlap_px: int
+) -> Float[Tensor, "3 canvasheight canvaswidth"]:
+    """The windows' pictures in one; where they overlap, each counts less towards its edge. Elsewhere 0."""
+    total = pieces[0].new_zeros(3, *canvas)
+    weights = pieces[0].new_zeros(canvas)
+    size = (pieces[0].shape[1], pieces[0].shape[2])
+    rows, cols = (_ramp(side, overlap_px).to(total) for side in size)
+    weight = rows[:, None] * cols
+    for piece, window in zip(pieces, windows, strict=True):
+        window.of(total, size).add_(weight * piece)
+        window.of(weights, size).add_(weight)
+    return total / weights.clamp_min(1e-9)
+
+
+def resized(image: Image, size: tuple[int, int]) -> Float[Tensor, "3 newheight newwidth"]:
+    """Bicubic, anti-aliased, in [0, 1]."""
+    return interpolate(image[None], size=size, mode="bicubic", antialias=True)[0].clamp(0, 1)
+
+
+def dilated(holes: Bool[Tensor, "height width"], by_px: int) -> Bool[Tensor, "height width"]:
+    """Holes dilated by a 3 x 3 cross, this many times."""
+    grown = holes[None].float()
+    for _ in range(by_px):
+        up_down, left_right = max_pool2d(grown, (3, 1), 1, (1, 0)), max_pool2d(grown, (1, 3), 1, (0, 1))
+        grown = torch.maximum(up_down, left_right)
+    return grown[0] > 0
+
+
+def _canvas(rgb: Image, missing: Bool[Tensor, "height width"], dilation_px: int) -> Canvas:
+    return Canvas((2 * rgb - 1) * ~dilated(missing, dilation_px), missing)
+
+
+def _starts(length: int, side: int, overlap_px: int) -> list[int]:
+    count = 1 + math.ceil((length - side) / (side - overlap_px))
+    return [round(i * (length - side) / max(count - 1, 1)) for i in range(count)]
+
+
+def _middles(starts: list[int], side: int, length: int) -> list[int]:
+    """Where one window's part of the canvas ends and the next one's begins, with the canvas's own ends."""
+    return [0, *((first + second + side) // 2 for first, second in pairwise(starts)), length]
+
+
+def _ramp(side: int, overlap_px: int) -> Float[Tensor, " side"]:
+    place = torch.arange(side) + 0.5
+    return (torch.minimum(place, side - place) / max(overlap_px, 1)).clamp(max=1)

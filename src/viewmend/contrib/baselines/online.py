@@ -1,0 +1,187 @@
+"""Published video inpainters as inpainters of live views: one frame at a time, only the past, any resolution."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.contrib.baselines.camera_windows import aim, camera_windows, foreground
+from viewmend.contrib.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
+from viewmend.contrib.baselines.framing import (
+    Canvas,
+    Window,
+    resized,
+    resized_canvas,
+    stitch,
+    window_canvas,
+    windows_over,
+)
+from viewmend.models.base import ContextProvider, Inpainter, State
+from viewmend.models.compositing import blend
+from viewmend.types import CompletedView, ContextViews, IncompleteView
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnlineConfig:
+    """How a published network is run on a stream."""
+
+    framing: Literal["def", "win", "mul"] = "def"
+    """The whole view resized to the network's size; overlapping windows in the view's own resolution; or windows, and
+    the source cameras of the view next to it in each frame."""
+    memory: bool = False
+    """Remember tokens (OM) instead of running the network on all frames again (O)."""
+    sampling: Sampling = field(default_factory=Sampling)
+    """Which past times are seen or remembered."""
+    size_px: tuple[int, int] = (240, 432)
+    """Height and width that the network is run at."""
+    dilation_px: int = 4
+    """Number of dilations of the holes by a 3 x 3 cross before a frame is input."""
+
+    @property
+    def overlap_px(self) -> int:
+        """Neighbouring windows overlap by at least so much, and are blended there: 48 at the authors' size."""
+        return min(self.size_px) // 5
+
+
+@dataclass(frozen=True)
+class OnlineState(State):
+    """What a stream of a baseline carries: bounded by what the sampling may still look at."""
+
+    frames: Mapping[int, Float[Tensor, "3 height width"]] = field(default_factory=dict)
+    """O: past canvases by time."""
+    slots: Mapping[tuple[Window, int], Any] = field(default_factory=dict)
+    """OM: what the network remembers of each window at each time."""
+    canvas_px: tuple[int, int] = (0, 0)
+    """The size that all this belongs to."""
+
+
+class OnlineInpainter(Inpainter):
+    """A published network behind the protocol of all inpainters.
+
+    Only windows with holes are run, so a window remembers (OM) just the times when it had some. Pixels with E > 0
+    alone change.
+
+    Raises:
+        ValueError: the network cannot take frames of `config.size_px`.
+    """
+
+    def __init__(self, network: OnlineNetwork, config: OnlineConfig | None = None) -> None:
+        self.network, self.config = network, config or OnlineConfig()
+        network.check_size(*self.config.size_px)
+
+    def initial_state(self) -> OnlineState:
+        """A stream without a past."""
+        return OnlineState()
+
+    @torch.inference_mode()
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, OnlineState]:
+        """The completed view; `context` is asked in the variant mul alone."""
+        canvas = self._canvas(view)
+        state = self._past(state, view.time, canvas)
+        completed, slots = view.rgb, state.slots
+        windows = self._windows_with_holes(view, canvas)
+        if windows:
+            look = _Looker(self.config, view, context, {view.time: canvas.image, **state.frames})
+            run = self._remembering if self.config.memory else self._at_once
+            pieces, slots = run(windows, look, state)
+            filled = self._fitted(stitch(pieces, windows, state.canvas_px, self.config.overlap_px), view)
+            completed = blend(view.rgb, view.error, filled, torch.ones_like(view.error))
+        return CompletedView(view, completed), self._kept(replace(state, slots=slots), view.time, canvas)
+
+    def advance_state(self, view: IncompleteView, state: State) -> OnlineState | None:
+        """The state after a frame that is not scored; None for OM, whose memory needs the network."""
+        if self.config.memory:
+            return None
+        canvas = self._canvas(view)
+        return self._kept(self._past(state, view.time, canvas), view.time, canvas)
+
+    def _kept(self, state: OnlineState, time: int, canvas: Canvas) -> OnlineState:
+        """What later views may look at of the past and of this time."""
+        frames = {} if self.config.memory else {time: canvas.image, **state.frames}
+        wanted = self.config.sampling.is_wanted_after
+        return replace(
+            state,
+            frames={past: frame for past, frame in frames.items() if wanted(past, time)},
+            slots={(window, past): slot for (window, past), slot in state.slots.items() if wanted(past, time)},
+        )
+
+    def _canvas(self, view: IncompleteView) -> Canvas:
+        make = resized_canvas if self.config.framing == "def" else window_canvas
+        return make(view.rgb, view.error > 0, self.config.size_px, self.config.dilation_px)
+
+    def _past(self, state: State, time: int, canvas: Canvas) -> OnlineState:
+        """What of the state is past and of the canvas's size."""
+        height, width = canvas.image.shape[1:]
+        if not isinstance(state, OnlineState) or state.canvas_px != (height, width):
+            return OnlineState(canvas_px=(height, width))
+        return replace(
+            state,
+            frames={t: frame for t, frame in state.frames.items() if t < time},
+            slots={(window, t): slot for (window, t), slot in state.slots.items() if t < time},
+        )
+
+    def _windows_with_holes(self, view: IncompleteView, canvas: Canvas) -> list[Window]:
+        if self.config.framing == "def":  # a hole may be too thin for the small canvas, but the view still has it
+            return [Window(0, 0)] if bool((view.error > 0).any()) else []
+        return list(windows_over(canvas.holes, self.config.size_px, self.config.overlap_px))
+
+    def _at_once(
+        self, windows: list[Window], look: "_Looker", state: OnlineState
+    ) -> tuple[list[Tensor], Mapping[tuple[Window, int], Any]]:
+        """O: each window by a run on all its frames."""
+        time, sampling = look.view.time, self.config.sampling
+        pieces = []
+        for window in windows:
+            near, far = sampling.neighbour_times(time), sampling.reference_times(time)
+            past = (tuple(look(window, t) for t in times if t in state.frames) for times in (near, far))
+            pieces.append(self.network.complete_clip(Clip(look(window, time), *past)))
+        return pieces, state.slots
+
+    def _remembering(
+        self, windows: list[Window], look: "_Looker", state: OnlineState
+    ) -> tuple[list[Tensor], Mapping[tuple[Window, int], Any]]:
+        """OM: each window by a run on its frames of this time and what it remembers."""
+        time, slots = look.view.time, dict(state.slots)
+        pieces = []
+        for window in windows:
+            past = [(window, t) for t in sorted(self.config.sampling.times(time))]
+            memory = tuple(slots[key] for key in past if key in slots)
+            piece, slots[window, time] = self.network.complete_remembering(look(window, time), memory)
+            pieces.append(piece)
+        return pieces, slots
+
+    def _fitted(
+        self, filled: Float[Tensor, "3 canvasheight canvaswidth"], view: IncompleteView
+    ) -> Float[Tensor, "3 height width"]:
+        height, width = view.error.shape
+        zero_to_one = (filled.float() + 1) / 2
+        if self.config.framing == "def":
+            return resized(zero_to_one.clamp(0, 1), (height, width))
+        return zero_to_one[:, :height, :width]
+
+
+class _Looker:
+    """Frames of a window at a time, the cameras' with them; images of a time are fetched once for all windows."""
+
+    def __init__(
+        self, config: OnlineConfig, view: IncompleteView, context: ContextProvider, frames: Mapping[int, Tensor]
+    ) -> None:
+        self.config, self.view, self.context, self.frames = config, view, context, frames
+        self.seen: dict[int, tuple[ContextViews, Tensor] | None] = {}
+
+    def __call__(self, window: Window, time: int) -> Frames:
+        size = self.config.size_px
+        own = window.of(self.frames[time], size)[None]
+        if self.config.framing != "mul":
+            return own
+        if time not in self.seen:
+            views = self.context(time, self.view.source_views) if self.view.source_views else None
+            self.seen[time] = None if views is None else (views, foreground(views))
+        seen = self.seen[time]
+        if seen is None:
+            return own
+        views, images = seen
+        return torch.cat([own, camera_windows(images, views, aim(self.view, window, size), size).to(own)])

@@ -1,0 +1,1 @@
+"""Broadcasting one view to any number of browsers as HLS."""

@@ -1,0 +1,1 @@
+"""Live cameras listed in a `rig.toml`: read, undistorted, masked and synchronised."""

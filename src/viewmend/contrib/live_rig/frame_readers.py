@@ -1,0 +1,302 @@
+"""What a camera's address gives: pictures, by PyAV, and when they were taken."""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from viewmend.contrib.live_rig.rig_file import LiveCamera
+
+WINDOW_S = 10.0
+"""The least delayed packet of so long says where the sender's clock is; clocks drift apart by less than 1 ms then."""
+JUMP_S = 1.0
+"""A sender has restarted if its timestamps jump by this much more or less than the elapsed time."""
+
+
+class SenderClock:
+    """Where a sender's clock is, by when its packets came.
+
+    Networks only delay. The packet that was least delayed within the last seconds tells best, and a delay of the others
+    does not change when their pictures were taken.
+    """
+
+    def __init__(self) -> None:
+        self._offsets: deque[tuple[float, float]] = deque()
+        """When a packet came and by how much that is later than the sender says, both growing."""
+        self._last: tuple[float, float] | None = None
+
+    def saw(self, sent_s: float, arrived_s: float) -> None:
+        """A packet of this time came just now: it did not lie in a queue here."""
+        if self._last is not None:
+            step_s, passed_s = sent_s - self._last[0], arrived_s - self._last[1]
+            if step_s < -JUMP_S or step_s > passed_s + JUMP_S:
+                self._offsets.clear()
+        self._last = sent_s, arrived_s
+        offset_s = arrived_s - sent_s
+        while self._offsets and self._offsets[-1][1] >= offset_s:
+            self._offsets.pop()
+        self._offsets.append((arrived_s, offset_s))
+        while self._offsets[0][0] < arrived_s - WINDOW_S:
+            self._offsets.popleft()
+
+    def here_s(self, sent_s: float) -> float | None:
+        """A sender's time on this machine's clock; None before any packet was seen to come."""
+        return sent_s + self._offsets[0][1] if self._offsets else None
+
+
+if TYPE_CHECKING:
+    from av import Packet, VideoFrame
+    from av.container import InputContainer
+
+OPEN_S, SILENT_S = 5.0, 1.0
+"""Seconds after which a silent address is reopened."""
+WAITED_S = 0.002
+"""A packet for which the reader had to wait so long did not lie in a queue."""
+TORN_S = 2.0
+"""Pictures after a torn one are built on it until the next key picture, and not shown; no longer than this."""
+LAG = {"rtsp": 1, "rtp": 1, "mpegts": 2}
+"""How many packets later FFmpeg gives one, by format: its parser knows a picture's end by the next one's beginning, and
+MPEG-TS of unknown lengths that of the parser's food likewise."""
+UNTIMED = ("mjpeg", "mpjpeg", "h264", "hevc", "rawvideo", "image2pipe", "jpeg_pipe")
+"""FFmpeg's formats whose times mean nothing."""
+FOR_ALL = {"probesize": "500000", "analyzeduration": "500000", "fpsprobesize": "0"}
+BY_SCHEME = {"udp": {"overrun_nonfatal": "1"}, "rtsp": {"rtsp_transport": "tcp"}, "rtsps": {"rtsp_transport": "tcp"}}
+"""FFmpeg's options: little is looked at before the first picture; lost parts are lost, not the stream."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A decoded picture, not yet converted."""
+
+    frame: "VideoFrame"
+    taken_s: float
+    """When it was taken, on this machine's monotonic clock."""
+
+
+class Playback:
+    """Where recordings are that are played as if they were live: over and over, all of a rig at one position."""
+
+    def __init__(self, length_s: float = 1.0) -> None:
+        self.start_s = time.monotonic()
+        self.length_s = length_s
+        """Where all of them start over: at the end of the shortest."""
+
+    def lap(self, now_s: float) -> tuple[float, float]:
+        """When the current lap began, and the position in it."""
+        passed_s = now_s - self.start_s
+        position_s = passed_s % self.length_s
+        return self.start_s + passed_s - position_s, position_s
+
+
+def file_length_s(camera: LiveCamera) -> float:
+    """How long a recording is.
+
+    Raises:
+        OSError: it cannot be opened, or has no pictures.
+    """
+    with closing(_opened(camera)) as container:
+        stream = container.streams.video[0]
+        if stream.duration is not None and stream.time_base is not None:
+            return float(stream.duration * stream.time_base)
+        if container.duration is not None:
+            return container.duration / 1e6
+    raise OSError("expected a video that says how long it is, got one that does not; write it as MP4 or MKV")
+
+
+def pictures_of(camera: LiveCamera, counts: "Counter[str]", playback: Playback, wait: Callable[[float], bool]) -> Any:
+    """The pictures of a camera from now on, until it fails; close it after use.
+
+    Args:
+        camera: where it is.
+        counts: "torn" and "duplicated" pictures are counted there.
+        playback: where recordings are.
+        wait: waits for a number of seconds; True if no more images are wanted.
+
+    Raises:
+        OSError: it cannot be opened, ends, or is silent.
+    """
+    return _played(camera, playback, wait) if camera.is_file else _received(camera, counts)
+
+
+def _received(camera: LiveCamera, counts: "Counter[str]") -> Iterator[Picture]:
+    import av
+
+    with closing(_opened(camera)) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.thread_count = 1
+        stamps, whole = _stamps(camera, container), _Whole(counts)
+        packets = container.demux(stream)
+        while True:
+            asked_s = time.monotonic()
+            packet = _next(packets)
+            arrived_s = time.monotonic()
+            stamps.saw(packet, arrived_s, arrived_s - asked_s > WAITED_S)
+            try:
+                frames = packet.decode()
+            except av.InvalidDataError:
+                whole.torn(arrived_s)
+                continue
+            for frame in frames:
+                if whole.is_good(frame, packet.is_corrupt, arrived_s) and stamps.is_new(frame, counts):
+                    taken_s = stamps.taken_s(frame, arrived_s)
+                    if taken_s is not None:
+                        yield Picture(frame, taken_s - camera.offset_s)
+
+
+def _played(camera: LiveCamera, playback: Playback, wait: Callable[[float], bool]) -> Iterator[Picture]:
+    """A recording's pictures when their time comes; those whose time has passed are left out."""
+    with closing(_opened(camera)) as container:
+        stream = container.streams.video[0]
+        stream.codec_context.thread_count = 1
+        assert stream.time_base is not None, "FFmpeg gives every stream a unit of time"
+        first_s = float((stream.start_time or 0) * stream.time_base)
+        lap_s, position_s = playback.lap(time.monotonic())
+        while True:
+            container.seek(int((first_s + position_s) / stream.time_base), stream=stream, backward=True)
+            for frame in container.decode(stream):
+                at_s = (frame.time or 0.0) - first_s
+                due_s = lap_s + at_s
+                if at_s >= playback.length_s - 1e-6:
+                    break
+                if at_s < position_s - 1e-6 or due_s < time.monotonic() - SILENT_S / 10:
+                    continue
+                if wait(due_s - time.monotonic()):
+                    return
+                yield Picture(frame, due_s - camera.offset_s)
+            lap_s, position_s = max(lap_s + playback.length_s, playback.lap(time.monotonic())[0]), 0.0
+            if wait(lap_s - time.monotonic()):
+                return
+
+
+def _opened(camera: LiveCamera) -> "InputContainer":
+    """The container.
+
+    Raises:
+        OSError: nothing answers there, or it has no video.
+    """
+    try:
+        import av
+    except ImportError:
+        raise ValueError("live cameras need the extra 'video'; from the clone: pip install -e '.[video]'") from None
+    options = FOR_ALL | BY_SCHEME.get(camera.url.partition("://")[0], {}) | dict(camera.options)
+    try:
+        given = {} if camera.is_file else options
+        container = av.open(camera.url, format=camera.format, options=given, timeout=(OPEN_S, SILENT_S))
+    except (av.FFmpegError, ValueError) as error:
+        raise OSError(_said(error)) from None
+    if not container.streams.video:
+        container.close()
+        raise OSError("expected a video, got none there")
+    return container
+
+
+def _next(packets: "Iterator[Packet]") -> "Packet":
+    """The next packet.
+
+    Raises:
+        OSError: there is none.
+    """
+    import av
+
+    try:
+        packet = next(packets, None)
+    except av.FFmpegError as error:
+        raise OSError(_said(error)) from None
+    if packet is None or packet.size == 0:
+        raise OSError("the stream has ended")
+    return packet
+
+
+def _said(error: Exception) -> str:
+    """FFmpeg's message, without numbers and addresses, which may hold a password."""
+    import av
+
+    if isinstance(error, av.ExitError):
+        return "it is silent"
+    return getattr(error, "strerror", None) or str(error).partition(":")[0]
+
+
+class _Stamps:
+    """When pictures were taken: when their packets came."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+
+    def saw(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
+        """A packet has come."""
+
+    def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
+        """When it was taken; None while that is not known."""
+        return arrived_s
+
+    def is_new(self, frame: "VideoFrame", counts: "Counter[str]") -> bool:
+        """Whether the sender's own time says that the picture is another than the last one."""
+        again = frame.pts is not None and frame.pts == self._last
+        self._last = frame.pts
+        counts["duplicated"] += again
+        return not again
+
+
+class _SenderStamps(_Stamps):
+    """The sender's own times, on this machine's clock."""
+
+    def __init__(self, lag: int = 0) -> None:
+        super().__init__()
+        self._clock = SenderClock()
+        self._came_s: deque[float | None] = deque(maxlen=lag + 1)
+        """When the packets came that are given now and next, where that is known."""
+
+    def saw(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
+        self._came_s.append(arrived_s if waited else None)
+        came_s = self._came_s[0] if len(self._came_s) == self._came_s.maxlen else None
+        if came_s is not None and packet.dts is not None and packet.time_base is not None:
+            self._clock.saw(float(packet.dts * packet.time_base), came_s)
+
+    def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
+        return None if frame.time is None else self._clock.here_s(frame.time)
+
+
+class _KernelStamps(_SenderStamps):
+    """The kernel's times, which are on this machine's clocks where the driver keeps to the rules."""
+
+    def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
+        for off_s in (0.0, time.time() - time.monotonic()):
+            if frame.time is not None and 0 <= arrived_s - (frame.time - off_s) < SILENT_S:
+                return frame.time - off_s
+        return super().taken_s(frame, arrived_s)
+
+
+def _stamps(camera: LiveCamera, container: "InputContainer") -> _Stamps:
+    names = container.format.name.split(",")
+    if camera.clock == "arrival" or (camera.clock == "auto" and set(names) & set(UNTIMED)):
+        return _Stamps()
+    if camera.clock == "auto" and "v4l2" in names:
+        return _KernelStamps()
+    return _SenderStamps(max(LAG.get(name, 0) for name in names))
+
+
+class _Whole:
+    """Which pictures are whole: not torn, nor built on torn ones."""
+
+    def __init__(self, counts: "Counter[str]") -> None:
+        self._counts = counts
+        self._begun = False
+        self._torn_s: float | None = None
+
+    def torn(self, now_s: float) -> None:
+        """A picture is torn. Those before the first whole one are no loss: a stream is entered in its middle."""
+        self._counts["torn"] += self._begun
+        self._torn_s = now_s
+
+    def is_good(self, frame: "VideoFrame", damaged: bool, now_s: float) -> bool:
+        """Whether this picture can be shown."""
+        if frame.is_corrupt or damaged:
+            self.torn(now_s)
+            return False
+        if self._torn_s is not None and not frame.key_frame and now_s < self._torn_s + TORN_S:
+            self._counts["torn"] += self._begun
+            return False
+        self._begun, self._torn_s = True, None
+        return True

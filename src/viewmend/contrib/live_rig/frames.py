@@ -1,0 +1,269 @@
+"""A live rig whose cameras this machine reads itself: `viewmend serve rig.toml`."""
+
+import logging
+import threading
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.contrib.live_rig.frame_readers import Playback, file_length_s, pictures_of
+from viewmend.contrib.live_rig.frame_sync import Aligner, Taken, Together
+from viewmend.contrib.live_rig.rig_file import LiveCamera, LiveRig, read_rig
+from viewmend.contrib.live_rig.worker import CameraWorker
+from viewmend.data.errors import CaptureError
+from viewmend.data.native_capture import CameraImages, pinhole_cameras, stack_images
+from viewmend.data.prepare import PreparedCapture, prepare
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
+from viewmend.live.frame_source import SourceStatus
+from viewmend.live.push import LiveSource
+from viewmend.types import MultiViewFrame
+
+WATCH_S = 1.0
+"""Seconds between looks at the rig's file."""
+REPORT_S = 30.0
+"""Seconds between lines that say what went wrong meanwhile."""
+GATHER_S = 3.0
+"""How long the first time waits for all cameras to be there: alignment and axes are taken from it."""
+WORTH_SAYING = ("late", "missing", "duplicated", "torn", "misaligned", "replaced", "refused")
+
+log = logging.getLogger("viewmend.live")
+
+
+@dataclass(frozen=True)
+class _OneTime:
+    """What a rig sees at one time, as a source of a single frame."""
+
+    name: str
+    cameras: Cameras
+    bounds: Bounds | None
+    up: Float[Tensor, "3"] | None
+    frame: MultiViewFrame
+    frame_ids: tuple[str, ...] = ("live",)
+    fps: float | None = None
+
+    def read(self, time: int) -> MultiViewFrame:
+        """The frame."""
+        return self.frame
+
+
+class RigSource(LiveSource):
+    """Frames of the cameras that a `rig.toml` names, put together by when they were taken.
+
+    The file is read again when it changes: cameras come, go and are replaced while the others go on.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        fps: float | None = None,
+        memory_mb: float = 500.0,
+        longest_px: int | None = None,
+        align: bool = True,
+        match_colours: bool = True,
+    ) -> None:
+        """Read the rig; its cameras are opened by `start`.
+
+        Raises:
+            CaptureError: the rig's file, its calibration, a clean plate or a recording cannot be used.
+        """
+        super().__init__(fps, memory_mb)
+        self.status = SourceStatus(error="waiting for the cameras")
+        self._path, self._longest_px, self._align, self._match = path, longest_px, align, match_colours
+        self._lock_cameras = threading.Condition()
+        self._playback = Playback()
+        self._aligner = Aligner((), 1.0, 1.0, 1.0)
+        self._workers: dict[str, CameraWorker] = {}
+        self._gather_until: float | None = None
+        self._stopped = False
+        self._file = _stamp(path)
+        self._said: dict[str, dict[str, int]] = {}
+        self._prepared: PreparedCapture | None = None
+        self._take_on(read_rig(path, longest_px))
+        self._thread = threading.Thread(target=self._run, name="rig", daemon=True)
+
+    def start(self) -> None:
+        """Open the cameras."""
+        self._begin_rig()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and let go of the cameras."""
+        self._stopped = True
+        with self._lock_cameras:
+            self._lock_cameras.notify_all()
+        if self._thread.is_alive():
+            self._thread.join(timeout=10)
+        workers = list(self._workers.values())
+        for worker in workers:
+            worker.ask_to_stop()
+        for worker in workers:
+            worker.stop()
+
+    def camera_counts(self) -> dict[str, dict[str, int]]:
+        """What was counted of each camera, and whether it is there."""
+        with self._lock_cameras:
+            each = {name: (worker, self._aligner.counts[name]) for name, worker in self._workers.items()}
+            return {name: {"up": int(w.up), **w.counts, **counts} for name, (w, counts) in each.items()}
+
+    def _take_on(self, rig: LiveRig) -> None:
+        """Be this rig from now on. Cameras of which nothing has changed go on, others are to be opened.
+
+        Raises:
+            CaptureError: a clean plate or a recording cannot be used; everything is as it was.
+        """
+        unchanged = {camera.key for camera in rig.cameras}
+        kept = {name: worker for name, worker in self._workers.items() if worker.camera.key in unchanged}
+        new = {camera.name: self._worker_of(camera) for camera in rig.cameras if camera.name not in kept}
+        length_s = min([_length_s(camera) for camera in rig.cameras if camera.is_file], default=1.0)
+        names = tuple(camera.name for camera in rig.cameras)
+        gone = [worker for name, worker in self._workers.items() if name not in kept]
+        aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
+        with self._lock_cameras:
+            aligner.counts.update({name: self._aligner.counts[name] for name in kept})
+            self._rig_file, self._prepared, self._aligner = rig, None, aligner
+            self._workers = {name: (kept | new)[name] for name in names}
+        self._playback.length_s = length_s
+        self._cameras = pinhole_cameras([camera.calibration for camera in rig.cameras])
+        self._gather_until = None
+        self._new = list(new.values())
+        for worker in gone:
+            worker.ask_to_stop()
+
+    def _worker_of(self, camera: LiveCamera) -> CameraWorker:
+        def connect(worker: CameraWorker) -> Any:
+            return pictures_of(camera, worker.counts, self._playback, worker.wait)
+
+        return CameraWorker(camera, connect, self._deliver, lambda at_s, period_s: self._aligner.wants(at_s, period_s))
+
+    def _begin_rig(self) -> None:
+        """Tell viewers of the rig, and open its cameras that are not open yet."""
+        rig = self._rig_file
+        bounds = None if rig.bounds_m is None else Bounds(*torch.tensor(rig.bounds_m, dtype=torch.float32).unbind(0))
+        self.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32))
+        for worker in self._new:
+            worker.start()
+
+    def _run(self) -> None:
+        watch_s = report_s = time.monotonic()
+        while not self._stopped:
+            try:
+                for together in self._next(0.1):
+                    self._show(together)
+            except Exception as error:  # nothing may end the thread
+                self._is_wrong(f"{type(error).__name__}: {error}"[:400])
+            now_s = time.monotonic()
+            if now_s > watch_s + WATCH_S:
+                watch_s = now_s
+                self._follow_file()
+                self._miss_cameras()
+            if now_s > report_s + REPORT_S:
+                report_s = now_s
+                self._report()
+
+    def _next(self, timeout_s: float) -> list[Together]:
+        """The times that are complete."""
+        with self._lock_cameras:
+            self._lock_cameras.wait(timeout_s)
+            return self._aligner.take(time.monotonic())
+
+    def _show(self, together: Together) -> None:
+        """Push one time, as `viewmend mend` would read it."""
+        taken = {name: images for name, images in together.taken.items() if name in self._cameras.names}
+        names = [name for name in self._cameras.names if name in taken]
+        if len(names) < 2 or self._gathers(len(names)):
+            return
+        frame = stack_images([taken[name].images for name in names], self._cameras.select(names), 0)
+        assert frame.mask is not None, "live cameras are masked"
+        if int((frame.mask.amax((1, 2)) > FOREGROUND).sum()) < 2:
+            self.status = replace(self.status, error="the masks are empty: no subject is visible")
+            return
+        rig = self.rig
+        assert rig is not None, "the rig has begun"
+        source = _OneTime(rig.name, self._cameras, rig.bounds, rig.up, frame)
+        if self._prepared is None:
+            self._prepared = prepare(source, align=self._align, match_colours=self._match)
+            for text in self._prepared.changes:
+                log.warning("%s", text)
+        self.spread_ms = 1000 * together.spread_s
+        self.add(replace(self._prepared, source=source).read(0))
+
+    def _gathers(self, there: int) -> bool:
+        """Whether to wait for more cameras before the first time is looked at."""
+        now_s = time.monotonic()
+        if self._gather_until is None:
+            self._gather_until = now_s + GATHER_S
+        return self._prepared is None and there < len(self._cameras) and now_s < self._gather_until
+
+    def _deliver(self, name: str, taken_s: float, images: CameraImages) -> None:
+        """Called by the cameras' workers."""
+        with self._lock_cameras:
+            if name in self._aligner.counts:  # else the camera has just left the rig
+                self._aligner.put(name, Taken(taken_s, images), time.monotonic())
+                self._lock_cameras.notify()
+
+    def _follow_file(self) -> None:
+        """Reload the rig file if it has changed; an invalid file is reported and ignored."""
+        stamp = _stamp(self._path)
+        if stamp == self._file:
+            return
+        self._file = stamp
+        try:
+            self._take_on(read_rig(self._path, self._longest_px))
+        except ValueError as error:
+            log.warning("the rig stays as it was: %s", error)
+            return
+        self._begin_rig()
+        log.warning("the rig has changed: %d cameras, %d of them new", len(self._workers), len(self._new))
+
+    def _miss_cameras(self) -> None:
+        """Say it to viewers while there are too few cameras."""
+        gone = [worker for worker in self._workers.values() if not worker.up]
+        there = len(self._workers) - len(gone)
+        if there < 2:
+            error = (
+                f"two cameras or more are needed, {there} there; '{gone[0].camera.name}': {gone[0].error or 'silent'}"
+            )
+            self._is_wrong(error)
+
+    def _is_wrong(self, error: str) -> None:
+        """Tell viewers by the status; the terminal too, once until something else is wrong."""
+        if self.status.error != error:
+            log.warning("%s", error)
+        self.status = replace(self.status, state="failing", error=error)
+        self.changed()
+
+    def _report(self) -> None:
+        """A line on what was lost since the last one, where anything was."""
+        lines = []
+        counted = self.camera_counts()
+        for name, counts in counted.items():
+            before = self._said.get(name, {})
+            new = {event: counts.get(event, 0) - before.get(event, 0) for event in WORTH_SAYING}
+            lost = [f"{count} {event}" for event, count in new.items() if count > 0]
+            lines += [f"{name} {', '.join(lost)}"] if lost else []
+        self._said = counted
+        if lines:
+            log.warning("in the last %.0f s: %s", REPORT_S, "; ".join(lines))
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What tells whether a file has changed; None while it is not there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+def _length_s(camera: LiveCamera) -> float:
+    try:
+        return file_length_s(camera)
+    except OSError as error:
+        raise CaptureError(f"{camera.url}: camera '{camera.name}': expected a video, got: {error}") from None

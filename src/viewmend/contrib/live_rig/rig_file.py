@@ -1,0 +1,200 @@
+"""A live rig's `rig.toml`: which calibration, where each camera is, how its masks are made."""
+
+import re
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from msgspec import Meta, Struct
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.formats import read_any_calibration
+from viewmend.data.native_format import NativeCalibration, NativeCamera
+from viewmend.utils.untrusted_input import one_of, typed
+
+MOST_BYTES = 1_000_000
+SCHEMES = ("rtsp", "rtsps", "rtp", "http", "https", "udp", "tcp", "srt")
+"""Addresses that are opened; all else is a file or a device."""
+DEVICE = re.compile(r"/dev/video\d+|/dev/v4l/.+")
+Text = Annotated[str, Meta(min_length=1, max_length=4000)]
+Milliseconds = Annotated[float, Meta(ge=1, le=10_000)]
+
+
+class MaskEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the masks of all cameras are made."""
+
+    method: Annotated[str, one_of("person", "plate")] = "person"
+    """The person-segmentation network, or the difference from a clean plate."""
+    plates: Text = "plates/{camera}.png"
+    """Method plate: path of each camera's clean plate."""
+    scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
+    """Scale at which masks are computed; 0.5 costs a quarter."""
+
+    def __post_init__(self) -> None:
+        if "{camera}" not in self.plates:
+            raise ValueError(f"plates: expected a path with {{camera}} in it, got '{self.plates}'; add it")
+
+
+class RigCameraEntry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One of the file's cameras."""
+
+    name: Text
+    url: Text
+    format: Text | None = None
+    options: dict[str, str] = {}
+    clock: Annotated[str, one_of("auto", "sender", "arrival")] = "auto"
+    offset_ms: Annotated[float, Meta(ge=-10_000, le=10_000)] = 0.0
+
+    def __post_init__(self) -> None:
+        scheme = re.match(r"([a-z]+)://", self.url)
+        if scheme and scheme[1] not in SCHEMES:
+            known = ", ".join(SCHEMES)
+            raise ValueError(f"expected a url of {known}, a device or a file, got '{self.url[:80]}'; choose one")
+
+
+class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All of the file."""
+
+    calibration: Text
+    kind: Text | None = None
+    name: Text | None = None
+    fps: Annotated[float, Meta(ge=0.1, le=240)] = 15.0
+    tolerance_ms: Milliseconds | None = None
+    wait_ms: Milliseconds = 200.0
+    mask: MaskEntry
+    cameras: Annotated[tuple[RigCameraEntry, ...], Meta(min_length=2, max_length=128)]
+
+    def __post_init__(self) -> None:
+        names = [camera.name for camera in self.cameras]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"cameras: expected different names, got {twice} more than once; rename one")
+
+
+@dataclass(frozen=True)
+class LiveCamera:
+    """Where one camera is, and what it is."""
+
+    calibration: NativeCamera
+    """The calibration of the pictures as they are worked on, before undistortion."""
+    taken_px: tuple[int, int]
+    """Width and height of the pictures as they come."""
+    url: str
+    format: str | None
+    """FFmpeg's input format where the url does not tell."""
+    options: tuple[tuple[str, str], ...]
+    """FFmpeg's, for this input."""
+    clock: str
+    offset_s: float
+    """Taken off the times of its pictures."""
+    mask: MaskEntry
+    plate: Path
+    """The clean plate, where the method wants one."""
+
+    @property
+    def name(self) -> str:
+        """The calibration's."""
+        return self.calibration.name
+
+    @property
+    def is_file(self) -> bool:
+        """Whether it is a recording that is played as if it were live."""
+        return "://" not in self.url and self.format is None
+
+    @property
+    def key(self) -> str:
+        """Tells whether anything of it has changed."""
+        return repr(self)
+
+
+@dataclass(frozen=True)
+class LiveRig:
+    """All of a `rig.toml`, with its calibration."""
+
+    name: str
+    cameras: tuple[LiveCamera, ...]
+    fps: float
+    tolerance_s: float
+    """How far from its time a picture may have been taken."""
+    wait_s: float
+    """How long a time waits for pictures that are late."""
+    up: Float64[np.ndarray, "3"] | None
+    bounds_m: Float64[np.ndarray, "2 3"] | None
+
+
+def read_rig(path: Path, longest_px: int | None = None) -> LiveRig:
+    """Read a `rig.toml` and the calibration that it names; pictures are to be at most so long.
+
+    Raises:
+        CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
+    """
+    try:
+        with path.open("rb") as file:
+            text = file.read(MOST_BYTES)
+        rig: RigFile = typed(tomllib.loads(text.decode()), RigFile)
+    except OSError as error:
+        raise CaptureError(f"{path}: expected a rig's TOML file, got: {error.strerror}; check the path") from None
+    except ValueError as error:  # of bytes, of TOML, of keys and values
+        what = f"expected TOML, got something else: {error}" if isinstance(error, UnicodeError) else str(error)
+        raise CaptureError(f"{path}: {what.rstrip('.')}") from None
+    folder = path.resolve().parent
+    calibration = _calibration(folder / rig.calibration, rig.kind)
+    known = {camera.name: camera for camera in calibration.cameras}
+    if unknown := [camera.name for camera in rig.cameras if camera.name not in known]:
+        names = ", ".join(known)
+        raise CaptureError(
+            f"{path}: expected cameras that {calibration.file} has ({names}), got {unknown}; rename them"
+        )
+    return LiveRig(
+        name=rig.name or folder.name,
+        cameras=tuple(_camera(entry, known[entry.name], rig.mask, folder, longest_px) for entry in rig.cameras),
+        fps=rig.fps,
+        tolerance_s=(rig.tolerance_ms or 500 / rig.fps) / 1000,
+        wait_s=rig.wait_ms / 1000,
+        up=calibration.up,
+        bounds_m=calibration.bounds_m,
+    )
+
+
+def _calibration(place: Path, kind: str | None) -> NativeCalibration:
+    """The calibration of a folder of any kind, or of a file in one.
+
+    Raises:
+        CaptureError: there is none, or another file of the folder would be read.
+    """
+    if not place.is_file():
+        return read_any_calibration(place, kind)
+    found = read_any_calibration(place.parent, kind)
+    if found.file.resolve() != place.resolve() and place.suffix == found.file.suffix and kind is None:
+        raise CaptureError(f"{place}: expected the folder's calibration, which is {found.file.name}; name the kind")
+    return found
+
+
+def _camera(
+    entry: RigCameraEntry, calibration: NativeCamera, mask: MaskEntry, folder: Path, longest_px: int | None
+) -> LiveCamera:
+    on_disk = "://" not in entry.url
+    device = on_disk and DEVICE.fullmatch(entry.url)
+    return LiveCamera(
+        calibration=_reduced(calibration, longest_px),
+        taken_px=(calibration.width, calibration.height),
+        url=str(folder / entry.url) if on_disk and not device and entry.format is None else entry.url,
+        format="v4l2" if device and entry.format is None else entry.format,
+        options=tuple(entry.options.items()),
+        clock=entry.clock,
+        offset_s=entry.offset_ms / 1000,
+        mask=mask,
+        plate=folder / mask.plates.replace("{camera}", entry.name),
+    )
+
+
+def _reduced(camera: NativeCamera, longest_px: int | None) -> NativeCamera:
+    """The camera of pictures reduced to at most this length; distortion does not change with it."""
+    longest = max(camera.width, camera.height)
+    if longest_px is None or longest <= longest_px:
+        return camera
+    width, height = (max(1, round(side * longest_px / longest)) for side in (camera.width, camera.height))
+    scale = np.diag([width / camera.width, height / camera.height, 1.0])
+    return replace(camera, width=width, height=height, K=scale @ camera.K)

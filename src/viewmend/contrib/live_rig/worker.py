@@ -1,0 +1,269 @@
+"""One worker a camera: it reads, comes back after failures, makes masks, and hands on what is done."""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from viewmend.contrib.live_rig.frame_readers import Picture
+from viewmend.contrib.live_rig.rig_file import LiveCamera
+from viewmend.data.errors import CaptureError
+from viewmend.data.native_capture import CameraImages, Undistortion
+from viewmend.preprocess.masks.maker import Mask, MaskMaker, Rgb
+from viewmend.preprocess.masks.person import PersonMasks
+from viewmend.preprocess.masks.plate import PlateMasks, read_plate
+
+
+class ReducedMasks:
+    """Makes masks of smaller pictures, and enlarges them."""
+
+    def __init__(self, maker: MaskMaker, size_px: tuple[int, int]) -> None:
+        self._maker = maker
+        self._size_px = size_px
+
+    def mask(self, rgb: Rgb) -> Mask:
+        """Foreground of the next image, of its size.
+
+        Raises:
+            ValueError: the image is not of the size that the maker was made for.
+        """
+        import cv2
+
+        small = self._maker.mask(reduced(rgb, self._size_px))
+        return np.asarray(cv2.resize(small, rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def reduced(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
+    """An image of this width and height; itself where it has them."""
+    import cv2
+
+    if rgb.shape[1::-1] == size_px:
+        return rgb
+    return np.asarray(cv2.resize(rgb, size_px, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def mask_maker(camera: LiveCamera) -> MaskMaker:
+    """What makes the masks of this camera's pictures, as its rig says.
+
+    Raises:
+        CaptureError: its clean plate is missing, unreadable or of another size.
+    """
+    size_px = camera.calibration.width, camera.calibration.height
+    small_px = max(1, round(size_px[0] * camera.mask.scale)), max(1, round(size_px[1] * camera.mask.scale))
+    maker = _maker(camera, small_px)
+    return maker if small_px == size_px else ReducedMasks(maker, small_px)
+
+
+def _maker(camera: LiveCamera, size_px: tuple[int, int]) -> MaskMaker:
+    if camera.mask.method == "person":
+        return PersonMasks()
+    where = f"{camera.plate}: the clean plate of camera '{camera.name}'"
+    plate = read_plate(camera.plate, where)
+    if plate.shape[1::-1] != camera.taken_px:
+        expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
+        raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
+    return PlateMasks(reduced(plate, size_px))
+
+
+T = TypeVar("T")
+
+
+class Slot(Generic[T]):
+    """One place between two threads: what is newer replaces what was not taken yet."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Condition()
+        self._value: T | None = None
+
+    def put(self, value: T) -> bool:
+        """Put a value in; whether another one was replaced."""
+        with self._lock:
+            replaced = self._value is not None
+            self._value = value
+            self._lock.notify()
+        return replaced
+
+    def take(self, timeout_s: float) -> T | None:
+        """Take the value out, None where none came in time."""
+        with self._lock:
+            self._lock.wait_for(lambda: self._value is not None, timeout_s)
+            value, self._value = self._value, None
+        return value
+
+
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
+"""From one attempt to reach a camera to the next: each time twice as long."""
+TAKE_S = 0.2
+PERIOD_FOLLOWS = 0.05
+"""How much of a step from picture to picture the estimate of them takes over."""
+
+log = logging.getLogger("viewmend.live")
+
+
+class CameraInput:
+    """Makes of one camera's pictures what is rendered from: small enough, masked, straightened."""
+
+    def __init__(self, camera: LiveCamera) -> None:
+        """Set up.
+
+        Raises:
+            CaptureError: the camera's clean plate is missing, or of another size.
+        """
+        self._camera = camera
+        self._masks = mask_maker(camera)
+        self._undistortion = Undistortion(camera.calibration)
+
+    def images(self, picture: Picture) -> CameraImages:
+        """A picture's images.
+
+        Raises:
+            ValueError: it has another size than the calibration.
+        """
+        frame, camera = picture.frame, self._camera.calibration
+        if (frame.width, frame.height) != self._camera.taken_px:
+            expected = "{} x {}".format(*self._camera.taken_px)
+            raise ValueError(
+                f"expected pictures of {expected} as the calibration says, got {frame.width} x {frame.height}; "
+                "set the camera's mode in 'options'"
+            )
+        rgb = frame.to_ndarray(format="rgb24", width=camera.width, height=camera.height, interpolation="AREA")
+        return self._undistortion.apply(CameraImages(rgb, self._masks.mask(rgb), None))
+
+
+def pauses() -> Iterator[float]:
+    """How long there is from one attempt to reach a camera to the next."""
+    pause_s = FIRST_PAUSE_S
+    while True:
+        yield pause_s
+        pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+
+class CameraWorker:
+    """Two threads of one camera: one reads and decodes, one masks. Between them is one slot, where the newest wins."""
+
+    def __init__(
+        self,
+        camera: LiveCamera,
+        connect: Callable[["CameraWorker"], Any],
+        deliver: Callable[[str, float, CameraImages], None],
+        wants: Callable[[float, float], bool],
+    ) -> None:
+        """Set up.
+
+        Args:
+            camera: where it is.
+            connect: gives the pictures from now on, as a generator (`pictures_of`).
+            deliver: takes name, time and images of a picture that is done.
+            wants: whether an image with this timestamp and interval is needed.
+
+        Raises:
+            CaptureError: the camera's clean plate is missing, or of another size.
+        """
+        self.camera = camera
+        self.counts: Counter[str] = Counter()
+        self.up = False
+        """Whether pictures come."""
+        self.error: str | None = None
+        """Why not, or what is wrong with them."""
+        self._input = CameraInput(camera)
+        self._connect, self._deliver, self._wants = connect, deliver, wants
+        self._since_s = time.monotonic()
+        """Since when it is up, or not."""
+        self._last_s: float | None = None
+        self._period_s = 0.0
+        self._slot: Slot[Picture] = Slot()
+        self._stopped = threading.Event()
+        self._threads = [
+            threading.Thread(target=work, name=f"{camera.name} {work.__name__}", daemon=True)
+            for work in (self.read, self.work)
+        ]
+
+    def start(self) -> None:
+        """Begin."""
+        for thread in self._threads:
+            thread.start()
+
+    def ask_to_stop(self) -> None:
+        """Begin to end; `stop` waits for it."""
+        self._stopped.set()
+
+    def stop(self) -> None:
+        """End; a camera that is silent is left alone after some seconds."""
+        self._stopped.set()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join(timeout=3)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait; whether the worker is to end."""
+        return self._stopped.wait(max(0.0, seconds)) if seconds > 0 else self._stopped.is_set()
+
+    def read(self) -> None:
+        """Read, and reach the camera again when it fails, until stopped."""
+        pause = pauses()
+        while not self._stopped.is_set():
+            began_s = time.monotonic()
+            try:
+                with closing(self._connect(self)) as pictures:
+                    for picture in pictures:
+                        if not self.up:
+                            self._is_up()
+                            pause = pauses()
+                        self._offer(picture)
+                        if self._stopped.is_set():
+                            return
+                if not self._stopped.is_set():
+                    self._is_down("its pictures have ended")
+            except Exception as error:  # whatever a camera does wrong, it is said, and tried again
+                self._is_down(str(error) or type(error).__name__)
+            if self.wait(began_s + next(pause) - time.monotonic()):
+                return
+
+    def work(self) -> None:
+        """Make images of the newest picture, again and again, until stopped."""
+        while not self._stopped.is_set():
+            picture = self._slot.take(TAKE_S)
+            if picture is None:
+                continue
+            try:
+                images = self._input.images(picture)
+            except ValueError as error:
+                self.counts["refused"] += 1
+                self._say(str(error))
+                continue
+            self._deliver(self.camera.name, picture.taken_s, images)
+
+    def _offer(self, picture: Picture) -> None:
+        """Put a picture into the slot if its time is wanted."""
+        if self._last_s is not None and 0 < picture.taken_s - self._last_s < 1:
+            step_s = picture.taken_s - self._last_s
+            self._period_s += PERIOD_FOLLOWS * (step_s - self._period_s) if self._period_s else step_s
+        self._last_s = picture.taken_s
+        self.counts["read"] += 1
+        if not self._wants(picture.taken_s, self._period_s):
+            self.counts["thinned"] += 1
+        elif self._slot.put(picture):
+            self.counts["replaced"] += 1
+
+    def _is_up(self) -> None:
+        gone_s = time.monotonic() - self._since_s
+        self.up, self.error, self._since_s = True, None, time.monotonic()
+        self.counts["connects"] += 1
+        log.warning("camera '%s' is there, after %.1f s", self.camera.name, gone_s)
+
+    def _is_down(self, reason: str) -> None:
+        if self.up:
+            self._since_s = time.monotonic()
+        self.up = False
+        self._say(reason)
+
+    def _say(self, error: str) -> None:
+        """Tell what is wrong, once until it changes."""
+        if error != self.error:
+            log.warning("camera '%s': %s", self.camera.name, error)
+        self.error = error

@@ -1,0 +1,1 @@
+"""Evaluation and live serving on a Ray cluster."""

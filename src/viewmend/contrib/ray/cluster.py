@@ -1,0 +1,70 @@
+"""Ray, an extra: whether it is there, and the way into a cluster."""
+
+import os
+import secrets
+import socket
+from typing import Any
+
+ANSWER_S = 5.0
+"""A cluster answers within this time."""
+LOCAL = "local"
+"""Instead of an address: a cluster of this machine alone, for as long as the run lasts."""
+QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}
+"""Disables usage reports."""
+ON_LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
+"""How Ray calls it that a cluster's own sockets are bound to 127.0.0.1, as on systems where it has no others."""
+
+AS_URGENT = {"RAY_worker_niceness": "0"}
+"""Work has the priority of the command that asks for it; by itself Ray gives it less than anything else has."""
+
+
+def find_ray(address: str) -> Any:
+    """Import ray with usage reports disabled and a local cluster bound to loopback.
+
+    A local cluster requires a random token.
+
+    Raises:
+        ValueError: Ray is not installed.
+    """
+    wanted = QUIET
+    if address == LOCAL:
+        wanted = wanted | ON_LOOPBACK | AS_URGENT | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    for name, value in wanted.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ValueError(
+            "expected Ray for --ray, got none; install viewmend's extra 'ray', or leave --ray away"
+        ) from error
+    return ray
+
+
+def connect(ray: Any, address: str, **own: object) -> None:
+    """Connect to a running cluster, or start one of this machine alone.
+
+    Args:
+        ray: what `find_ray` gave.
+        address: of a running cluster (HOST:PORT, ray://HOST:PORT, auto), or `LOCAL`.
+        own: options of `ray.init` for a cluster that is started.
+
+    Raises:
+        ValueError: there is no cluster at the address.
+    """
+    local = address == LOCAL
+    try:
+        _knock(address)
+        quiet = {"include_dashboard": False, "log_to_driver": False, "configure_logging": False}
+        ray.init(None if local else address, **quiet, **(own if local else {}))
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ValueError(
+            f"expected a Ray cluster at '{address}', got none ({' '.join(str(error).split())[:200]}); check --ray, or "
+            f"use --ray {LOCAL}"
+        ) from error
+
+
+def _knock(address: str) -> None:
+    """Raise OSError if HOST:PORT does not accept connections; Ray itself would wait for minutes."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()

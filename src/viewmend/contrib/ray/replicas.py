@@ -1,0 +1,265 @@
+"""Many viewers, on Ray Serve: one actor reads the rig, replicas render for the viewers that its proxy gives them."""
+
+import asyncio
+import contextlib
+import logging
+import math
+import socket
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from viewmend.contrib.ray.cluster import LOCAL, connect, find_ray
+from viewmend.contrib.ray.ingest import Ingest, SourceState
+from viewmend.contrib.ray.shared_frame import SharedFrame
+from viewmend.contrib.ray.shared_source import SharedSource
+from viewmend.live.frame_source import FrameSource
+from viewmend.live.renderer import Renderer
+from viewmend.live.server import LiveServer, ServerConfig
+from viewmend.live.service import RenderService
+from viewmend.models.base import Inpainter
+from viewmend.models.registry import error_model_for
+from viewmend.stream import StreamConfig
+from viewmend.utils.heap import configure_allocator, freeze_loaded_objects
+
+NAME = "viewmend"
+"""Serve's name for the application."""
+ANSWER_S = 30.0
+"""So much longer than it was asked to wait an ingest may take for an answer: it may be carving."""
+READY_S = 120.0
+"""A replica takes viewers when it has rendered its first view, or after this long."""
+SPARE_REQUESTS = 8
+"""Requests of a replica besides its viewers: pictures, paths, /health."""
+WELL_FILLED = 0.75
+"""Replicas are added where more than this part of all places is taken."""
+STOPPING_S = 5.0
+INGEST_SHARE, REPLICAS_SHARE = 0.4, 0.4
+"""Parts of the store: what the ingest keeps, and what all replicas of one machine may still use of what it dropped."""
+REPLICAS_A_MACHINE = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class ManyViewers:
+    """What is served, and how many replicas render it."""
+
+    open_source: Callable[[], FrameSource]
+    """Called where the cameras are read; ValueError or OSError for a source that cannot be."""
+    load_inpainter: Callable[[], Inpainter]
+    server: ServerConfig
+    stream: StreamConfig
+    device: str
+    replicas: tuple[int, int]
+    """How many at least, and at most."""
+    store_mb: float
+    """A machine's shared memory."""
+
+    @property
+    def replica_mb(self) -> float:
+        """What one replica may use of it."""
+        return REPLICAS_SHARE * self.store_mb / min(self.replicas[1], REPLICAS_A_MACHINE)
+
+
+class IngestActor:
+    """The ingest as an actor. The source is opened by the first call, so that what is wrong with it is an answer."""
+
+    def __init__(self, served: ManyViewers, put: Callable[[SharedFrame], Any]) -> None:
+        configure_allocator()
+        self._served, self._put = served, put
+        self._opening = threading.Lock()
+        self._ingest: Ingest | None = None
+
+    def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
+        """As `Ingest.state`."""
+        return self._opened().state(known, wait_s, watched)
+
+    def frame(self, index: int, wait_s: float) -> tuple[str, Any] | None:
+        """As `Ingest.frame`."""
+        return self._opened().frame(index, wait_s)
+
+    def _opened(self) -> Ingest:
+        with self._opening:
+            if self._ingest is None:
+                served, kept_mb = self._served, INGEST_SHARE * self._served.store_mb
+                source, inpainter = served.open_source(), served.load_inpainter()
+                self._ingest = Ingest(source, inpainter, served.stream.hull, kept_mb, self._put)
+                freeze_loaded_objects()
+            return self._ingest
+
+
+class RayIngest:
+    """The way to the ingest's actor. What it gives is read from this machine's object store, where it lies."""
+
+    def __init__(self, actor: Any) -> None:
+        self._actor = actor
+
+    def state(self, known: int, wait_s: float, watched: bool) -> SourceState:
+        """As `IngestLink.state`."""
+        return self._answer(self._actor.state.remote(known, wait_s, watched), wait_s)
+
+    def frame(self, index: int, wait_s: float) -> tuple[str, SharedFrame] | None:
+        """As `IngestLink.frame`."""
+        found = self._answer(self._actor.frame.remote(index, wait_s), wait_s)
+        return None if found is None else (found[0], self._answer(found[1][0], wait_s))
+
+    def _answer(self, reference: Any, wait_s: float) -> Any:
+        import ray  # pyright: ignore[reportMissingImports]
+        from ray.exceptions import RayError  # pyright: ignore[reportMissingImports]
+
+        try:
+            return ray.get(reference, timeout=wait_s + ANSWER_S)  # pyright: ignore
+        except RayError as error:
+            raise ConnectionError(" ".join(str(error).split())[:200]) from error
+
+
+@contextlib.contextmanager
+def serving(served: ManyViewers, address: str) -> Iterator[str]:
+    """Serve on a cluster until the context ends; the address for viewers, once replicas are ready for them.
+
+    Args:
+        served: what, and how.
+        address: of a running cluster, or `cluster.LOCAL`.
+
+    Raises:
+        ValueError: Ray is not installed, there is no cluster, Serve runs on it, or the source cannot be read.
+        OSError: the port is in use.
+    """
+    host, port = served.server.host, _free_port(served.server.host, served.server.port)
+    ray = find_ray(address)
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    cpus = served.replicas[1] + 1
+    connect(ray, address, num_cpus=cpus, object_store_memory=int(1e6 * served.store_mb))
+    from ray import serve  # pyright: ignore
+
+    logging.getLogger("ray.serve").setLevel(logging.ERROR)
+
+    try:
+        _demand_no_serve(ray)
+        calls = 4 * served.replicas[1] + 8  # two questions a replica, and as many of those that it replaces
+        actor = ray.remote(num_cpus=1, max_restarts=-1, max_concurrency=calls)(IngestActor)
+        ingest = actor.remote(served, _put)
+        opened = ingest.state.remote(-1, 0.0, False)
+        quiet = {"enable_access_log": False, "log_level": "ERROR"}
+        serve.start(http_options={"host": host, "port": port}, logging_config=quiet)
+        _demand(ray, opened)
+        serve.run(_application(serve, served, ingest), name=NAME, route_prefix="/", logging_config=quiet)
+        try:
+            yield f"http://{f'[{host}]' if ':' in host else host}:{port}"
+        finally:
+            if address != LOCAL:  # which ends as a whole
+                serve.shutdown()
+                ray.kill(ingest)
+    finally:
+        ray.shutdown()
+
+
+def _application(serve: Any, served: ManyViewers, ingest: Any) -> Any:
+    """What Serve runs: replicas of the live server's application."""
+
+    def build() -> StartWhenReady:
+        return _replica(served, RayIngest(ingest))
+
+    viewers, (fewest, most) = served.server.limits.viewers, served.replicas
+    scaling = {
+        "min_replicas": fewest,
+        "initial_replicas": fewest,
+        "max_replicas": most,
+        "target_ongoing_requests": max(1, math.floor(WELL_FILLED * viewers)),
+    }
+    deployment = serve.deployment(
+        name="replica",
+        ray_actor_options={"num_cpus": 1, "num_gpus": 1 if served.device.startswith("cuda") else 0},
+        max_ongoing_requests=viewers + SPARE_REQUESTS,
+        autoscaling_config=scaling,
+        graceful_shutdown_timeout_s=STOPPING_S,
+        health_check_period_s=1.0,
+    )
+    return deployment(serve.ingress(build)(_Replica)).bind()
+
+
+class StartWhenReady:
+    """An ASGI application that reports its start once it is ready, for Serve's proxy, which has limits of its own."""
+
+    def __init__(self, app: ASGIApp, ready: Callable[[], Awaitable[None]]) -> None:
+        """Wrap an application; `ready` returns when viewers may connect."""
+        self._app, self._ready = app, ready
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As ASGI specifies."""
+
+        async def send_when_ready(message: Message) -> None:
+            if message["type"] == "lifespan.startup.complete":
+                await self._ready()
+            await send(message)
+
+        await self._app(scope, receive, send_when_ready if scope["type"] == "lifespan" else send)
+
+
+class _Replica:
+    """Holds the application; Serve's ingress adds what it is called by."""
+
+
+def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
+    """The application of one replica: its renderer works on frames of the ingest."""
+    configure_allocator()
+    source = SharedSource(ingest, served.replica_mb / 2)
+    stream = replace(served.stream, memory_mb=min(served.stream.memory_mb or math.inf, served.replica_mb / 2))
+    inpainter = served.load_inpainter()
+    error_model = error_model_for(inpainter, served.device)
+    renderer = Renderer(source, inpainter, stream, served.device, error_model)
+    service = RenderService(renderer, source)
+
+    async def ready() -> None:
+        end = time.monotonic() + READY_S
+        while not service.is_ready and time.monotonic() < end and not (source.status.error or service.error):
+            await asyncio.sleep(0.05)
+        freeze_loaded_objects()
+
+    return StartWhenReady(LiveServer(service, served.server).app(), ready)
+
+
+def _put(shared: SharedFrame) -> list[Any]:
+    """The time, in the object store; its reference in a list, so that who is handed it fetches it himself."""
+    import ray  # pyright: ignore[reportMissingImports]
+
+    return [ray.put(shared)]  # pyright: ignore
+
+
+def _demand_no_serve(ray: Any) -> None:
+    """Raise if Ray Serve already runs on this cluster, since it has a single port."""
+    try:
+        ray.get_actor("SERVE_CONTROLLER_ACTOR", namespace="serve")
+    except ValueError:
+        return
+    raise ValueError(
+        "expected a Ray cluster on which Serve does not run, got one on which it does; end what it serves (serve "
+        "shutdown), or use another cluster"
+    )
+
+
+def _demand(ray: Any, opened: Any) -> None:
+    """See that the source is open; what is wrong with it is said in its own words."""
+    try:
+        ray.get(opened)
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, ValueError | OSError):
+            raise error.cause from None
+        raise
+
+
+def _free_port(host: str, port: int) -> int:
+    """The port, or a free one for 0: what Ray says of one that is taken is long, and comes late.
+
+    Raises:
+        OSError: it is in use.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host, port), family=family) as listener:
+            return int(listener.getsockname()[1])
+    except OSError as error:
+        what = error.strerror or str(error)
+        raise OSError(f"port {port} of {host}: {what}; choose another --port or --host") from None

@@ -1,0 +1,1 @@
+"""The RIFTCast wire protocol."""

@@ -1,0 +1,1 @@
+"""Captures on disk, the readers, held-out scenes, and the synthetic studio."""

@@ -1,0 +1,76 @@
+"""Camera paths: reading poses from a JSON file, and pairing them with frames."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from msgspec import Meta, Struct
+
+from viewmend.geometry.cameras import Cameras, is_intrinsics
+from viewmend.geometry.rigid import invert_rigid, is_rotation
+from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, shown, typed
+
+Row4 = tuple[Number, Number, Number, Number]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+Pixels = Annotated[int, Meta(ge=1, le=16384)]
+
+
+class PathFile(Struct, frozen=True):
+    """A file of camera poses."""
+
+    world_from_camera: Annotated[tuple[Matrix4, ...], Meta(min_length=1)]
+    K: tuple[Triple, Triple, Triple] | None = None
+    width: Pixels | None = None
+    height: Pixels | None = None
+
+    def __post_init__(self) -> None:
+        poses = torch.tensor(self.world_from_camera)
+        good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
+        if not bool(good.all()):
+            raise ValueError(
+                f"pose {int((~good).nonzero()[0])}: expected a rotation and translation with the last row 0 0 0 1, got "
+                "another matrix; write rigid motions world_from_camera"
+            )
+        if self.K is not None and not bool(is_intrinsics(torch.tensor(self.K))):
+            expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
+            raise ValueError(f"expected 'K' as {expected}, got {shown(self.K)}; correct it")
+        if (self.width is None) != (self.height is None):
+            raise ValueError("expected both 'width' and 'height', got one of them; write both or neither")
+
+
+def read_camera_path(file: Path, like: Cameras) -> Cameras:
+    """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
+
+    The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object with that list as
+    "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and "height".
+
+    Raises:
+        ValueError: the file has other content.
+    """
+    try:
+        content = read_json(bounded_bytes(file))
+        path: PathFile = typed(content if isinstance(content, dict) else {"world_from_camera": content}, PathFile)
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    except OSError as error:
+        raise ValueError(f"{file}: expected a file with camera poses, got: {error.strerror}; check --path") from error
+    poses, first, count = torch.tensor(path.world_from_camera), like[0], len(path.world_from_camera)
+    K = first.K.cpu() if path.K is None else torch.tensor([path.K])
+    size = first.size_px.cpu() if path.width is None else torch.tensor([[path.width, path.height]])
+    names = tuple(f"view{n:03d}" for n in range(count))
+    return Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
+
+
+def pair_with_frames(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:
+    """Pair frames with poses: one frame from every pose, or every frame from its own pose or from a single one.
+
+    Raises:
+        ValueError: there are several frames and another number of poses.
+    """
+    if len(times) == 1:
+        return [(times[0], path[n]) for n in range(len(path))]
+    if len(path) not in (1, len(times)):
+        expected = f"one pose or one per frame ({len(times)} frames)"
+        raise ValueError(f"expected {expected}, got {len(path)} poses; choose frames with --frames")
+    return [(time, path[n if len(path) > 1 else 0]) for n, time in enumerate(times)]

@@ -1,0 +1,111 @@
+"""Finds cameras whose images do not show the same surface as the others', or have another sharpness."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.data.colour_matching import SurfaceColours, SurfacePoints, agreement, best_agreement
+from viewmend.data.errors import Issue
+from viewmend.data.resize import limit_size
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.hull import FOREGROUND, HullConfig
+from viewmend.geometry.proxy import reconstruct
+from viewmend.geometry.sampling import sample_bilinear
+from viewmend.types import MultiViewFrame
+
+LONGEST_PX = 256
+HULL = HullConfig(resolution=64)
+FAR = 2.5
+"""An image shows something else if its colour distance to the others is this many times the median."""
+FARTHER, LESS_ALIKE = 1.55, 0.72
+"""It also does at this lower ratio if its best correlation is below this share of the median."""
+SUSPECT, FITS = 1.25, 0.65
+"""From this ratio on, mirrored, rotated and other cameras' images are tried. One that reduces the distance to this
+share is the explanation."""
+PALE, COLOURFUL = 0.4, 0.05
+"""An image is grey if its saturation is below this share of the median, which must be at least the second value."""
+BLURRED, NOISY = 0.45, 2.0
+"""Ratio of pixel differences to the median: below the first an image is blurred, above the second noisy."""
+
+
+def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
+    """Find cameras whose images do not match the others'; empty if they cannot be compared."""
+    small = limit_size(frame, LONGEST_PX)
+    if small.mask is None or len(small.cameras) < 3:
+        return ()
+    try:
+        surface = SurfacePoints.from_proxy(small, reconstruct(small.mask, small.cameras, bounds, HULL))
+    except ValueError:
+        return ()
+    colours = surface.colours(small.rgb)
+    distance, correlation = best_agreement(colours)
+    typical, alike = distance.nanmedian(), correlation.nanmedian()
+    suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
+    better = _find_better_fits(small, surface, colours, distance, suspects)
+    detail, saturation = _detail(small), _saturation(small)
+    grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
+    far = (distance > FAR * typical) | ((distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike))
+    blurred, noisy = detail < BLURRED * detail.nanmedian(), detail > NOISY * detail.nanmedian()
+    mismatch, texts = "its images do not match those of the other cameras", {}
+    for view in range(len(small.cameras)):
+        if bool(grey[view]):
+            texts[view] = "its images are grey, but the others' are not; check its settings"
+        elif view in better:
+            texts[view] = f"{mismatch}, and fit much better {better[view]}; exchange or rotate its files"
+        elif bool(far[view]):
+            texts[view] = (
+                f"{mismatch} (colours differ by {100 * distance[view]:.0f} %, typically by {100 * typical:.0f} %); "
+                "check whether they are from another camera or frame, rotated, mirrored, BGR or of another exposure"
+            )
+        elif bool(blurred[view] | noisy[view]):
+            fault = "blurred" if bool(blurred[view]) else "noisy"
+            texts[view] = f"its images are {fault} compared with the others'; check focus and gain"
+    return tuple(Issue(f"camera '{small.cameras.names[view]}': {text}") for view, text in texts.items())
+
+
+def _find_better_fits(
+    frame: MultiViewFrame,
+    surface: SurfacePoints,
+    colours: SurfaceColours,
+    distance: Float[Tensor, "view"],
+    suspects: Sequence[int],
+) -> dict[int, str]:
+    """The suspects whose images match the others much better mirrored, rotated, or as another camera's; and which."""
+    found, names = {}, frame.cameras.names
+    for view in suspects:
+        width, height = (int(side) for side in frame.cameras.size_px[view])
+        own = frame.rgb[view, :, :height, :width]
+        candidates = {"mirrored": own.flip(2), "upside down": own.flip(1), "rotated by 180 degrees": own.flip(1, 2)}
+        candidates |= {
+            f"as that of '{names[other]}'": frame.rgb[other, :, :height, :width]
+            for other, size in enumerate(frame.cameras.size_px.tolist())
+            if other != view and size == [width, height]
+        }
+        images = torch.stack(list(candidates.values())).float() / 255
+        sampled = sample_bilinear(images, surface.uv_px[view].expand(len(candidates), -1, -1), "border")
+        shared = surface.seen[view] & surface.seen
+        distances = {
+            name: agreement(rgb, shared, colours, view)[0] for name, rgb in zip(candidates, sampled, strict=True)
+        }
+        best = min(distances, key=distances.__getitem__)
+        if distances[best] < FITS * float(distance[view]):
+            found[view] = best
+    return found
+
+
+def _detail(frame: MultiViewFrame) -> Float[Tensor, "view"]:
+    """Mean difference of neighbouring pixels of the subject in each camera; NaN without foreground."""
+    assert frame.mask is not None
+    grey, inside = frame.rgb.float().mean(1), frame.mask > FOREGROUND
+    both = inside[:, :, 1:] & inside[:, :, :-1]
+    return ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))
+
+
+def _saturation(frame: MultiViewFrame) -> Float[Tensor, "view"]:
+    """Difference of the subject's colour channels, relative to brightness, in each camera; NaN without foreground."""
+    assert frame.mask is not None
+    rgb, inside = frame.rgb.float(), frame.mask > FOREGROUND
+    difference = ((rgb.amax(1) - rgb.amin(1)) * inside).sum((1, 2))
+    return difference / (rgb.mean(1) * inside).sum((1, 2))

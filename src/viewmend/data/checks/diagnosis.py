@@ -1,0 +1,217 @@
+"""Finds faults in the masks and the calibration of a frame, and explains them.
+
+`viewmend check` prints the issues; `prepare` raises an error or warns about them.
+"""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.data.checks.colours import find_odd_images
+from viewmend.data.checks.leave_one_out import find_outlier_by_hull, find_outlier_by_outlines
+from viewmend.data.errors import Issue
+from viewmend.data.resize import limit_size
+from viewmend.geometry.alignment import LEAST_IOU, silhouette_iou
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND, HullConfig
+from viewmend.geometry.proxy import reconstruct
+from viewmend.types import MultiViewFrame
+
+INVERTED_BORDER = 0.75
+"""A mask is inverted if a larger share of its border is foreground."""
+EMPTY_SHARE = 0.25
+"""An empty mask is wrong if the others' hull would cover this share of what a typical mask covers."""
+MIN_IMPROVEMENT = 0.1
+"""A change of the calibration explains the fault if it improves the IoU of hull and masks by this much."""
+LONGEST_PX = 384
+"""Images are reduced to this size."""
+MAX_CAMERAS_FOR_SWAPS = 24
+"""In larger rigs swapped pairs are not searched, since each pair needs a hull."""
+PAIRS_PX = 192
+PAIRS_HULL = HullConfig(resolution=48)
+MIN_CAMERA_IOU = 0.5
+"""A camera below this IoU is faulty, however well the others agree."""
+MIN_SIZE_M, MAX_SIZE_M = 0.05, 20.0
+"""Subjects outside this range usually have the wrong unit."""
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
+"""Between OpenGL's and OpenCV's camera axes."""
+
+
+def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue, ...]:
+    """Find the faults of one frame; empty for a good frame and for one without masks.
+
+    If hull and masks disagree, common mistakes are undone one at a time, and the issue names the change that makes
+    them agree.
+
+    Args:
+        frame: the input cameras. A good frame costs one hull and a small one per camera.
+        bounds: the bounds of the capture.
+    """
+    frame = limit_size(frame, LONGEST_PX)
+    if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > FOREGROUND).any()):
+        return ()
+    issues = find_bad_masks(frame, frame.cameras.names, bounds)
+    if any(issue.fatal for issue in issues):
+        return issues
+    frame = frame.without([issue.camera for issue in issues if issue.camera])
+    if len(frame.cameras) < 2:
+        return issues
+    iou, size_m = _agreement(frame, frame.cameras, bounds)
+    if iou < LEAST_IOU:
+        return (*issues, _explain(frame, bounds, iou))
+    if not MIN_SIZE_M <= size_m <= MAX_SIZE_M:
+        expected = f"a subject of about {MIN_SIZE_M} to {MAX_SIZE_M:g} m"
+        issues = (*issues, Issue(f"expected {expected}, got {size_m:.3g} m; check metres_per_unit"))
+    issues = (*issues, *_find_outlier(frame, bounds))
+    consistent = frame.without([issue.camera for issue in issues if issue.camera])
+    return (*issues, *find_odd_images(consistent, bounds))
+
+
+def _find_outlier(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
+    """The camera that is inconsistent with the others, by the hull, unless the outlines point to another camera."""
+    by_hull, by_outlines = find_outlier_by_hull(frame, bounds), find_outlier_by_outlines(frame, bounds)
+    if by_outlines is None or (by_hull and any(f"'{name}'" in by_hull[0].text for name in by_outlines[0])):
+        return by_hull
+    names, factor = " or ".join(f"'{name}'" for name in by_outlines[0]), by_outlines[1]
+    text = f"without camera {names} the outlines of the other cameras agree {factor:.2g} times better"
+    return (Issue(f"{text}; check its calibration, its mask and its synchronisation"),)
+
+
+def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds | None) -> tuple[Issue, ...]:
+    """Find masks that are inverted, or empty although the other input cameras see the subject there.
+
+    Returns one issue per camera, or a single fatal one if at least half of the masks are inverted. A camera that is not
+    an input is judged by its own mask alone and is not left out, since results are scored against it; it does not
+    affect the judgement of other cameras.
+    """
+    if frame.mask is None:
+        return ()
+    names = frame.cameras.names
+    inverted = [name for view, name in enumerate(names) if _border_share(frame, view) > INVERTED_BORDER]
+    bad = [name for name in inverted if name in inputs]
+    if bad and 2 * len(bad) >= sum(name in inputs for name in names):
+        got = f"foreground along the image borders in {len(bad)} of {len(inputs)} cameras: they are inverted"
+        return (Issue(f"expected masks of 255 on the subject, got {got}; write 255 - mask", fatal=True),)
+    inputs_text = "camera '{}': its mask is inverted, so it is left out; write 255 - mask"
+    others_text = "camera '{}': its mask is inverted, so scores against it are meaningless; write 255 - mask"
+    issues = [Issue(inputs_text.format(name), camera=name) for name in bad]
+    issues += [Issue(others_text.format(name)) for name in inverted if name not in inputs]
+    good = [name for name in names if name in inputs and name not in inverted]
+    return (*issues, *(_find_empty_masks(frame.select(good), bounds) if len(good) > 2 else ()))
+
+
+def _border_share(frame: MultiViewFrame, view: int) -> float:
+    assert frame.mask is not None
+    width, height = frame.cameras.size_px[view].tolist()
+    mask = frame.mask[view, :height, :width] > FOREGROUND
+    return float(torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean())
+
+
+def _find_empty_masks(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[Issue]:
+    assert frame.mask is not None
+    share = (frame.mask > FOREGROUND).sum((1, 2)) / frame.cameras.size_px.prod(-1).to(frame.mask.device)
+    names = [name for name, covered in zip(frame.cameras.names, share.tolist(), strict=True) if covered == 0]
+    others = frame.without(names)
+    if not names or len(others.cameras) < 2 or others.mask is None:
+        return
+    try:
+        proxy = reconstruct(others.mask, others.cameras, bounds)
+    except ValueError:  # the calibration is wrong too, so that masks cannot be judged by it
+        return
+    enough = EMPTY_SHARE * float(share[share > 0].median())
+    for name in names:
+        camera = frame.cameras.select([name])
+        covered = float((proxy.depth(camera) > 0).sum() / camera.size_px.prod())
+        if covered >= enough:
+            expected = f"the subject should cover {100 * covered:.1f} % of the image"
+            text = f"camera '{name}': its mask is empty, but {expected}, so it is left out; segment it again"
+            yield Issue(text, camera=name)
+
+
+def _agreement(
+    frame: MultiViewFrame, cameras: Cameras, bounds: Bounds | None, config: HullConfig | None = None
+) -> tuple[float, float]:
+    """IoU of hull and masks with these cameras, and the longest side of the hull in metres; zeros without a hull.
+
+    The IoU is the mean of all cameras, or the lowest if that is below `MIN_CAMERA_IOU`, ignoring small masks.
+    """
+    assert frame.mask is not None
+    try:
+        proxy = reconstruct(frame.mask, cameras, bounds, config)
+    except ValueError:
+        return 0.0, 0.0
+    vertices = proxy.mesh.vertices
+    if not len(vertices):
+        return 0.0, 0.0
+    iou = silhouette_iou(proxy.depth(cameras) > 0, frame.mask)
+    covered = (frame.mask > FOREGROUND).sum((1, 2))
+    lowest = float(iou[covered >= covered.median() / 4].nan_to_num(1.0).min())
+    mean = float(iou.nanmean().nan_to_num(0.0))
+    return mean if lowest >= MIN_CAMERA_IOU else lowest, float((vertices.amax(0) - vertices.amin(0)).max())
+
+
+def _explain(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Issue:
+    """The change that makes hull and masks agree; if there is none, a warning, or a fatal issue without any hull."""
+    tried = list(_changes(frame, bounds))
+    if max((score for score, _ in tried), default=0.0) < LEAST_IOU and len(frame.cameras) <= MAX_CAMERAS_FOR_SWAPS:
+        tried += list(_swaps(frame, bounds))
+    best, issue = max(tried, key=lambda change: change[0], default=(0.0, Issue("")))
+    agreement = f"hull and masks agree only to an IoU of {iou:.3f}"
+    if best >= max(LEAST_IOU, iou + MIN_IMPROVEMENT):
+        return replace(issue, text=f"{agreement}, but of {best:.3f} after a correction: {issue.text}")
+    text = f"{agreement}: check axes, units, K and masks; viewmend check --out draws them"
+    return Issue(text, fatal=iou == 0.0)
+
+
+def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float, Issue]]:
+    """Common mistakes: the IoU after each is undone, and the issue that it would be."""
+    for mistake, pose in _poses(frame.cameras):
+        text = f"{mistake}; cameras.json needs R and t that map world to camera in OpenCV axes: convert them"
+        cameras = replace(frame.cameras, camera_from_world=pose)
+        yield _agreement(frame, cameras, bounds)[0], Issue(text, fatal=True)
+    for factor in (0.5, 2.0):
+        text = f"K is for images {factor:g} times as large; scale fx, fy, cx, cy and the skew by {1 / factor:g}"
+        K = frame.cameras.K.clone()
+        K[:, :2] /= factor
+        yield _agreement(frame, replace(frame.cameras, K=K), bounds)[0], Issue(text, fatal=True)
+    if bounds is not None:
+        iou, size_m = _agreement(frame, frame.cameras, None)
+        text = f"the bounds do not contain the subject of {size_m:.3g} m; check metres_per_unit, t's unit and bounds"
+        yield iou, Issue(text, fatal=True)
+    if len(frame.cameras) >= 4:
+        for name in frame.cameras.names:
+            text = f"camera '{name}' disagrees with all others, so it is left out; check its calibration and mask"
+            others = frame.without([name])
+            yield _agreement(others, others.cameras, bounds)[0], Issue(text, camera=name, always=True)
+
+
+def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float, Issue]]:
+    """Each pair of cameras with exchanged calibrations, as in `_changes`."""
+    names, frame = frame.cameras.names, limit_size(frame, PAIRS_PX)
+    for first, second in itertools.combinations(range(len(names)), 2):
+        order = list(range(len(names)))
+        order[first], order[second] = second, first
+        if frame.cameras.size_px[first].tolist() != frame.cameras.size_px[second].tolist():
+            continue
+        cameras = replace(frame.cameras[order], names=names)
+        text = f"cameras '{names[first]}' and '{names[second]}' are swapped; exchange their files or calibrations"
+        yield _agreement(frame, cameras, bounds, PAIRS_HULL)[0], Issue(text, fatal=True)
+
+
+def _poses(cameras: Cameras) -> Iterator[tuple[str, Float[Tensor, "view 4 4"]]]:
+    """What camera_from_world may have been confused with, and the corrected camera_from_world."""
+    stored, flip = cameras.camera_from_world, FLIP.to(cameras.K)
+    transposed = stored.clone()
+    transposed[:, :3, :3] = stored[:, :3, :3].mT
+    yield "R and t are camera-to-world", cameras.world_from_camera
+    yield "R and t have OpenGL axes (y up, z back)", flip @ stored
+    yield "R and t are camera-to-world with OpenGL axes (y up, z back)", flip @ cameras.world_from_camera
+    yield "R is camera-to-world (transposed)", transposed
+    centred = stored.clone()
+    centred[:, :3, 3:] = -stored[:, :3, :3] @ stored[:, :3, 3:]
+    yield "t is the camera's centre", centred

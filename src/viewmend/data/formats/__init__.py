@@ -1,0 +1,79 @@
+"""The capture formats that can be read, and how a folder's format is recognised.
+
+Each format is one module with two functions. `find(folder)` returns the file that identifies the format, or None.
+`content(folder, file)` returns the equivalent content of a `cameras.json` and raises a ValueError for invalid input.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.formats import (
+    actorshq,
+    agisoft,
+    colmap,
+    dna_rendering,
+    easymocap,
+    genebody,
+    middlebury,
+    mvhumannet,
+    opencv,
+    panoptic,
+    pose2sim,
+    qualisys,
+    riftcast,
+    transforms,
+    zju_mocap,
+)
+from viewmend.data.native_format import CALIBRATION, NativeCalibration, calibration_from_content, read_calibration
+
+
+@dataclass(frozen=True)
+class Format:
+    """The functions of a format's module."""
+
+    find: Callable[[Path], Path | None]
+    content: Callable[[Path, Path], dict[str, Any]]
+    root: Callable[[Path, Path], Path] = lambda path, _: path
+    """The folder that the paths in the content are relative to."""
+
+
+_DATA_SETS = (dna_rendering, riftcast, easymocap, genebody, zju_mocap, mvhumannet, actorshq, panoptic)
+_TOOLS = (pose2sim, qualisys, agisoft, middlebury, opencv)
+FORMATS = {
+    module.__name__.rpartition(".")[2]: Format(module.find, module.content, getattr(module, "root", Format.root))
+    for module in (transforms, colmap, *_DATA_SETS, *_TOOLS)
+}
+"""All formats but our own, in the order in which they are tried."""
+FORMAT_NAMES = ("plain", *FORMATS)
+
+
+def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
+    """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
+
+    Args:
+        path: the folder or file.
+        format: one of `FORMAT_NAMES`; by default the first one that matches.
+
+    Raises:
+        CaptureError: the format is unknown, the folder does not have it, or its calibration cannot be used.
+    """
+    if format not in (None, *FORMAT_NAMES):
+        raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")
+    if format == "plain" or (format is None and (path / CALIBRATION).is_file()):
+        return read_calibration(path)
+    for name in FORMATS if format is None else (format,):
+        if (file := FORMATS[name].find(path)) is not None:
+            try:
+                with np.errstate(all="ignore"):  # overflow becomes infinity, which is rejected
+                    calibration = calibration_from_content(FORMATS[name].content(path, file), file)
+                    return replace(calibration, folder=FORMATS[name].root(path, file))
+            except (ValueError, OSError) as error:
+                raise CaptureError(f"{file}: {error}") from None
+    if format is None:
+        return read_calibration(path)  # its error message lists what a capture folder contains
+    raise CaptureError(f"{path}: expected a capture of format '{format}', got none of its files; see docs/formats.md")

@@ -1,0 +1,322 @@
+"""Helpers of the format readers: image sizes, poses, footage found by camera names, and safe XML."""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError, fromstring
+
+import numpy as np
+
+from viewmend.data.containers import read_bytes
+from viewmend.data.images import size_from_header
+from viewmend.data.native_format import stays_inside
+from viewmend.data.videos import is_video, video_properties
+
+HEADER_BYTES = 2**20
+"""How much of an image is read to find its size."""
+PLACES = ("videos", "videos-raw", "recordings", "images", "")
+"""Folders that are searched for footage; in `recordings` also its only subfolder."""
+MASK_PLACES = ("masks", "mask", "mask_cihp", "schp", "fmask", "rvm", "bgmtv2")
+"""Folders that are searched for masks; the later names are those of segmentation networks and of MVHumanNet."""
+LABELS = ("mask_cihp", "schp")
+"""Folders whose masks are body part labels, of which only 0 is background."""
+NO_SUBJECT = re.compile("background|plate|empty|board|calib|intrinsic")
+"""Videos with such names do not show the subject."""
+MAX_CROP_PX = 16
+"""Encoders round sizes down to whole blocks; the calibration of a slightly larger image stays valid."""
+
+
+def folders_containing(folder: Path, part: str) -> list[Path]:
+    """A folder and its subfolders whose names contain `part`; empty if the folder does not exist."""
+    within = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [folder, *(path for path in within if path.is_dir() and part in path.name.lower())] if within else []
+
+
+def image_size_px(folder: Path, name: str) -> tuple[int, int]:
+    """Width and height of an image in the folder, from its header.
+
+    Raises:
+        ValueError: the path leaves the folder, or there is no such image.
+    """
+    size = None
+    if stays_inside(name):
+        try:
+            size = size_from_header(read_bytes(folder / name, HEADER_BYTES))
+        except OSError:
+            size = None
+    if size is None:
+        raise ValueError(f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file")
+    return size
+
+
+def names_from_paths(paths: Sequence[str]) -> list[str]:
+    """A camera name for each image: the file name without suffix, or the whole path if file names are not unique."""
+    stems = [PurePosixPath(path).stem for path in paths]
+    if len(set(stems)) == len(stems):
+        return stems
+    return [str(PurePosixPath(path).with_suffix("")).replace("/", "_") if path else path for path in paths]
+
+
+def find_mask(folder: Path, image: str) -> str | None:
+    """The path of an image's mask in `masks`: `a.jpg.png`, as in COLMAP, or `a.png`; None without that folder."""
+    if not (folder / "masks").is_dir():
+        return None
+    replaced = f"masks/{image.rpartition('.')[0]}.png"
+    return replaced if "\0" not in image and (folder / replaced).is_file() else f"masks/{image}.png"
+
+
+def to_rotation(name: str, values: object) -> list[list[float]]:
+    """A rotation matrix from its nine numbers or from a Rodrigues vector.
+
+    Raises:
+        ValueError: the values are neither.
+    """
+    import cv2
+
+    numbers = _to_array(values)
+    if numbers.size not in (3, 9):
+        raise ValueError(f"camera '{name}': expected a rotation of 3 or 9 numbers, got {numbers.size}; add it")
+    matrix = cv2.Rodrigues(numbers)[0] if numbers.size == 3 else numbers.reshape(3, 3)
+    return np.asarray(matrix).tolist()
+
+
+def to_distortion(name: str, values: object) -> list[float]:
+    """OpenCV's k1 k2 p1 p2 k3 from 0, 4 or 5 numbers, or more if the others are 0.
+
+    Raises:
+        ValueError: there are other numbers.
+    """
+    numbers = _to_array(values)
+    if 0 < numbers.size < 4 or numbers[5:].any():
+        got = f"{numbers.size} numbers"
+        raise ValueError(f"camera '{name}': expected k1 k2 p1 p2 k3, got {got}; undistort the images first")
+    return [*numbers[:5].tolist(), 0.0, 0.0, 0.0, 0.0, 0.0][:5]
+
+
+def _to_array(values: object) -> np.ndarray:
+    try:
+        return np.asarray(values, float).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("expected numbers, got something else; export the calibration again") from None
+
+
+def invert_pose(world_from_camera: np.ndarray) -> dict[str, list[Any]]:
+    """R and t of camera_from_world, from world_from_camera (3 x 4 or 4 x 4)."""
+    R = world_from_camera[:3, :3].T
+    return {"R": R.tolist(), "t": (-R @ world_from_camera[:3, 3]).tolist()}
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Images and masks of all cameras."""
+
+    frames: tuple[str, ...]
+    fps: float | None
+    entries: dict[str, dict[str, Any]]
+    """The keys of a `cameras.json` for a camera's size, images and masks, by its name."""
+
+    def entry(self, name: str, calibrated_px: Sequence[int | float] | None = None) -> dict[str, Any]:
+        """The keys of one camera, which was calibrated at this width and height if known.
+
+        Raises:
+            ValueError: its images have another size.
+        """
+        entry = self.entries[name]
+        size = entry["width"], entry["height"]
+        if calibrated_px and any(not 0 <= a - b <= MAX_CROP_PX for a, b in zip(calibrated_px, size, strict=True)):
+            expected = " x ".join(f"{max(-1e9, min(side, 1e9)):g}" for side in calibrated_px)  # huge integers overflow
+            got = f"{size[0]} x {size[1]}"
+            raise ValueError(f"camera '{name}': expected images of {expected} pixels, got {got}; export that size")
+        return {"name": name, **entry}
+
+
+@dataclass(frozen=True)
+class ImageList:
+    """The images of one camera in a folder."""
+
+    pattern: str
+    """A path with `{frame}` for the frame id."""
+    frames: frozenset[str]
+
+    def first(self) -> str:
+        """The path of the first image."""
+        return self.pattern.replace("{frame}", min(self.frames, key=frame_order))
+
+
+def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLACES) -> Footage:
+    """Find videos, or folders of images, that are named after the cameras; likewise their masks, if any.
+
+    Raises:
+        ValueError: no place has footage of every camera, or only some cameras have masks.
+    """
+    for place in places:
+        only = [f"{place}/{name}" for name in _subfolders(folder / place)] if place == "recordings" else []
+        for where in (place, *(only if len(only) == 1 else ())):
+            for found in (_videos(folder, where), _folders(folder, where)):
+                if paths := match_names(names, found):
+                    return collect_footage(folder, dict(zip(names, paths, strict=True)))
+    searched = ", ".join(place or "the folder" for place in places)
+    raise ValueError(
+        f"expected a video or a folder of images named after each camera ({', '.join(names)[:80]}) in {searched}, "
+        "got none; rename them"
+    )
+
+
+def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
+    """Collect the footage of cameras whose videos or folders of images are known, by name, and find their masks.
+
+    Raises:
+        ValueError: there are fewer than two, a camera has none, or only some cameras have masks.
+    """
+    if len(paths) < 2:
+        raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
+    entries, frames, rates = {}, set(), []
+    paths = {name: _only_video(folder, path) or path for name, path in paths.items()}
+    videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
+    for name, path in paths.items():
+        if name in videos:
+            video = videos[name]
+            entries[name] = {"width": video.width, "height": video.height, "video": path}
+            rates.append(video.fps)
+            continue
+        images = list_images(folder, path)
+        if images is None:
+            raise ValueError(f"expected images of camera '{name}' in {path}, got none; add them")
+        width, height = image_size_px(folder, images.first())
+        entries[name] = {"width": width, "height": height, "image": images.pattern}
+        frames |= images.frames
+    if videos:
+        frames = {f"{time:06d}" for time in range(min(video.frames for video in videos.values()))}
+    for name, mask in _find_masks(folder, tuple(paths)).items():
+        entries[name] |= mask
+    return Footage(tuple(sorted(frames, key=frame_order)), rates[0] if rates else None, entries)
+
+
+def list_images(folder: Path, place: str) -> ImageList | None:
+    """The images in a subfolder whose names differ only in a number, of the most frequent pattern; None without any."""
+    named = [re.fullmatch(r"(.*?)(\d+)([^\d]*)(\.\w+)|([^.].*)()()(\.\w+)", name) for name in _files(folder / place)]
+    parts = [m.groups()[:4] if m[2] else ("", m[5], "", m[8]) for m in named if m and not is_video(m[0])]
+    if not parts:
+        return None
+    (before, after, suffix), _ = Counter(sorted((p[0], p[2], p[3]) for p in parts)).most_common(1)[0]
+    frames = frozenset(p[1] for p in parts if (p[0], p[2], p[3]) == (before, after, suffix))
+    return ImageList(f"{place}/{before}{{frame}}{after}{suffix}".removeprefix("/"), frames)
+
+
+def frame_order(frame: str) -> tuple[int, str]:
+    """Sort key of frame ids, in which 9 precedes 10."""
+    return len(frame), frame
+
+
+def match_names(names: Sequence[str], paths: Iterable[str]) -> list[str] | None:
+    """The path of each camera name, by the first of several comparisons that assigns exactly one to each; else None."""
+    stems = {path: Path(path).stem if is_video(path) else Path(path).name for path in paths}
+    for key in _KEYS:
+        by_key: dict[Hashable, list[str]] = {}
+        for path, stem in stems.items():
+            by_key.setdefault(key(stem), []).append(path)
+        keys = [key(name) for name in names]
+        if None not in keys and len(set(keys)) == len(keys) and all(len(by_key.get(k, ())) == 1 for k in keys):
+            return [by_key[k][0] for k in keys]
+    return None
+
+
+def _after_cam(text: str) -> str:
+    """What follows the last "cam", "camera" or "port", without leading zeros; without one of them, the whole text."""
+    found = re.findall(r"(?:cam(?:era)?|port)[-_ ]?([a-z0-9]+)", text.lower())
+    return (found[-1] if found else text.lower()).lstrip("0")
+
+
+def _last_number(text: str) -> int | None:
+    found = re.findall(r"\d{1,9}", text)
+    return int(found[-1]) if found else None
+
+
+_KEYS: tuple[Callable[[str], Hashable], ...] = (str, _after_cam, _last_number)
+"""Comparisons of names, the strictest first."""
+
+
+def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """The keys of a `cameras.json` for each camera's masks; empty if there are no masks.
+
+    Raises:
+        ValueError: only some cameras have masks.
+    """
+    place = next((place for place in MASK_PLACES if (folder / place).is_dir()), None)
+    if place is None:
+        return {}
+    paths = match_names(names, _videos(folder, place)) or match_names(names, _folders(folder, place))
+    if paths is None:
+        raise ValueError(f"expected masks of each camera in {place}, got others; name them after the cameras")
+    labels = {"mask_labels": True} if place in LABELS else {}
+    found = {}
+    for name, path in zip(names, paths, strict=True):
+        images = None if is_video(path) else list_images(folder, path)
+        pattern = images.pattern if images else path if is_video(path) else f"{path}/{{frame}}.png"
+        found[name] = {"mask": pattern} | labels
+    return found
+
+
+def _only_video(folder: Path, path: str) -> str | None:
+    """The only video in a camera's folder that shows the subject."""
+    found = [video for video in _videos(folder, path) if not NO_SUBJECT.search(Path(video).name.lower())]
+    return found[0] if len(found) == 1 else None
+
+
+def _videos(folder: Path, place: str) -> list[str]:
+    return [f"{place}/{name}".removeprefix("/") for name in _files(folder / place) if is_video(name)]
+
+
+def _folders(folder: Path, place: str) -> list[str]:
+    return [f"{place}/{name}".removeprefix("/") for name in _subfolders(folder / place)]
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+
+
+def _subfolders(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name[0] != ".") if folder.is_dir() else []
+
+
+def read_xml(data: bytes) -> Element:
+    """Parse an XML document.
+
+    Raises:
+        ValueError: it is not XML, or declares a document type, whose entities can expand without limit.
+    """
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
+        raise ValueError("expected XML without a document type, got one; export it again")
+    try:
+        return fromstring(data)
+    except (ParseError, ValueError, LookupError) as error:
+        raise ValueError(f"expected XML, got something else: {str(error)[:80]}; export it again") from None
+
+
+def xml_number(what: str, text: str | None) -> float:
+    """Parse a finite number; `what` starts the error message.
+
+    Raises:
+        ValueError: it is missing or invalid.
+    """
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{what}: expected a number, got {'nothing' if not text else repr(text[:40])}; add it")
+    return value
+
+
+def xml_attributes(camera: str, element: Element | None, keys: str) -> list[float]:
+    """Numbers that an element of a camera has as attributes.
+
+    Raises:
+        ValueError: one is missing or invalid.
+    """
+    attributes = {} if element is None else element.attrib
+    return [xml_number(f"camera '{camera}': {key}", attributes.get(key)) for key in keys.split()]

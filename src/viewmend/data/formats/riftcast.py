@@ -1,0 +1,297 @@
+"""RIFTCast data sets (VCI): `calibration.json`, and one folder per frame with images and run-length masks.
+
+RIFTCast is started with a meta file, which names the data set's folder, its frames, and the volume of the subject.
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from msgspec import Meta, Struct
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.formats.files import to_distortion
+from viewmend.data.images import RUN_LENGTH_SUFFIX, encode_run_lengths, write_image
+from viewmend.data.native_format import stays_inside
+from viewmend.data.native_writer import atomic_folder
+from viewmend.data.source import CaptureSource, prefetch
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.proxy import reconstruct
+from viewmend.types import MultiViewFrame
+from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, typed
+
+CALIBRATION, META = "calibration.json", "dataset.json"
+TYPES = ("VCI", "VCI_REAL")
+MAX_META_BYTES = 2**16
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between OpenGL axes, which the program uses, and OpenCV axes, which its files use."""
+MARGIN = 1.2
+"""Size of the written cube relative to the hull of the first frame, if the source has no bounds."""
+Sixteen = Annotated[list[Number], Meta(min_length=16, max_length=16)]
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+class Extrinsics(Struct, kw_only=True):
+    """Pose of a camera: camera_from_world in row-major order, OpenCV axes."""
+
+    view_matrix: Sixteen
+
+
+class Intrinsics(Struct, kw_only=True):
+    """Lens of a camera; the centre of the first pixel is at 0.5."""
+
+    camera_matrix: Annotated[list[Number], Meta(min_length=9, max_length=9)]
+    resolution: tuple[int, int]
+    distortion_coefficients: list[Number] = []
+
+
+class RiftcastCameraEntry(Struct, kw_only=True):
+    """One of the cameras."""
+
+    camera_id: int | str
+    extrinsics: Extrinsics
+    intrinsics: Intrinsics
+
+
+class RiftcastCalibration(Struct, kw_only=True):
+    """The content of `calibration.json`."""
+
+    cameras: list[RiftcastCameraEntry]
+
+
+class Dataset(Struct, kw_only=True):
+    """The data set in a meta file."""
+
+    path: str = "."
+    camera_path: str = CALIBRATION
+    frame_count: Annotated[int, Meta(ge=1)] | None = None
+    start_frame: int = 0
+    flip_images: bool = True
+    flip_masks: bool = True
+    to_world: Sixteen | None = None
+
+
+class Volume(Struct, kw_only=True):
+    """The cube that contains the subject, in the program's frame; `scale` is half of its side."""
+
+    position: Triple
+    scale: Annotated[float, Meta(gt=0, le=1e6)] = 1.0
+
+
+class MetaFile(Struct, kw_only=True):
+    """A meta file; other keys are ignored."""
+
+    type: str
+    version: str
+    dataset: Dataset
+    volume: Volume | None = None
+
+
+def find(path: Path) -> Path | None:
+    """The path itself if it is a meta file, or the calibration of a folder with images as RIFTCast stores them."""
+    if path.is_file():
+        return path if path.suffix == ".json" and _is_meta(path) else None
+    found = (path / CALIBRATION).is_file() and next(path.glob("frame_*/rgb"), None) is not None
+    return path / CALIBRATION if found else None
+
+
+def root(path: Path, file: Path) -> Path:
+    """The folder of the data set, which a meta file names."""
+    if path.is_dir():
+        return path
+    named = file.parent / _read_meta(file).dataset.path
+    return named if named.is_dir() else file.parent
+
+
+def content(path: Path, file: Path) -> dict[str, Any]:
+    """All cameras; bounds, up and the range of frames are those of a meta file, if there is one.
+
+    Raises:
+        ValueError: a file has other content, or images are stored bottom-up.
+    """
+    folder, meta = root(path, file), _meta_of(path, file)
+    place = meta.dataset.camera_path if meta and stays_inside(meta.dataset.camera_path) else CALIBRATION
+    cameras = typed(read_json(bounded_bytes(folder / place)), RiftcastCalibration).cameras
+    frames = _frames(folder, meta)
+    entries = [_camera(folder, camera, frames) for camera in cameras]
+    result = {"first_pixel_center": [0.5, 0.5], "frames": frames, "cameras": entries}
+    return result | (_meta_keys(meta) if meta else {})
+
+
+def stored_from_program(path: Path) -> np.ndarray:
+    """The 4 x 4 transform from the program's frame, y up, to that of `calibration.json` (of a data set or meta file).
+
+    Raises:
+        ValueError: this is not a data set, or its meta file has other content.
+    """
+    if (file := find(path)) is None:
+        raise ValueError(f"expected a data set of RIFTCast or its meta file, got {path}; check the path")
+    return _stored_from_program(_meta_of(path, file))
+
+
+def _stored_from_program(meta: MetaFile | None) -> np.ndarray:
+    if meta is None or meta.dataset.to_world is None:
+        return FLIP
+    return FLIP @ np.array(meta.dataset.to_world).reshape(4, 4)
+
+
+def _meta_of(path: Path, file: Path) -> MetaFile | None:
+    """The meta file that this path is, or the first one in the folder."""
+    files = [file] if path.is_file() else sorted(json for json in root(path, file).glob("*.json") if _is_meta(json))
+    return _read_meta(files[0]) if files else None
+
+
+def _frames(folder: Path, meta: MetaFile | None) -> list[str]:
+    found = (re.fullmatch(r"frame_(\d{1,9})", place.name) for place in folder.glob("frame_*"))
+    frames = sorted((match[1] for match in found if match), key=int)
+    if meta is None or meta.dataset.frame_count is None:
+        return frames
+    first = meta.dataset.start_frame
+    return [frame for frame in frames if first <= int(frame) < first + meta.dataset.frame_count]
+
+
+def _camera(folder: Path, camera: RiftcastCameraEntry, frames: list[str]) -> dict[str, Any]:
+    name, view = str(camera.camera_id), np.array(camera.extrinsics.view_matrix).reshape(4, 4)
+    K, size = np.array(camera.intrinsics.camera_matrix).reshape(3, 3), camera.intrinsics.resolution
+    entry = {"name": name, "width": size[0], "height": size[1], "K": K.tolist()}
+    entry |= {"R": view[:3, :3].tolist(), "t": view[:3, 3].tolist()}
+    entry["dist"] = to_distortion(name, camera.intrinsics.distortion_coefficients)
+    entry["image"] = _pattern(folder, f"rgb/rgb_{name}", frames, (".jpeg", ".jpg", ".png"))
+    if any((folder / f"frame_{frame}" / "mask").is_dir() for frame in frames[:1]):
+        entry["mask"] = _pattern(folder, f"mask/mask_{name}", frames, (RUN_LENGTH_SUFFIX, ".png"))
+    return entry
+
+
+def _pattern(folder: Path, stem: str, frames: list[str], suffixes: tuple[str, ...]) -> str:
+    """The path of these files, with the first suffix that any of them has."""
+    paths = ((suffix, folder / f"frame_{frame}/{stem}{suffix}") for suffix in suffixes for frame in frames)
+    suffix = next((suffix for suffix, path in paths if "\0" not in str(path) and path.is_file()), suffixes[0])
+    return f"frame_{{frame}}/{stem}{suffix}"
+
+
+def _meta_keys(meta: MetaFile) -> dict[str, Any]:
+    """The keys `up` and `bounds` from a meta file."""
+    if not (meta.dataset.flip_images and meta.dataset.flip_masks):
+        raise ValueError("expected flip_images and flip_masks of true, got files stored bottom-up; flip the files")
+    stored = _stored_from_program(meta)
+    result: dict[str, Any] = {"up": stored[:3, 1].tolist()}
+    if meta.volume is not None:
+        corners = np.c_[np.array(meta.volume.position) + meta.volume.scale * CORNERS, np.ones(8)] @ stored.T
+        result["bounds"] = [corners[:, :3].min(0).tolist(), corners[:, :3].max(0).tolist()]
+    return result
+
+
+def _is_meta(file: Path) -> bool:
+    try:
+        value = read_json(_without_comments(bounded_bytes(file, MAX_META_BYTES)))
+    except (ValueError, OSError):
+        return False
+    return isinstance(value, dict) and value.get("type") in TYPES
+
+
+def _read_meta(file: Path) -> MetaFile:
+    meta = typed(read_json(_without_comments(bounded_bytes(file, MAX_META_BYTES))), MetaFile)
+    if meta.version.partition(".")[0] != "2":
+        raise ValueError(f"expected version 2 of RIFTCast's meta file, got {meta.version[:20]!r}; write it again")
+    return meta
+
+
+def _without_comments(data: bytes) -> bytes:
+    """Remove comments, from // to the end of the line, outside of strings."""
+    return re.sub(rb'("(?:\\.|[^"\\\n])*")|//[^\n]*', lambda found: found[1] or b"", data)
+
+
+def write_riftcast(
+    source: CaptureSource, out: Path, *, progress: Callable[[Iterable[int]], Iterable[int]] | None = None
+) -> None:
+    """Write a source as a RIFTCast data set: JPEG images, run-length masks, `calibration.json`, and `dataset.json`.
+
+    Cameras are numbered in their order. In the program's frame y is up, if the source knows up, and the cube contains
+    the bounds of the source, or the hull of the first frame. `out` is complete or absent. `progress` wraps the iterated
+    frame indices.
+
+    Raises:
+        CaptureError: `out` is in use, or the source has images of different sizes, gaps or no masks.
+    """
+    sizes = sorted({tuple(size) for size in source.cameras.size_px.tolist()})
+    if len(sizes) > 1:
+        raise CaptureError(f"{source.name}: expected images of one size, got {sizes}; choose cameras of one size")
+    times = range(len(source.frame_ids))
+    bounds = source.bounds
+    with atomic_folder(out) as folder:
+        for number, frame in enumerate(prefetch(source, times if progress is None else progress(times))):
+            _write_frame(source, frame, folder / f"frame_{number:05d}")
+            if bounds is None:
+                bounds = _hull_bounds(frame)
+        calibration, meta = {"cameras": _camera_entries(source)}, _meta_content(source, bounds, Path(out).resolve())
+        for name, value in ((CALIBRATION, calibration), (META, meta)):
+            (folder / name).write_text(json.dumps(value, indent=1), encoding="utf-8")
+
+
+def _write_frame(source: CaptureSource, frame: MultiViewFrame, folder: Path) -> None:
+    where = f"{source.name}: frame '{source.frame_ids[frame.time]}'"
+    if frame.mask is None:
+        raise CaptureError(f"{where}: expected masks, which RIFTCast needs for its hull, got none; make them first")
+    if len(frame.cameras) < len(source.cameras):
+        got = f"{len(frame.cameras)} of {len(source.cameras)}"
+        raise CaptureError(f"{where}: expected all cameras, got {got}; leave out the frame or the cameras")
+    for view in range(len(frame.cameras)):
+        write_image(folder / f"rgb/rgb_{view}.jpeg", frame.rgb[view].permute(1, 2, 0).contiguous().cpu().numpy())
+        file = folder / f"mask/mask_{view}{RUN_LENGTH_SUFFIX}"
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(encode_run_lengths(frame.mask[view].cpu().numpy()))
+
+
+def _hull_bounds(frame: MultiViewFrame) -> Bounds | None:
+    assert frame.mask is not None
+    vertices = reconstruct(frame.mask, frame.cameras, None).mesh.vertices
+    if not len(vertices):
+        return None
+    low, high = vertices.amin(0), vertices.amax(0)
+    grow = (MARGIN - 1) / 2 * (high - low)
+    return Bounds(low - grow, high + grow)
+
+
+def _camera_entries(source: CaptureSource) -> list[dict[str, Any]]:
+    cameras = source.cameras.to("cpu")
+    return [
+        {
+            "camera_id": view,
+            "camera_model_name": name,
+            "extrinsics": {"view_matrix": cameras.camera_from_world[view].flatten().tolist()},
+            "intrinsics": {
+                "camera_matrix": cameras.K[view].flatten().tolist(),
+                "resolution": cameras.size_px[view].tolist(),
+            },
+        }
+        for view, name in enumerate(cameras.names)
+    ]
+
+
+def _meta_content(source: CaptureSource, bounds: Bounds | None, path: Path) -> dict[str, Any]:
+    turn = _source_from_y_up(source)
+    dataset = {"frame_count": len(source.frame_ids), "start_frame": 0, "path": str(path), "camera_path": CALIBRATION}
+    to_world = np.eye(4)
+    to_world[:3, :3] = FLIP[:3, :3] @ turn  # stored = FLIP @ to_world @ program
+    dataset |= {"flip_images": True, "flip_masks": True, "to_world": to_world.ravel().tolist()}
+    meta = {"type": "VCI", "version": "2.0.0", "dataset": dataset, "reconstructor": {"partial_masks": True}}
+    if bounds is not None:
+        low, high = torch.stack([bounds.low, bounds.high]).double().cpu().numpy()
+        corners = np.where(CORNERS > 0, high, low) @ turn
+        low, high = corners.min(0), corners.max(0)
+        meta["volume"] = {"position": ((low + high) / 2).tolist(), "scale": float((high - low).max() / 2)}
+    return meta
+
+
+def _source_from_y_up(source: CaptureSource) -> np.ndarray:
+    """A rotation from a frame with y up to the source's frame; the identity if the source does not know up."""
+    if source.up is None:
+        return np.eye(3)
+    up = source.up.double().cpu().numpy()
+    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    side /= np.linalg.norm(side)
+    return np.stack([side, up, np.cross(side, up)], 1)

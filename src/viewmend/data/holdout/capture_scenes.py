@@ -1,0 +1,317 @@
+"""Real captures as scenes with one held-out camera each, seen from all other cameras or from a few; and split files."""
+
+import hashlib
+import json
+import math
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+from msgspec import Meta, Struct, structs
+
+from viewmend.data.containers import container_of
+from viewmend.data.formats import read_any_calibration
+from viewmend.data.holdout.scenes import LeaveOneOut, LeaveOneOutFrame, LeaveOneOutScene
+from viewmend.data.native_capture import NativeCapture, open_capture
+from viewmend.data.native_format import CALIBRATION
+from viewmend.data.prepare import open_masked, prepare
+from viewmend.geometry.cameras import Cameras
+from viewmend.rendering.view import select_closest
+from viewmend.utils.untrusted_input import bounded_bytes, read_json, typed
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureScene(LeaveOneOutScene):
+    """One held-out camera of a capture, which is prepared as in `viewmend mend`."""
+
+    folder: Path
+    inputs: tuple[str, ...]
+    """Input cameras."""
+    count: int
+    """Frames from the first."""
+    fingerprint: str
+    """Hash of the capture's files."""
+    kind: str | None = None
+    """The capture's format, None to recognise it."""
+
+    @property
+    def definition(self) -> str:
+        """The capture's fingerprint, which cameras, how many frames."""
+        return repr((self.fingerprint, self.held, self.inputs, self.count))
+
+    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
+        """Frames in which the camera that was left out, and at least two of the inputs, have images."""
+        capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.kind), self.inputs)
+        bounds = None if capture.bounds is None else capture.bounds.to(device)
+        for time in range(self.count):
+            frame = capture.read(time).to(device)
+            if self.held in frame.cameras.names and len(frame.cameras) >= 3:
+                yield LeaveOneOut({time: frame}, bounds).frame(self.held, time)
+
+
+def capture_set(
+    folder: Path, inputs: str = "all", frames: int | None = None, kind: str | None = None
+) -> tuple[CaptureScene, ...]:
+    """Every camera of a capture left out in turn.
+
+    Args:
+        folder: of the capture.
+        inputs: "all" others, or a number of cameras, chosen by `evenly_around`, without the held-out one.
+        frames: how many from the first; None for all.
+        kind: the capture's format, None to recognise it.
+
+    Raises:
+        CaptureError: the capture cannot be read, has no masks, or too few cameras.
+        ValueError: `inputs` or `frames` is no such number.
+    """
+    capture = open_masked(folder, held=1, format=kind)
+    names = capture.cameras.names
+    if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
+        raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
+    if frames is not None and frames < 1:
+        raise ValueError(f"expected --frames of at least 1, got {frames}; leave it away for all")
+    looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
+    fingerprint, count = _fingerprint(folder, kind), min(frames or len(capture.frame_ids), len(capture.frame_ids))
+    return tuple(
+        CaptureScene(
+            name=f"{capture.name}-{held}-from-{inputs}",
+            set=f"{capture.name} from {inputs}",
+            rig=f"{inputs} of {len(names)}",
+            style="capture",
+            folder=folder,
+            held=held,
+            inputs=tuple(name for name in looking if name != held),
+            count=count,
+            fingerprint=fingerprint,
+            kind=kind,
+        )
+        for held in names
+    )
+
+
+def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
+    """Names of this many cameras, evenly in the order in which they stand around; the first is the rig's first.
+
+    Camera n of the ordered N is taken for n = floor(i N / count): for a ring, every k-th.
+    """
+    eyes = (cameras.centers - cameras.centers.mean(0)).double()
+    first, second = torch.linalg.svd(eyes, full_matrices=False).Vh[:2]  # the plane that the cameras stand in
+    turn = 2 * math.pi
+    angle = torch.atan2(eyes @ second, eyes @ first)
+    around = (angle - angle[0]) % turn
+    if float(around[1]) > turn / 2:  # the way around in which names go up
+        around = (turn - around) % turn
+    order: Sequence[int] = around.argsort(stable=True).tolist()
+    return tuple(cameras.names[order[i * len(order) // count]] for i in range(count))
+
+
+def _fingerprint(folder: Path, kind: str | None) -> str:
+    """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
+    is_file = folder.name == CALIBRATION and folder.is_file()
+    plain = read_any_calibration(folder.parent if is_file else folder, kind)
+    folder = plain.folder
+    named = {c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames}
+    files = sorted({container_of(folder / name) for name in named})
+    stats = [(str(file.relative_to(folder)), file.stat()) for file in files if file.is_file()]
+    listed = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
+    calibration = plain.file.read_bytes()
+    if plain.file.name != CALIBRATION:  # there may be other files in the folder
+        calibration = repr([(c.name, *(n.tolist() for n in (c.K, c.R, c.t_m, c.dist))) for c in plain.cameras]).encode()
+    return hashlib.sha256(calibration + repr(listed).encode()).hexdigest()
+
+
+FORMAT = "viewmend-splits/1"
+CLOSEST = 3
+MOST_BYTES = 2**26
+
+
+class SplitScene(Struct, frozen=True, kw_only=True):
+    """One capture of the file's `scenes`."""
+
+    name: str
+    path: Annotated[str, Meta(min_length=1)]
+    """Where the capture is, relative to the file's folder."""
+    kind: str | None = None
+    subject: str
+    split: Literal["training", "test"]
+    left_out: str
+    closest: tuple[str, ...]
+    """The three others closest to it, in angle at the point that all cameras look at, nearest first."""
+    calibration_sha256: str
+    """Hash of names, lenses and poses: another calibration is another scene."""
+
+
+class SplitFile(Struct, frozen=True, kw_only=True):
+    """All of the file."""
+
+    format: Literal["viewmend-splits/1"]
+    seed: int
+    scenes: Annotated[tuple[SplitScene, ...], Meta(min_length=1)]
+
+
+def make_splits(
+    captures: Sequence[Path],
+    base: Path,
+    *,
+    seed: int = 0,
+    test_fraction: float = 0.1,
+    subject: str = "(.*)",
+    kind: str | None = None,
+) -> SplitFile:
+    """Split captures so that no subject is in both parts, and choose the camera that each leaves out.
+
+    The order of subjects and the cameras follow from hashes of their names and the seed alone: the same on every
+    machine, and adding a capture does not change the cameras of the others.
+
+    Args:
+        captures: folders, or files that stand for them.
+        base: the folder that paths are relative to.
+        seed: chooses subjects and cameras.
+        test_fraction: at least this part of the scenes is for tests; at least one subject.
+        subject: a regular expression, whose first group in a capture's name is its subject.
+        kind: the captures' format, None to recognise it.
+
+    Raises:
+        ValueError: fewer than two subjects, a name without a subject, two scenes of one name, or fewer than 4 cameras.
+    """
+    scenes = [_scene(path, base, seed, subject, kind) for path in captures]
+    names = [scene.name for scene in scenes]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    subjects = sorted({scene.subject for scene in scenes}, key=lambda one: _hash(seed, "subject", one))
+    if twice or len(subjects) < 2:
+        got = f"{twice[:3]} twice" if twice else f"the subjects {subjects}"
+        raise ValueError(f"expected captures of different names and of two subjects or more, got {got}; see --subject")
+    tested: set[str] = set()
+    for one in subjects[:-1]:
+        if tested and sum(scene.subject in tested for scene in scenes) >= test_fraction * len(scenes):
+            break
+        tested.add(one)
+    split = [structs.replace(s, split="test" if s.subject in tested else "training") for s in scenes]
+    return SplitFile(format=FORMAT, seed=seed, scenes=tuple(sorted(split, key=lambda s: (s.split, s.subject, s.name))))
+
+
+def splits_json(splits: SplitFile) -> str:
+    """The file's text."""
+    values = structs.asdict(splits) | {"scenes": [structs.asdict(scene) for scene in splits.scenes]}
+    return json.dumps({"format": FORMAT, "protocol": _PROTOCOL, **values}, indent=1) + "\n"
+
+
+def is_splits(file: Path) -> bool:
+    """Whether this is a file of splits, by its beginning."""
+    if not file.is_file() or file.suffix != ".json":
+        return False
+    with file.open("rb") as stream:
+        return FORMAT.encode() in stream.read(2048)
+
+
+def read_splits(file: Path) -> SplitFile:
+    """A file that `make_splits` made.
+
+    Raises:
+        ValueError: it is none.
+        OSError: it cannot be read.
+    """
+    if file.stat().st_size > MOST_BYTES:
+        raise ValueError(f"{file}: expected splits, got {file.stat().st_size} bytes; is it the right file?")
+    try:
+        return typed(read_json(bounded_bytes(file)), SplitFile, "see viewmend splits --help")
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, ...]:
+    """The test scenes of a file: each capture without its held-out camera, with all others as inputs.
+
+    Raises:
+        ValueError: it is none, or a capture is absent or was recalibrated.
+    """
+    found = []
+    for scene, path in _scenes_of(file, "test"):
+        held = next(one for one in capture_set(path, frames=frames, kind=scene.kind) if one.held == scene.left_out)
+        found.append(replace(held, name=f"{scene.name}-{scene.left_out}", set=file.stem))
+    if not found:
+        raise ValueError(f"{file}: expected a scene for tests, got none; make splits of two subjects or more")
+    return tuple(found)
+
+
+def training_captures(file: Path) -> tuple[tuple[NativeCapture, str], ...]:
+    """The captures of a file that are for training, each with the camera that it leaves out, the truth.
+
+    Raises:
+        ValueError: it is none, or a capture is absent, cannot be used, or was recalibrated.
+    """
+    found = tuple(
+        (open_masked(path, held=1, format=scene.kind), scene.left_out) for scene, path in _scenes_of(file, "training")
+    )
+    if not found:
+        raise ValueError(f"{file}: expected a scene for training, got none; make splits of two subjects or more")
+    return found
+
+
+def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple[SplitScene, Path]]:
+    """One part of a file, and where its captures are; ValueError for one that is absent or was recalibrated."""
+    for scene in read_splits(file).scenes:
+        if scene.split != split:
+            continue
+        path = file.parent / scene.path
+        if not path.exists():
+            raise ValueError(f"{file}: expected the capture {path}, got none; put the file where its paths hold")
+        if (now := _calibration_sha256(path, scene.kind)) != scene.calibration_sha256:
+            raise ValueError(
+                f"{path}: expected the calibration that {file.name} was made with, {scene.calibration_sha256[:12]}, "
+                f"got another, {now[:12]}; take that version of the data, or make splits of your own"
+            )
+        yield scene, path
+
+
+_PROTOCOL = (
+    "No subject is in both splits. Of each scene one camera, left_out, is used for nothing but the truth. "
+    "Its view is coloured by the 3 others that are closest in angle at the subject; the hull is of all others."
+)
+
+
+def _scene(path: Path, base: Path, seed: int, subject: str, kind: str | None) -> SplitScene:
+    capture = open_capture(path, format=kind)
+    names = capture.cameras.names
+    matched = re.search(subject, capture.name)
+    if matched is None or not matched.groups() or not matched[1]:
+        raise ValueError(
+            f"expected a subject by --subject '{subject}' in '{capture.name}', got none; (..) is its group"
+        )
+    if len(names) < CLOSEST + 1:
+        raise ValueError(f"{path}: expected {CLOSEST + 1} cameras or more, got {len(names)}; leave the capture out")
+    held = names[_hash(seed, "camera", capture.name) % len(names)]
+    others = capture.cameras.select([name for name in names if name != held])
+    closest = select_closest(capture.cameras.select([held]), others, _looked_at(capture.cameras), CLOSEST)
+    return SplitScene(
+        name=capture.name,
+        path=os.path.relpath(path.resolve(), base.resolve()),
+        kind=kind,
+        subject=matched[1],
+        split="training",
+        left_out=held,
+        closest=closest,
+        calibration_sha256=_calibration_sha256(path, kind),
+    )
+
+
+def _hash(seed: int, what: str, name: str) -> int:
+    return int.from_bytes(hashlib.sha256(f"{seed} {what} {name}".encode()).digest())
+
+
+def _looked_at(cameras: Cameras) -> torch.Tensor:
+    """The point that is nearest to all optical axes, metres."""
+    forward = cameras.world_from_camera[:, :3, 2].double()
+    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None]
+    point = torch.linalg.lstsq(across.sum(0), (across @ cameras.centers.double()[:, :, None]).sum(0)).solution
+    return point[:, 0].float()
+
+
+def _calibration_sha256(path: Path, kind: str | None) -> str:
+    cameras = read_any_calibration(path, kind).cameras
+    values = [[c.name, c.width, c.height, *(n.round(6).tolist() for n in (c.K, c.R, c.t_m, c.dist))] for c in cameras]
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()

@@ -1,0 +1,202 @@
+"""Studio scenes: the fixed sets P and Q, their long versions with a whole window of past frames, and turning people."""
+
+import hashlib
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS, TEST_FOLDER, LeaveOneOut, LeaveOneOutFrame, LeaveOneOutScene
+from viewmend.data.holdout.true_visibility import TrueSurface, backward_flow, surface_seen
+from viewmend.data.synthetic.procedural import PerformerStyle, procedural_scene
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.models.paper.config import paper
+from viewmend.models.paper.context_tokens import window_times
+from viewmend.types import MultiViewFrame
+
+P_SEEDS = PROCEDURAL_SEEDS["test"][:30]
+RINGS = (12, 8)
+"""Cameras of the two rigs, the left-out one among them: a usual ring, and a sparse one."""
+TEMPOS = ("calm", "dance", "fast")
+Q_SEEDS = PROCEDURAL_SEEDS["test"][10000:]
+"""Seeds of lights, rig and the part of the motion that is used."""
+FRAMES, SIZE_PX = 10, 512
+LONG_FRAMES = 41
+"""Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's window is whole."""
+TURN_SEEDS = PROCEDURAL_SEEDS["test"][100:124]
+TURN_RINGS = (8, 7)
+"""Rings in which holes are a few percent of the subject, and of these what only the past shows is a good part."""
+TURNS: tuple[tuple["Tempo", str], ...] = (("calm", "turn"), ("dance", "spin"))
+
+Background = Literal["black", "stage"]
+Tempo = Literal["calm", "dance", "fast"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudioScene(LeaveOneOutScene):
+    """A scene of the studio, perfectly calibrated; the truth is exact."""
+
+    config: StudioConfig
+    tempo: Tempo | None = None
+    """How fast procedural people move; None leaves it to the seed."""
+    motion: str | None = None
+    """How procedural people move, one person alone on an empty stage; None leaves all that to the seed."""
+    files_sha256: tuple[str, ...] = ()
+    """Hashes of the character's and the motion's files; () for procedural people."""
+
+    @property
+    def definition(self) -> str:
+        """The studio's config without paths and device, and what else matters."""
+        config = replace(self.config, performers=None, motions=None, device="cpu")
+        longer = (self.scored_from, self.motion) if self.scored_from or self.motion else ()
+        return repr((config, self.held, self.tempo, self.files_sha256, *longer))
+
+    def studio(self, device: str = "cpu") -> Studio:
+        """The studio with its people: frames of all cameras, the one that is left out among them."""
+        config = replace(self.config, device=device)
+        if self.tempo is None:
+            return Studio(config)
+        alone = {} if self.motion is None else {"motion": self.motion, "people": 1, "furniture": False}
+        return Studio(config, procedural_scene(config.seed, style=PerformerStyle(tempo=self.tempo, **alone)))
+
+    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
+        """Renders them, one at a time. Of those before the first that is scored, only what a context needs is made."""
+        studio = self.studio(device)
+        before: MultiViewFrame | None = None
+        surfaces: dict[int, TrueSurface] = {}
+        for time in range(self.config.frames):
+            drawn = studio.read(time)
+            frame = LeaveOneOut({time: drawn}).frame(self.held, time)
+            scored = time >= self.scored_from
+            if self.scored_from:
+                mesh = studio.scene(time).mesh
+                surfaces[time] = TrueSurface.of(drawn.without((self.held,)), mesh)
+                surfaces.pop(time - paper().window - 1, None)
+                if scored:
+                    seen = surface_seen(surfaces, window_times(time, paper()), mesh, frame.truth.cameras)
+                    frame = replace(frame, seen=seen)
+            if scored and before is not None and before.depth is not None:
+                now, then = (studio.scene(t).mesh for t in (time, time - 1))
+                flow_px = backward_flow(now, then, before.depth[0], frame.truth.cameras)
+                frame = replace(frame, backward_flow_px=flow_px)
+            yield frame
+            before = frame.truth
+
+
+def procedural_set(
+    frames: int = FRAMES, size_px: int = SIZE_PX, background: Background = "black"
+) -> tuple[StudioScene, ...]:
+    """P: 30 procedural scenes; the two rigs and three tempos alternate, so that each pair occurs five times.
+
+    With a stage as the background it is P-stage: the same people, for models that are not given masks.
+    """
+    name = "P" if background == "black" else f"P-{background}"
+    scenes = []
+    for n, seed in enumerate(P_SEEDS):
+        cameras, tempo = RINGS[n % 2], TEMPOS[n % 3]
+        scenes.append(
+            StudioScene(
+                name=f"{name}-{seed}",
+                set=name,
+                rig=f"ring of {cameras}",
+                style=tempo,
+                config=StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background),
+                held=held_camera(seed, cameras),
+                tempo=tempo,
+            )
+        )
+    return tuple(scenes)
+
+
+def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
+    """P-turn: 24 people who turn or spin on an empty stage, seen by two rings; rigs and motions alternate.
+
+    Some missing pixels are seen by no source view now, but were seen some frames ago.
+    """
+    scenes = []
+    for n, seed in enumerate(TURN_SEEDS):
+        cameras, (tempo, motion) = TURN_RINGS[n % 2], TURNS[n // 2 % 2]
+        scenes.append(
+            StudioScene(
+                name=f"P-turn-{seed}",
+                set="P-turn",
+                rig=f"ring of {cameras}",
+                style=motion,
+                config=StudioConfig(seed=seed, cameras=cameras, frames=LONG_FRAMES, size_px=size_px),
+                held=held_camera(seed, cameras),
+                tempo=tempo,
+                motion=motion,
+                scored_from=LONG_FRAMES - FRAMES,
+            )
+        )
+    return tuple(scenes)
+
+
+def lengthened(scenes: Sequence[StudioScene]) -> tuple[StudioScene, ...]:
+    """P-long of P, Q-long of Q: the same scenes of `LONG_FRAMES` frames, whose last `FRAMES` are scored."""
+    return tuple(
+        replace(
+            scene,
+            name=scene.name.replace(scene.set, f"{scene.set}-long", 1),
+            set=f"{scene.set}-long",
+            config=replace(scene.config, frames=LONG_FRAMES),
+            scored_from=LONG_FRAMES - FRAMES,
+        )
+        for scene in scenes
+    )
+
+
+def performer_set(
+    folder: Path, motions: Path | None = None, frames: int = FRAMES, size_px: int = SIZE_PX
+) -> tuple[StudioScene, ...]:
+    """Q: every character with every motion, each with both rigs.
+
+    Args:
+        folder: characters (.glb, .gltf) in it or in its `test`.
+        motions: BVH files in it; by default `motions/test`, `motions`, or the folder itself.
+        frames: of each scene.
+        size_px: width and height.
+
+    Raises:
+        CaptureError: there are no characters or no motions.
+    """
+    people = _files((folder / TEST_FOLDER, folder), (".glb", ".gltf"), "characters")
+    clips = _files(
+        (motions,) if motions else (folder / "motions" / TEST_FOLDER, folder / "motions", folder), (".bvh",), "motions"
+    )
+    sha256 = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*people, *clips)}
+    scenes = []
+    for seed, (person, clip) in zip(Q_SEEDS, itertools.product(people, clips), strict=False):
+        for cameras in RINGS:
+            config = StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px)
+            scenes.append(
+                StudioScene(
+                    name=f"Q-{person.stem}-{clip.stem}-{cameras}",
+                    set="Q",
+                    rig=f"ring of {cameras}",
+                    style=clip.stem,
+                    config=replace(config, performers=person, motions=clip),
+                    held=held_camera(seed, cameras),
+                    files_sha256=(sha256[person], sha256[clip]),
+                )
+            )
+    return tuple(scenes)
+
+
+def held_camera(seed: int, cameras: int) -> str:
+    """The name of the studio's camera that is left out: any, by the seed, but not in step with it."""
+    return f"cam{int(np.random.SeedSequence([seed, cameras]).generate_state(1)[0]) % cameras:02d}"
+
+
+def _files(places: Sequence[Path], suffixes: tuple[str, ...], what: str) -> list[Path]:
+    """Files with these suffixes in the first of the places that has any, by name."""
+    for place in places:
+        found = sorted(f for f in place.iterdir() if f.suffix.lower() in suffixes) if place.is_dir() else []
+        if found:
+            return found
+    tried = ", ".join(str(place) for place in places)
+    raise CaptureError(f"expected {what} ({', '.join(suffixes)}) in one of {tried}, found none; check --performers")

@@ -1,0 +1,254 @@
+"""Image files: colours, masks and depth, read safely from untrusted bytes, and written atomically."""
+
+import functools
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from viewmend.data.containers import read_bytes
+from viewmend.data.errors import CaptureError
+from viewmend.utils.atomic_writes import write_atomically
+
+DEPTH_UNITS_PER_M = 1000
+"""Depth is stored as 16-bit whole millimetres."""
+MAX_DEPTH_M = 65.535
+MAX_PIXELS = 2**27
+"""The largest image that is decoded. Its header is checked first."""
+PNG_START, PNG_CHUNK_OVERHEAD = b"\x89PNG\r\n\x1a\n", 12
+"""The signature of a PNG, and the bytes of each chunk besides its data: length, type and checksum."""
+FULL_16_BIT = 4096
+"""16-bit images whose values stay below this hold 8, 10 or 12 bits; the upper 8 of 16 bits would be black."""
+RUN_LENGTH_SUFFIX = ".bin"
+"""Suffix of RIFTCast's run-length masks: an int32 for the value of the first pixel, then the end of each run."""
+
+
+def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an image file as 8-bit RGB, exactly as stored: EXIF rotation is ignored, as calibrations ignore it.
+
+    `where` starts the error messages: file, camera, frame.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded.
+    """
+    import cv2
+
+    bgr = _read(path, where, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    if bgr.dtype == np.uint16 and not 0 < bgr.max() < FULL_16_BIT:
+        bgr = (bgr >> 8).astype(np.uint8)
+    if bgr.dtype != np.uint8:
+        got = f"{bgr.dtype} with values up to {bgr.max():g}"
+        raise CaptureError(f"{where}: expected 8 bit, or 16 bit in full range, got {got}; write it as 8-bit PNG")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def exif_rotation(path: Path) -> str | None:
+    """How EXIF asks viewers to rotate the image, in words; None if it does not, or if this is not an image."""
+    import cv2
+
+    small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(read_bytes(path), np.uint8)
+    stored, turned = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION), cv2.imdecode(data, small)
+    if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
+        return None
+    flips = ((-1, -1), (1, -1), (-1, 1))
+    if stored.shape != turned.shape or not any((stored[::y, ::x] == turned).all() for y, x in flips):
+        return "turned by 90 degrees"
+    return "turned by 180 degrees" if (stored[::-1, ::-1] == turned).all() else "mirrored"
+
+
+def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
+    """Read an 8-bit image file with alpha, as stored.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or has other channels.
+    """
+    import cv2
+
+    bgra = _read(path, where, cv2.IMREAD_UNCHANGED)
+    if bgra.dtype != np.uint8 or bgra.ndim != 3 or bgra.shape[2] != 4:
+        raise CaptureError(f"{where}: expected 8-bit RGB and alpha, got {bgra.dtype} of shape {bgra.shape}")
+    return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
+
+
+def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
+    """Read an 8-bit mask file; see `to_mask`.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or is not 8 bit.
+    """
+    import cv2
+
+    mask = _read(path, where, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if mask.dtype != np.uint8:
+        raise CaptureError(f"{where}: expected an 8-bit mask, got {mask.dtype}; write it as 8-bit PNG")
+    return to_mask(mask)
+
+
+def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "height width"]:
+    """Convert an image of 1 to 4 channels to a mask: alpha if it is not opaque everywhere, else the largest channel."""
+    import cv2
+
+    if image.ndim == 2:
+        return image
+    channels = cv2.split(image)
+    if len(channels) in (2, 4):
+        alpha = channels[-1]
+        if (alpha != 255).any():
+            return alpha
+        channels = channels[:-1]
+    return functools.reduce(cv2.max, channels)  # pyright: ignore[reportArgumentType]
+
+
+def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
+    """Read a run-length mask as 0 and 255. The file does not store its size, which is (height, width).
+
+    Raises:
+        CaptureError: the file cannot be read, or its runs do not fill that size.
+    """
+    height, width = size
+    data = _read_file(path, where)
+    numbers = np.frombuffer(data[: len(data) // 4 * 4], "<i4")
+    runs = np.diff(numbers[1:].astype(np.int64), prepend=0)
+    malformed = len(data) % 4 or len(numbers) < 2 or numbers[0] not in (0, 1) or (runs < 0).any()
+    if malformed or runs.sum() != width * height:
+        end = int(numbers[-1]) if len(numbers) else 0
+        raise CaptureError(
+            f"{where}: expected runs of 0 and 1 that end at {width} x {height} = {width * height} pixels, got "
+            f"{len(data)} bytes that end at {end}; write it for the calibration's size"
+        )
+    values = (np.arange(len(runs)) + numbers[0]) % 2 * 255
+    return np.repeat(values.astype(np.uint8), runs).reshape(height, width)
+
+
+def encode_run_lengths(mask: UInt8[np.ndarray, "height width"], threshold: int = 127) -> bytes:
+    """Encode a mask as run lengths; values above the threshold are foreground."""
+    flat = mask.ravel() > threshold
+    ends = np.append(np.flatnonzero(flat[1:] != flat[:-1]) + 1, flat.size)
+    return np.concatenate([[int(flat[0])], ends]).astype("<i4").tobytes()
+
+
+def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
+    """Read a 16-bit PNG of millimetres as z-depth in metres; 0 means no surface.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or is not one channel of 16 bit.
+    """
+    import cv2
+
+    depth = _read(path, where, cv2.IMREAD_UNCHANGED)
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        got = f"{depth.dtype} of shape {depth.shape}"
+        raise CaptureError(f"{where}: expected one channel of 16-bit millimetres, got {got}; write it as 16-bit PNG")
+    return depth.astype(np.float32) / DEPTH_UNITS_PER_M
+
+
+def size_from_header(data: bytes) -> tuple[int, int] | None:
+    """Width and height from the header of image data, without decoding; None if they are not found."""
+    import imagesize
+
+    try:
+        width, height = imagesize.get(io.BytesIO(data))
+    except Exception:  # imagesize raises almost anything for malformed bytes
+        return None
+    return (int(width), int(height)) if width > 0 and height > 0 else None
+
+
+def _read_file(path: Path, where: str) -> bytes:
+    try:
+        return read_bytes(path)
+    except OSError as error:
+        raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
+
+
+def _read(path: Path, where: str, flags: int) -> np.ndarray:
+    data = _read_file(path, where)
+    if (size := size_from_header(data)) is not None and size[0] * size[1] > MAX_PIXELS:
+        raise CaptureError(
+            f"{where}: expected an image of at most {MAX_PIXELS / 1e6:.0f} million pixels, got {size[0]} x {size[1]}; "
+            "reduce its size"
+        )
+    if (image := decode_image(data, flags)) is None:
+        got = f"{len(data)} bytes that are not an image or are truncated"
+        raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")
+    return image
+
+
+def decode_image(data: bytes, flags: int, max_pixels: int = MAX_PIXELS) -> np.ndarray | None:
+    """Decode untrusted image data with these OpenCV flags; None if it is not an image, truncated or too large.
+
+    The size in the header and the lengths of PNG chunks are checked before any memory is allocated for them.
+    """
+    import cv2
+
+    width, height = size_from_header(data) or (0, 0)
+    if not data or width * height > max_pixels or not _is_complete(data):
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # the header claims more pixels than OpenCV accepts
+        return None
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether PNG and JPEG data reach their end marker: decoders fill what is missing with grey.
+
+    No PNG chunk may be longer than the data either, because OpenCV allocates its length first.
+    """
+    if data.startswith(PNG_START):
+        at = len(PNG_START)
+        while at + 8 <= len(data):
+            length, chunk = struct.unpack_from(">I4s", data, at)
+            at += PNG_CHUNK_OVERHEAD + length
+            if at > len(data) or chunk == b"IEND":
+                return chunk == b"IEND"
+        return False
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in data[len(data) // 2 :]
+    return True
+
+
+def write_image(
+    path: Path,
+    image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width channel"],
+    jpeg_quality: int = 95,
+) -> None:
+    """Write a grey image, RGB, or RGB with straight alpha; the suffix (.png, .jpg, ...) selects the format.
+
+    Raises:
+        ValueError: the suffix is not that of an image format.
+        OSError: the file cannot be written.
+    """
+    import cv2
+
+    # No chroma subsampling (4:4:4), which would blur coloured edges.
+    jpeg = (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
+    options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)
+    swapped = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    _write(path, cv2.cvtColor(image, swapped[image.shape[2]]) if image.ndim == 3 else image, options)
+
+
+def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> None:
+    """Write z-depth in metres as a 16-bit PNG of millimetres, rounded.
+
+    Raises:
+        CaptureError: a depth is negative, not a number, or beyond 65.535 m.
+    """
+    if not ((depth_m >= 0) & (depth_m <= MAX_DEPTH_M)).all():
+        got = f"{np.nanmin(depth_m)} to {np.nanmax(depth_m)} m"
+        raise CaptureError(f"{path}: expected depths of 0 to {MAX_DEPTH_M} m, got {got}; check the scene's units")
+    _write(path, np.rint(depth_m * DEPTH_UNITS_PER_M).astype(np.uint16), ())
+
+
+def _write(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
+    import cv2
+
+    if not path.suffix or not cv2.haveImageWriter(path.suffix):
+        raise ValueError(f"expected the file name of an image, got {path}; use the suffix .png or .jpg")
+    done, data = cv2.imencode(path.suffix, image, options)
+    if not done:
+        got = f"{image.shape} {image.dtype}"
+        raise ValueError(f"{path}: expected an image that the format can store, got {got}; use .png")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda temporary: temporary.write_bytes(data.tobytes()))

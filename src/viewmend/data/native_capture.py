@@ -1,0 +1,422 @@
+"""Capture folders as sources of frames: `open_capture`, and the readers of their images, masks and depth."""
+
+import functools
+import logging
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from torch import Tensor
+
+from viewmend.data.containers import names_in
+from viewmend.data.errors import CaptureError
+from viewmend.data.formats import read_any_calibration
+from viewmend.data.images import (
+    RUN_LENGTH_SUFFIX,
+    exif_rotation,
+    read_depth,
+    read_mask,
+    read_rgb,
+    read_rgba,
+    read_run_lengths,
+    to_mask,
+)
+from viewmend.data.native_format import CALIBRATION, FileKind, NativeCamera, stays_inside
+from viewmend.data.videos import VideoFile, is_video
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
+from viewmend.geometry.rigid import rigid
+from viewmend.types import MultiViewFrame
+
+
+def open_capture(
+    path: Path | str, cameras: Sequence[str] | None = None, format: str | None = None, *, alpha: bool = False
+) -> "NativeCapture":
+    """Open a capture folder of any supported format (docs/formats.md).
+
+    Args:
+        path: the folder, or the file that stands for it, such as `cameras.json`.
+        cameras: names of the cameras to use; all by default.
+        format: name of the format; by default it is recognised.
+        alpha: use the alpha channel of the images as masks.
+
+    Raises:
+        CaptureError: the calibration is invalid, files are missing, or a camera is unknown (see `NativeCapture`).
+
+    Examples:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from viewmend import open_capture
+        >>> from viewmend.data.native_writer import write_capture
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> folder = Path(tempfile.mkdtemp()) / "take"
+        >>> write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), folder)
+        >>> capture = open_capture(folder)
+        >>> len(capture.cameras), len(capture.frame_ids), capture.has_masks
+        (4, 1, True)
+        >>> capture.read(0).rgb.shape
+        torch.Size([4, 3, 64, 64])
+    """
+    path = Path(path)
+    folder = path.parent if path.name == CALIBRATION and path.is_file() else path
+    return NativeCapture(folder, cameras, format, alpha)
+
+
+class NativeCapture:
+    """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
+
+    A camera whose image or mask is missing is absent from that frame (a gap). Images and masks are undistorted to
+    pinhole images with the same K, and padded right and below to the largest of the frame. The arguments are those of
+    `open_capture`.
+
+    Raises:
+        CaptureError: `cameras.json` is invalid; a camera has no files in any frame, or a frame has no camera; only
+            some cameras have masks or depth; a file lies outside the folder; a camera name is unknown.
+    """
+
+    def __init__(
+        self, path: Path, cameras: Sequence[str] | None = None, format: str | None = None, alpha: bool = False
+    ):
+        calibration = read_any_calibration(path, format)
+        self.folder = folder = calibration.folder
+        self._name = path.stem if path.is_file() else folder.resolve().name
+        self._file = calibration.file
+        self._entries = _select(calibration.cameras, cameras, self._file)
+        if alpha:
+            self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
+        self._calibration = calibration
+        self.has_masks = self._all_or_none("mask")
+        self.has_depth = self._all_or_none("depth")
+        self.present = self._find_files()
+        """Whether each camera has its files in each frame."""
+        self._readers = tuple(CameraReader(folder, camera) for camera in self._entries)
+        self._cameras = pinhole_cameras(self._entries)
+
+    @property
+    def name(self) -> str:
+        """Name of the folder, or of the file that was opened."""
+        return self._name
+
+    @property
+    def cameras(self) -> Cameras:
+        """All cameras, after undistortion, in metres."""
+        return self._cameras
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Frame ids in temporal order."""
+        return self._calibration.frames
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second; None if unknown or static."""
+        return self._calibration.fps
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """World up, unit length; None if unknown."""
+        up = self._calibration.up
+        return None if up is None else torch.tensor(up, dtype=torch.float32)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The volume that contains the subject, in metres; None if unknown."""
+        corners = self._calibration.bounds_m
+        return None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Length of the folder's own unit. All values of this class are in metres."""
+        return self._calibration.metres_per_unit
+
+    @property
+    def gaps(self) -> tuple[tuple[str, str], ...]:
+        """Camera name and frame id of each missing image."""
+        missing = np.argwhere(~self.present)
+        return tuple((self._entries[camera].name, self.frame_ids[time]) for camera, time in missing)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
+
+        Raises:
+            CaptureError: a file is unreadable or has the wrong size, or no mask has any foreground.
+            IndexError: `time` is not in the capture.
+        """
+        if not 0 <= time < len(self.frame_ids):
+            raise IndexError(f"{self._file}: expected a frame index of 0 to {len(self.frame_ids) - 1}, got {time}")
+        views = [int(view) for view in np.flatnonzero(self.present[:, time])]
+        frame_id = self.frame_ids[time]
+        with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
+            images = list(pool.map(lambda view: self._readers[view].read(frame_id, time), views))
+        self._warn_of_rotation()
+        frame = stack_images(images, self._cameras[views], time)
+        if frame.mask is not None and (highest := int(frame.mask.max())) <= FOREGROUND:
+            camera = self._entries[views[0]]
+            raise CaptureError(
+                f"{self.folder / camera.file('mask', frame_id)}: camera '{camera.name}', frame '{frame_id}': expected "
+                f"foreground (255) in this or another camera's mask, got no value above {highest} in any; segment the "
+                f"images, multiply masks of 0 and 1 by 255, or remove the frame from {self._file.name}"
+            )
+        return frame
+
+    def undistort(self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Undistort another image of this camera, such as a clean plate, as its frames are.
+
+        Raises:
+            ValueError: there is no such camera, or the image does not have its size.
+        """
+        self.cameras.select([camera])
+        return self._readers[self.cameras.names.index(camera)].undistort(rgb)
+
+    def _warn_of_rotation(self) -> None:
+        rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
+        if rotated:
+            names = ", ".join(f"'{reader.camera.name}'" for reader in rotated)
+            logging.getLogger("viewmend").warning(
+                f"{self.name}: EXIF says that images should be {rotated[0].rotation}, but pixels are used as stored "
+                f"(cameras {names}); if calibration and masks are upright, make the images upright too (exiftran -ai)"
+            )
+        for reader in rotated:
+            reader.warned = True
+
+    def _all_or_none(self, kind: FileKind) -> bool:
+        missing = [f"camera '{camera.name}'" for camera in self._entries if getattr(camera, kind) is None]
+        if missing and len(missing) < len(self._entries):
+            raise CaptureError(
+                f"{self._file}: expected '{kind}' for every camera or for none, got none for {', '.join(missing)}; "
+                "add it, or leave these cameras out"
+            )
+        return not missing
+
+    def _find_files(self) -> Bool[np.ndarray, "view time"]:
+        listing = functools.cache(lambda parent: names_in(self.folder / parent))  # each folder is listed once
+
+        def exists(path: str) -> bool:
+            if not stays_inside(path):
+                raise CaptureError(f"{self.folder}: expected a file inside the folder, got {path}; rename the frame")
+            parent, name = os.path.split(path)
+            return name in listing(parent)
+
+        def has_all(camera: NativeCamera, frame: str) -> bool:
+            return all(exists(camera.file(kind, frame)) for kind in camera.file_kinds)
+
+        present = np.array([[has_all(camera, frame) for frame in self.frame_ids] for camera in self._entries], bool)
+        for camera, row in zip(self._entries, present, strict=True):
+            if not row.any():
+                raise CaptureError(self._never_present(camera, exists))
+        for frame, column in zip(self.frame_ids, present.T, strict=True):
+            if not column.any():
+                first = self._entries[0]
+                raise CaptureError(
+                    f"{self.folder / first.file(first.file_kinds[0], frame)}: camera '{first.name}', frame '{frame}': "
+                    f"expected this file or another camera's, got none of any camera; add them, or remove the frame "
+                    f"from {self._file}"
+                )
+        return present
+
+    def _never_present(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
+        """The error message for a camera that is in no frame."""
+        frames, kinds = self.frame_ids, camera.file_kinds
+        absent: list[FileKind] = [
+            kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in frames)
+        ]
+        expected = f"{' and '.join(kinds)} of the camera in the same frame"
+        if absent:
+            expected = f"the camera's {absent[0]} in one frame or more"
+        example = self.folder / camera.file((absent or kinds)[0], frames[0])
+        return (
+            f"{example}: camera '{camera.name}', frame '{frames[0]}': expected {expected}, found in none of "
+            f"{len(frames)}; correct the paths in {self._file}, or leave the camera out"
+        )
+
+
+def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file: Path) -> tuple[NativeCamera, ...]:
+    if names is None:
+        return cameras
+    by_name = {camera.name: camera for camera in cameras}
+    unknown = [name for name in names if name not in by_name]
+    if unknown or not names or len(set(names)) < len(names):
+        raise CaptureError(f"{file}: expected different cameras among {list(by_name)}, got {list(names)}; choose again")
+    return tuple(by_name[name] for name in names)
+
+
+def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> NativeCamera:
+    """The camera with its images as masks; raises a CaptureError if its first image has no alpha."""
+    if camera.image is None:
+        raise CaptureError(
+            f"{folder}: camera '{camera.name}': expected images with alpha, got a video; use another --method"
+        )
+    for file in (folder / camera.file("image", frame) for frame in frames):
+        if file.is_file():
+            read_rgba(file, f"{file}: camera '{camera.name}'")
+            break
+    return replace(camera, mask=camera.image)
+
+
+def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
+    """The cameras after undistortion, in metres."""
+    R = torch.tensor(np.stack([camera.R for camera in cameras]))
+    t = torch.tensor(np.stack([camera.t_m for camera in cameras]))
+    return Cameras(
+        names=tuple(camera.name for camera in cameras),
+        K=torch.tensor(np.stack([camera.K for camera in cameras])).float(),
+        camera_from_world=rigid(R, t).float(),
+        size_px=torch.tensor([[camera.width, camera.height] for camera in cameras]),
+    )
+
+
+@dataclass(frozen=True)
+class CameraImages:
+    """The images of one camera in one frame."""
+
+    rgb: UInt8[np.ndarray, "height width 3"]
+    mask: UInt8[np.ndarray, "height width"] | None
+    depth: Float32[np.ndarray, "height width"] | None
+    """z-depth in metres; 0 where unknown."""
+
+
+class CameraReader:
+    """Reads the files of one camera. Keeps its videos open and its undistortion map. Thread-safe."""
+
+    def __init__(self, folder: Path, camera: NativeCamera):
+        self.camera = camera
+        self.rotation: str | None = None
+        """How EXIF asks to rotate the first image that was read; "" if it does not."""
+        self.warned = False
+        """Whether the user was warned of the rotation."""
+        self._folder = folder
+        self._undistortion = Undistortion(camera)
+        paths = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
+        self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in paths)
+        self._curves = None if camera.colour is None else _colour_curves(camera.colour)
+
+    def read(self, frame: str, index: int) -> CameraImages:
+        """Read and undistort the images of frame id `frame`, which has this index in the capture.
+
+        Raises:
+            CaptureError: a file is missing, unreadable, or does not have the camera's size.
+        """
+        camera = self.camera
+        path, where = self._locate("video" if camera.video else "image", frame)
+        rgb = self._video.read(index, where) if self._video else read_rgb(path, where)
+        if self.rotation is None:
+            self.rotation = "" if self._video else exif_rotation(path) or ""
+        self._check_size(rgb, where, self.rotation)
+        mask, depth = None, None
+        if camera.mask:
+            path, where = self._locate("mask", frame)
+            mask = self._read_mask(path, where, index)
+            self._check_size(mask, where)
+        if camera.depth:
+            path, where = self._locate("depth", frame)
+            depth = read_depth(path, where)
+            self._check_size(depth, where)
+        return self._undistortion.apply(CameraImages(self._correct_colours(rgb), mask, depth))
+
+    def undistort(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        """Correct colours and distortion of another image of this camera, such as a clean plate."""
+        return self._undistortion.apply(CameraImages(self._correct_colours(rgb), None, None)).rgb
+
+    def _correct_colours(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        import cv2
+
+        return rgb if self._curves is None else cv2.LUT(rgb, self._curves)
+
+    def _read_mask(self, path: Path, where: str, index: int) -> UInt8[np.ndarray, "height width"]:
+        if self._mask_video:
+            mask = to_mask(self._mask_video.read(index, where))
+        elif path.suffix == RUN_LENGTH_SUFFIX:
+            mask = read_run_lengths(path, where, (self.camera.height, self.camera.width))
+        else:
+            mask = read_mask(path, where)
+        return 255 * (mask > 0).astype(np.uint8) if self.camera.mask_labels else mask
+
+    def _locate(self, kind: FileKind, frame: str) -> tuple[Path, str]:
+        path = self._folder / self.camera.file(kind, frame)
+        return path, f"{path}: camera '{self.camera.name}', frame '{frame}'"
+
+    def _check_size(self, image: np.ndarray, where: str, rotation: str = "") -> None:
+        height, width = image.shape[:2]
+        if (width, height) != (self.camera.width, self.camera.height):
+            advice = "correct width, height and K in the calibration, or replace the file"
+            if rotation:
+                advice = f"EXIF says that it should be {rotation}: make it upright (exiftran -ai), or {advice}"
+            raise CaptureError(
+                f"{where}: expected {self.camera.width} x {self.camera.height} pixels as in the calibration, "
+                f"got {width} x {height}; {advice}"
+            )
+
+
+class Undistortion:
+    """Removes the lens distortion of one camera. Computes its map at first use. Thread-safe."""
+
+    def __init__(self, camera: NativeCamera):
+        self._camera = camera
+        self._lock = threading.Lock()
+        self._maps: tuple[np.ndarray, np.ndarray] | None = None
+
+    def apply(self, images: CameraImages) -> CameraImages:
+        """Undistort images to the pinhole camera with the same K and size; returns them if there is no distortion.
+
+        Pixels that lie outside the distorted image (corners, with pincushion distortion) repeat its border, so that
+        the mask of a subject cut off by the border continues and does not carve the hull. Depth there is 0, unknown.
+        """
+        import cv2
+
+        if not self._camera.dist.any():
+            return images
+        first, second = self._map()
+        border = cv2.BORDER_REPLICATE
+        rgb = cv2.remap(images.rgb, first, second, cv2.INTER_LINEAR, borderMode=border)
+        mask, depth = images.mask, images.depth
+        if mask is not None:
+            mask = cv2.remap(mask, first, second, cv2.INTER_LINEAR, borderMode=border)
+        if depth is not None:  # nearest: interpolated depths would be wrong at edges
+            depth = cv2.remap(depth, first, second, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        return CameraImages(rgb, mask, depth)
+
+    def _map(self) -> tuple[np.ndarray, np.ndarray]:
+        import cv2
+
+        with self._lock:
+            if self._maps is None:
+                camera = self._camera
+                K = camera.K.copy()
+                K[:2, 2] -= 0.5  # in OpenCV the centre of the first pixel is at 0
+                size, fixed = (camera.width, camera.height), cv2.CV_16SC2  # 1/32 pixel, three times as fast as floats
+                first, second = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, fixed)  # pyright: ignore
+                self._maps = first, second
+            return self._maps
+
+
+def _colour_curves(colour: Float64[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "1 256 3"]:
+    """Lookup table of each channel's quadratic; see `NativeCamera.colour`."""
+    values = np.vander(np.arange(256.0), 3) @ colour.T
+    return np.rint(values.clip(0, 255)).astype(np.uint8)[None]
+
+
+def stack_images(images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
+    """Stack the images of several cameras, padded right and below to the largest.
+
+    Masks are kept only if all cameras have one; likewise depth.
+    """
+    width, height = cameras.max_size_px
+    masks, depths = (all(getattr(image, key) is not None for image in images) for key in ("mask", "depth"))
+    rgb = torch.zeros(len(images), 3, height, width, dtype=torch.uint8)
+    mask = torch.zeros(len(images), height, width, dtype=torch.uint8) if masks else None
+    depth = torch.zeros(len(images), height, width) if depths else None
+    for view, image in enumerate(images):
+        h, w = image.rgb.shape[:2]
+        rgb[view, :, :h, :w] = torch.from_numpy(image.rgb).permute(2, 0, 1)
+        if mask is not None:
+            mask[view, :h, :w] = torch.from_numpy(image.mask)
+        if depth is not None:
+            depth[view, :h, :w] = torch.from_numpy(image.depth)
+    return MultiViewFrame(cameras, rgb, mask, time, depth)

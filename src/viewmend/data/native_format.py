@@ -1,0 +1,254 @@
+"""Our own capture format, "plain-capture/1": parsing and writing of `cameras.json`."""
+
+import difflib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from msgspec import Meta, Struct
+
+from viewmend.data.errors import CaptureError
+from viewmend.geometry.cameras import is_intrinsics
+from viewmend.geometry.rigid import is_rotation
+from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, shown, typed
+
+FORMAT = "plain-capture/1"
+CALIBRATION = "cameras.json"
+ROTATION_TOLERANCE = 1e-3
+FileKind = Literal["image", "video", "mask", "depth"]
+FILE_KINDS: tuple[FileKind, ...] = ("image", "video", "mask", "depth")
+Text = Annotated[str, Meta(min_length=1)]
+Pixels = Annotated[int, Meta(ge=1, le=2**31 - 1)]
+Positive = Annotated[float, Meta(gt=0, le=1e300)]
+Matrix = tuple[Triple, Triple, Triple]
+
+
+class NativeCameraEntry(Struct, frozen=True, kw_only=True):
+    """One entry of `cameras` in the file."""
+
+    name: Text
+    width: Pixels
+    height: Pixels
+    K: Matrix
+    R: Matrix
+    t: Triple
+    dist: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    image: Text | None = None
+    video: Text | None = None
+    mask: Text | None = None
+    depth: Text | None = None
+    colour: Matrix | None = None
+    mask_labels: bool = False
+
+    def __post_init__(self) -> None:
+        if not bool(is_intrinsics(torch.tensor(self.K, dtype=torch.float64))):
+            expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
+            raise _invalid("K", expected, shown(self.K), "convert the calibration to OpenCV's convention, in pixels")
+        R = np.array(self.R)
+        if not bool(is_rotation(torch.from_numpy(R), ROTATION_TOLERANCE)):
+            off = abs(R @ R.T - np.eye(3)).max()
+            got = f"determinant {np.linalg.det(R):.4g}, R R^T off by {off:.2g}, {shown(self.R)}"
+            raise _invalid("R", "a rotation, world to camera", got, "check axes, signs and the number of digits")
+        if (self.image is None) == (self.video is None):
+            got = "neither" if self.image is None else "both"
+            raise _invalid("image", "either 'image' or 'video'", got, "name one of the two")
+        for kind in FILE_KINDS:
+            path = getattr(self, kind)
+            if path and not stays_inside(path):
+                next_step = "move the file into the folder and write a relative path"
+                raise _invalid(kind, "a path inside the capture folder", shown(path), next_step)
+
+
+class NativeFile(Struct, frozen=True, kw_only=True):
+    """The whole file."""
+
+    format: str
+    first_pixel_center: tuple[Number, Number] = (0.0, 0.0)
+    metres_per_unit: Positive = 1.0
+    up: Triple | None = None
+    fps: Positive | None = None
+    bounds: tuple[Triple, Triple] | None = None
+    frames: Annotated[tuple[Text, ...], Meta(min_length=1)]
+    cameras: tuple[NativeCameraEntry, ...]
+
+    def __post_init__(self) -> None:
+        if self.bounds is not None and not all(low < high for low, high in zip(*self.bounds, strict=True)):
+            raise _invalid("bounds", "[low corner, high corner]", shown(self.bounds), "put the smaller numbers first")
+        if self.up is not None and not any(self.up):
+            raise _invalid("up", "a direction or null", shown(self.up), "write null if it is unknown")
+        if len(self.cameras) < 2:
+            raise _invalid("cameras", "two cameras or more", str(len(self.cameras)), "add the rig's other cameras")
+        for key, names in (("frames", self.frames), ("cameras", tuple(camera.name for camera in self.cameras))):
+            repeated = sorted(name for name, count in Counter(names).items() if count > 1)[:5]
+            if repeated:
+                raise _invalid(key, "different names", f"{repeated} more than once", "rename or remove the duplicates")
+
+
+@dataclass(frozen=True)
+class NativeCamera:
+    """One camera of a calibration, for images before undistortion."""
+
+    name: str
+    width: int
+    height: int
+    K: Float64[np.ndarray, "3 3"]
+    """Pixels; the centre of the top-left pixel is at (0.5, 0.5)."""
+    R: Float64[np.ndarray, "3 3"]
+    """Rotation of camera_from_world, exactly orthonormal."""
+    t_m: Float64[np.ndarray, "3"]
+    """Translation of camera_from_world."""
+    dist: Float64[np.ndarray, "5"]
+    """Brown-Conrady coefficients k1 k2 p1 p2 k3, in OpenCV's order."""
+    image: str | None
+    video: str | None
+    mask: str | None
+    depth: str | None
+    colour: Float64[np.ndarray, "3 3"] | None = None
+    """Coefficients a, b, c of red, green and blue: a value x in 0..255 becomes a x^2 + b x + c."""
+    mask_labels: bool = False
+    """Whether mask values are labels, of which only 0 is background."""
+
+    @property
+    def file_kinds(self) -> tuple[FileKind, ...]:
+        """The kinds of files that the camera has."""
+        return tuple(kind for kind in FILE_KINDS if getattr(self, kind) is not None)
+
+    def file(self, kind: FileKind, frame: str) -> str:
+        """Path of one file of this frame, relative to the capture. The camera must have files of that kind."""
+        pattern = getattr(self, kind)
+        assert isinstance(pattern, str), f"camera {self.name} has no {kind}"
+        return pattern.replace("{frame}", frame)
+
+
+@dataclass(frozen=True)
+class NativeCalibration:
+    """The content of a `cameras.json`, with lengths in metres."""
+
+    frames: tuple[str, ...]
+    cameras: tuple[NativeCamera, ...]
+    up: Float64[np.ndarray, "3"] | None
+    """Unit length."""
+    fps: float | None
+    bounds_m: Float64[np.ndarray, "2 3"] | None
+    metres_per_unit: float
+    file: Path
+    """The file that it was read from."""
+    folder: Path
+    """The folder that the cameras' paths are relative to."""
+
+
+def read_calibration(folder: Path) -> NativeCalibration:
+    """Parse the `cameras.json` of a capture folder.
+
+    Converts K to this project's pixel convention (`first_pixel_center`) and t and bounds to metres
+    (`metres_per_unit`). A rotation that is orthonormal to within 1e-3 is made exactly orthonormal.
+
+    Raises:
+        CaptureError: the file is missing, is not JSON, lacks a key, or has an invalid value.
+    """
+    path = folder / CALIBRATION
+    if not path.is_file():
+        got = "the folder has none" if folder.is_dir() else "there is no such folder"
+        raise CaptureError(f"expected a capture folder with {path}, but {got}; check the path")
+    try:
+        content = typed(read_json(bounded_bytes(path)), dict[str, Any], "see docs/plain-capture.md")
+        _check_keys(content)
+        return calibration_from_content(content, path)
+    except ValueError as error:
+        raise CaptureError(f"{path}: {error}") from None
+
+
+def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
+    """Convert the content of a `cameras.json`; `path` is the file that it was read from.
+
+    Raises:
+        ValueError: a key is missing, or a value is invalid.
+    """
+    file = typed({"format": FORMAT, **read_json(json.dumps(content))}, NativeFile)
+    shift_px = 0.5 - np.array(file.first_pixel_center)
+    up = None if file.up is None else np.array(file.up)
+    return NativeCalibration(
+        frames=file.frames,
+        cameras=tuple(_camera(entry, shift_px, file.metres_per_unit) for entry in file.cameras),
+        up=None if up is None else up / np.linalg.norm(up),
+        fps=file.fps,
+        bounds_m=None if file.bounds is None else np.array(file.bounds) * file.metres_per_unit,
+        metres_per_unit=file.metres_per_unit,
+        file=path,
+        folder=path.parent,
+    )
+
+
+def _camera(entry: NativeCameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> NativeCamera:
+    K = np.array(entry.K)
+    K[:2, 2] += shift_px
+    u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations are often rounded
+    return NativeCamera(
+        **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", *FILE_KINDS)},
+        K=K,
+        R=u @ vt,
+        t_m=np.array(entry.t) * scale,
+        dist=np.array(entry.dist),
+        colour=None if entry.colour is None else np.array(entry.colour),
+    )
+
+
+def write_calibration(folder: Path, calibration: NativeCalibration) -> None:
+    """Write a `cameras.json` that reads back as this calibration. File paths are kept as they are."""
+    content = {
+        "format": FORMAT,
+        "first_pixel_center": [0.5, 0.5],
+        "metres_per_unit": 1.0,
+        "up": None if calibration.up is None else calibration.up.tolist(),
+        "fps": calibration.fps,
+        "bounds": None if calibration.bounds_m is None else calibration.bounds_m.tolist(),
+        "frames": list(calibration.frames),
+        "cameras": [_entry(camera) for camera in calibration.cameras],
+    }
+    (folder / CALIBRATION).write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _entry(camera: NativeCamera) -> dict[str, Any]:
+    entry: dict[str, Any] = {"name": camera.name, "width": camera.width, "height": camera.height}
+    entry |= {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t_m.tolist(), "dist": camera.dist.tolist()}
+    entry |= {kind: getattr(camera, kind) for kind in camera.file_kinds}
+    if camera.colour is not None:
+        entry["colour"] = camera.colour.tolist()
+    return entry | ({"mask_labels": True} if camera.mask_labels else {})
+
+
+def _check_keys(content: dict[str, Any]) -> None:
+    """Check the version and the spelling of the keys."""
+    version = content.get("format")
+    if version != FORMAT:
+        got = "nothing" if version is None else shown(version)
+        raise _invalid("format", f'"{FORMAT}"', got, "convert the capture, or use a version of viewmend that reads it")
+    _check_spelling(content, NativeFile.__struct_fields__)
+    for entry in content["cameras"] if isinstance(content.get("cameras"), list) else ():
+        if isinstance(entry, dict):
+            _check_spelling(entry, NativeCameraEntry.__struct_fields__)
+
+
+def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:
+    """Reject an unknown key that resembles a known key which is absent. Other unknown keys are ignored."""
+    absent = [key for key in known if key not in entry]
+    for key in entry.keys() - set(known):
+        close = difflib.get_close_matches(key.lower(), [a.lower() for a in absent], n=1, cutoff=0.8)
+        if close:
+            raise _invalid(key, f"the key '{close[0]}'", f"'{key}'", "rename the key")
+
+
+def _invalid(key: str, expected: str, got: str, next_step: str) -> ValueError:
+    return ValueError(f"{key}: expected {expected}, got {got}; {next_step}")
+
+
+def stays_inside(path: str) -> bool:
+    """Whether a relative path cannot leave its folder: it is not absolute and has no drive and no `..`."""
+    posix, windows = PurePosixPath(path), PureWindowsPath(path)
+    return not (posix.is_absolute() or windows.drive or windows.root or ".." in windows.parts or not posix.parts)

@@ -1,0 +1,189 @@
+"""Preparing a capture: check it, align it on its input cameras, match colours, limit the image size.
+
+`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`, so they use the same pixels. Serious
+faults of a capture raise a `CaptureError`; others are logged once as warnings of the logger `viewmend`.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
+from viewmend.data.checks.leave_one_out import MAX_DELAY, find_desynchronised_camera
+from viewmend.data.colour_matching import ColourMatch, match_colours
+from viewmend.data.errors import CaptureError, Issue
+from viewmend.data.native_capture import NativeCapture, open_capture
+from viewmend.data.resize import limit_camera_size, limit_size
+from viewmend.data.source import CaptureSource, CaptureWrapper
+from viewmend.geometry.alignment import Alignment, shared_offset
+from viewmend.geometry.cameras import Cameras
+from viewmend.types import MultiViewFrame
+
+
+@dataclass(frozen=True)
+class PreparedCapture(CaptureWrapper):
+    """A source with aligned cameras, matched colours and reduced images; see `prepare`."""
+
+    source: CaptureSource
+    alignment: Alignment | None = None
+    """The shift of all images that was found in the masks of the input cameras; None if alignment was off."""
+    longest_px: int | None = None
+    """Maximum length of the longer image side; None for full size."""
+    inputs: tuple[str, ...] | None = None
+    """The input cameras; None for all."""
+    left_out: tuple[str, ...] = ()
+    """Cameras that disagree with all others and are therefore absent from every frame."""
+    colours: ColourMatch | None = None
+    """Colour corrections of the input cameras; None if colours stay as they are."""
+    _reported: set[str] = field(default_factory=set, compare=False, repr=False)
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """What preparation has changed, as sentences for the user."""
+        changes = [] if self.colours is None else [self.colours.summary]
+        if self.alignment is not None and self.alignment.offset_px != (0.0, 0.0):
+            x, y = self.alignment.offset_px
+            changes.append(
+                f"all principal points moved by ({x:+.2f}, {y:+.2f}) pixels, which improves the agreement of hull and "
+                f"masks from IoU {self.alignment.iou_before:.3f} to {self.alignment.iou_after:.3f}; check "
+                "first_pixel_center, or use --no-align"
+            )
+        return tuple(changes)
+
+    @property
+    def cameras(self) -> Cameras:
+        """All cameras including those that are not inputs, shifted by the alignment and resized with their images."""
+        x_px, y_px = self.alignment.offset_px if self.alignment else (0.0, 0.0)
+        return limit_camera_size(self.source.cameras.moved(x_px, y_px), self.longest_px)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """Read the frame at index `time` with the calibration of `cameras`.
+
+        A camera whose mask is inverted, or wrongly empty, is left out of the frame and reported once.
+
+        Raises:
+            CaptureError: the source cannot be read, half of the masks are inverted, or no camera is left.
+        """
+        frame = self.source.read(time).without(self.left_out)
+        inputs = self.cameras.names if self.inputs is None else self.inputs
+        absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
+        text = "camera '{}' has no image or no mask and is absent; check its files"
+        issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
+        _raise_or_warn(f"{self.name}: frame '{self.frame_ids[time]}'", issues, self._reported)
+        bad = [issue.camera for issue in issues if issue.camera]
+        if len(bad) == len(frame.cameras):
+            raise CaptureError(
+                f"{self.name}: frame '{self.frame_ids[time]}': expected at least one correct mask, got none; redo them"
+            )
+        frame = limit_size(frame.without(bad), self.longest_px)
+        frame = replace(frame, cameras=self.cameras.select(frame.cameras.names))
+        return frame if self.colours is None else self.colours.apply(frame)
+
+
+def prepare(
+    source: CaptureSource,
+    inputs: Sequence[str] | None = None,
+    *,
+    longest_px: int | None = None,
+    align: bool = True,
+    match_colours: bool = True,
+    first: int = 0,
+) -> PreparedCapture:
+    """Check and align a capture, match its colours, and limit its image size.
+
+    Args:
+        source: the capture.
+        inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras have no effect.
+        longest_px: images are reduced to at most this length of their longer side.
+        align: find a shift that all images share, in the masks of one frame at full size, and look for a camera that
+            is out of sync, in the frames around it. That frame is the first from `first` on in which two input cameras
+            have any foreground.
+        match_colours: match the input cameras' colours in the same frame, if that improves their agreement on parts
+            of the surface that the correction was not fitted to.
+        first: index of the first frame that will be used.
+
+    Raises:
+        CaptureError: a frame cannot be read, or its masks or calibration are unusable.
+        ValueError: the masks have no common subject.
+
+    Examples:
+        >>> from viewmend import prepare
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> capture = prepare(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), longest_px=32, align=False)
+        >>> capture.read(0).rgb.shape
+        torch.Size([4, 3, 32, 32])
+    """
+    names = None if inputs is None else tuple(inputs)
+    frame = _first_masked(source, names, first)
+    if frame is None:
+        return PreparedCapture(source, None, longest_px, names)
+    reported: set[str] = set()
+    issues = diagnose(frame, source.bounds)
+    _raise_or_warn(f"{source.name}: frame '{source.frame_ids[frame.time]}'", issues, reported)
+    left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
+    frame = frame.without([issue.camera for issue in issues if issue.camera])
+    alignment = None
+    if align:
+        issues = find_desynchronised_camera(*_frames_around(source, frame), source.bounds)
+        _raise_or_warn(source.name, issues, reported)
+    if align and frame.mask is not None and len(frame.cameras) >= 2:
+        alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
+    prepared = PreparedCapture(source, alignment, longest_px, names, left_out, None, reported)
+    return _with_matched_colours(prepared, frame) if match_colours else prepared
+
+
+def _with_matched_colours(prepared: PreparedCapture, frame: MultiViewFrame) -> PreparedCapture:
+    cameras = replace(prepared, longest_px=None).cameras.select(frame.cameras.names)
+    colours = match_colours(replace(frame, cameras=cameras), prepared.bounds)
+    return replace(prepared, colours=colours) if colours is not None and colours.helps else prepared
+
+
+def _raise_or_warn(where: str, issues: Sequence[Issue], reported: set[str]) -> None:
+    """Raise a CaptureError for the first fatal issue; log each other issue once per camera."""
+    for issue in issues:
+        if issue.fatal:
+            raise CaptureError(f"{where}: {issue.text}")
+        key = issue.camera or issue.text
+        if key not in reported:
+            reported.add(key)
+            logging.getLogger("viewmend").warning("%s: %s", where, issue.text)
+
+
+def open_masked(
+    path: Path | str, cameras: Sequence[str] | None = None, held: int = 0, format: str | None = None
+) -> NativeCapture:
+    """Open a capture that has masks, and at least two input cameras besides `held` held-out cameras.
+
+    Raises:
+        CaptureError: it cannot be opened (see `open_capture`), has no masks, or has too few cameras.
+    """
+    capture = open_capture(path, cameras, format)
+    if not capture.has_masks:
+        raise CaptureError(
+            f"{path}: expected a 'mask' for every camera, got none; the visual hull is computed from masks: make them "
+            f"with viewmend masks {path} OUT, or name their files in cameras.json"
+        )
+    count = len(capture.cameras) - held
+    if count < 2:
+        raise CaptureError(f"{path}: expected at least 2 input cameras, got {count}; use more cameras")
+    return capture
+
+
+def _frames_around(source: CaptureSource, frame: MultiViewFrame) -> tuple[list[MultiViewFrame], int]:
+    """This frame with those before and after it, of the cameras that all of them have, and its position in the list."""
+    times = range(max(0, frame.time - MAX_DELAY), min(len(source.frame_ids), frame.time + MAX_DELAY + 1))
+    frames = [frame if time == frame.time else source.read(time) for time in times]
+    names = [name for name in frame.cameras.names if all(name in other.cameras.names for other in frames)]
+    return [other.select(names) for other in frames], frame.time - times[0]
+
+
+def _first_masked(source: CaptureSource, inputs: Sequence[str] | None, first: int) -> MultiViewFrame | None:
+    """The input cameras in the first frame from `first` on in which two of them are present with any foreground."""
+    for time in range(first, len(source.frame_ids)):
+        frame = source.read(time)
+        if inputs is not None:
+            frame = frame.select([name for name in inputs if name in frame.cameras.names])
+        if len(frame.cameras) >= 2 and frame.mask is not None and bool((frame.mask > 0).any()):
+            return frame
+    return None

@@ -1,0 +1,151 @@
+"""Sources of frames: the protocol, wrappers around a source, and reading ahead."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.data.resize import resize_frame
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras, concatenate_cameras
+from viewmend.types import MultiViewFrame
+
+FRAMES_AHEAD = 2
+"""Frames that `prefetch` reads ahead."""
+
+
+@runtime_checkable
+class CaptureSource(Protocol):
+    """A calibrated multi-camera capture: a folder, a synthetic scene, a live rig."""
+
+    @property
+    def name(self) -> str:
+        """Name for messages and titles."""
+        ...
+
+    @property
+    def cameras(self) -> Cameras:
+        """All cameras, after undistortion, in metres."""
+        ...
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Frame ids in temporal order. A static capture has one."""
+        ...
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second; None if unknown or static."""
+        ...
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """World up, used only as a default by viewers and orbits; None if unknown."""
+        ...
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The volume that contains the subject; None if unknown."""
+        ...
+
+    def read(self, time: int) -> MultiViewFrame:
+        """Read the frame at index `time` of `frame_ids`. Cameras without an image in this frame are absent.
+
+        Raises:
+            CaptureError: a file is missing for every camera, is unreadable or has the wrong size.
+            IndexError: `time` is not in the capture.
+        """
+        ...
+
+
+class CaptureWrapper:
+    """Base class of sources that change another source; every property is that of the wrapped source."""
+
+    source: CaptureSource
+
+    @property
+    def name(self) -> str:
+        """Name for messages and titles."""
+        return self.source.name
+
+    @property
+    def cameras(self) -> Cameras:
+        """All cameras, after undistortion, in metres."""
+        return self.source.cameras
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Frame ids in temporal order."""
+        return self.source.frame_ids
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second."""
+        return self.source.fps
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """World up."""
+        return self.source.up
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """The volume that contains the subject."""
+        return self.source.bounds
+
+
+@dataclass(frozen=True)
+class CaptureSubset(CaptureWrapper):
+    """Some frames of a source, optionally with smaller images."""
+
+    source: CaptureSource
+    times: range
+    """Indices into the source's frames."""
+    scale: float = 1.0
+    """Scale of the image sides, at most 1. Below 1, depth is dropped."""
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras of the scaled images."""
+        return self._scaled(self.source.cameras)
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Ids of the selected frames."""
+        return tuple(self.source.frame_ids[time] for time in self.times)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """Read the frame at index `time` of the subset; raises as `CaptureSource.read` does."""
+        frame = self.source.read(self.times[time])
+        small = resize_frame(frame, self._scaled(frame.cameras))
+        return MultiViewFrame(small.cameras, small.rgb, small.mask, time, small.depth)
+
+    def _scaled(self, cameras: Cameras) -> Cameras:
+        if self.scale == 1:
+            return cameras
+        sizes = [[max(1, round(side * self.scale)) for side in size] for size in cameras.size_px.tolist()]
+        return concatenate_cameras([cameras[view].resized(*size) for view, size in enumerate(sizes)])
+
+
+def prefetch(source: CaptureSource, times: Iterable[int] | None = None) -> Iterator[MultiViewFrame]:
+    """Yield the frames at `times` (default: all) in order, while a thread reads the next ones.
+
+    Frames are read one at a time: folders already decode their cameras in parallel, and videos need frames in order.
+    An error is raised in the place of the frame that could not be read. Closing the iterator cancels pending reads.
+    """
+    coming = iter(range(len(source.frame_ids)) if times is None else times)
+    pending: deque[Future[MultiViewFrame]] = deque()
+    pool = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+    try:
+        while True:
+            pending.extend(pool.submit(source.read, time) for time in islice(coming, FRAMES_AHEAD + 1 - len(pending)))
+            if not pending:
+                return
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,1 @@
+"""A software studio that renders captures with exact ground truth."""

@@ -1,0 +1,428 @@
+"""glTF 2.0 characters: reads a .glb or .gltf into skinned, textured geometry and a tree of nodes."""
+
+import base64
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.images import decode_image, size_from_header
+from viewmend.data.native_format import stays_inside
+from viewmend.geometry.mesh import Mesh, vertex_normals
+from viewmend.utils.untrusted_input import read_json, shown
+
+MAX_BYTES = 2 * 10**9
+"""The largest file that is read."""
+MAX_TEXELS = 2**26
+"""The most pixels of a texture."""
+
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+@dataclass(frozen=True)
+class Document:
+    """A parsed file: its JSON and its buffers."""
+
+    path: Path
+    json: Mapping[str, Any]
+    buffers: tuple[bytes, ...] = field(repr=False)
+
+    def entry(self, kind: str, index: int) -> Mapping[str, Any]:
+        """`json[kind][index]`, or a CaptureError that names what is missing."""
+        entries = self.json.get(kind, [])
+        if type(index) is not int or not 0 <= index < len(entries):
+            raise CaptureError(
+                f"{self.path}: expected {kind} number {index}, the file has {len(entries)}; export it again"
+            )
+        return entries[index]
+
+    def view(self, index: int) -> bytes:
+        """The bytes of a buffer view."""
+        entry = self.entry("bufferViews", index)
+        start, length = _count(entry.get("byteOffset", 0)), _count(entry["byteLength"])
+        data = self.buffers[_count(entry["buffer"])]
+        if start + length > len(data):
+            raise CaptureError(
+                f"{self.path}: expected at least {start + length} bytes of binary data, found {len(data)}: "
+                "the file is cut short; copy or export it again"
+            )
+        return data[start : start + length]
+
+    def accessor(self, index: int) -> np.ndarray:
+        """The values of an accessor, (count, width); normalised integers come as floats."""
+        entry = self.entry("accessors", index)
+        if "sparse" in entry or "bufferView" not in entry:
+            raise CaptureError(f"{self.path}: sparse accessors are not supported; export without shape keys")
+        dtype, width = np.dtype(_COMPONENTS[entry["componentType"]]), _WIDTHS[entry["type"]]
+        data = self.view(entry["bufferView"])
+        stride = _count(self.entry("bufferViews", entry["bufferView"]).get("byteStride", dtype.itemsize * width))
+        offset, count = _count(entry.get("byteOffset", 0)), _count(entry["count"])
+        if stride < dtype.itemsize * width:
+            raise CaptureError(
+                f"{self.path}: expected a byteStride of at least {dtype.itemsize * width} for accessor {index}, got "
+                f"{stride}; export it again"
+            )
+        if count and offset + stride * (count - 1) + dtype.itemsize * width > len(data):
+            raise CaptureError(
+                f"{self.path}: accessor {index} wants {count} elements, its view has only {len(data)} bytes: "
+                "the file is damaged; export it again"
+            )
+        values = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize)).copy()
+        if dtype.kind == "f" and not np.isfinite(values).all():
+            raise CaptureError(
+                f"{self.path}: accessor {index} holds NaN or infinity; repair the mesh and export it again"
+            )
+        if entry.get("normalized") and dtype.kind != "f":
+            values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1)
+        return values
+
+    def base_color(self, material: int) -> np.ndarray:
+        """A material's base colour as sRGB in [0, 1], (3, height, width); one texel where it has no texture."""
+        entry = self.entry("materials", material) if material >= 0 else {}
+        pbr = entry.get("pbrMetallicRoughness", {})
+        factor = np.array(pbr.get("baseColorFactor", [1, 1, 1, 1])[:3], dtype=np.float32)
+        # glTF factors are linear light; the power 1/2.2 is within 1 % of the sRGB curve and multiplies through.
+        tint = factor[:, None, None] ** (1 / 2.2)
+        if "baseColorTexture" not in pbr:
+            return np.ascontiguousarray(tint)
+        texture = self.entry("textures", pbr["baseColorTexture"]["index"])
+        return self._image(texture.get("source", -1)) * tint
+
+    def _image(self, index: int) -> np.ndarray:
+        import cv2
+
+        entry = self.entry("images", index)
+        data = self.view(entry["bufferView"]) if "bufferView" in entry else _resource(self.path, entry["uri"])
+        size = size_from_header(data) or (0, 0)
+        if size[0] * size[1] > MAX_TEXELS:
+            raise CaptureError(
+                f"{self.path}: expected images of at most {MAX_TEXELS} pixels, got {size[0]} x {size[1]}; shrink it"
+            )
+        image = decode_image(data, cv2.IMREAD_COLOR)
+        if image is None:
+            raise CaptureError(
+                f"{self.path}: image {entry.get('name', index)} is no readable JPEG or PNG; export it again"
+            )
+        return np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)).astype(np.float32) / 255
+
+
+def read_document(path: Path) -> Document:
+    """Parse a .glb (binary) or .gltf (JSON with separate files or data URIs).
+
+    Raises:
+        CaptureError: missing, cut short, not glTF 2.0, or an extension is required.
+    """
+    data = _read(path)
+    if data[:4] == b"glTF":
+        text, binary = _chunks(path, data)
+    elif path.suffix.lower() == ".gltf":
+        text, binary = data, b""
+    else:
+        raise CaptureError(f"{path}: expected a glTF binary that starts with 'glTF', got {data[:4]!r}; export a .glb")
+    try:
+        document = read_json(text)
+    except ValueError as error:
+        raise CaptureError(f"{path}: its JSON part does not parse ({error}); export the file again") from error
+    if not isinstance(document, dict):
+        raise CaptureError(f"{path}: expected JSON keys, got a {type(document).__name__}; export it again")
+    version = str(document.get("asset", {}).get("version", "none"))
+    if not version.startswith("2"):
+        raise CaptureError(f"{path}: expected glTF version 2.0, got {version[:40]}; export it as glTF 2.0")
+    needed = [e for e in document.get("extensionsRequired", []) if not e.startswith(("KHR_materials", "KHR_mesh_q"))]
+    if needed:
+        raise CaptureError(f"{path}: needs extensions {shown(needed)}, got no reader; export without compression")
+    buffers = tuple(_resource(path, b["uri"]) if "uri" in b else binary for b in document.get("buffers", []))
+    return Document(path, document, buffers)
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
+    """The JSON and the binary chunk of a .glb."""
+    length = struct.unpack_from("<I", data, 8)[0] if len(data) >= 12 else 0
+    if length < 20 or len(data) < length:
+        raise CaptureError(f"{path}: expected {length} bytes, the file has {len(data)}: it is cut short; copy it again")
+    chunks: dict[bytes, bytes] = {}
+    offset = 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", data, offset)
+        chunks.setdefault(kind, data[offset + 8 : offset + 8 + size])
+        offset += 8 + size
+    if b"JSON" not in chunks:
+        raise CaptureError(f"{path}: expected a JSON chunk, found {sorted(chunks)}; export the file again")
+    return chunks[b"JSON"], chunks.get(b"BIN\0", b"")
+
+
+def _resource(path: Path, uri: str) -> bytes:
+    if uri.startswith("data:"):
+        return base64.b64decode(uri.partition(",")[2])
+    file = path.parent / unquote(uri)
+    if not stays_inside(unquote(uri)) or not file.resolve().is_relative_to(path.parent.resolve()):
+        raise CaptureError(f"{path}: expected files in its own folder, got '{uri[:200]}'; move the file there")
+    return _read(file)
+
+
+def _count(value: object) -> int:
+    """A number of bytes or things.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if type(value) is not int or value < 0:
+        raise ValueError(f"expected a whole number from 0 on, got {str(value)[:40]}")
+    return value
+
+
+def _read(path: Path) -> bytes:
+    if path.exists() and not (path.is_file() and path.stat().st_size <= MAX_BYTES):
+        raise CaptureError(f"{path}: expected a file of at most {MAX_BYTES // 10**6} MB, got another; check the path")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error.strerror}); check the path") from error
+
+
+MISFITS = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, struct.error)
+"""What indices, types and shapes raise that do not fit one another."""
+MAX_VERTICES = 20_000_000
+"""Vertices of all parts, each counted where it stands."""
+HEAVIEST = 65535.0
+"""Weights are divided by their sum, so that whole numbers of 16 bit will do; what is heavier is none."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """One node of the tree, its transform relative to its parent (identity, 0, 1 where the file gives none)."""
+
+    name: str
+    parent: int
+    """Position of the parent among the character's nodes, -1 for a root; parents come first."""
+    translation: Float[Tensor, "3"]
+    rotation: Float[Tensor, "3 3"]
+    scale: Float[Tensor, "3"]
+
+
+@dataclass(frozen=True)
+class Character:
+    """A character in its rest pose: all parts as one mesh. Lengths are the file's (glTF: metres, y up)."""
+
+    nodes: tuple[Node, ...]
+    vertices: Float[Tensor, "vertex 3"]
+    normals: Float[Tensor, "vertex 3"]
+    uv: Float[Tensor, "vertex 2"]
+    faces: Int[Tensor, "face 3"]
+    texture_of_face: Int[Tensor, "face"]
+    textures: tuple[Float[Tensor, "3 _ _"], ...]
+    joints: Int[Tensor, "vertex 4"]
+    """Per vertex, positions in `node_of_joint`."""
+    weights: Float[Tensor, "vertex 4"]
+    node_of_joint: Int[Tensor, "joint"]
+    joint_from_bind: Float[Tensor, "joint 4 4"]
+    """Inverse bind matrices."""
+
+
+def load_character(path: Path) -> Character:
+    """Read a character; parts without a skin follow the node that they hang on.
+
+    Opaque base colours only: alpha, normal maps, morph targets and animations are ignored.
+
+    Raises:
+        CaptureError: the file is missing, cut short, not glTF 2.0, needs an extension that this reader
+            lacks (compressed meshes), has no triangles or no skin, or has parts that do not fit one another.
+    """
+    try:
+        return _load(path)
+    except CaptureError:
+        raise
+    except MISFITS as error:
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        raise CaptureError(
+            f"{path}: expected a glTF character, got parts that do not fit one another ({said}); export the file again"
+        ) from error
+
+
+def _load(path: Path) -> Character:
+    document = read_document(path)
+    order, parent_of = _tree(document)
+    position = {node: place for place, node in enumerate(order)}
+    nodes = tuple(_node(document.json["nodes"][n], n, position.get(parent_of[n], -1), path) for n in order)
+    parts = _Parts(document, position)
+    for node in order:
+        entry = document.json["nodes"][node]
+        for primitive in document.entry("meshes", entry["mesh"])["primitives"] if "mesh" in entry else ():
+            if primitive.get("mode", 4) == 4:
+                parts.add(node, entry.get("skin"), primitive)
+    if not parts.faces or not parts.skinned:
+        raise CaptureError(
+            f"{path}: expected a character with a skinned triangle mesh, found "
+            f"{'no skin' if parts.faces else 'no triangles'}; export mesh and armature together"
+        )
+    return parts.character(nodes)
+
+
+def _tree(document: Document) -> tuple[list[int], dict[int, int]]:
+    """The scene's nodes, parents first, and each one's parent (absent: -1)."""
+    entries = document.json.get("nodes", [])
+    parent_of = dict.fromkeys(range(len(entries)), -1)
+    for n, entry in enumerate(entries):
+        for child in entry.get("children", ()):
+            parent_of[child] = n
+    scenes = document.json.get("scenes")
+    roots = scenes[document.json.get("scene", 0)].get("nodes", []) if scenes else []
+    waiting = list(roots or [n for n, p in parent_of.items() if p < 0])
+    order: list[int] = []
+    while waiting:
+        n = waiting.pop(0)
+        order.append(n)
+        waiting.extend(entries[n].get("children", ()))
+        if len(order) > len(entries):
+            raise CaptureError(f"{document.path}: expected a tree of nodes, found a loop; export the file again")
+    return order, parent_of
+
+
+def _node(entry: Mapping[str, Any], index: int, parent: int, path: Path) -> Node:
+    name = str(entry.get("name", f"node{index}"))
+    if "matrix" in entry:
+        matrix = torch.tensor(entry["matrix"], dtype=torch.float32).reshape(4, 4).T
+        scale = matrix[:3, :3].norm(dim=0)
+        if not bool((scale > 0).all()):
+            raise CaptureError(f"{path}: node {name} has a singular matrix; apply transforms and export again")
+        return Node(name, parent, matrix[:3, 3].clone(), matrix[:3, :3] / scale, scale)
+    rotation = _rotation_from_quaternion(torch.tensor(entry.get("rotation", [0, 0, 0, 1]), dtype=torch.float32))
+    translation = torch.tensor(entry.get("translation", [0, 0, 0]), dtype=torch.float32)
+    return Node(name, parent, translation, rotation, torch.tensor(entry.get("scale", [1, 1, 1]), dtype=torch.float32))
+
+
+def _rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """The rotation of a quaternion (x, y, z, w) of any length but zero."""
+    x, y, z, w = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+class _Parts:
+    """Collects the primitives of a file into one mesh."""
+
+    def __init__(self, document: Document, position: Mapping[int, int]) -> None:
+        self.document = document
+        self.position = position
+        self.columns: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("vertices", "normals", "uv", "joints", "weights")
+        }
+        self.faces: list[np.ndarray] = []
+        self.texture_of_face: list[np.ndarray] = []
+        self.textures: list[np.ndarray] = []
+        self.texture_index: dict[int, int] = {}
+        self.joint_nodes: list[int] = []
+        self.inverse_binds: list[np.ndarray] = []
+        self.first_joint: dict[tuple[str, int], int] = {}
+        self.skinned = False
+        self.count = 0
+
+    def add(self, node: int, skin: int | None, primitive: Mapping[str, Any]) -> None:
+        """Append one primitive of the mesh at `node`."""
+        attributes, read = primitive["attributes"], self.document.accessor
+        vertices = read(attributes["POSITION"]).astype(np.float32)
+        n = len(vertices)
+        if self.count + n > MAX_VERTICES:
+            raise CaptureError(f"{self.document.path}: expected at most {MAX_VERTICES} vertices, got more; simplify it")
+        faces = (read(primitive["indices"]).reshape(-1) if "indices" in primitive else np.arange(n)).astype(np.int64)
+        if len(faces) % 3 or (len(faces) and faces.max() >= n):
+            raise CaptureError(
+                f"{self.document.path}: expected triangles whose corners are below {n}, found an index list "
+                f"of {len(faces)} up to {faces.max(initial=0)}; export the file again"
+            )
+        faces = faces.reshape(-1, 3)
+        shape = Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
+        normals = read(attributes["NORMAL"]) if "NORMAL" in attributes else vertex_normals(shape).numpy()
+        uv = read(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((n, 2))
+        joints, weights = self._binding(node, skin, attributes, n)
+        # Tiled textures: whole turns are dropped once for the primitive, the rest is clamped by the sampler.
+        uv = uv - np.floor(uv.min(0)) if n and (uv.min() < 0 or uv.max() > 1) else uv
+        columns = (vertices, normals, uv, joints, weights)
+        for column, values in zip(self.columns.values(), columns, strict=True):
+            column.append(values)
+        texture = self._texture(primitive.get("material", -1))
+        self.faces.append(faces + self.count)
+        self.texture_of_face.append(np.full(len(faces), texture))
+        self.count += n
+
+    def _binding(
+        self, node: int, skin: int | None, attributes: Mapping[str, int], n: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Joint positions and weights of n vertices; the weights sum to one."""
+        if skin is None or "JOINTS_0" not in attributes:
+            key = ("node", node)
+            if key not in self.first_joint:
+                self._add_joints(key, [node], np.eye(4, dtype=np.float32)[None])
+            joints = np.full((n, 4), self.first_joint[key], dtype=np.int64)
+            return joints, np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (n, 1))
+        self.skinned = True
+        entry = self.document.entry("skins", skin)
+        key = ("skin", skin)
+        if key not in self.first_joint:
+            identity = np.tile(np.eye(4, dtype=np.float32), (len(entry["joints"]), 1, 1))
+            given = entry.get("inverseBindMatrices")
+            binds = identity if given is None else self.document.accessor(given).reshape(-1, 4, 4).transpose(0, 2, 1)
+            self._add_joints(key, entry["joints"], binds)
+        joints = self.document.accessor(attributes["JOINTS_0"]).astype(np.int64)
+        weights = self.document.accessor(attributes["WEIGHTS_0"]).astype(np.float32)
+        if len(joints) != n or len(weights) != n or joints.max(initial=0) >= len(entry["joints"]):
+            raise CaptureError(
+                f"{self.document.path}: expected joints and weights for {n} vertices with joints below "
+                f"{len(entry['joints'])}, found {len(joints)} and {len(weights)} up to joint "
+                f"{joints.max(initial=0)}; export the file again"
+            )
+        if not bool(((weights >= 0) & (weights <= HEAVIEST)).all()):
+            raise CaptureError(f"{self.document.path}: expected weights of joints in [0, 1]; export the file again")
+        return joints + self.first_joint[key], weights / np.maximum(weights.sum(1, keepdims=True), 1e-8)
+
+    def _add_joints(self, key: tuple[str, int], nodes: list[int], binds: np.ndarray) -> None:
+        missing = [n for n in nodes if n not in self.position]
+        if missing:
+            raise CaptureError(f"{self.document.path}: joints {missing} are not in the scene; export the file again")
+        self.first_joint[key] = len(self.joint_nodes)
+        self.joint_nodes += [self.position[n] for n in nodes]
+        self.inverse_binds.append(binds.astype(np.float32))
+
+    def _texture(self, material: int) -> int:
+        """Position of this material's base colour among the textures."""
+        if material not in self.texture_index:
+            self.texture_index[material] = len(self.textures)
+            self.textures.append(self.document.base_color(material))
+        return self.texture_index[material]
+
+    def character(self, nodes: tuple[Node, ...]) -> Character:
+        """All that was added, as tensors."""
+        joined = {name: np.concatenate(parts) for name, parts in self.columns.items()}
+
+        def floats(values: np.ndarray) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
+
+        for node in nodes:
+            if not all(bool(part.isfinite().all()) for part in (node.translation, node.rotation, node.scale)):
+                raise CaptureError(f"{self.document.path}: node {node.name} is no finite transform; export it again")
+        return Character(
+            nodes=nodes,
+            vertices=floats(joined["vertices"]),
+            normals=torch.nn.functional.normalize(floats(joined["normals"]), dim=-1),
+            uv=floats(joined["uv"]),
+            faces=torch.from_numpy(np.concatenate(self.faces)),
+            texture_of_face=torch.from_numpy(np.concatenate(self.texture_of_face).astype(np.int64)),
+            textures=tuple(floats(t) for t in self.textures),
+            joints=torch.from_numpy(joined["joints"].astype(np.int64)),
+            weights=floats(joined["weights"]),
+            node_of_joint=torch.tensor(self.joint_nodes),
+            joint_from_bind=floats(np.concatenate(self.inverse_binds)),
+        )

@@ -1,0 +1,247 @@
+"""Cloth as paint: stripes, checks, prints, lettering, gradients and noise, in metres on a flat chart."""
+
+import colorsys
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from viewmend.data.synthetic.procedural.skeleton import Vector
+
+PX_PER_M = 520.0
+WORDS = ("VIEW", "MEND", "STUDIO", "NORTH", "RIVER", "SUN", "TEAM 7", "HELLO", "WAVE", "1984", "JAZZ", "ATLAS", "GO!")
+KINDS = (
+    *("plain", "heather", "stripes", "pinstripes", "bands", "gingham", "tartan", "dots"),
+    *("flowers", "blobs", "gradient", "zigzag", "denim", "knit", "letters"),
+)
+QUIET = ("plain", "heather", "denim", "knit", "stripes", "gradient", "bands")
+"""Kinds that leave room for a word across the chest."""
+Image = Float[np.ndarray, "height width 3"]
+Plane = Float[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A chart's texels in metres: x to the right with 0 in the middle (the front), y up from the lower edge."""
+
+    width_m: float
+    height_m: float
+    px_per_m: float = PX_PER_M
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of texels."""
+        return max(8, round(self.height_m * self.px_per_m)), max(8, round(self.width_m * self.px_per_m))
+
+    @property
+    def x(self) -> Plane:
+        """Metres right of the middle, of each texel."""
+        rows, columns = self.shape
+        return np.broadcast_to(np.linspace(-0.5, 0.5, columns) * self.width_m, (rows, columns))
+
+    @property
+    def y(self) -> Plane:
+        """Metres above the lower edge, of each texel."""
+        rows, columns = self.shape
+        return np.broadcast_to((np.linspace(1, 0, rows) * self.height_m)[:, None], (rows, columns))
+
+    def noise(self, rng: np.random.Generator, cell_x_m: float, cell_y_m: float) -> Plane:
+        """Smooth noise of about unit variance whose grains have this size."""
+        rows, columns = self.shape
+        coarse = (max(2, round(self.height_m / cell_y_m) + 1), max(2, round(self.width_m / cell_x_m) + 1))
+        values = rng.standard_normal(coarse)
+        if coarse[0] > rows or coarse[1] > columns:
+            return rng.standard_normal((rows, columns))
+        return cv2.resize(values, (columns, rows), interpolation=cv2.INTER_CUBIC)
+
+
+def hsv(h: float, s: float, v: float) -> Vector:
+    """SRGB of a hue, saturation and value, each in [0, 1]."""
+    return np.array(colorsys.hsv_to_rgb(h % 1.0, min(max(s, 0), 1), min(max(v, 0), 1)))
+
+
+@dataclass(frozen=True)
+class Fabric:
+    """A cloth: its kind, three colours and the size of its pattern."""
+
+    kind: str
+    colors: Float[np.ndarray, "3 3"]
+    period_m: float
+    seed: int
+
+    def paint(self, canvas: Canvas) -> Image:
+        """The cloth laid flat on this canvas."""
+        rng = np.random.default_rng(self.seed)
+        image = _PAINTERS[KINDS.index(self.kind)](self, canvas, rng)
+        weave = 1 + 0.025 * rng.standard_normal(canvas.shape)
+        return np.clip(image * weave[..., None], 0, 1)
+
+
+def sample_fabric(rng: np.random.Generator, kinds: tuple[str, ...] = KINDS) -> Fabric:
+    """Draw a cloth among these kinds."""
+    quiet = tuple(k for k in kinds if k in QUIET)
+    pool = quiet if quiet and rng.random() < 0.3 else kinds
+    kind = pool[int(rng.integers(len(pool)))]
+    hue = rng.random()
+    muted = rng.random() < 0.45
+    saturation = rng.uniform(0.0, 0.35) if muted else rng.uniform(0.4, 0.95)
+    value = rng.uniform(0.15, 0.95) if muted else rng.uniform(0.35, 0.95)
+    main = hsv(hue, saturation, value)
+    pale_or_dark = hsv(hue + rng.normal(0, 0.08), saturation * 0.4, 0.95 if value < 0.6 else 0.22)
+    accent = hsv(hue + rng.choice([0.08, 0.33, 0.5, 0.6]), rng.uniform(0.3, 0.9), rng.uniform(0.3, 0.95))
+    if kind == "denim":
+        main = hsv(rng.uniform(0.58, 0.63), rng.uniform(0.35, 0.65), rng.uniform(0.22, 0.6))
+    second = accent if rng.random() < 0.35 else pale_or_dark
+    period = float(np.exp(rng.uniform(np.log(0.028), np.log(0.11))))
+    return Fabric(kind, np.stack([main, second, accent]), period, int(rng.integers(2**31)))
+
+
+def blend(base: Image, color: Vector | Image, alpha: Plane) -> Image:
+    """`color` over `base` with coverage `alpha`."""
+    return base + np.clip(alpha, 0, 1)[..., None] * (color - base)
+
+
+def edge(distance_m: Plane, canvas: Canvas) -> Plane:
+    """Anti-aliased coverage of the region where `distance_m` is positive."""
+    return np.clip(distance_m * canvas.px_per_m + 0.5, 0, 1)
+
+
+def wave(position_m: Plane, period_m: float, share: float, canvas: Canvas) -> Plane:
+    """Coverage of stripes across this coordinate, `share` of each period wide, anti-aliased."""
+    phase = np.abs((position_m / period_m) % 1.0 - 0.5)
+    return edge((phase - 0.5 + share / 2) * period_m, canvas)
+
+
+def _flat(fabric: Fabric, canvas: Canvas, color: int = 0) -> Image:
+    return np.broadcast_to(fabric.colors[color], (*canvas.shape, 3)).astype(np.float64)
+
+
+def _heather(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    grain = 0.10 * canvas.noise(rng, 0.006, 0.002) + 0.05 * canvas.noise(rng, 0.02, 0.004)
+    return _flat(fabric, canvas) * (1 + grain[..., None])
+
+
+def _stripes(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    share = rng.uniform(0.25, 0.6)
+    return blend(_flat(fabric, canvas), fabric.colors[1], wave(canvas.y, fabric.period_m, share, canvas))
+
+
+def _pinstripes(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    period = fabric.period_m * rng.uniform(0.5, 1.2)
+    return blend(_flat(fabric, canvas), fabric.colors[1], wave(canvas.x, period, 0.25, canvas))
+
+
+def _bands(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    low, high = sorted(rng.uniform(0.25, 0.85, 2) * canvas.height_m)
+    inside = edge(canvas.y - low, canvas) * edge(high + 0.03 - canvas.y, canvas)
+    image = blend(_flat(fabric, canvas), fabric.colors[1], inside)
+    rim = edge(0.012 - np.abs(canvas.y - low), canvas) + edge(0.012 - np.abs(canvas.y - high - 0.03), canvas)
+    return blend(image, fabric.colors[2], rim)
+
+
+def _gingham(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    image = blend(_flat(fabric, canvas), fabric.colors[1], 0.5 * wave(canvas.y, fabric.period_m, 0.5, canvas))
+    return blend(image, fabric.colors[1], 0.5 * wave(canvas.x, fabric.period_m, 0.5, canvas))
+
+
+def _tartan(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    image, period = _flat(fabric, canvas), fabric.period_m * 1.8
+    for color, share, shift, alpha in ((1, 0.35, 0.0, 0.5), (2, 0.10, 0.31, 0.75), (1, 0.05, 0.62, 0.8)):
+        for axis in (canvas.x, canvas.y):
+            stripe = wave(axis + shift * period, period, share, canvas)
+            image = blend(image, fabric.colors[color], alpha * stripe)
+    return image
+
+
+def _dots(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    period, radius = fabric.period_m, fabric.period_m * rng.uniform(0.18, 0.32)
+    row = np.floor(canvas.y / period)
+    x = (canvas.x / period + 0.5 * (row % 2)) % 1.0 - 0.5
+    y = (canvas.y / period) % 1.0 - 0.5
+    return blend(_flat(fabric, canvas), fabric.colors[1], edge(radius - period * np.hypot(x, y), canvas))
+
+
+def _flowers(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    image = _bytes(_flat(fabric, canvas))
+    rows, columns = canvas.shape
+    size = fabric.period_m * 0.42 * canvas.px_per_m
+    count = int(rows * columns / (2.6 * size) ** 2 * 1.6)
+    palette = [fabric.colors[1], fabric.colors[2], hsv(0.32, 0.5, 0.4)]
+    for _ in range(max(count, 3)):
+        center = rng.uniform(0, 1, 2) * (columns, rows)
+        turn, scale = rng.uniform(0, 6.3), size * rng.uniform(0.5, 1.1)
+        color, petals = (255 * palette[int(rng.integers(3))]).tolist(), int(rng.integers(4, 7))
+        for k in range(petals):
+            angle = turn + 2 * np.pi * k / petals
+            x, y = center + 0.55 * scale * np.array([np.cos(angle), np.sin(angle)])
+            axes = (max(1, int(0.45 * scale)), max(1, int(0.25 * scale)))
+            cv2.ellipse(image, (int(x), int(y)), axes, np.degrees(angle), 0, 360, color, -1, cv2.LINE_AA)
+        middle, radius = (int(center[0]), int(center[1])), max(1, int(0.22 * scale))
+        cv2.circle(image, middle, radius, (240, 200, 50), -1, cv2.LINE_AA)
+    return image / 255.0
+
+
+def _blobs(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    cell = fabric.period_m * 0.9
+    first = canvas.noise(rng, cell, cell) + 0.4 * canvas.noise(rng, cell / 2.5, cell / 2.5)
+    second = canvas.noise(rng, cell, cell) + 0.4 * canvas.noise(rng, cell / 2.5, cell / 2.5)
+    image = blend(_flat(fabric, canvas), fabric.colors[1], edge((first - 0.2) * cell * 0.3, canvas))
+    return blend(image, fabric.colors[2], edge((second - 0.6) * cell * 0.3, canvas))
+
+
+def _gradient(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    return blend(_flat(fabric, canvas), fabric.colors[1], canvas.y / canvas.height_m)
+
+
+def _zigzag(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    period = fabric.period_m
+    fold = period * 0.6 * np.abs((canvas.x / period) % 1.0 - 0.5)
+    image = blend(_flat(fabric, canvas), fabric.colors[1], wave(canvas.y + fold, period, 0.4, canvas))
+    return blend(image, fabric.colors[2], wave(canvas.y + fold + 0.4 * period, period, 0.12, canvas))
+
+
+def _denim(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    twill = 0.08 * rng.standard_normal(canvas.shape) + 0.06 * canvas.noise(rng, 0.003, 0.03)
+    worn = 0.16 * canvas.noise(rng, 0.12, 0.25)
+    return _flat(fabric, canvas) * (1 + (twill + worn)[..., None])
+
+
+def _knit(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    rib = 0.13 * np.cos(2 * np.pi * canvas.x / 0.018) + 0.05 * np.cos(2 * np.pi * canvas.y / 0.011)
+    return _flat(fabric, canvas) * (0.9 + rib[..., None])
+
+
+def _letters(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    image, step = _flat(fabric, canvas), 0.13
+    word = WORDS[int(rng.integers(len(WORDS)))]
+    for row, top in enumerate(np.arange(step / 2, canvas.height_m, step)):
+        for left in np.arange(-(row % 2) * step - canvas.width_m / 2, canvas.width_m / 2, 1.9 * step):
+            image = write(image, canvas, word, fabric.colors[1], (left + step, top), 0.8 * step)
+    return image
+
+
+def write(
+    image: Image, canvas: Canvas, word: str, color: Vector, center_m: tuple[float, float], width_m: float
+) -> Image:
+    """A word of this width, at most 9 cm tall, centred at this place of the canvas."""
+    font, thick = cv2.FONT_HERSHEY_DUPLEX, max(2, round(0.05 * width_m * canvas.px_per_m))
+    (wide, tall), _ = cv2.getTextSize(word, font, 1.0, 1)
+    scale = min(width_m * canvas.px_per_m / wide, 0.09 * canvas.px_per_m / tall)
+    left = int((center_m[0] + canvas.width_m / 2) * canvas.px_per_m - scale * wide / 2)
+    base = int((canvas.height_m - center_m[1]) * canvas.px_per_m + scale * tall / 2)
+    ink = np.zeros(canvas.shape, dtype=np.uint8)
+    cv2.putText(ink, word, (left, base), font, scale, 255, thick, cv2.LINE_AA)
+    return blend(image, color, ink / 255.0)
+
+
+def _bytes(image: Image) -> UInt8[np.ndarray, "height width 3"]:
+    """The only depth OpenCV draws smooth edges in."""
+    return np.ascontiguousarray((255 * image).astype(np.uint8))
+
+
+_PAINTERS = (
+    *(lambda fabric, canvas, rng: _flat(fabric, canvas), _heather, _stripes, _pinstripes, _bands, _gingham, _tartan),
+    *(_dots, _flowers, _blobs, _gradient, _zigzag, _denim, _knit, _letters),
+)
+"""In the order of `KINDS`."""

@@ -1,0 +1,207 @@
+"""The studio: performers, lights and cameras as a capture with exact truth."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.synthetic.imperfections import Imperfections, imperfect_cameras, imperfect_frame
+from viewmend.data.synthetic.performer import Performer, TexturedMesh
+from viewmend.data.synthetic.render import Surface, light, render, stage_backdrop, stage_lights
+from viewmend.data.synthetic.rigs import dome_rig, ring_rig
+from viewmend.data.synthetic.textures import TexturePyramid, texture_pyramid
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.types import MultiViewFrame
+
+BOUNDS_SAMPLES = 48
+BOUNDS_MARGIN_M = 0.08
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudioConfig:
+    """One capture of the studio; all randomness follows from `seed`."""
+
+    seed: int = 0
+    """Seed of the performer, the lights, the rig's jitter and the imperfections. Procedural seeds from 10000 on are
+    kept for tests and evaluation."""
+    cameras: int | Cameras = 12
+    """How many cameras the rig has, or the rig itself, in the stage's world."""
+    rig: Literal["ring", "dome"] = "ring"
+    """How a number of cameras is placed."""
+    frames: int = 30
+    """Length of the capture."""
+    size_px: int | tuple[int, int] = 512
+    """Images' width and height, or side of square ones; a rig that is given keeps its own."""
+    fps: float | int = 30.0
+    """Frames per second."""
+    performers: Path | None = None
+    """A glTF character (.glb, .gltf), or a folder of which one is picked; None for a procedural scene."""
+    motions: Path | None = None
+    """A BVH motion, or a folder of which one is picked; goes with `performers`."""
+    cloth_variety: float = 0.0
+    """Share of a glTF character's garments that get other colours or cloth by seed; 0 keeps them.
+    Procedural performers are always dressed by seed."""
+    background: Literal["black", "stage"] = "black"
+    """What the cameras see behind the subject; truth views always have black."""
+    samples_per_side: int = 2
+    """Each pixel is the mean of this many samples squared."""
+    imperfections: Imperfections = field(default_factory=Imperfections)
+    """Imperfections of the capture; none by default."""
+    device: str = "cpu"
+    """Device for rendering and for frames."""
+
+
+class Studio:
+    """A capture stage in software: a `CaptureSource` that also renders ground truth for any view."""
+
+    def __init__(self, config: StudioConfig | None = None, performer: Performer | None = None) -> None:
+        """Set up the stage.
+
+        Args:
+            config: all defaults if None.
+            performer: replaces the one of the config.
+
+        Raises:
+            CaptureError: performers or motions that are missing, none in their folder, or unreadable.
+            ValueError: sizes or counts that are not positive, a variety of cloth beyond [0, 1].
+        """
+        self.config = config = config or StudioConfig()
+        size = (config.size_px, config.size_px) if isinstance(config.size_px, int) else config.size_px
+        if config.frames < 1 or not config.fps > 0 or min(size) < 1:
+            raise ValueError(
+                f"expected at least one frame, a positive rate and size, got {config.frames} frames at "
+                f"{config.fps}/s of {size} pixels; correct the studio's config"
+            )
+        performer_seed, rig_seed, light_seed, backdrop_seed, self._error_seed = _seeds(config.seed)
+        self.performer = performer or _cast(config, performer_seed)
+        rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
+        cameras = config.cameras if isinstance(config.cameras, Cameras) else rig(config.cameras, size, seed=rig_seed)
+        self.true_cameras = cameras.to(config.device)
+        """True poses of the cameras; `cameras` has the calibration errors of the capture."""
+        self._cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
+        self._lights = stage_lights(light_seed).to(config.device)
+        self._backdrop = None
+        if config.background == "stage":
+            self._backdrop = stage_backdrop(self.true_cameras, backdrop_seed)
+        # Cache of the last frame, since a frame and its ground truth are read in pairs.
+        self._last_surface: tuple[int, Surface] | None = None
+        self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
+        self._bounds: Bounds | None = None
+
+    @property
+    def name(self) -> str:
+        """Seed and performer."""
+        return f"studio {self.config.seed}: {self.performer.description}"
+
+    @property
+    def cameras(self) -> Cameras:
+        """The calibration of the capture, including its errors."""
+        return self._cameras
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Six digits each, from 000000."""
+        return tuple(f"{time:06d}" for time in range(self.config.frames))
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second, None for a single frame."""
+        return float(self.config.fps) if self.config.frames > 1 else None
+
+    @property
+    def up(self) -> Float[Tensor, "3"] | None:
+        """+y."""
+        return torch.tensor([0.0, 1.0, 0.0], device=self.config.device)
+
+    @property
+    def bounds(self) -> Bounds | None:
+        """Bounds of the performers over the capture, with a margin (sampled at most 48 times)."""
+        if self._bounds is None:
+            count = min(self.config.frames, BOUNDS_SAMPLES)
+            times = np.linspace(0, self.config.frames - 1, count).round().astype(int)
+            corners = [self.performer.pose(int(t) / self.config.fps).mesh.vertices.aminmax(dim=0) for t in times]
+            low = torch.stack([c.min for c in corners]).amin(0) - BOUNDS_MARGIN_M
+            high = torch.stack([c.max for c in corners]).amax(0) + BOUNDS_MARGIN_M
+            self._bounds = Bounds(low, high).to(self.config.device)
+        return self._bounds
+
+    def scene(self, time: int) -> TexturedMesh:
+        """The performers' surface at index `time`, which may lie beyond the capture's frames."""
+        return self.performer.pose(time / self.config.fps).to(self.config.device)
+
+    def read(self, time: int) -> MultiViewFrame:
+        """All cameras at index `time`: images and masks with the imperfections, and the true depth.
+
+        Raises:
+            IndexError: `time` is not in the capture.
+        """
+        if not 0 <= time < self.config.frames:
+            raise IndexError(f"expected a time from 0 to {self.config.frames - 1}, got {time}")
+        frame = self._draw(self.true_cameras, time, self._backdrop)
+        frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, self._backdrop)
+        return replace(frame, cameras=self._cameras)
+
+    def truth(self, cameras: Cameras, time: int) -> MultiViewFrame:
+        """What perfect cameras anywhere would see at index `time`, before black, with exact mask and depth."""
+        return self._draw(cameras.to(self.config.device), time, None)
+
+    def _draw(
+        self, cameras: Cameras, time: int, backdrop: Float[Tensor, "view 3 height width"] | None
+    ) -> MultiViewFrame:
+        return replace(render(self._surface(time), cameras, backdrop, self.config.samples_per_side), time=time)
+
+    def _surface(self, time: int) -> Surface:
+        last = self._last_surface
+        if last is not None and last[0] == time:
+            return last[1]
+        scene = self.scene(time)
+        surface = light(scene, self._lights, self._pyramid(scene.textures))
+        self._last_surface = (time, surface)
+        return surface
+
+    def _pyramid(self, textures: tuple[Tensor, ...]) -> TexturePyramid:
+        last = self._last_pyramid
+        if last is not None and [*map(id, last[0])] == [*map(id, textures)]:
+            return last[1]
+        pyramid = texture_pyramid(textures).to(self.config.device)
+        self._last_pyramid = (textures, pyramid)
+        return pyramid
+
+
+def _seeds(seed: int) -> tuple[int, ...]:
+    """Independent seeds for performer, rig, lights, backdrop and errors."""
+    return tuple(int(s) for s in np.random.SeedSequence(seed).generate_state(5))
+
+
+def _cast(config: StudioConfig, seed: int) -> Performer:
+    """The performer of the config."""
+    if config.performers is None and config.motions is None:
+        from viewmend.data.synthetic.procedural import procedural_scene
+
+        return procedural_scene(config.seed)
+    if config.performers is None or config.motions is None:
+        missing = "performers" if config.performers is None else "motions"
+        raise CaptureError(f"expected performers and motions together, got no {missing}; give both folders")
+    from viewmend.data.synthetic.gltf_performer import GltfPerformer
+
+    chance = np.random.default_rng(seed)
+    character = _pick(config.performers, (".glb", ".gltf"), chance)
+    motion = _pick(config.motions, (".bvh",), chance)
+    return GltfPerformer(character, motion, seed, config.frames / config.fps, config.cloth_variety)
+
+
+def _pick(place: Path, suffixes: tuple[str, ...], chance: np.random.Generator) -> Path:
+    """The file itself, or one of the folder's."""
+    if place.is_file():
+        return place
+    files = sorted(f for f in place.iterdir() if f.suffix.lower() in suffixes) if place.is_dir() else []
+    if not files:
+        found = "no such files in it" if place.is_dir() else "no such folder or file"
+        raise CaptureError(f"{place}: expected a {' or '.join(suffixes)} file or a folder of them, found {found}")
+    return files[int(chance.integers(len(files)))]

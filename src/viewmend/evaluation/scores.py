@@ -1,0 +1,309 @@
+"""The scorer of `mend`, `demo` and `evaluate`: a completed view against the image of a held-out camera (section 10)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from viewmend.geometry.hull import FOREGROUND
+from viewmend.metrics.image_quality import SsimWindow, change, mask_iou, psnr, ssim_map, warp_error
+from viewmend.metrics.lpips import load_lpips
+from viewmend.metrics.vfid import MODES, I3d, load_i3d, video_features
+from viewmend.models.compositing import Background, composite
+from viewmend.types import CompletedView, MultiViewFrame
+from viewmend.utils.weight_files import MissingWeightsError
+
+MIN_HOLE_PX = 50
+"""Frames with fewer hole pixels are left out of mean scores in the holes: their PSNR is mostly noise."""
+STILL = 0.02
+"""A pixel of the truth counts as still if no channel changes by more, in [0, 1]."""
+CLIP_FRAMES = 16
+"""Length of the videos of VFID. The rest of a stream is a video, too, if it is half as long or the only one."""
+FEATURES = 1024
+"""Length of I3D's feature vectors."""
+KINDS = tuple(f"{kind}_{mode}" for mode in MODES for kind in ("whole", "masked"))
+"""Readings of VFID: whole images, or images blackened outside the holes; I3D in either mode."""
+Features = dict[str, Float[np.ndarray, "clip 1024"]]
+"""I3D's feature vectors of the videos of a stream, for each of `KINDS`."""
+ScoreMap = Callable[[Tensor, Tensor], Tensor | None]
+"""score(image, truth): a value for each pixel, NaN where undefined; None for images that are too small."""
+
+
+@dataclass(frozen=True)
+class Scorers:
+    """Background of the comparison and metrics besides PSNR; None skips a metric."""
+
+    background: Background = "black"
+    """Background on which views and truth are composited."""
+    ssim: SsimWindow | None = "gaussian"
+    lpips_alex: ScoreMap | None = None
+    lpips_vgg: ScoreMap | None = None
+    i3d: I3d | None = None
+
+
+NETWORKS: dict[str, tuple[str, Callable[[str], object]]] = {
+    "lpips-alex": ("lpips_alex", lambda device: load_lpips("alex", device)),
+    "lpips-vgg": ("lpips_vgg", lambda device: load_lpips("vgg", device)),
+    "i3d": ("i3d", load_i3d),
+}
+"""Networks of metrics: the field of `Scorers`, and the function that loads them."""
+
+
+def load_scorers(background: Background, ssim: SsimWindow, networks: Sequence[str], device: str) -> Scorers:
+    """Scorers with some of `NETWORKS`.
+
+    Raises:
+        WeightsError: weights are missing or wrong.
+    """
+    loaded = {field: load(device) for name, (field, load) in NETWORKS.items() if name in networks}
+    return Scorers(background, ssim, **loaded)  # pyright: ignore[reportArgumentType]
+
+
+def available_networks() -> tuple[tuple[str, ...], dict[str, str]]:
+    """The `NETWORKS` whose weights are installed, and the reason for each other one.
+
+    Raises:
+        WeightsError: weights are installed but wrong.
+    """
+    there, missing = [], {}
+    for name, (_, load) in NETWORKS.items():
+        try:
+            load("cpu")
+            there.append(name)
+        except MissingWeightsError as error:
+            missing[name] = str(error)
+    return tuple(there), missing
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewScores:
+    """Scores of one view: PSNR in dB, SSIM in [-1, 1], differences in [0, 1]; None where there is nothing to score.
+
+    PSNR, SSIM and LPIPS have four readings: `whole`, over all pixels; `holes`, over the holes only (a); `holes_fg`,
+    over the holes inside the true mask; `masked`, over all pixels of images blackened outside the holes (b). SSIM and
+    LPIPS over some pixels are means of the maps of the unmasked images. The holes are `IncompleteView.holes`, whatever
+    the error rule.
+    """
+
+    time: int
+    width_px: int
+    height_px: int
+    hull_px: int
+    """Pixels that the geometry proxy covers."""
+    hole_px: int
+    hole_fg_px: int
+    past_px: int = 0
+    """Holes that only the past shows (`psnr_past`)."""
+    psnr_whole: float
+    psnr_whole_rendered: float
+    """`psnr_whole` of the view before inpainting."""
+    psnr_subject: float | None = None
+    """PSNR inside the true mask."""
+    psnr_valid: float | None = None
+    """PSNR over the pixels of the proxy that a source view colours."""
+    psnr_holes: float | None = None
+    psnr_holes_fg: float | None = None
+    psnr_masked: float | None = None
+    psnr_past: float | None = None
+    """PSNR over the holes whose surface no source view sees now and one saw earlier in the window."""
+    ssim_whole: float | None = None
+    ssim_holes: float | None = None
+    ssim_holes_fg: float | None = None
+    ssim_masked: float | None = None
+    lpips_alex_whole: float | None = None
+    lpips_alex_holes: float | None = None
+    lpips_alex_holes_fg: float | None = None
+    lpips_alex_masked: float | None = None
+    lpips_vgg_whole: float | None = None
+    lpips_vgg_holes: float | None = None
+    lpips_vgg_holes_fg: float | None = None
+    lpips_vgg_masked: float | None = None
+    alpha_iou: float | None = None
+    """IoU of the true mask and alpha above one half (M for an inpainter without alpha)."""
+    hull_iou: float | None = None
+    """IoU of the true mask and the proxy."""
+    flicker: float | None = None
+    """Change of the error since the previous frame along the surface's true motion, over the holes; 0 for the truth."""
+    flicker_whole: float | None = None
+    """The same over the subject and the proxy; compare with the method `unfilled`, which shows the rendered view."""
+    change_still: float | None = None
+    """Change since the previous frame where the truth is still (`STILL`); needs no true motion."""
+    warp_error: float | None = None
+    """Change of the view since the previous frame along the true motion, over the holes."""
+    warp_error_truth: float | None = None
+    change: float | None = None
+    """Change since the previous frame in place, over the holes of both frames."""
+    change_truth: float | None = None
+
+    @property
+    def image_px(self) -> int:
+        """Pixels of the image."""
+        return self.width_px * self.height_px
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """The target of a completed view."""
+
+    rgb: Float[Tensor, "3 height width"]
+    """Colours in [0, 1], on the background of the `Scorers`."""
+    mask: Bool[Tensor, "height width"]
+    backward_flow_px: Float[Tensor, "height width 2"] | None = None
+    """Position of each pixel's surface point in the previous true image; None if unknown."""
+    by_past_alone: Bool[Tensor, "height width"] | None = None
+    """Pixels whose surface the source views saw only in the past (`SurfaceSeen.by_past_alone`); None if unknown."""
+
+
+@dataclass(frozen=True)
+class PreviousView:
+    """The previous frame of a stream."""
+
+    rgb: Float[Tensor, "3 height width"]
+    truth: Float[Tensor, "3 height width"]
+    holes: Bool[Tensor, "height width"]
+
+
+def true_view(
+    frame: MultiViewFrame,
+    background: Background = "black",
+    backward_flow_px: Float[Tensor, "height width 2"] | None = None,
+    by_past_alone: Bool[Tensor, "height width"] | None = None,
+) -> TrueView:
+    """The image of a camera (a frame of one view with a mask), composited on a background by its mask."""
+    assert frame.mask is not None, "held-out cameras have masks"
+    alpha = frame.mask[0].float() / 255
+    rgb = composite(background, frame.rgb[0].float() / 255 * alpha, alpha)
+    return TrueView(rgb, frame.mask[0] > FOREGROUND, backward_flow_px, by_past_alone)
+
+
+def score_view(
+    completed: CompletedView,
+    truth: TrueView,
+    scorers: Scorers,
+    previous: PreviousView | None = None,
+) -> ViewScores:
+    """All scores of one completed view; the temporal ones need the previous frame."""
+    view, background = completed.view, scorers.background
+    rgb = composite(background, completed.rgb, completed.opacity)
+    rendered = composite(background, view.rgb, view.mask)
+    hull, holes = view.mask > 0.5, view.holes
+    past = torch.zeros_like(holes) if truth.by_past_alone is None else truth.by_past_alone & holes
+    height, width = holes.shape
+    whole, whole_rendered = psnr(rgb, truth.rgb), psnr(rendered, truth.rgb)
+    assert whole is not None and whole_rendered is not None, "images have pixels"
+    maps = {"lpips_alex": scorers.lpips_alex, "lpips_vgg": scorers.lpips_vgg}
+    maps["ssim"] = None if scorers.ssim is None else partial(ssim_map, window=scorers.ssim)
+    by_map: dict[str, float | None] = {}
+    for name, score in maps.items():
+        by_map |= {} if score is None else _readings(name, score, (rgb, truth.rgb), holes, truth.mask)
+    return ViewScores(
+        time=view.time,
+        width_px=width,
+        height_px=height,
+        hull_px=int(hull.sum()),
+        hole_px=int(holes.sum()),
+        hole_fg_px=int((holes & truth.mask).sum()),
+        past_px=int(past.sum()),
+        psnr_whole=whole,
+        psnr_whole_rendered=whole_rendered,
+        psnr_subject=psnr(rgb, truth.rgb, truth.mask),
+        psnr_valid=psnr(rgb, truth.rgb, hull & ~holes),
+        psnr_holes=psnr(rgb, truth.rgb, holes),
+        psnr_holes_fg=psnr(rgb, truth.rgb, holes & truth.mask),
+        psnr_masked=psnr(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None,
+        psnr_past=psnr(rgb, truth.rgb, past),
+        alpha_iou=mask_iou(completed.opacity > 0.5, truth.mask),
+        hull_iou=mask_iou(hull, truth.mask),
+        **by_map,
+        **({} if previous is None else _temporal(rgb, holes, (view.mask > 0) | truth.mask, truth, previous)),
+    )
+
+
+def mean_over_frames(values: Sequence[float | None], pixels: Sequence[int] | None = None) -> float | None:
+    """Mean of the frames that have a value; None if none has.
+
+    With `pixels`, the number of pixels behind each value, frames with fewer than `MIN_HOLE_PX` count only if all are.
+    """
+    there = [(v, n) for v, n in zip(values, pixels or [0] * len(values), strict=True) if v is not None]
+    enough = [v for v, n in there if n >= MIN_HOLE_PX] or [v for v, _ in there]
+    return sum(enough) / len(enough) if enough else None
+
+
+def _readings(
+    name: str,
+    score: ScoreMap,
+    images: tuple[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]],
+    holes: Bool[Tensor, "height width"],
+    true_mask: Bool[Tensor, "height width"],
+) -> dict[str, float | None]:
+    """The four readings of a score that has a map; NaN values of the map do not count."""
+    image, truth = images
+    scored = score(image, truth)
+    if scored is None:
+        return {}
+    masked = score(image * holes, truth * holes) if bool(holes.any()) else None
+    maps = {"whole": scored, "holes": scored[holes], "holes_fg": scored[holes & true_mask], "masked": masked}
+    return {f"{name}_{region}": _finite_mean(values) for region, values in maps.items()}
+
+
+def _finite_mean(values: Tensor | None) -> float | None:
+    finite = values if values is None else values[values.isfinite()]
+    return None if finite is None or not finite.numel() else float(finite.double().mean())
+
+
+def _temporal(
+    now: Float[Tensor, "3 height width"],
+    holes: Bool[Tensor, "height width"],
+    shown: Bool[Tensor, "height width"],
+    truth: TrueView,
+    previous: PreviousView,
+) -> dict[str, float | None]:
+    then, true_now, true_then = previous.rgb, truth.rgb, previous.truth
+    still = shown & ((true_now - true_then).abs().amax(0) < STILL)
+    found = {
+        "change_still": change(now, then, still, MIN_HOLE_PX),
+        "change": change(now, then, holes | previous.holes, MIN_HOLE_PX),
+        "change_truth": change(true_now, true_then, holes | previous.holes, MIN_HOLE_PX),
+    }
+    if (flow := truth.backward_flow_px) is not None:
+        found["flicker_whole"] = warp_error(now - true_now, then - true_then, flow, shown)
+        found["flicker"] = warp_error(now - true_now, then - true_then, flow, holes, MIN_HOLE_PX)
+        found["warp_error"] = warp_error(now, then, flow, holes, MIN_HOLE_PX)
+        found["warp_error_truth"] = warp_error(true_now, true_then, flow, holes, MIN_HOLE_PX)
+    return found
+
+
+class VideoFeatures:
+    """Cuts a stream into videos and computes their features for VFID."""
+
+    def __init__(self, network: I3d | None) -> None:
+        self.network = network
+        self._frames: list[tuple[Tensor, Tensor]] = []
+        self._found: dict[str, list[Tensor]] = {kind: [] for kind in KINDS}
+
+    def add(self, rgb: Float[Tensor, "3 height width"], holes: Bool[Tensor, "height width"]) -> None:
+        """Add the next frame."""
+        if self.network is not None:
+            self._frames.append((rgb, rgb * holes))
+            if len(self._frames) == CLIP_FRAMES:
+                self._cut()
+
+    def features(self) -> Features | None:
+        """Features of all frames so far; None without the network, or without frames."""
+        cut = self._found[KINDS[0]]
+        if self._frames and (not cut or 2 * len(self._frames) >= CLIP_FRAMES):
+            self._cut()
+        if not cut:
+            return None
+        return {kind: torch.stack(found).cpu().numpy() for kind, found in self._found.items()}
+
+    def _cut(self) -> None:
+        assert self.network is not None, "frames are kept only for the network"
+        for mode in MODES:
+            for kind, frames in zip(("whole", "masked"), zip(*self._frames, strict=True), strict=True):
+                self._found[f"{kind}_{mode}"].append(video_features(self.network, frames, mode))
+        self._frames = []

@@ -1,0 +1,172 @@
+"""Writes the default model as a file for other runtimes: an AOTInductor package (libtorch), or ONNX."""
+
+import json
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from torch.export import Dim, ExportedProgram
+
+from viewmend import __version__
+from viewmend.export.model_inputs import ViewInputs, ViewOutputs
+from viewmend.export.traceable import LARGEST_PX, ExportedModel
+from viewmend.models.views.model import ViewSynthNet
+from viewmend.utils.atomic_writes import write_atomically
+
+SMALLEST_PX = 64
+"""Shortest side of views and images."""
+MOST_CAMERAS = 64
+EXAMPLE = {"height": 70, "width": 66, "rows": 67, "columns": 73, "chosen": 3, "camera": 5}
+"""Sizes of the tensors that the model is traced with: all different, so that none is traced as equal to another."""
+OPSET = 18
+"""Version of ONNX's operators."""
+DTYPES = {"Float": torch.float32, "Int": torch.int64, "UInt8": torch.uint8, "Bool": torch.bool}
+"""Types of the inputs, by their annotations."""
+INDUCTOR = {
+    "joint_graph_constant_folding": False,
+    "layout_optimization": False,
+    "cpp.dynamic_threads": True,
+    "cpp.simdlen": 1,
+}
+"""Constant folding needs known sizes. With layout optimisation, convolutions of a batch of unknown size give wrong
+results (torch 2.13). The caller sets the number of threads. Vectorised kernels compile for minutes and gain little."""
+
+
+def sizes(net: ViewSynthNet) -> dict[str, tuple[int, int]]:
+    """Smallest and largest value of each size that the inputs' annotations name."""
+    pixels = dict.fromkeys(("height", "width", "rows", "columns"), (SMALLEST_PX, LARGEST_PX))
+    return pixels | {"chosen": (2, max(3, net.config.num_views)), "camera": (2, MOST_CAMERAS)}
+
+
+def check_exportable(model: object, name: str) -> ViewSynthNet:
+    """The model, if it is one that can be exported.
+
+    Raises:
+        ValueError: it is no `ViewSynthNet`.
+    """
+    if not isinstance(model, ViewSynthNet):
+        raise ValueError(
+            f"expected a model of the default architecture, got '{name}', a {type(model).__name__}; export 'views', or "
+            "a model trained by viewmend train views"
+        )
+    return model
+
+
+def trace(net: ViewSynthNet) -> ExportedProgram:
+    """Traces the model for all sizes, in float32 on the CPU."""
+    ranges = {size: Dim(size, min=low, max=high) for size, (low, high) in sizes(net).items()}
+    example, dynamic = [], [{axis: ranges[size] for axis, size in own.items()} for own in _named_axes()]
+    for kind in ViewInputs.__annotations__.values():
+        dtype, shape = DTYPES[kind.__name__.split("[")[0]], kind.dim_str.split()
+        example.append(torch.ones([EXAMPLE.get(size) or int(size) for size in shape], dtype=dtype))
+    with torch.enable_grad(), _quiet():  # with gradients, layers do not use compiled loops
+        return torch.export.export(
+            ExportedModel(net).eval().requires_grad_(False),
+            tuple(example),
+            dynamic_shapes=(tuple(dynamic),),
+            prefer_deferred_runtime_asserts_over_guards=True,
+        )
+
+
+def _named_axes() -> tuple[dict[int, str], ...]:
+    """The named axes of each input, by their number."""
+    shapes = [kind.dim_str.split() for kind in ViewInputs.__annotations__.values()]
+    return tuple({axis: size for axis, size in enumerate(shape) if size in EXAMPLE} for shape in shapes)
+
+
+def metadata(net: ViewSynthNet, name: str) -> dict[str, str]:
+    """Metadata of a file: model, names of inputs and outputs in order, and ranges of sizes."""
+    ranges = ",".join(f"{size}={low}:{high}" for size, (low, high) in sizes(net).items())
+    return {
+        "viewmend_version": __version__,
+        "viewmend_model": name,
+        "viewmend_config": json.dumps(net.config.to_dict()),
+        "inputs": ",".join(ViewInputs._fields),
+        "outputs": ",".join(ViewOutputs._fields),
+        "sizes": ranges,
+    }
+
+
+def check_compiler() -> None:
+    """ValueError without the C++ compiler that AOTInductor needs."""
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler:
+        raise ValueError(
+            "expected a C++ compiler for --format pt2, found none; install one (Debian: apt-get install g++), set CXX "
+            "to one, or use --format onnx"
+        ) from None
+
+
+def check_onnx() -> None:
+    """ValueError without the packages that write ONNX."""
+    absent = [name for name in ("onnx", "onnxscript") if find_spec(name) is None]
+    if absent:
+        raise ValueError(f"expected {' and '.join(absent)} for --format onnx, got none; pip install 'viewmend[all]'")
+
+
+def write_pt2(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -> None:
+    """Compiles a program for this machine's processor, and writes it as an AOTInductor package with its metadata.
+
+    Raises:
+        OSError: it cannot be written; then there is no file.
+    """
+    from torch._inductor import aoti_compile_and_package
+    from torch._inductor.utils import fresh_cache
+
+    configs = INDUCTOR | {"aot_inductor.metadata": dict(notes)}
+
+    def write(draft: Path) -> None:
+        aoti_compile_and_package(program, package_path=str(draft), inductor_configs=configs)
+
+    with _quiet(), fresh_cache():
+        write_atomically(path, write, durable=True)
+
+
+def write_onnx(program: ExportedProgram, path: Path, notes: Mapping[str, str]) -> None:
+    """Writes a program as one ONNX file with its metadata.
+
+    Raises:
+        OSError: it cannot be written; then there is no file.
+    """
+    with _quiet():
+        made = torch.onnx.export(
+            program,
+            input_names=ViewInputs._fields,
+            output_names=ViewOutputs._fields,
+            dynamic_shapes=(_named_axes(),),  # the program is traced already: these are names only
+            opset_version=OPSET,
+            external_data=False,
+            verbose=False,
+        )
+    assert made is not None
+    made.model.metadata_props.update(notes)
+    write_atomically(path, lambda draft: made.save(draft, external_data=False), durable=True)
+
+
+FORMATS: dict[str, tuple[Callable[[], None], Callable[[ExportedProgram, Path, Mapping[str, str]], None]]] = {
+    "pt2": (check_compiler, write_pt2),
+    "onnx": (check_onnx, write_onnx),
+}
+"""Check of what each format needs, and its writer."""
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hides torch's warnings about deprecations and optional packages."""
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(before)

@@ -1,0 +1,230 @@
+"""The default model as one module from tensors to tensors that `torch.export` traces for any sizes.
+
+Layers and ray sampler are the model's own. What differs is here: image pyramids and a smooth fill whose operations do
+not depend on sizes or contents. Each scale of an image lies in a canvas with at least one spare row and column, since a
+length of one would be traced as fixed. From some level on all canvases are as large as those of the largest image:
+expressions of many nested halves would take the compiler long.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.export.model_inputs import ViewInputs, ViewOutputs
+from viewmend.geometry.cameras import Cameras
+from viewmend.models.smooth_fill import from_near, spread
+from viewmend.models.views.grid import rim_depth, scatter_to_image
+from viewmend.models.views.model import ViewSynthNet
+from viewmend.models.views.pyramids import (
+    AREA_LEVEL,
+    SMALLEST_PX,
+    MipLevels,
+    SceneScale,
+    SourceCameras,
+    choose_levels,
+)
+from viewmend.models.views.ray_fill import gather_ray_inputs
+from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+
+LARGEST_PX = 4096
+"""Longest side of images and views."""
+LEVELS = 11
+"""Scales of an image: enough for a shorter side of `LARGEST_PX`."""
+CONSTANT = 5
+"""First level whose canvas is as large for all images: 130 pixels."""
+SPARE = 16
+"""Rows of `_packed` beyond the finest level's: its other levels add up to that height, but for their borders."""
+FILL_LEVELS, FILL_CONSTANT = 12, 3
+"""The same of the smooth fill, which halves a view until one pixel is left."""
+
+
+class ExportedModel(nn.Module):
+    """`ViewSynthNet.step` of one view."""
+
+    def __init__(self, net: ViewSynthNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """`ViewOutputs` of `ViewInputs`."""
+        inputs = ViewInputs(*tensors)
+        view, sources = inputs.view, PackedSources.of_inputs(inputs)
+        where = view.refine_mask & (rim_depth(view.depth) > 0)
+        guess = self._guess(view, sources)
+        prediction = self.net(view, sources, where=where, guess=guess)
+        fill = None if self.net.coarse is None else guess
+        completed = prediction.composite_into(view, where, torch.zeros_like(where), inputs.alpha_slope, fill)
+        assert completed.confidence is not None, "the model predicts it"
+        return tuple(ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth))
+
+    def _guess(self, view: IncompleteView, sources: "PackedSources") -> Float[Tensor, "3 height width"]:
+        """`ViewSynthNet.coarse_guess`."""
+        guess = fill_any_size(view.rgb, view.holes, view.mask > 0)
+        if self.net.coarse is None:
+            return guess
+        holes = view.holes & (view.depth > 0).any()
+        first = torch.arange(holes.numel()).view(holes.shape) == 0
+        pixels = torch.nonzero(holes | first)  # some layers need at least one
+        holed = replace(view, error=view.holes.to(view.error))
+        colours = self.net.coarse.mix(gather_ray_inputs(holed, sources, pixels, guess))
+        return torch.where(holes, scatter_to_image(colours, pixels, holes.shape), guess)
+
+
+@dataclass(frozen=True)
+class PackedSources(SourceCameras):
+    """The source cameras of an exported model's inputs, with pyramids of a fixed number of levels."""
+
+    coloured: Bool[Tensor, "view"]
+    use_kernels = False  # pyright: ignore
+    rays_at_once = None  # pyright: ignore
+
+    @classmethod
+    def of_inputs(cls, inputs: ViewInputs) -> "PackedSources":
+        """The chosen cameras, and the silhouettes of all."""
+        tensors = inputs.rig_K, inputs.rig_camera_from_world, inputs.image_sizes_px
+        cameras = Cameras((), *(tensor[inputs.chosen] for tensor in tensors))
+        images, masks, depth = (t[inputs.chosen] for t in (inputs.images, inputs.masks, inputs.proxy_depths))
+        views = ContextViews(MultiViewFrame(cameras, images, masks, 0), depth)
+        return cls(views, (), Silhouettes(inputs.masks, Cameras((), *tensors)), (), inputs.is_source)
+
+    def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
+        """Which cameras coloured the view: an input here, since cameras have no names."""
+        return self.coloured
+
+    def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
+        """`SourceCameras.mips`."""
+        parts = (self.images, self.cameras, 3), (self.silhouettes.mask[:, None], self.silhouettes.cameras, 0)
+        found = []
+        for images, cameras, mask in parts:
+            packed = PackedPyramids.of(images.float(), cameras.size_px, mask)
+            levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
+            found += map(packed.at, levels)
+        return found
+
+
+class PackedPyramids(NamedTuple):
+    """The pyramids of some cameras, all levels in one tensor, so that levels may depend on the inputs."""
+
+    pixels: Float[Tensor, "camera pixel channel"]
+    """0 to 255; each level has a border of black pixels."""
+    first: Int[Tensor, "level"]
+    """Index of each level's first pixel."""
+    columns: Int[Tensor, "level"]
+    """Pixels per row of each level, with the border."""
+    last: Int[Tensor, "camera"]
+    """The coarsest level of each camera."""
+    subject_px: Float[Tensor, "camera"]
+    """Root of the subject's area in each image."""
+
+    @classmethod
+    def of(
+        cls, images: Float[Tensor, "camera channel rows columns"], sizes_px: Int[Tensor, "camera 2"], mask: int
+    ) -> "PackedPyramids":
+        """The pyramids of images of 0 to 255; `mask` is the mask's channel."""
+        levels = halvings(images, LEVELS - 1, lambda means: (means + 0.5).floor(), CONSTANT)
+        area = levels[AREA_LEVEL][:, mask].double().sum((1, 2)) / 255 * 4**AREA_LEVEL
+        sides = torch.tensor([2**level for level in range(LEVELS)])
+        shortest = (sizes_px.amin(1)[:, None] + sides - 1) // sides
+        last = (shortest > SMALLEST_PX).sum(1).clamp_max(LEVELS - 1)
+        return cls(*_packed(levels), last, area.sqrt().clamp_min(1))
+
+    def at(self, level: Int[Tensor, "camera"]) -> MipLevels:
+        """One level of each camera."""
+        first = self.first[level] + torch.arange(level.shape[0]) * self.pixels.shape[1]
+        return MipLevels(self.pixels.flatten(0, 1), first, self.columns[level], 0.5 ** level.double())
+
+
+def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """All levels as one row of pixels, channels last; the index of each level's first pixel, and its row length.
+
+    The finest level and, below each other to its right, those before `CONSTANT` make one sheet; the others follow.
+    """
+    finest, right, others = levels[0], levels[1:CONSTANT], levels[CONSTANT:]
+    height, width, half = finest.shape[2] + SPARE, finest.shape[3] + 1, right[0].shape[3] + 1
+    strips = [F.pad(level, (1, half - 1 - level.shape[3], 1, 0)) for level in right]
+    below = height - sum(level.shape[2] for level in strips)
+    left = F.pad(finest, (1, 0, 1, SPARE - 1))
+    sheet = torch.cat([left, F.pad(torch.cat(strips, 2), (0, 0, 0, below))], 3)
+    rows = [F.pad(level, (1, 0, 1, 0)) for level in others]
+    pixels = torch.cat([image.flatten(2) for image in (sheet, *rows)], 2).movedim(1, 2)
+    tops = torch.cat([torch.full((1,), size, dtype=torch.long) for size in (0, *(s.shape[2] for s in strips[:-1]))])
+    tops, columns = tops.cumsum(0), sheet.shape[3]
+    sizes = torch.tensor([0, *(level.shape[2] * level.shape[3] for level in rows)]).cumsum(0)[:-1]
+    first = torch.zeros(1, dtype=torch.long), tops * columns + width, sizes + sheet.shape[2] * columns
+    all_columns = torch.full((CONSTANT,), columns, dtype=torch.long), torch.tensor([r.shape[3] for r in rows])
+    return pixels, torch.cat(first), torch.cat(all_columns)
+
+
+def halvings(
+    images: Float[Tensor, "image channel height width"],
+    count: int,
+    change: Callable[[Tensor], Tensor],
+    constant: int,
+) -> list[Float[Tensor, "image channel _height _width"]]:
+    """Some images at full resolution and at `count` halved ones, each in a canvas.
+
+    Args:
+        images: of any size up to `LARGEST_PX`.
+        count: number of halvings.
+        change: applied to the means of 2 x 2 pixels before they are halved again.
+        constant: first level whose canvas is as large as the largest image's.
+    """
+    levels = [F.pad(images, (0, 1, 0, 1))]
+    for level in range(1, count + 1):
+        half = F.pad(change(F.avg_pool2d(levels[-1], 2)), (0, 1, 0, 1))
+        if level == constant:
+            at = torch.arange(LARGEST_PX // 2**constant + 2)
+            for axis in (2, 3):
+                half = half.index_select(axis, at.clamp_max(half.shape[axis] - 1))
+        levels.append(half)
+    return levels
+
+
+def fill_any_size(
+    rgb: Float[Tensor, "channel height width"],
+    missing: Bool[Tensor, "height width"],
+    subject: Bool[Tensor, "height width"],
+) -> Float[Tensor, "channel height width"]:
+    """`smooth_fill.fill`, by the same operations whatever is missing."""
+    near, _ = from_near(rgb, ~missing, missing)
+    wide = missing & spread(~spread(~missing))
+    filled, reached = from_near(rgb, ~missing & subject, missing)
+    deep = missing & ~reached
+    filled = torch.where(deep, pull_push_any_size(filled, ~deep & subject), filled)
+    return torch.where(wide, filled, near)
+
+
+def pull_push_any_size(
+    image: Float[Tensor, "channel height width"], known: Bool[Tensor, "height width"]
+) -> Float[Tensor, "channel height width"]:
+    """`smooth_fill.pull_push`."""
+
+    def mean(half: Tensor) -> Tensor:
+        colour, weight = half.split((len(image), 1), 1)
+        return torch.cat([colour / weight.clamp_min(1e-6), (weight > 0).to(weight)], 1)
+
+    weighted = torch.cat([image * known, known[None].to(image)])
+    levels = [level[0] for level in halvings(weighted[None], FILL_LEVELS, mean, FILL_CONSTANT)]
+    scale = torch.tensor([2**level for level in range(FILL_LEVELS + 1)])
+    sizes = [(axis, (size + scale - 1) // scale) for axis, size in zip((1, 2), known.shape, strict=True)]
+    filled = levels[-1][:-1]
+    for level in range(FILL_LEVELS - 1, -1, -1):
+        colour, weight = levels[level][:-1], levels[level][-1:]
+        for axis, size in sizes:
+            filled = _interpolate(filled, axis, size[level + 1], size[level], colour.shape[axis])
+        filled = torch.where(weight > 0, colour, filled)
+    return torch.where(known, image, filled[:, : known.shape[0], : known.shape[1]])
+
+
+def _interpolate(image: Tensor, axis: int, coarse: Tensor, fine: Tensor, length: int) -> Tensor:
+    """An image of `coarse` pixels along an axis, interpolated to `fine` pixels in a canvas of this length."""
+    at = ((torch.arange(length) + 0.5) * (coarse / fine) - 0.5).clamp_min(0)
+    first = torch.minimum(at.long(), coarse - 1)
+    share = (at - first).clamp(0, 1).view([-1 if other == axis else 1 for other in range(3)])
+    after = torch.minimum(first + 1, coarse - 1)
+    return (1 - share) * image.index_select(axis, first) + share * image.index_select(axis, after)

@@ -1,0 +1,150 @@
+"""One frame of a stream with its geometry proxy, and everything computed from it that does not depend on a view."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import GeometryProxy, reconstruct
+from viewmend.models.base import Memory
+from viewmend.types import ContextViews, MultiViewFrame
+from viewmend.utils.mmap_tensors import size_bytes, to_mmap
+from viewmend.utils.timing import ms_since, now_s
+
+WINDOW = 33
+"""k_w n_w + n_c: how many frames back the inpainters' temporal windows reach."""
+
+
+@runtime_checkable
+class DepthProvider(Protocol):
+    """Geometry as inpainting needs it: depth in the cameras. `GeometryProxy` is one; so may be your own geometry.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import DepthProvider
+        >>> class Wall:
+        ...     def depth(self, cameras):
+        ...         width, height = cameras.max_size_px
+        ...         return torch.full((len(cameras), height, width), 3.0)
+        >>> isinstance(Wall(), DepthProvider)
+        True
+    """
+
+    def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
+        """z-depth of the surface in each camera, metres; 0 where there is none."""
+        ...
+
+
+@dataclass
+class CachedFrame:
+    """A frame, its geometry proxy, and what was computed from them; shared by all viewers.
+
+    Examples:
+        >>> from viewmend import Stream, make_method
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> Stream(make_method("telea")).add_frame(frame).depth(frame.cameras.names[:1]).shape
+        torch.Size([1, 64, 64])
+    """
+
+    frame: MultiViewFrame
+    proxy: GeometryProxy | DepthProvider
+    """G[t]. Rendering needs a `GeometryProxy`; inpainting needs only a `DepthProvider`."""
+    geometry_ms: float = 0.0
+    """Milliseconds spent on the proxy; charged to the first view of this frame, then 0."""
+    encoded: Memory = field(default_factory=dict, repr=False)
+    """The frame's memory, as `ContextProvider` uses it."""
+    depths: dict[str, Float[Tensor, "height width"]] = field(default_factory=dict, repr=False)
+    """The proxy's depth by camera name, for cameras that were requested so far."""
+    _counted: tuple[tuple[int, int], int] = field(default=((-1, -1), 0), repr=False, init=False)
+    """Numbers of depths and encoded entries when `size` was last computed, and its value."""
+
+    def depth(self, names: Sequence[str]) -> Float[Tensor, "view height width"]:
+        """The proxy's z-depth in these cameras, metres, 0 where there is none; each is rendered only once."""
+        self._render(names)
+        width, height = self.frame.cameras.select(names).max_size_px
+        return torch.stack([self.depths[name][:height, :width] for name in names])  # as `frame.select` cuts images
+
+    def _render(self, names: Sequence[str]) -> None:
+        """Render the proxy's depth in those of these cameras where it is not known yet."""
+        new = [name for name in names if name not in self.depths]
+        if new:
+            rendered = self.proxy.depth(self.frame.cameras.select(new))
+            right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
+            if right or below:
+                rendered = F.pad(rendered, (0, right, 0, below))  # padded as the images are
+            self.depths.update(zip(new, to_mmap(rendered), strict=True))
+
+    def context(self, names: Sequence[str]) -> ContextViews | None:
+        """These cameras with the proxy's depth, without copying; names that are not in the frame are left out.
+
+        None if no name is in the frame.
+        """
+        present = [name for name in names if name in self.frame.cameras.names]
+        self._render(present)
+        if not present:
+            return None
+        return ContextViews.of_depths(self.frame.select(present), [self.depths[name] for name in present])
+
+    def pop_geometry_ms(self) -> float:
+        """`geometry_ms`, which is 0 afterwards."""
+        ms, self.geometry_ms = self.geometry_ms, 0.0
+        return ms
+
+    @property
+    def size(self) -> int:
+        """Bytes of all large tensors; recomputed only if something was added."""
+        entries = len(self.depths), len(self.encoded)
+        if self._counted[0] != entries:
+            self._counted = (entries, self._count())
+        return self._counted[1]
+
+    def _count(self) -> int:
+        made = [self.frame.rgb, self.frame.mask, *self.depths.values(), *self.encoded.values()]
+        if isinstance(self.proxy, GeometryProxy):
+            made += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
+        return size_bytes(made)
+
+
+def cache_frame(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig) -> CachedFrame:
+    """Reconstruct the geometry proxy of one frame.
+
+    Args:
+        frame: the cameras' images and masks; use `frame.without` to leave out a camera.
+        bounds: the volume that may contain the subject; None to find it from the masks.
+        config: parameters of the visual hull.
+
+    Raises:
+        ValueError: the frame has no masks, no foreground, or a single camera.
+    """
+    if frame.mask is None:
+        raise ValueError(
+            "expected a capture with masks, got one without: the visual hull is computed from them; make "
+            "them with viewmend masks CAPTURE OUT, or name their files as each camera's 'mask'"
+        )
+    device = frame.rgb.device
+    start = now_s(device)
+    proxy = to_mmap(reconstruct(frame.mask, frame.cameras, bounds if bounds is None else bounds.to(device), config))
+    return CachedFrame(frame, proxy, ms_since(start, device))
+
+
+def evict(frames: OrderedDict[int, CachedFrame], time: int, memory_mb: float | None) -> None:
+    """Drop the least recently used frames until the others fit into `memory_mb`.
+
+    Without a limit, drop those more than `WINDOW` frames before `time`.
+    """
+    if memory_mb is None:
+        for old in [other for other in frames if other < time - WINDOW]:
+            del frames[old]
+        return
+    bytes_left = sum(cached.size for cached in frames.values())
+    while bytes_left > 1e6 * memory_mb and len(frames) > 1:
+        bytes_left -= frames.popitem(last=False)[1].size

@@ -1,1 +1,0 @@
-"""Scenes with a camera that is left out and its truth, for training and evaluation alike."""

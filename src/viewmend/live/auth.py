@@ -1,0 +1,105 @@
+"""Access control by token, origin and host name, and rate limits for messages."""
+
+import asyncio
+import hmac
+import re
+import time
+from collections.abc import Callable
+from ipaddress import ip_address
+
+from starlette.requests import HTTPConnection
+
+MIN_TOKEN_LENGTH = 16
+WRONG_TOKEN_S = 0.5
+"""Delay before a wrong token is answered."""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address can be reached from this machine only."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:  # any other name, such as 127.0.0.1.example, may resolve to any address
+        return False
+
+
+class AccessControl:
+    """Checks the token, the origin and, on a loopback address, the host name of a request."""
+
+    def __init__(self, host: str, token: str | None) -> None:
+        """Set up the checks of one server.
+
+        Raises:
+            ValueError: the address is not a loopback address and there is no token, or the token is too short.
+        """
+        if token is not None and len(token) < MIN_TOKEN_LENGTH:
+            raise ValueError(
+                f"expected a token of at least {MIN_TOKEN_LENGTH} characters, got {len(token)}; create a random one, "
+                "for example with: python -c 'import secrets; print(secrets.token_urlsafe())'"
+            )
+        if not is_loopback(host) and not token:
+            raise ValueError(
+                f"expected --token with --host {host}, which other machines can reach; create a long random token, "
+                "or leave out --host"
+            )
+        self._local = is_loopback(host)
+        self._token = token
+
+    def find_foreign_origin(self, connection: HTTPConnection) -> str | None:
+        """The reason to refuse a request that another site's page has caused; None for any other request.
+
+        Such a page has another `Origin`, or embeds an image of ours (`Sec-Fetch-Site`). A page whose own host name
+        resolves to this machine has that name as `Host`. Plain links from any page are allowed.
+        """
+        host = connection.headers.get("host", "")
+        address = _parse_host(host, 80)
+        if address is None or (self._local and not is_loopback(address[0])):
+            return f"expected a request to localhost, got one to '{host[:60]}'; open the address that was printed"
+        origin = connection.headers.get("origin")
+        if origin is not None and not _is_same_origin(origin, host):
+            return f"expected a request from this server's own page, got the origin '{origin[:60]}'"
+        site = connection.headers.get("sec-fetch-site", "none")
+        is_link = connection.headers.get("sec-fetch-dest") == "document"
+        if site not in ("none", "same-origin") and not is_link:
+            return f"expected a request from this server's own page, got a {site[:20]} request"
+        return None
+
+    async def has_token(self, connection: HTTPConnection) -> bool:
+        """Whether the request carries the token, or none is required. A wrong token is answered with a delay."""
+        if not self._token:
+            return True
+        scheme, _, given = connection.headers.get("authorization", "").partition(" ")
+        if scheme.lower() != "bearer":
+            given = connection.query_params.get("token", "")
+        valid = hmac.compare_digest(given.encode(errors="replace"), self._token.encode())
+        if given and not valid:
+            await asyncio.sleep(WRONG_TOKEN_S)
+        return valid
+
+
+def _parse_host(host: str, default_port: int) -> tuple[str, int] | None:
+    """Name, in lower case, and port of a `Host` header; None for a malformed one."""
+    found = re.fullmatch(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::(\d{1,5}))?", host.lower(), re.ASCII)
+    return found and (found[1] or found[2], int(found[3] or default_port))
+
+
+def _is_same_origin(origin: str, host: str) -> bool:
+    scheme, _, address = origin.partition("://")
+    port = {"http": 80, "https": 443}.get(scheme.lower())
+    return port is not None and None is not _parse_host(host, port) == _parse_host(address, port)
+
+
+class RateLimit:
+    """A token bucket: `per_s` events a second on average, `burst` at once."""
+
+    def __init__(self, per_s: float | int, burst: float | int, now: Callable[[], float] = time.monotonic) -> None:
+        self._per_s, self._burst, self._now = per_s, burst, now
+        self._left, self._updated_s = burst, now()
+
+    def allow(self) -> bool:
+        """Count one event; False if it is above the limit."""
+        now = self._now()
+        self._left = min(self._burst, self._left + (now - self._updated_s) * self._per_s)
+        self._updated_s = now
+        allowed = self._left >= 1
+        self._left -= allowed
+        return allowed

@@ -1,0 +1,332 @@
+"""Limits for connections: what unauthenticated clients may send, and what any client may leave unread.
+
+`LimitedConnection` sits between a socket and uvicorn: it is the socket's `asyncio.Protocol`, and the
+`asyncio.Transport` of uvicorn's HTTP and WebSocket protocols. So it can count, delay and drop bytes with public
+interfaces only. A client is unauthenticated until a request has shown the token or, where no token is required, does
+not come from another site's page. docs/live.md lists all limits.
+"""
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from starlette.requests import HTTPConnection
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketDisconnect
+from uvicorn.config import Config
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
+
+MAX_UNAUTHENTICATED = 128
+"""Unauthenticated connections at a time; the oldest one is closed when another arrives."""
+MAX_UNAUTHENTICATED_BYTES = 262_144
+"""Bytes that an unauthenticated connection may send in all."""
+MESSAGE_SLACK_BYTES, MESSAGE_SLACK_BYTES_PER_S = 524_288, 1000
+"""Bytes on a WebSocket in addition to the message that is read: of the next message, and of pings and pongs."""
+IDLE_S = 10.0
+"""A connection without a complete request is closed after this many seconds."""
+HANDSHAKE_S = 1.0
+"""A WebSocket handshake that uvicorn cannot parse is closed after this long."""
+UNREAD_S, UNREAD_BYTES = 20.0, 64_000
+"""A client with unread data has to read this many bytes of it within this many seconds."""
+PIECE_BYTES = 4096
+"""Unauthenticated input is handed to uvicorn in pieces of at most this size."""
+PAUSE_FACTOR, MIN_PAUSE_S = 4.0, 0.005
+"""After a turn, unauthenticated clients wait for this multiple of its duration, and at least for this long."""
+TOO_LARGE = b"\x88\x02\x03\xf1"
+"""A WebSocket close frame with code 1009, message too large."""
+STATE_KEY = "connection"
+"""The key of a request's `LimitedConnection` in the ASGI scope's `state`."""
+
+log = logging.getLogger("viewmend.live")
+
+
+class FairScheduler:
+    """Runs one callback at a time and pauses after each, so that unauthenticated clients use a fifth of the time.
+
+    Of the waiting callbacks, the first one of a connection goes before later ones of other connections.
+    """
+
+    def __init__(
+        self, now: Callable[[], float], call_later: Callable[[float, Callable[[], None]], object] | None = None
+    ) -> None:
+        """Set up a scheduler; `call_later` is the running event loop's by default."""
+        self._now, self._call_later = now, call_later
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._free_at_s = 0.0
+        self._is_planned = False
+
+    def submit(self, callback: Callable[[], None], first: bool) -> None:
+        """Call `callback` when its turn comes."""
+        (self._waiting.appendleft if first else self._waiting.append)(callback)
+        self._plan()
+
+    def withdraw(self, callback: Callable[[], None]) -> None:
+        """Remove a callback, if it waits."""
+        if callback in self._waiting:
+            self._waiting.remove(callback)
+
+    def _plan(self) -> None:
+        if self._waiting and not self._is_planned:
+            self._is_planned = True
+            call_later = self._call_later or asyncio.get_running_loop().call_later
+            call_later(max(0.0, self._free_at_s - self._now()), self._run_next)
+
+    def _run_next(self) -> None:
+        start_s = self._now()
+        try:
+            if self._waiting:
+                self._waiting.popleft()()
+        finally:
+            end_s = self._now()
+            self._free_at_s = end_s + max(MIN_PAUSE_S, PAUSE_FACTOR * (end_s - start_s))
+            self._is_planned = False
+            self._plan()
+
+
+class LimitedConnection(asyncio.Protocol, asyncio.Transport):
+    """One connection: the socket's protocol, and the transport of uvicorn's protocol."""
+
+    def __init__(
+        self,
+        limits: "ConnectionLimits",
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__()
+        self.authenticated = False
+        self.requests = 0
+        """Requests that are being answered: 0 or 1."""
+        self.since_s = self.idle_since_s = self._read_at_s = limits.now()
+        self._limits = limits
+        self._uvicorn: asyncio.BaseProtocol = H11Protocol(config, server_state, app_state | {STATE_KEY: self}, _loop)
+        self._is_websocket = False
+        self.message_bytes = self._max_message_bytes = 0
+        """Bytes that have been read since the application received the last message, and their limit."""
+        self._held = b""
+        """Input that uvicorn has not received yet."""
+        self._received_bytes = self._turns = self._unread_bytes = 0
+        self._input_paused = self._output_paused = self._is_waiting = False
+        self._next_request: Callable[[], None] | None = None
+        """Continues the request that waits for its turn."""
+
+    def authenticate(self, max_message_bytes: int) -> None:
+        """Lift the limits for unauthenticated clients; WebSocket messages may have `max_message_bytes` from now on."""
+        self.authenticated, self._max_message_bytes = True, max_message_bytes
+        asyncio.get_running_loop().call_soon(self._forward)
+
+    def is_stalled(self, now: float) -> bool:
+        """Whether the client has read too little of its unread data; to be called once a second."""
+        self.message_bytes = max(0, self.message_bytes - MESSAGE_SLACK_BYTES_PER_S)
+        left = self.get_write_buffer_size()
+        if left == 0 or left <= self._unread_bytes - UNREAD_BYTES:
+            self._read_at_s, self._unread_bytes = now, left
+        self._unread_bytes = max(self._unread_bytes, left)
+        return now - self._read_at_s >= UNREAD_S
+
+    async def wait_for_turn(self) -> bool:
+        """Wait until a request may be answered; False if the client has gone meanwhile."""
+        if not (self.authenticated or self.is_closing()):
+            turn = asyncio.Event()
+            self._next_request = turn.set
+            self._limits.scheduler.submit(turn.set, self._turns <= 1)
+            await turn.wait()
+            self._next_request = None
+        return not self.is_closing()
+
+    # The socket's protocol.
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin, and close the oldest unauthenticated connections if there are too many."""
+        assert isinstance(transport, asyncio.Transport), "servers accept streams"
+        self._transport = transport
+        self._limits.add(self)
+        self._uvicorn.connection_made(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Release everything that waits for this connection."""
+        self._limits.connections.discard(self)
+        self._limits.scheduler.withdraw(self._take_turn)
+        self._held = b""
+        if self._next_request is not None:
+            self._limits.scheduler.withdraw(self._next_request)
+            self._next_request()
+        self._uvicorn.connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Take input from the socket."""
+        self._received_bytes += len(data)
+        if not self.authenticated and self._received_bytes > MAX_UNAUTHENTICATED_BYTES:
+            self.abort()
+            return
+        self._held += data
+        self._forward()
+
+    def pause_writing(self) -> None:
+        """Hold input back while output is not read: pings would be answered without bound."""
+        self._output_paused = True
+        self._uvicorn.pause_writing()
+
+    def resume_writing(self) -> None:
+        """Go on after nearly all output was read."""
+        self._output_paused = False
+        self._unread_bytes, self._read_at_s = self.get_write_buffer_size(), self._limits.now()
+        self._uvicorn.resume_writing()
+        self._forward()
+
+    def _forward(self) -> None:
+        """Hand held input to uvicorn: all of it, or the next piece when it is an unauthenticated client's turn."""
+        is_held_back = self._input_paused or self._output_paused or self.is_closing()
+        if self._held and not is_held_back:
+            if self.authenticated:
+                self._deliver(len(self._held))
+            elif not self._is_websocket and not self._is_waiting:  # a WebSocket is read once it is authenticated
+                self._is_waiting = True
+                self._limits.scheduler.submit(self._take_turn, self._turns == 0)
+        if not self.is_closing():
+            (self._transport.pause_reading if self._held or self._input_paused else self._transport.resume_reading)()
+
+    def _take_turn(self) -> None:
+        self._is_waiting = False
+        self._turns += 1
+        if self._held and not self._input_paused and not self.is_closing():
+            self._deliver(PIECE_BYTES)
+        self._forward()
+
+    def _deliver(self, max_bytes: int) -> None:
+        data, self._held = self._held[:max_bytes], self._held[max_bytes:]
+        self.message_bytes += len(data)
+        if self._is_websocket and self.message_bytes > self._max_message_bytes + MESSAGE_SLACK_BYTES:
+            self.write(TOO_LARGE)
+            self.close()
+            return
+        assert isinstance(self._uvicorn, asyncio.Protocol), "uvicorn's protocols read streams"
+        try:
+            self._uvicorn.data_received(data)
+        except Exception:  # malformed input, for example after the end of a response
+            log.debug("while parsing a request", exc_info=True)
+            self.abort()
+
+    # The transport of uvicorn's protocol.
+
+    def set_protocol(self, protocol: asyncio.BaseProtocol) -> None:
+        """Upgrade to a WebSocket."""
+        self._uvicorn, self._is_websocket = protocol, True
+        asyncio.get_running_loop().call_later(HANDSHAKE_S, lambda: self.requests or self.close())
+
+    def pause_reading(self) -> None:
+        """Hold input back."""
+        self._input_paused = True
+        self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Hand on input again, but not within this call: uvicorn's protocol may be in the middle of its own work."""
+        self._input_paused = False
+        asyncio.get_running_loop().call_soon(self._forward)
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """As the socket's transport."""
+        return self._transport.get_extra_info(name, default)
+
+    def get_write_buffer_size(self) -> int:
+        """As the socket's transport."""
+        return self._transport.get_write_buffer_size()
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """As the socket's transport, if that is still open."""
+        if not self.is_closing():
+            self._transport.write(data)
+
+    def is_closing(self) -> bool:
+        """As the socket's transport."""
+        return self._transport.is_closing()
+
+    def close(self) -> None:
+        """As the socket's transport."""
+        self._transport.close()
+
+    def abort(self) -> None:
+        """As the socket's transport."""
+        self._transport.abort()
+
+
+class ConnectionLimits:
+    """All connections of a server, and the ASGI middleware that follows their requests."""
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self.now = now
+        self.connections: set[LimitedConnection] = set()
+        self.scheduler = FairScheduler(now)
+
+    def connect(self, *args: Any, **options: Any) -> LimitedConnection:
+        """Make a connection's protocol, as uvicorn's option `http` does."""
+        return LimitedConnection(self, *args, **options)
+
+    def add(self, connection: LimitedConnection) -> None:
+        """Count a connection, and close the oldest unauthenticated one if there are too many."""
+        self.connections.add(connection)
+        unauthenticated = [c for c in self.connections if not (c.authenticated or c.is_closing())]
+        if len(unauthenticated) > MAX_UNAUTHENTICATED:
+            min(unauthenticated, key=lambda c: c.since_s).abort()
+
+    def close_stalled(self) -> None:
+        """Close connections without a request, and drop those that do not read; to be called once a second."""
+        now = self.now()
+        for connection in list(self.connections):
+            if connection.is_stalled(now):
+                connection.abort()
+            elif not connection.requests and now - connection.idle_since_s > IDLE_S:
+                connection.close()
+
+    def close_unauthenticated(self) -> None:
+        """Drop all connections but those of authenticated clients that have read everything."""
+        for connection in list(self.connections):
+            if not connection.authenticated or connection.get_write_buffer_size():
+                connection.abort()
+
+    def wrap(self, app: ASGIApp) -> ASGIApp:
+        """Make the application follow the limits, and log its errors in place of uvicorn."""
+
+        async def limited(scope: Scope, receive: Receive, send: Send) -> None:
+            connection = scope.get("state", {}).get(STATE_KEY)
+            if connection is None:  # the application's start and end
+                await app(scope, receive, send)
+                return
+
+            async def receive_next() -> Message:
+                message = await receive()
+                connection.message_bytes = 0
+                return message
+
+            connection.requests += 1
+            try:
+                if await connection.wait_for_turn():
+                    await app(scope, receive_next, send)
+            except (OSError, WebSocketDisconnect):
+                log.debug("a client has gone while it was answered")
+            except Exception:
+                log.exception("while answering %s", scope["path"])
+                raise
+            finally:
+                connection.requests -= 1
+                connection.idle_since_s = self.now()
+
+        return limited
+
+
+def authenticate(request: HTTPConnection, max_message_bytes: int = 0) -> None:
+    """Lift the limits of a request's connection, as `LimitedConnection.authenticate`; behind a proxy there are none."""
+    connection = request.scope.get("state", {}).get(STATE_KEY)
+    if connection is not None:
+        connection.authenticate(max_message_bytes)
+
+
+def is_gone(request: HTTPConnection) -> bool:
+    """Whether a request's connection is closed; False where a proxy holds it."""
+    connection = request.scope.get("state", {}).get(STATE_KEY)
+    return connection is not None and connection.is_closing()

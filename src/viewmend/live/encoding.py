@@ -1,0 +1,233 @@
+"""Views as images (each mode of the protocol), JPEG, packed depth, and the binary messages of frames."""
+
+import time
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8, UInt16
+from torch import Tensor
+
+from viewmend.geometry.threads import light_operations
+from viewmend.live.poses import cameras_json
+from viewmend.live.protocol import BLACK, HULL_MODES, MENDED_MODES, FrameTimes, Look, pack
+from viewmend.live.renderer import RenderRequest, RenderResult
+from viewmend.live.video import STRINGS, VideoStream
+from viewmend.models.views.grid import rim_depth
+from viewmend.types import FAINT, CompletedView, IncompleteView
+
+Image = UInt8[np.ndarray, "height width 3"]
+HOLE = (1.0, 0.15, 0.55)
+"""Colour of missing pixels: a pink that clothes and skin do not have."""
+COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
+"""Colours of the source views in the mode `coverage`."""
+DEPTH_STRIDES = ((160, 1), (400, 2))
+"""Pairs (longest side, stride): image pixels per depth pixel for images of at most this size."""
+COARSEST_STRIDE = 4
+"""Image pixels per depth pixel in larger images."""
+
+
+def draw_mode(
+    completed: CompletedView, mode: str, background: str = BLACK, hulls: Mapping[str, Tensor] | None = None
+) -> Image:
+    """Draw one of the protocol's modes as 8-bit RGB on a background (hexadecimal RGB).
+
+    rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule. mended: Fhat. depth:
+    bright is near. coverage: the colours of the source views, missing pixels in pink. confidence: from violet (low)
+    to yellow (high); grey if the inpainter does not predict it. hull and points: as in `RenderResult.hulls`.
+    """
+    hull = (hulls or {})[mode] if mode in HULL_MODES else None
+    image = _draw_on_black(completed, mode) if hull is None else _to_8bit(hull[:3])
+    if background == BLACK:
+        return image
+    import cv2
+
+    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if hull is None else hull[3]
+    transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
+    channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
+    return cv2.add(image, cv2.merge(channels))
+
+
+def _draw_on_black(completed: CompletedView, mode: str) -> Image:
+    view = completed.view
+    if mode == "mended":
+        return _to_8bit(completed.rgb)
+    if mode == "confidence":
+        return _draw_confidence(completed)
+    if mode == "depth":
+        return _to_8bit(_shade(view.depth).expand(3, -1, -1))
+    base = _draw_coverage(view) if mode == "coverage" else view.rgb
+    if mode == "rendered":
+        return _to_8bit(base)
+    pink = torch.tensor(HOLE, device=base.device)[:, None, None]
+    return _to_8bit(torch.lerp(base, pink.expand_as(base), view.holes.to(base)))
+
+
+def surface_depth(completed: CompletedView) -> Float[Tensor, "height width"]:
+    """Depth in metres, 0 for background; the proxy's if the inpainter predicts none.
+
+    Pixels of soft outlines get the depth of the neighbouring surface.
+    """
+    if completed.depth is None:
+        return completed.view.depth
+    return torch.where(completed.opacity > FAINT, rim_depth(completed.depth), 0.0)
+
+
+def mean_confidence(completed: CompletedView) -> float | None:
+    """Mean confidence of the subject's pixels; None if the inpainter does not predict it."""
+    if completed.confidence is None:
+        return None
+    return round(float((completed.confidence * completed.opacity).sum() / completed.opacity.sum().clamp(min=1)), 4)
+
+
+def _draw_confidence(completed: CompletedView) -> Image:
+    import cv2
+
+    if completed.confidence is None:
+        return _to_8bit(completed.rgb.mean(0).expand(3, -1, -1))
+    confidence = (completed.confidence.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    heat = torch.from_numpy(cv2.applyColorMap(confidence, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy())
+    return _to_8bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
+
+
+def _draw_coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    """The colours of the source views, mixed by their blending weights and shaded by the image's brightness."""
+    colours = [COLOURS[n % len(COLOURS)] for n in range(len(view.source_views))]
+    mixed = torch.einsum("chw,cr->rhw", view.weights, torch.tensor(colours, device=view.rgb.device) / 255)
+    return mixed * (0.45 + 0.55 * view.rgb.mean(0))
+
+
+def _shade(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    surface = depth > 0
+    if not bool(surface.any()):
+        return torch.zeros_like(depth)
+    near, far = depth[surface].aminmax()
+    return torch.where(surface, 1 - 0.8 * (depth - near) / (far - near).clamp(min=1e-6), 0.0)
+
+
+def _to_8bit(rgb: Float[Tensor, "3 height width"]) -> Image:
+    return (rgb.clamp(0, 1) * 255).round().byte().movedim(0, -1).contiguous().cpu().numpy()
+
+
+def to_jpeg(image: Image, quality: int) -> bytes:
+    """Encode as JPEG; without chroma subsampling from quality 90, to keep coloured edges."""
+    import cv2
+
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    if quality >= 90:
+        options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    assert done, "8-bit images can be encoded"
+    return data.tobytes()
+
+
+def from_jpeg(data: bytes) -> Image:
+    """Decode a JPEG as RGB."""
+    import cv2
+
+    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
+
+
+@dataclass(frozen=True)
+class PackedDepth:
+    """Depth in the protocol's form."""
+
+    data: bytes
+    width: int
+    height: int
+    stride: int
+    """Image pixels per depth pixel, horizontally and vertically."""
+    near_m: float
+    far_m: float
+
+
+def depth_stride(height: int, width: int) -> int:
+    """Image pixels per depth pixel; small images need fine depth, or their outlines become ragged."""
+    return next((stride for longest, stride in DEPTH_STRIDES if max(height, width) <= longest), COARSEST_STRIDE)
+
+
+def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth:
+    """Pack every `stride`-th pixel: inverse depth in 16 bits, horizontal differences, zlib."""
+    height, width = depth.shape
+    rows = (torch.arange(-(-height // stride)) * stride + stride // 2).clamp(max=height - 1)
+    columns = (torch.arange(-(-width // stride)) * stride + stride // 2).clamp(max=width - 1)
+    z = depth[rows.to(depth.device)[:, None], columns.to(depth.device)].double().cpu().numpy()
+    surface = z > 0
+    near, far = (float(z[surface].min()), float(z[surface].max())) if surface.any() else (1.0, 2.0)
+    far = max(far, near * 1.001)
+    inverse = 1 / np.where(surface, z, near)
+    q = np.where(surface, 1 + np.rint(65534 * (inverse - 1 / far) / (1 / near - 1 / far)), 0).astype(np.uint16)
+    deltas = np.diff(q, axis=1, prepend=np.uint16(0))
+    return PackedDepth(zlib.compress(deltas.tobytes(), 1), len(columns), len(rows), stride, near, far)
+
+
+def unpack_depth(packed: PackedDepth) -> Float[np.ndarray, "height width"]:
+    """Depth in metres, 0 for background: the inverse of `pack_depth`."""
+    deltas: UInt16[np.ndarray, "height width"] = np.frombuffer(zlib.decompress(packed.data), np.uint16)
+    q = np.add.accumulate(deltas.reshape(packed.height, packed.width), axis=1, dtype=np.uint16)
+    inverse = 1 / packed.far_m + (q.astype(float) - 1) / 65534 * (1 / packed.near_m - 1 / packed.far_m)
+    return np.where(q > 0, 1 / inverse, 0.0)
+
+
+class Encoders:
+    """Encodes one viewer's images; keeps a video stream per eye and mode."""
+
+    def __init__(self) -> None:
+        self._streams: dict[tuple[int, str], VideoStream] = {}
+        self.key_frame = False
+        """Whether the next frame starts all streams again."""
+
+    def encode(self, image: Image, eye: int, mode: str, look: Look) -> tuple[dict[str, Any], bytes]:
+        """Encode an image; returns its entry in the header, and its data."""
+        part: dict[str, Any] = {"kind": "image", "eye": eye, "mode": mode, "codec": look.codec}
+        if look.codec == "jpeg":
+            data = to_jpeg(image, look.quality)
+        else:
+            stream = self._streams.setdefault((eye, mode), VideoStream())
+            data, part["key"] = stream.encode(image, look.codec, self.key_frame)
+            part["codec_string"] = STRINGS[look.codec]
+        return part | {"bytes": len(data)}, data
+
+
+@light_operations()
+def encode_frame(
+    look: Look, request: RenderRequest, result: RenderResult, encoders: Encoders, wait_ms: float, **fields: Any
+) -> tuple[bytes, FrameTimes]:
+    """Build the message of a frame, with more `fields` in its header; returns it with the times of all stages."""
+    start = time.perf_counter()
+    parts, data = [], []
+    for eye, (completed, hulls) in enumerate(result.eyes):
+        for mode in look.modes:
+            image = draw_mode(completed, mode, look.background or result.background, hulls)
+            part, encoded = encoders.encode(image, eye, mode, look)
+            parts.append(part)
+            data.append(encoded)
+        if look.depth:
+            depth = surface_depth(completed) if MENDED_MODES.issuperset(look.modes) else completed.view.depth
+            packed = asdict(pack_depth(depth, depth_stride(*depth.shape)))
+            data.append(packed.pop("data"))
+            parts.append({"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed})
+    encode_ms = 1000 * (time.perf_counter() - start)
+    times = FrameTimes(**vars(result.times), encode=encode_ms, wait=wait_ms)
+    first = result.completed[0].view
+    header: dict[str, Any] = {
+        "look": look.id,
+        "sent_ms": look.sent_ms,
+        "time": result.time,
+        "width": first.mask.shape[1],
+        "height": first.mask.shape[0],
+        "cameras": [{k: c[k] for k in ("K", "R", "T")} for v in result.completed for c in cameras_json(v.view.camera)],
+        "source_views": list(first.source_views),
+        "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
+        "holes": round(float(first.holes.sum()) / max(1.0, float((first.mask > 0).sum())), 5),
+        "confidence": mean_confidence(result.completed[0]),
+        "top_k": request.quality.top_k,
+        "context_times": request.quality.context_times,
+        "refine_fraction": request.quality.refine_fraction,
+        "stage_ms": times.as_json(),
+        "parts": parts,
+    }
+    return pack(fields | header, data), times

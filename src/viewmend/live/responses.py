@@ -1,0 +1,128 @@
+"""HTTP responses and their content: the page's files, error messages, request bodies and metrics."""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response
+
+from viewmend.live.connection import SessionRegistry
+from viewmend.live.protocol import ProtocolError
+from viewmend.utils.heap import resident_bytes
+
+MAX_BODY_BYTES, BODY_S = 1_000_000, 10.0
+"""The largest request body, and the time in which it has to arrive."""
+POLICY = (
+    "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
+    "worker-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",  # the address may contain the token
+    "Cache-Control": "no-cache",
+}
+MEDIA_TYPES = {
+    ".js": "text/javascript",
+    ".mjs": "text/javascript",
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css",
+    ".svg": "image/svg+xml",
+    ".webmanifest": "application/manifest+json",
+}
+
+
+@dataclass(frozen=True)
+class PageFile:
+    """A file of the page."""
+
+    content: bytes
+    media_type: str
+
+
+def page_files() -> dict[str, PageFile]:
+    """All files of `viewmend/live/page` by their relative path, read once: requests can name no other file."""
+    root = Path(__file__).parent / "page"
+    paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file()]
+    return {
+        path.as_posix(): PageFile((root / path).read_bytes(), MEDIA_TYPES.get(path.suffix, "application/octet-stream"))
+        for path in paths
+        if not any(part.startswith((".", "_")) for part in path.parts)
+    }
+
+
+def error_response(status: int, message: str | None) -> Response:
+    """An error message as JSON."""
+    return JSONResponse({"error": message}, status, headers={"Cache-Control": "no-store"})
+
+
+async def read_body(request: Request) -> bytearray | None:
+    """Read the body of a request; None if it is too large.
+
+    Raises:
+        ProtocolError: the body is incomplete, or does not arrive in time.
+    """
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > MAX_BODY_BYTES:
+                    return None
+    except TimeoutError:
+        raise ProtocolError(f"expected the whole body within {BODY_S:g} s; send it faster") from None
+    except ClientDisconnect:
+        raise ProtocolError("expected the whole body, got a part of it") from None
+    return body
+
+
+def metrics_text(registry: SessionRegistry) -> str:
+    """All counters and gauges in the text format of Prometheus."""
+    service = registry.service
+    source, counts = service.source, service.counts
+    ready = int(service.is_ready and source.status.state == "ready")
+    dropped = sum(session.dropped for session in list(registry.sessions))
+    stages = {label(stage=stage): ms / 1000 for stage, ms in vars(service.times).items() if stage != "wait"}
+    lines = [
+        *metric("viewmend_up", "gauge", "1 while views can be rendered.", ready),
+        *metric("viewmend_viewers", "gauge", "Connected viewers.", len(registry.sessions)),
+        *metric("viewmend_frames_total", "counter", "Rendered views.", counts["frames"]),
+        *metric("viewmend_shared_total", "counter", "Views of a frame with known geometry.", counts["shared"]),
+        *metric("viewmend_dropped", "gauge", "Looks of present viewers replaced before they were rendered.", dropped),
+        *metric("viewmend_errors_total", "counter", "Views that failed.", counts["errors"]),
+        *metric("viewmend_source_frames", "gauge", "Frames that can be requested.", source.span.end),
+        *metric("viewmend_stage_seconds_total", "counter", "Seconds spent in each stage.", stages),
+    ]
+    for extension in registry.extensions:
+        lines += extension.metrics()
+    if cameras := source.camera_counts():
+        up = {label(camera=name): counts["up"] for name, counts in cameras.items()}
+        images = {
+            label(camera=name, event=event): count
+            for name, counts in cameras.items()
+            for event, count in counts.items()
+            if event != "up"
+        }
+        lines += metric("viewmend_camera_up", "gauge", "1 while the camera delivers images.", up)
+        lines += metric("viewmend_camera_pictures_total", "counter", "Images of each camera by event.", images)
+    if (spread_ms := source.spread_ms) is not None:
+        text = "Time between the first and the last image of the newest frame."
+        lines += metric("viewmend_cameras_apart_seconds", "gauge", text, spread_ms / 1000)
+    if (resident := resident_bytes()) is not None:
+        lines += metric("process_resident_memory_bytes", "gauge", "Resident memory size in bytes.", resident)
+    return "\n".join(lines) + "\n"
+
+
+def label(**labels: str) -> str:
+    """Labels in Prometheus' form."""
+    escaped = ((key, value.replace("\\", "\\\\").replace('"', '\\"')) for key, value in labels.items())
+    return "{" + ",".join(f'{key}="{value!s}"' for key, value in escaped).replace("\n", "\\n") + "}"
+
+
+def metric(name: str, kind: str, text: str, values: Mapping[str, float | int] | float | int) -> list[str]:
+    """The lines of a metric: one value, or values by `label`."""
+    by_label = values if isinstance(values, Mapping) else {"": values}
+    rows = [f"{name}{labels} {value!r}" for labels, value in by_label.items()]
+    return [f"# HELP {name} {text}", f"# TYPE {name} {kind}", *rows]

@@ -1,0 +1,1 @@
+"""Inpainters: the base class, the registry, and the models."""

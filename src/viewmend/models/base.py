@@ -1,0 +1,271 @@
+"""The base class of all inpainters, and what `step` receives: the view, its context and the viewer's state.
+
+An inpainter completes one view at a time: `step(view, context, state) -> (completed, state)`. It keeps nothing between
+calls. What one viewer's view leaves for the next is the state; what is computed once per frame and shared by all
+viewers is kept by the `ContextProvider`.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
+
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.models.compositing import Background, from_background, to_background
+from viewmend.types import CompletedView, ContextViews, IncompleteView
+from viewmend.utils.mmap_tensors import to_mmap
+from viewmend.utils.timing import ms_since, now_s
+
+ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]
+"""views(time, names): the cameras of these names in the frame `time`, with the proxy's depth. Cameras without an image
+in that frame are left out; None if all are."""
+Memory = dict[Any, Any]
+"""What was computed from one frame: encoded images by camera name, everything else by (kind, camera name)."""
+T = TypeVar("T")
+REMEMBERED_FRAMES = 34
+"""Frames that a provider with a memory of its own keeps: the view's own, and k_w n_w + n_c before it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderQuality:
+    """How much work one view may cost. The default is everything that the model was trained with.
+
+    Examples:
+        >>> from viewmend import RenderQuality
+        >>> cheapest = RenderQuality(context_times=0)
+    """
+
+    mend: bool = True
+    """False skips inpainting: the view is returned as rendered."""
+    top_k: int | None = None
+    """Context tokens that survive pruning; None for the model's own number."""
+    context_times: int | None = None
+    """How many frames of the temporal window are context, the latest first (1: only the view's own); None for all.
+    With 0 no camera image is encoded: the paper's model then completes patches from the view's own patches."""
+    refine_fraction: float | None = None
+    """Re-synthesise at most this fraction of the proxy's pixels, those with the highest predicted gain; holes are
+    always filled. None: all pixels of the error mask. With 0, holes are filled from their surroundings, and pixels
+    that are predicted to be background are attenuated."""
+
+
+class ContextProvider:
+    """The camera images that an inpainter may use, and a memory of what it computed from them.
+
+    `provider(time, names)` returns these cameras in the frame `time`, or None. Code that calls `step` directly makes
+    one provider for all views of its stream. `viewmend.Stream` makes one per view, with a memory that all viewers
+    share.
+
+    Examples:
+        >>> from viewmend import ContextProvider, Stream, make_method
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> cached = Stream(make_method("telea")).add_frame(frame)
+        >>> context = ContextProvider(lambda time, names: cached.context(names) if time == 0 else None)
+        >>> context(0, frame.cameras.names[:2]).frame.rgb.shape
+        torch.Size([2, 3, 64, 64])
+        >>> context(-1, frame.cameras.names) is None
+        True
+    """
+
+    def __init__(
+        self,
+        views: ViewsAt,
+        quality: RenderQuality | None = None,
+        exclude: Sequence[str] = (),
+        memory: Callable[[int], Memory] | None = None,
+    ) -> None:
+        """Create a provider.
+
+        Args:
+            views: returns cameras by frame and name.
+            quality: how much the view may cost.
+            exclude: names of cameras that must not be used.
+            memory: returns the memory of a frame; by default the provider keeps one for each of the last frames.
+        """
+        self.quality = quality or RenderQuality()
+        self.encoding_ms = 0.0
+        """Milliseconds spent in `encoded` so far."""
+        self._views = views
+        self._exclude = frozenset(exclude)
+        self._own: dict[int, Memory] = {}
+        self._memory = memory or self._own_memory
+
+    def __call__(self, time: int, names: Sequence[str]) -> ContextViews | None:
+        """These cameras in this frame, without those that are excluded or have no image; None if none is left."""
+        names = tuple(name for name in names if name not in self._exclude)
+        return self._views(time, names) if names else None
+
+    def encoded(
+        self,
+        times: Sequence[int],
+        names: Sequence[str],
+        encode: Callable[[list[ContextViews]], Sequence[Sequence[Any]]],
+    ) -> list[Any]:
+        """The encodings of these cameras in these frames, in the order of frames and then of names.
+
+        Cameras without an image are left out. `encode` is called once, with every frame that has cameras which are not
+        in the memory yet; it returns one result per camera for each element of its argument.
+        """
+        names = [name for name in names if name not in self._exclude]
+        memories = {time: self._memory(time) for time in times}
+        absent = [self(time, [n for n in names if n not in memory]) for time, memory in memories.items()]
+        new = [views for views in absent if views is not None and len(views.frame.cameras)]
+        if new:
+            device = new[0].depth.device
+            start = now_s(device)
+            for views, results in zip(new, encode(new), strict=True):
+                pairs = zip(views.frame.cameras.names, results, strict=True)
+                memories[views.frame.time].update({name: to_mmap(result) for name, result in pairs})
+            self.encoding_ms += ms_since(start, device)
+        return [memory[name] for memory in memories.values() for name in names if name in memory]
+
+    def remembered(
+        self, time: int, kind: str, names: Sequence[str], make: Callable[[Sequence[str]], Sequence[T]]
+    ) -> list[T]:
+        """One result per camera of one frame, computed now or for an earlier view.
+
+        Args:
+            time: index of the frame.
+            kind: distinguishes these results from others of the same cameras.
+            names: the cameras.
+            make: computes one result for each of the names that it is given; called with those that are missing.
+        """
+        memory = self._memory(time)
+        absent = [name for name in names if (kind, name) not in memory]
+        if absent:
+            pairs = zip(absent, make(absent), strict=True)
+            memory.update({(kind, name): to_mmap(made) for name, made in pairs})
+        return [memory[kind, name] for name in names]
+
+    def _own_memory(self, time: int) -> Memory:
+        memory = self._own.setdefault(time, {})
+        if len(self._own) > REMEMBERED_FRAMES:
+            del self._own[max(self._own, key=lambda other: abs(other - time))]
+        return memory
+
+
+@dataclass(frozen=True)
+class State:
+    """What an inpainter carries from one view of a viewer to the next. Subclass it to add fields; never mutate it.
+
+    Examples:
+        >>> from viewmend import State, make_method
+        >>> isinstance(make_method("telea").initial_state(), State)
+        True
+    """
+
+
+class ErrorMap(NamedTuple):
+    """A model's prediction of what is wrong with each pixel of a rendered view; 0 far from the proxy."""
+
+    wrong: Float[Tensor, "height width"]
+    """Probability that a channel of the rendered colour is off by more than a tenth."""
+    gain: Float[Tensor, "height width"]
+    """Expected squared change of the colour when the pixel is re-synthesised, mean of the channels."""
+    alpha: Float[Tensor, "height width"]
+    """Expected coverage of the pixel by the subject."""
+    rest: Float[Tensor, "height width"]
+    """The gain that is left once the rendered colour is attenuated by `alpha`."""
+
+
+@dataclass(frozen=True)
+class HeldOutView:
+    """The view of one of the rig's own cameras, rendered without it, and the image of that camera."""
+
+    view: IncompleteView
+    context: ContextProvider
+    """The other cameras."""
+    truth: Float[Tensor, "3 height width"]
+    """The camera's image times its mask, in [0, 1]."""
+
+
+class Inpainter:
+    """Base class of everything that completes views. Override `step`; everything else has a default.
+
+    Examples:
+        >>> from viewmend import CompletedView, Inpainter, Stream
+        >>> class Grey(Inpainter):
+        ...     def step(self, view, context, state):
+        ...         return CompletedView(view, view.error * 0.5 + (1 - view.error) * view.rgb), state
+        >>> stream = Stream(Grey())
+        >>> stream.error_rule
+        'holes'
+    """
+
+    error_rule: str = "holes"
+    """The error rule that this inpainter is made for (`rendering.error_mask`)."""
+    background: Background | None = None
+    """The background that its output is painted on. None: the background of its input, as for classical fills."""
+    predicts_errors: bool = False
+    """Whether `predict_errors` is implemented."""
+
+    def initial_state(self) -> State:
+        """The state before the first view of a viewer."""
+        return State()
+
+    def step(self, view: IncompleteView, context: ContextProvider, state: Any) -> tuple[CompletedView, State]:
+        """Complete one view.
+
+        Args:
+            view: the view to complete. Only pixels with `view.error` > 0 may change.
+            context: the cameras; must not be called for frames later than `view.time`.
+            state: what `initial_state` or the last `step` returned.
+
+        Returns:
+            The completed view, and the state for the viewer's next view.
+
+        Raises:
+            NotImplementedError: the subclass does not override it.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: override `step`")
+
+    def step_on(
+        self, background: Background, view: IncompleteView, context: ContextProvider, state: Any
+    ) -> tuple[CompletedView, State]:
+        """`step` with a view on black as input and output, but the inpainter's input on this background.
+
+        Args:
+            background: ignored by an inpainter that has one of its own, which it composites its input on itself.
+            view: as for `step`.
+            context: as for `step`.
+            state: as for `step`.
+        """
+        given = "black" if self.background is not None else background
+        completed, state = self.step(to_background(given, view), context, state)
+        return from_background(given, completed, view), state
+
+    def crop_margin_px(self, quality: RenderQuality) -> int | None:
+        """Margin around the subject within which a crop of the view gives the same result as the whole view, pixels.
+
+        None: `step` needs the whole view.
+        """
+        return None
+
+    def encode_history(self, view: IncompleteView, context: ContextProvider) -> None:
+        """Encode what `step` would need of the frames before `view`, as if they had been streamed."""
+
+    def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
+        """Encode everything about these cameras that does not depend on the view, into the memory of `context`."""
+
+    def advance_state(self, view: IncompleteView, state: Any) -> State | None:
+        """The state after a view whose completion is not needed; None if only `step` can compute it."""
+        return None
+
+    def reveal_truth(self, state: Any, truth: Float[Tensor, "3 height width"]) -> State:
+        """The state once the true image of the last view is known; for upper bounds such as the offline method rgvi.
+
+        Only the evaluation calls this. Methods that ignore the truth, as all others must, return `state`.
+        """
+        return state
+
+    def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
+        """Predict which pixels of a rendered view are wrong; None if no camera is available."""
+        return None
+
+    def calibrate_to_rig(self, held_out: Iterable[HeldOutView]) -> "Inpainter":
+        """An inpainter adapted to a rig by views of its own cameras; this one is not changed.
+
+        The views are rendered as they are iterated over.
+        """
+        return self

@@ -1,0 +1,59 @@
+"""Compositing on a background: black, or white as in the paper's experiments (section 13).
+
+Elsewhere in the package, images of a subject are on black, that is, multiplied by alpha.
+"""
+
+from dataclasses import replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.types import CompletedView, IncompleteView
+
+Background = Literal["black", "white"]
+
+
+def composite(
+    background: Background, rgb: Float[Tensor, "3 height width"], alpha: Float[Tensor, "height width"]
+) -> Float[Tensor, "3 height width"]:
+    """An image on black, of this alpha, composited on a background; in [0, 1]."""
+    return rgb if background == "black" else (rgb + (1 - alpha)).clamp(0, 1)
+
+
+def blend(
+    known: Float[Tensor, "3 height width"],
+    error: Float[Tensor, "height width"],
+    inpainted: Float[Tensor, "3 height width"],
+    coverage: Float[Tensor, "height width"],
+    clamp: bool = True,
+) -> Float[Tensor, "3 height width"]:
+    """Fhat = E Ftilde + (1 - E) F (section 1). Bit-identical to F where E or the coverage of Ftilde is 0.
+
+    With `clamp`, Ftilde is clamped to [0, 1] first.
+    """
+    completed = error * (inpainted.clamp(0, 1) if clamp else inpainted) + (1 - error) * known
+    return torch.where((error > 0) & (coverage > 0), completed, known)
+
+
+def painted_alpha(view: IncompleteView) -> Float[Tensor, "height width"]:
+    """Alpha of a view whose masked pixels were painted on white: M, and 1 on all of E.
+
+    Where E lies on true background, the painted white counts as subject.
+    """
+    return 1 - (1 - view.mask) * (1 - view.error)
+
+
+def to_background(background: Background, view: IncompleteView) -> IncompleteView:
+    """A view on black as a view on this background; its holes stay black."""
+    return view if background == "black" else replace(view, rgb=view.rgb + (1 - painted_alpha(view)))
+
+
+def from_background(background: Background, completed: CompletedView, view: IncompleteView) -> CompletedView:
+    """What was made of `to_background(background, view)`, on black again."""
+    if background == "black":
+        return completed
+    alpha = painted_alpha(view)
+    rgb = torch.where(view.error > 0, completed.rgb - (1 - alpha), view.rgb)
+    return replace(completed, view=view, rgb=rgb, alpha=alpha if completed.alpha is None else completed.alpha)

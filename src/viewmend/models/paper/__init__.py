@@ -1,0 +1,1 @@
+"""The paper's transformer. Read config, patches, tokenizer, attention, transformer, decoder, patch_transformer."""

@@ -1,0 +1,103 @@
+"""Input and context tokens of several novel views as one padded batch (sections 4 and 5)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.models.paper.config import PaperConfig
+from viewmend.models.paper.context_tokens import ContextFrame
+from viewmend.models.paper.patches import centers_px, reproject
+from viewmend.models.paper.transformer import TokenPositions
+from viewmend.types import IncompleteView
+
+Positions = tuple[Float[Tensor, "_patch 3"], Bool[Tensor, "_patch"]]
+"""(u, v, s) of patches, and which of them are valid."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A novel view's kept patches. The incomplete ones are the input set P, the others join the context."""
+
+    view: IncompleteView
+    places: Int[Tensor, "patch 3"]
+    tokens: Float[Tensor, "patch dim"]
+    incomplete: Bool[Tensor, "patch"]
+    """Patches with any pixel of E > 0."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The input of the transformer."""
+
+    queries: Float[Tensor, "sample query dim"]
+    at: TokenPositions
+    keys_values: Float[Tensor, "block 2 sample key dim"]
+    context_at: TokenPositions
+
+
+def collate(
+    targets: Sequence[Target],
+    contexts: Sequence[Sequence[ContextFrame]],
+    own_keys_values: Sequence[Float[Tensor, "block 2 _ dim"]],
+    config: PaperConfig,
+) -> Batch:
+    """Pad the input tokens of all targets, and their context: first its frames, then the target's complete patches.
+
+    `own_keys_values` are K and V of each target's complete patches.
+    """
+    queries, query_positions, keys, key_positions = [], [], [], []
+    for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
+        uvs = F.pad(centers_px(target.places) / whole_size_px(target.view), (0, 1))  # s = 0 in the novel view
+        valid = torch.ones_like(target.incomplete)
+        queries.append(target.tokens[target.incomplete])
+        query_positions.append((uvs[target.incomplete], valid[target.incomplete]))
+        parts = [_carry(frame, frames, target.view, config) for frame in frames]
+        parts.append((uvs[~target.incomplete], valid[~target.incomplete]))
+        key_positions.append(tuple(torch.cat(values) for values in zip(*parts, strict=True)))
+        keys.append([*(frame.keys_values.to(own) for frame in frames), own])
+    # At least one key, although it is not present: kernels do not accept empty tensors.
+    num_keys = max(1, *(sum(part.shape[2] for part in parts) for parts in keys))
+    num_queries = max(len(q) for q in queries)
+    joined = [_join(parts, num_keys) for parts in keys]
+    keys_values = torch.stack(joined, 2) if len(joined) > 1 else joined[0][:, :, None]  # one sample: no copy
+    padded = torch.stack([_pad(q, num_queries) for q in queries])
+    return Batch(padded, _stack(query_positions, num_queries), keys_values, _stack(key_positions, num_keys))
+
+
+def whole_size_px(view: IncompleteView) -> Int[Tensor, "2"]:
+    """Width and height by which (u, v) are normalised: of the view, or of the whole view it was cropped from."""
+    own = view.camera.size_px[0]
+    return own if view.part is None else own.new_tensor(view.part.whole_size_px)
+
+
+def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig) -> Positions:
+    """C_G(x) of a frame's patches. Past frames use the current geometry, if their camera has a current frame."""
+    points, valid = frame.points_world, frame.valid
+    if frame.time != view.time:
+        current = [f for f in frames if f.name == frame.name and f.time == view.time]
+        if current:
+            points, valid = frame.lifted_by(current[0])
+    uv, valid = reproject(points, valid, view.camera)
+    uv = uv * (view.camera.size_px[0] / whole_size_px(view))
+    s = torch.full_like(uv[:, :1], (view.time - frame.time) / config.window)
+    return torch.cat([uv, s], 1), valid
+
+
+def _stack(positions: Sequence[Positions], length: int) -> TokenPositions:
+    return TokenPositions(*(torch.stack([_pad(own, length) for own in v]) for v in zip(*positions, strict=True)))
+
+
+def _join(parts: Sequence[Float[Tensor, "block 2 _ dim"]], length: int) -> Float[Tensor, "block 2 key dim"]:
+    """The parts concatenated and zero-padded to this length, in a single copy: they take most of a step's memory."""
+    blocks, two, _, dim = parts[0].shape
+    missing = length - sum(part.shape[2] for part in parts)
+    return torch.cat([*parts, parts[0].new_zeros(blocks, two, missing, dim)], 2)
+
+
+def _pad(rows: Float[Tensor, "row *feature"] | Bool[Tensor, "row"], length: int) -> Tensor:
+    """The rows, followed by zeros (or False) up to this length."""
+    return torch.cat([rows, rows.new_zeros(length - len(rows), *rows.shape[1:])])

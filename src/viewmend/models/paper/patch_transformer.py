@@ -1,0 +1,206 @@
+"""The paper's model: from an incomplete view and its context to a complete view (sections 1, 2, 7 and 9)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from viewmend.models.base import ContextProvider, State
+from viewmend.models.compositing import blend, painted_alpha
+from viewmend.models.network import Network
+from viewmend.models.paper.collate import Batch, Target, collate
+from viewmend.models.paper.config import PaperConfig
+from viewmend.models.paper.context_tokens import ContextFrame, window_times
+from viewmend.models.paper.decoder import Decoder
+from viewmend.models.paper.patches import STEP_PX, any_in_patch, centers_px, lift, merge, patch_depths
+from viewmend.models.paper.tokenizer import EncoderInput, Tokeniser, build_context_input, build_target_input
+from viewmend.models.paper.transformer import Transformer
+from viewmend.types import CompletedView, ContextViews, IncompleteView
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The model's output for one view. RGB is approximately in [0, 1] but not clamped."""
+
+    inpainted: Float[Tensor, "3 height width"]
+    """Ftilde: the decoded patches, blended; 0 where none covers a pixel."""
+    coverage: Float[Tensor, "height width"]
+    """1 where a decoded patch covers the pixel, else 0."""
+    completed: Float[Tensor, "3 height width"]
+    """Fhat = E Ftilde + (1 - E) F, with F on black. Bit-identical to F where E is 0."""
+    alpha: Float[Tensor, "height width"] | None
+    """Alpha of a view painted on white: M, and 1 on all of E. None for a model on black, where alpha is M."""
+
+    @property
+    def composited(self) -> Float[Tensor, "3 height width"]:
+        """Fhat on the model's background."""
+        return self.completed if self.alpha is None else self.completed + (1 - self.alpha)
+
+
+class PatchTransformer(Network):
+    """T(F[t] | G[t], I[i, tau]) of section 1. It is stateless: the context provider caches encoded camera images."""
+
+    config: PaperConfig
+
+    def __init__(self, config: PaperConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.background = config.background
+        self.tokeniser = Tokeniser(config)
+        self.transformer = Transformer(config)
+        self.decoder = Decoder(config)
+
+    def forward(
+        self,
+        views: Sequence[IncompleteView],
+        contexts: Sequence[Sequence[ContextFrame | ContextViews]],
+        top_k: int | None = None,
+    ) -> list[Prediction]:
+        """One prediction per view, each from its own context. Gradients reach every parameter.
+
+        Args:
+            views: of any sizes.
+            contexts: per view, encoded frames (used as they are) and camera images, which are encoded here in one
+                batch. Images of frames and cameras outside the view's window are ignored, as in `step`.
+            top_k: context tokens kept by pruning; None for the config's.
+
+        Raises:
+            ValueError: the numbers of views and contexts differ.
+        """
+        if len(views) != len(contexts):
+            raise ValueError(f"expected one context per view, got {len(views)} views and {len(contexts)} contexts")
+        frames = self.encode_windows(views, contexts)
+        targets = self.encode_targets(views)
+        missing = [i for i, target in enumerate(targets) if bool(target.incomplete.any())]
+        patches: dict[int, Tensor] = {}
+        if missing:
+            batch = self.collate([targets[i] for i in missing], [frames[i] for i in missing])
+            decoded = self.decode(batch, self.config.top_k if top_k is None else top_k)
+            patches = dict(zip(missing, decoded, strict=True))
+        return [self._predict(target, patches.get(i)) for i, target in enumerate(targets)]
+
+    @torch.no_grad()
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+        """Complete a view from the cameras and frames of its window (section 9); unchanged if it has no holes."""
+        if not bool((view.error > 0).any()):
+            return CompletedView(view, view.rgb), state
+        times = window_times(view.time, self.config)[: context.quality.context_times]
+        frames = context.encoded(times, self.source_names(view), self.encode_contexts)
+        prediction = self([view], [frames], context.quality.top_k)[0]
+        return CompletedView(view, prediction.completed.clamp(0, 1), prediction.alpha), state
+
+    @torch.no_grad()
+    def encode_history(self, view: IncompleteView, context: ContextProvider) -> None:
+        """Encode the view's cameras at the earlier frames of its window."""
+        if bool((view.error > 0).any()):
+            context.encoded(window_times(view.time, self.config)[1:], self.source_names(view), self.encode_contexts)
+
+    @torch.no_grad()
+    def encode_cameras(self, views: ContextViews, context: ContextProvider) -> None:
+        """Encode all of these cameras at their frame."""
+        context.encoded((views.frame.time,), views.frame.cameras.names, self.encode_contexts)
+
+    def source_names(self, view: IncompleteView) -> tuple[str, ...]:
+        """Names of the cameras in a view's context, the closest first (section 2)."""
+        return view.closest_views(self.config.num_source_views)
+
+    def select_window(
+        self, view: IncompleteView, context: Sequence[ContextFrame | ContextViews]
+    ) -> list[ContextFrame | ContextViews]:
+        """The context, with camera images restricted to the frames and cameras of the view's window (section 2)."""
+        names, times = self.source_names(view), window_times(view.time, self.config)
+        kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
+        kept = [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]
+        return [c for c in kept if isinstance(c, ContextFrame) or len(c.frame.cameras)]
+
+    def encode_windows(
+        self, views: Sequence[IncompleteView], contexts: Sequence[Sequence[ContextFrame | ContextViews]]
+    ) -> list[list[ContextFrame]]:
+        """The views' contexts restricted to their windows, with all camera images encoded in one batch."""
+        contexts = [self.select_window(view, context) for view, context in zip(views, contexts, strict=True)]
+        images = [item for context in contexts for item in context if isinstance(item, ContextViews)]
+        encoded = iter(self.encode_contexts(images))
+        return [
+            [f for item in context for f in (next(encoded) if isinstance(item, ContextViews) else (item,))]
+            for context in contexts
+        ]
+
+    def encode_contexts(self, many: Sequence[ContextViews]) -> list[tuple[ContextFrame, ...]]:
+        """One encoded frame per camera of each element, in order; all images in one batch (sections 3 to 5)."""
+        if not many:
+            return []
+        stacks = [build_context_input(views, self.config) for views in many]
+        with self.autocast():
+            tokens = self.tokeniser(stacks)
+            keys_values = self.transformer.project_context(tokens)
+        counts = [len(stack.places) for stack in stacks]
+        parts = zip(many, stacks, tokens.split(counts), keys_values.split(counts, 2), strict=True)
+        return [_split_by_camera(*part) for part in parts]
+
+    def encode_targets(self, views: Sequence[IncompleteView]) -> list[Target]:
+        """Tokens of every kept patch of each view (sections 3 and 4)."""
+        stacks = [build_target_input(view, self.config) for view in views]
+        with self.autocast():
+            tokens = self.tokeniser(stacks).split([len(stack.places) for stack in stacks])
+        return [
+            Target(view, stack.places, own, any_in_patch(view.error[None] > 0)[stack.kept])
+            for view, stack, own in zip(views, stacks, tokens, strict=True)
+        ]
+
+    def collate(self, targets: Sequence[Target], contexts: Sequence[Sequence[ContextFrame]]) -> Batch:
+        """The transformer's input for targets with incomplete patches."""
+        with self.autocast():
+            own = [self.transformer.project_context(t.tokens[~t.incomplete]) for t in targets]
+        return collate(targets, contexts, own, self.config)
+
+    def decode(self, batch: Batch, top_k: int | None) -> list[Float[Tensor, "patch 3 28 28"]]:
+        """RGB of each target's incomplete patches: transformer and decoder (sections 6 and 7)."""
+        with self.autocast():
+            tokens = self.transformer(batch.queries, batch.at, batch.keys_values, batch.context_at, top_k)
+            decoded = self.decoder(tokens[batch.at.present])
+        return list(decoded.float().split(batch.at.present.sum(1).tolist()))
+
+    def _predict(self, target: Target, patches: Float[Tensor, "patch 3 28 28"] | None) -> Prediction:
+        """The decoded patches merged, and the view completed (section 7); unchanged without patches."""
+        view = target.view
+        alpha = painted_alpha(view) if self.config.background == "white" else None
+        if patches is None:
+            return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb, alpha)
+        height, width = view.mask.shape
+        (inpainted,), (coverage,) = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
+        completed = blend(view.rgb, view.error, inpainted, coverage, clamp=False)
+        return Prediction(inpainted, coverage, completed, alpha)
+
+
+def _split_by_camera(
+    views: ContextViews,
+    images: EncoderInput,
+    tokens: Float[Tensor, "patch dim"],
+    keys_values: Float[Tensor, "block 2 patch dim"],
+) -> tuple[ContextFrame, ...]:
+    """The encoded patches of one frame, lifted (section 5) and split by camera."""
+    cameras, places = views.frame.cameras, images.places
+    depths = patch_depths(views.depth, images.foreground)
+    points, valid = lift(places, depths, cameras)
+    uv_px = centers_px(places)
+    frames, first = [], 0
+    for i, count in enumerate(images.kept.sum((1, 2)).tolist()):
+        own = slice(first, first + count)
+        frames.append(
+            ContextFrame(
+                camera=cameras[i],
+                time=views.frame.time,
+                places=places[own, 1:],
+                uv_px=uv_px[own],
+                points_world=points[own],
+                valid=valid[own],
+                depths=depths[i],
+                # Copies, so that a frame does not keep the memory of the whole batch alive.
+                tokens=tokens[own].clone(),
+                keys_values=keys_values[:, :, own].clone(memory_format=torch.contiguous_format),
+            )
+        )
+        first += count
+    return tuple(frames)

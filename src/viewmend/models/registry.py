@@ -1,0 +1,175 @@
+"""Inpainters by name, for all commands: `METHODS`, baselines, classes in files, and models' folders."""
+
+import hashlib
+import re
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import partial
+from inspect import signature
+from pathlib import Path
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from viewmend.models.base import Inpainter
+from viewmend.models.checkpoint import load_inpainter, shipped_models
+from viewmend.utils.plugins import import_object, load_from_file
+from viewmend.utils.weight_files import MissingWeightsError
+
+REFERENCE = "telea"
+"""Tables show the difference of every method from this one."""
+ERROR_MODEL = "views"
+"""The shipped model that predicts errors for inpainters that do not."""
+PRIVILEGED = ("rgvi",)
+"""Methods that use the ground truth; their table rows say so."""
+
+
+class MethodMissing(ValueError):  # noqa: N818
+    """A known method whose weights are not installed; tables show n/a and this message."""
+
+
+METHODS: dict[str, str] = {
+    "telea": "viewmend.models.classical:Telea",
+    "navier-stokes": "viewmend.models.classical:NavierStokes",
+    "nearest": "viewmend.models.classical:NearestColour",
+    "smooth": "viewmend.models.smooth_fill:SmoothFill",
+    "reprojection": "viewmend.models.classical:ReprojectionFill",
+    "unfilled": "viewmend.models.classical:Unfilled",
+    "rgvi": "viewmend.contrib.baselines.rgvi:make_rgvi",
+}
+"""MODULE:NAME of each method's factory, imported on demand, and called with the device if it takes one."""
+FAMILIES = dict.fromkeys(
+    ("dstt", "fuseformer", "e2fgvi", "riftcast"), "viewmend.contrib.baselines.published:make_baseline"
+)
+"""MODULE:NAME of the factory of all methods whose names start with this word; called with the name and the device."""
+BASELINES = tuple(
+    f"{network}-o-{framing}{weights}"
+    for network in ("dstt", "fuseformer", "e2fgvi")
+    for weights in ("", "-finetuned")
+    for framing in ("def", "win", "mul")
+)
+"""The baselines of the paper's Table 1, in its order: pretrained, then fine-tuned. `baselines.published` has more."""
+
+
+def method_names(selection: str) -> tuple[str, ...]:
+    """The names in a comma-separated list; "all" stands for shipped models and `METHODS`, "baselines" for `BASELINES`.
+
+    Raises:
+        ValueError: the list is empty.
+    """
+    groups = {"all": (*shipped_models(), *METHODS), "baselines": BASELINES}
+    names = [
+        name for part in selection.split(",") if part.strip() for name in groups.get(part.strip(), (part.strip(),))
+    ]
+    if not names:
+        raise ValueError(f"expected --methods all, or names with commas, got '{selection}'")
+    return tuple(dict.fromkeys(names))
+
+
+def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpainter:
+    """The inpainter of this name: an entry of `METHODS`, a baseline, FILE.py:NAME, a shipped model, a model's folder.
+
+    For FILE.py:NAME, the file's NAME is called with the device; it must return a `viewmend.Inpainter`.
+
+    Raises:
+        MethodMissing: its weights are not installed.
+        ValueError: the name or the precision is unknown, the method is not an `Inpainter`, or it cannot be loaded
+            (`WeightsError`).
+
+    Examples:
+        >>> from viewmend import make_method
+        >>> type(make_method("telea")).__name__
+        'Telea'
+    """
+    made = _make(name, device, precision)
+    if not isinstance(made, Inpainter):
+        raise ValueError(
+            f"{name}: expected an inpainter, got {type(made).__name__}; make its class a subclass of viewmend.Inpainter"
+        )
+    return made
+
+
+def error_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | None:
+    """The model that predicts errors for `inpainter`: the shipped `views`; None if it predicts them itself."""
+    return None if inpainter.predicts_errors else load_inpainter(ERROR_MODEL, device)
+
+
+def _make(name: str, device: str, precision: str) -> object:
+    if name in METHODS:
+        make = import_object(METHODS[name])
+        return make(device) if "device" in signature(make).parameters else make()
+    if name in shipped_models() or Path(name).is_dir():
+        return load_inpainter(name, device, precision)
+    if ".py:" in name:
+        make = cast(Callable[[str], Inpainter], load_from_file(name))
+        try:
+            signature(make).bind(device)
+        except TypeError as error:
+            raise ValueError(f"{name}: expected a callable that takes the device ('{device}'), got {error}") from error
+        return make(device)
+    if (family := re.split("[-@]", name)[0]) in FAMILIES:
+        try:
+            return import_object(FAMILIES[family])(name, device)
+        except MissingWeightsError as error:
+            raise MethodMissing(str(error)) from error
+    known = ", ".join([*shipped_models(), *METHODS])
+    raise ValueError(
+        f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
+        f"'{name}'; see --methods"
+    )
+
+
+def default_method() -> str:
+    """The shipped model, `views` if there are several; OpenCV's Telea if there is none."""
+    shipped = shipped_models()
+    return next((name for name in ("views", *shipped) if name in shipped), "telea")
+
+
+def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[str, ...], dict[str, str]]:
+    """The methods whose weights are installed, and for each of the others why it is missing.
+
+    Raises:
+        ValueError: a method is unknown or broken.
+    """
+    missing = {}
+    for name in names:
+        try:
+            make_method(name, device)
+        except MethodMissing as error:
+            missing[name] = str(error)
+    return tuple(name for name in names if name not in missing), missing
+
+
+def identity(inpainter: object) -> str:
+    """Class, parameters and SHA-256 of the weights of an inpainter: a key of cached results. Code is not included."""
+    if isinstance(inpainter, nn.Module):
+        own = {
+            name: value for name, value in vars(inpainter).items() if not name.startswith("_") and name != "training"
+        }
+        plain = {name: value for name, value in own.items() if not isinstance(value, nn.Module)}
+        return f"{_class(inpainter)}({identity(dict(inpainter.state_dict()))}, {identity(plain)})"
+    if isinstance(inpainter, Tensor):
+        data = inpainter.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
+        return f"{inpainter.dtype}{tuple(inpainter.shape)}:{hashlib.sha256(data).hexdigest()}"
+    if isinstance(inpainter, dict):
+        text = ", ".join(
+            f"{key}={identity(value)}" for key, value in sorted(inpainter.items(), key=lambda i: str(i[0]))
+        )
+        return hashlib.sha256(text.encode()).hexdigest() if len(text) > 1000 else f"{{{text}}}"
+    if isinstance(inpainter, list | tuple):
+        return f"[{', '.join(map(identity, inpainter))}]"
+    if isinstance(inpainter, str | int | float | bool | Enum | Path | torch.dtype | None):
+        return repr(inpainter)
+    if isinstance(inpainter, partial):
+        return f"partial({identity(inpainter.func)}, {identity(inpainter.args)}, {identity(inpainter.keywords)})"
+    if is_dataclass(inpainter) and not isinstance(inpainter, type):
+        return f"{_class(inpainter)}({identity({f.name: getattr(inpainter, f.name) for f in fields(inpainter)})})"
+    if callable(inpainter) and hasattr(inpainter, "__qualname__"):
+        return f"{getattr(inpainter, '__module__', '')}.{inpainter.__qualname__}"  # pyright: ignore
+    return f"{_class(inpainter)}({identity(dict(vars(inpainter)) if hasattr(inpainter, '__dict__') else {})})"
+
+
+def _class(value: object) -> str:
+    return f"{type(value).__module__}.{type(value).__qualname__}"

@@ -1,0 +1,127 @@
+"""Fills holes smoothly from their surroundings; and the base class of fills."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.models.base import ContextProvider, RenderQuality, State
+from viewmend.models.compositing import blend
+from viewmend.models.network import Network
+from viewmend.types import CompletedView, IncompleteView
+
+MARGIN_PX = 8
+REACH_PX = 2
+"""Largest distance along an axis between a pixel near the edge of a hole and the pixels it is filled from."""
+THIN_PX = 2 * REACH_PX + 1
+"""A hole is thin where no square of this side fits into it."""
+
+
+class CoarseFill(Network):
+    """A fill of all of E. On its own, it is an inpainter without state."""
+
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
+        """The view's image with all of E filled; other pixels are unchanged, bit for bit."""
+        raise NotImplementedError
+
+    def crop_margin_px(self, quality: RenderQuality) -> int:
+        """More than the distance over which a fill depends on its surroundings: outside a crop, views are black."""
+        return MARGIN_PX
+
+    @torch.no_grad()
+    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
+        """The view with E filled."""
+        if not bool((view.error > 0).any()):
+            return CompletedView(view, view.rgb), state
+        filled = self.fill_view(view, context).float()
+        return CompletedView(view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask))), state
+
+
+class SmoothFill(CoarseFill):
+    """`fill` as an inpainter: it uses no camera."""
+
+    background = None
+
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
+        """The view's image with all of E filled; other pixels are unchanged, bit for bit."""
+        return fill(view.rgb, view.error > 0, view.mask > 0)
+
+
+def fill(
+    rgb: Float[Tensor, "channel height width"],
+    missing: Bool[Tensor, "height width"],
+    subject: Bool[Tensor, "height width"],
+) -> Float[Tensor, "channel height width"]:
+    """The image with every missing pixel filled from the others, which are unchanged, bit for bit.
+
+    Pixels of thin holes become the mean of known pixels nearby, weighted by distance, background included: at a
+    silhouette they are half background. In wide holes only pixels of the `subject` count; farther than `REACH_PX` from
+    any of these, holes are filled by `pull_push`.
+    """
+    near, _ = from_near(rgb, ~missing, missing)
+    wide = missing & spread(~spread(~missing))
+    if not bool(wide.any()):
+        return near  # then everything is within reach, too
+    filled, reached = from_near(rgb, ~missing & subject, missing)
+    deep = missing & ~reached
+    if bool(deep.any()):
+        filled = torch.where(deep, pull_push(filled, ~deep & subject), filled)
+    return torch.where(wide, filled, near)
+
+
+def from_near(
+    rgb: Float[Tensor, "channel height width"],
+    known: Bool[Tensor, "height width"],
+    missing: Bool[Tensor, "height width"],
+) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
+    """Missing pixels as the weighted mean of the known ones within reach; and which missing pixels have any."""
+    near = _sum_around(torch.cat([rgb * known, known[None].to(rgb)]))
+    colour, weight = near[:-1], near[-1]
+    reached = missing & (weight > 0)
+    return torch.where(reached, colour / weight.clamp_min(1e-6), rgb), reached
+
+
+def _sum_around(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel height width"]:
+    """Sums over the pixels within reach, weighted by a Gaussian of distance with a sigma of one pixel.
+
+    Shifts along each axis are faster than a convolution, which reorders memory.
+    """
+    for axis in (1, 2):
+        length = image.shape[axis]
+        pad = (0, 0, REACH_PX, REACH_PX) if axis == 1 else (REACH_PX, REACH_PX)
+        around = F.pad(image, pad)
+        image = torch.zeros_like(image)
+        for i in range(2 * REACH_PX + 1):
+            image.add_(around.narrow(axis, i, length), alpha=math.exp(-0.5 * (i - REACH_PX) ** 2))
+    return image
+
+
+def spread(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Where a square of `THIN_PX` around a pixel contains any of them; there are none outside the image."""
+    for axis, pad in ((0, (0, 0, REACH_PX, REACH_PX)), (1, (REACH_PX, REACH_PX))):
+        around, length = F.pad(pixels, pad), pixels.shape[axis]
+        pixels = torch.stack([around.narrow(axis, i, length) for i in range(THIN_PX)]).any(0)
+    return pixels
+
+
+def pull_push(
+    rgb: Float[Tensor, "channel height width"], known: Bool[Tensor, "height width"]
+) -> Float[Tensor, "channel height width"]:
+    """The image with every unknown pixel filled smoothly from the known ones, which are unchanged, bit for bit.
+
+    Pull: means of the known pixels at halved resolutions, down to one pixel. Push: unknown pixels get the interpolated
+    colour of the coarser level. Without any known pixel the fill is 0.
+    """
+    weight = known.to(rgb)[None, None]
+    levels = [(rgb[None] * weight, weight)]
+    while max(levels[-1][0].shape[2:]) > 1:
+        colour, weight = (F.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False) for x in levels[-1])
+        # A coarse pixel with any known one counts in full from here on.
+        levels.append((colour / weight.clamp_min(1e-6) * (weight > 0), (weight > 0).to(rgb)))
+    filled = levels[-1][0]
+    for colour, weight in reversed(levels[:-1]):
+        coarse = F.interpolate(filled, size=colour.shape[2:], mode="bilinear", align_corners=False)
+        filled = torch.where(weight > 0, colour, coarse)
+    return torch.where(known, rgb, filled[0])

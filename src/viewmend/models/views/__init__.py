@@ -1,0 +1,1 @@
+"""The default model: ray samples, aggregation, depth distribution, blending; and the ray fill."""

@@ -1,0 +1,271 @@
+"""Compiled CPU kernels of `sampler.py`, `pyramids.py` and `aggregation.py`, which hold the references in PyTorch.
+
+Functions called in a kernel live in this file: numba does not recompile a kernel when another file changes.
+"""
+
+from collections.abc import Callable
+from inspect import unwrap
+from math import exp, floor, sqrt, tanh
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from viewmend.models.views.config import CONTRAST, FAR, IN_VIEW, NEAR
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator that compiles a function, without the wrapper of a run-time type checker; it releases the GIL."""
+    return lambda function: njit(nogil=True, error_model="numpy", **options)(unwrap(function))
+
+
+kernel = compiled(cache=True)
+inlined = compiled(inline="always")  # passing many arrays takes as long as the work itself
+
+
+@kernel
+def halve(image, half):
+    """Rounded means of 2 x 2 pixels; images (row, column, channel) have a border of one black pixel."""
+    rows, columns, channels = half.shape
+    last_row, last_column = image.shape[0] - 1, image.shape[1] - 1
+    for row in range(1, rows - 1):
+        top = 2 * row - 1
+        below = min(top + 1, last_row)
+        for column in range(1, columns - 1):
+            left = 2 * column - 1
+            right = min(left + 1, last_column)
+            for c in range(channels):
+                total = np.int32(image[top, left, c]) + np.int32(image[below, left, c])
+                total += np.int32(image[top, right, c]) + np.int32(image[below, right, c])
+                half[row, column, c] = (total + 2) >> 2
+
+
+@kernel
+def premultiply(rgb, mask, depth, out):
+    """RGB on black, mask and coverage by the proxy, with a border of one black pixel."""
+    height, width = mask.shape
+    for row in range(height):
+        for column in range(width):
+            m = np.uint32(mask[row, column])
+            if m > 0:
+                for c in range(3):
+                    out[row + 1, column + 1, c] = (np.uint32(rgb[c, row, column]) * m + 127) // 255
+                out[row + 1, column + 1, 3] = m
+            if depth[row, column] > 0:
+                out[row + 1, column + 1, 4] = 255
+
+
+@kernel
+def average_boxes(image, first, step, side, out):
+    """Means of channels from `first` on over boxes of `side` x `side` pixels, of every `step`-th row and column."""
+    height, width = image.shape[0] - 1, image.shape[1] - 1
+    boxes_down, boxes_across, channels = out.shape
+    for box_row in range(1, boxes_down - 1):
+        top = 1 + (box_row - 1) * side * step
+        for row in range(top, min(top + side * step, height), step):
+            for box_column in range(1, boxes_across - 1):
+                left = 1 + (box_column - 1) * side * step
+                right = min(left + side * step, width)
+                for c in range(first, first + channels):
+                    total = 0
+                    for column in range(left, right, step):
+                        total += image[row, column, c]
+                    out[box_row, box_column, c - first] += total
+    out /= side**2
+
+
+@inlined
+def _project(per_metre, start, t, size):
+    """Pixel and z-depth in a camera of a sample at z-depth t, and whether it is in view."""
+    z = per_metre[2] * t + start[2]
+    if not (t > 0 and z > 1e-6):
+        return 0.0, 0.0, 0.0, False
+    u, v = (per_metre[0] * t + start[0]) / z, (per_metre[1] * t + start[1]) / z
+    return u, v, z, u >= 0 and v >= 0 and u < size[0] and v < size[1]
+
+
+@inlined
+def _cosine(offset, direction, t):
+    """Cosine of the angle at a sample between the ray and the camera, which is `offset` from the viewer."""
+    x, y, z = offset[0] - t * direction[0], offset[1] - t * direction[1], offset[2] - t * direction[2]
+    along = x * direction[0] + y * direction[1] + z * direction[2]
+    squares = direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2]
+    return -along / max(sqrt((x * x + y * y + z * z) * squares), 1e-12)
+
+
+@inlined
+def _sample(image, u, v, scale, out, ray, sample, view, first, count):
+    """The first `count` channels of an image with a border, bilinearly, in [0, 1], as channels from `first` on."""
+    x, y = u * scale + 0.5, v * scale + 0.5
+    left, top = min(floor(x), image.shape[1] - 2), min(floor(y), image.shape[0] - 2)
+    right, below = x - left, y - top
+    w00, w01, w10, w11 = (1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below
+    for c in range(count):
+        out[ray, sample, view, first + c] = (1 / 255) * (
+            w00 * image[top, left, c]
+            + w01 * image[top, left + 1, c]
+            + w10 * image[top + 1, left, c]
+            + w11 * image[top + 1, left + 1, c]
+        )
+
+
+@inlined
+def _covered_depth(depth, u, v):
+    """Bilinear share of the pixels that have a depth, and the mean of their depths times it."""
+    left, top = floor(u - 0.5), floor(v - 0.5)
+    right, below = u - 0.5 - left, v - 0.5 - top
+    share, total = 0.0, 0.0
+    for row in range(max(0, top), min(depth.shape[0], top + 2)):
+        for column in range(max(0, left), min(depth.shape[1], left + 2)):
+            if depth[row, column] > 0:
+                weight = (right if column > left else 1 - right) * (below if row > top else 1 - below)
+                share += weight
+                total += weight * depth[row, column]
+    return share, total
+
+
+@kernel
+def sample_camera(
+    first, end, view, z, directions, per_metre, start, offset, size, images, scales, depth, size_m, is_source,
+    least_share, out, prior,
+):  # fmt: skip
+    """`CameraFeatures` of the samples on rays first to end - 1 in one camera, and prior weights, not normalised.
+
+    With a `least_share` above 0, distances behind the proxy are those of `RayFill`, and there are no prior weights.
+    """
+    fine, wide, shapes = images
+    per_near, per_far = 1 / (NEAR * size_m), 1 / (FAR * size_m)
+    extent = np.float32(size[0]), np.float32(size[1])
+    for ray in range(first, end):
+        for sample in range(z.shape[1]):
+            t = z[ray, sample]
+            u, v, w, in_view = _project(per_metre[ray], start, t, extent)
+            if not in_view:
+                for c in range(out.shape[3]):
+                    out[ray, sample, view, c] = 0.0
+                prior[ray, sample, view] = 0.0
+                continue
+            _sample(fine, u, v, scales[0], out, ray, sample, view, 0, 4)
+            _sample(wide, u, v, scales[1], out, ray, sample, view, 9, wide.shape[2])
+            cosine = _cosine(offset, directions[ray], t)
+            if least_share > 0:
+                _sample(shapes, u, v, scales[2], out, ray, sample, view, 12, 2)
+                share, total = _covered_depth(depth, u, v)
+                behind = w - total / share if share > least_share else 0.0
+                near, far = tanh(behind * per_near), tanh(behind * per_far)
+            else:
+                surface = depth[min(int(v), size[1] - 1), min(int(u), size[0] - 1)]
+                behind = w - surface if surface > 0 else 0.0
+                near, far = behind * per_near, behind * per_far
+                near, far = near / (1 + abs(near)), far / (1 + abs(far))
+                prior[ray, sample, view] = exp(4 * cosine) / (1 + exp(6 * near))
+            out[ray, sample, view, 4] = near
+            out[ray, sample, view, 5] = far
+            out[ray, sample, view, 6] = cosine
+            out[ray, sample, view, 7] = is_source
+            out[ray, sample, view, 8] = 1.0
+
+
+@kernel
+def compare_cameras(first, end, features, prior, statistics):
+    """Normalises prior weights; writes means and variances of colours by them, and differences from the means."""
+    samples, views = prior.shape[1:]
+    for ray in range(first, end):
+        for sample in range(samples):
+            total = 1e-6
+            for view in range(views):
+                total += prior[ray, sample, view]
+            for view in range(views):
+                prior[ray, sample, view] /= total
+                features[ray, sample, view, 17] = prior[ray, sample, view]
+            for c in range(3):
+                mean, square = 0.0, 0.0
+                for view in range(views):
+                    value, weight = features[ray, sample, view, c], prior[ray, sample, view]
+                    mean += weight * value
+                    square += weight * value * value
+                statistics[ray, sample, c] = mean
+                statistics[ray, sample, 3 + c] = CONTRAST * max(0.0, square - mean * mean)
+                for view in range(views):
+                    inside = features[ray, sample, view, IN_VIEW]
+                    features[ray, sample, view, 14 + c] = inside * (features[ray, sample, view, c] - mean)
+
+
+@inlined
+def _sample_mask(image, u, v, scale):
+    """The only channel of an image with a border, as `_sample`."""
+    x, y = u * scale + 0.5, v * scale + 0.5
+    left, top = min(floor(x), image.shape[1] - 2), min(floor(y), image.shape[0] - 2)
+    right, below = x - left, y - top
+    upper = (1 - right) * image[top, left, 0] + right * image[top, left + 1, 0]
+    lower = (1 - right) * image[top + 1, left, 0] + right * image[top + 1, left + 1, 0]
+    return (1 / 255) * ((1 - below) * upper + below * lower)
+
+
+@inlined
+def _keep_smallest(smallest, ray, sample, first, value):
+    """Inserts a value into the two smallest of a sample, in order."""
+    if value < smallest[ray, sample, first]:
+        smallest[ray, sample, first + 1], smallest[ray, sample, first] = smallest[ray, sample, first], value
+    elif value < smallest[ray, sample, first + 1]:
+        smallest[ray, sample, first + 1] = value
+
+
+@kernel
+def compare_silhouette(first, end, z, per_metre, start, size, images, scales, smallest):
+    """Lowers the two smallest masks, and the two smallest averaged masks, of samples that this camera has in view."""
+    extent = np.float32(size[0]), np.float32(size[1])
+    for ray in range(first, end):
+        for sample in range(z.shape[1]):
+            u, v, _, in_view = _project(per_metre[ray], start, z[ray, sample], extent)
+            if in_view:
+                _keep_smallest(smallest, ray, sample, 0, _sample_mask(images[0], u, v, scales[0]))
+                _keep_smallest(smallest, ray, sample, 2, _sample_mask(images[1], u, v, scales[1]))
+
+
+@compiled(cache=True, fastmath={"reassoc", "contract", "nsz"})  # so that sums over features are vectorised
+def aggregate(first, end, bias, features, statistics, prior, hidden, shared, weight, out, trust):
+    """Softmax over the cameras that have a sample in view, and weighted sums over them, of rays first to end - 1."""
+    _, samples, views, width = hidden.shape
+    count, channels = features.shape[3], statistics.shape[2]
+    for ray in range(first, end):
+        for sample in range(samples):
+            row, shares = out[ray, sample], trust[ray, sample]
+            most = np.float32(-1e30)
+            for view in range(views):
+                if features[ray, sample, view, IN_VIEW] == 0:
+                    continue
+                own, score = hidden[ray, sample, view], np.float32(bias)
+                for c in range(width):
+                    own[c] = max(np.float32(0), own[c] + shared[ray, sample, c])
+                    score += own[c] * weight[c]
+                shares[view] = score
+                most = max(most, score)
+            total = np.float32(0)
+            for view in range(views):
+                if features[ray, sample, view, IN_VIEW] == 0:
+                    shares[view] = np.float32(0)
+                    continue
+                shares[view] = (prior[ray, sample, view] + np.float32(1e-3)) * np.float32(exp(shares[view] - most))
+                total += shares[view]
+            certain = np.float32(0)
+            for view in range(views):
+                if shares[view] == 0:
+                    continue
+                share = shares[view] / total
+                shares[view] = share
+                certain += share * share
+                own, own_features = hidden[ray, sample, view], features[ray, sample, view]
+                for c in range(width):
+                    row[c] += share * own[c]
+                for c in range(count):
+                    row[width + c] += share * own_features[c]
+                for c in range(3):
+                    row[width + count + c] += share * own_features[c] * own_features[c]
+            for c in range(3):
+                mean = row[width + c]
+                square = row[width + count + c]
+                row[width + count + c] = np.float32(CONTRAST) * max(np.float32(0), square - mean * mean)
+            for c in range(channels):
+                row[width + count + 3 + c] = statistics[ray, sample, c]
+            row[width + count + 3 + channels] = certain

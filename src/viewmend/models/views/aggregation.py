@@ -1,0 +1,88 @@
+"""Aggregates what the source cameras show of each ray sample, and scores whether the surface is there."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.geometry.threads import heavy_operations, parallel_for
+from viewmend.models.views.config import COLOUR, CONTRAST, FEATURES, IN_VIEW, MASK, STATISTICS
+from viewmend.models.views.sampler import RaySamples
+
+BAND = 64
+"""Rays that a thread takes at a time."""
+
+
+class AggregatedSamples(NamedTuple):
+    """Ray samples after aggregation over cameras."""
+
+    colour: Float[Tensor, "ray sample 3"]
+    """RGB on black, the weighted mean of the cameras."""
+    mask: Float[Tensor, "ray sample 1"]
+    """Their masks, likewise."""
+    features: Float[Tensor, "ray sample feature"]
+    score: Float[Tensor, "ray sample"]
+    """Evidence that the surface is at the sample."""
+    trust: Float[Tensor, "ray sample view"]
+    """Weights of the cameras; the sum is 1, or 0 where none has the sample in view."""
+
+
+class SampleAggregator(nn.Module):
+    """One hidden layer per camera and sample, a softmax over cameras, and a small network per sample."""
+
+    def __init__(self, width: int, channels: int) -> None:
+        super().__init__()
+        self.camera = nn.Linear(FEATURES, width)
+        self.all_cameras = nn.Linear(STATISTICS, width)
+        self.trust = nn.Linear(width, 1)
+        inputs = width + FEATURES + 3 + STATISTICS + 1
+        self.sample = nn.Sequential(nn.Linear(inputs, 2 * width), nn.ReLU(), nn.Linear(2 * width, channels + 1))
+
+    def forward(self, samples: RaySamples, prior: Float[Tensor, "ray sample view"] | None = None) -> AggregatedSamples:
+        """The aggregated samples; `prior` replaces the initial weights of the cameras."""
+        features, statistics = samples.features, samples.statistics
+        prior = samples.prior if prior is None else prior
+        if features.device.type == "cpu" and not torch.is_grad_enabled():
+            return self._aggregate_numba(samples, prior)
+        hidden = F.relu(self.camera(features) + self.all_cameras(statistics)[:, :, None])
+        score = self.trust(hidden)[..., 0].float() + (prior + 1e-3).log()
+        inside = features[..., IN_VIEW]
+        trust = inside * score.masked_fill(inside == 0, -1e4).softmax(2)
+        summary = _weighted_sum(trust.to(hidden), hidden)
+        with torch.autocast(features.device.type, enabled=False):  # colours need more than eight bits
+            mean = _weighted_sum(trust, features)
+            square = _weighted_sum(trust, features[..., COLOUR].square())
+        variance = CONTRAST * (square - mean[..., COLOUR].square()).clamp_min(0)
+        certainty = trust.square().sum(2, keepdim=True)
+        out = self.sample(torch.cat([summary.float(), mean, variance, statistics, certainty], -1))
+        return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)
+
+    def _aggregate_numba(self, samples: RaySamples, prior: Float[Tensor, "ray sample view"]) -> AggregatedSamples:
+        """The same in float32 by a compiled loop: sums over a few cameras are slow in PyTorch."""
+        from viewmend.models.views._sampler_numba import aggregate
+
+        count, per_ray, views = prior.shape
+        with torch.autocast("cpu", enabled=False), heavy_operations():
+            hidden = samples.features @ self.camera.weight.T.float()
+            shared = self.all_cameras(samples.statistics) + self.camera.bias.float()
+            weight, bias = self.trust.weight[0].float(), float(self.trust.bias)
+            inputs = torch.zeros(count, per_ray, len(weight) + FEATURES + 3 + STATISTICS + 1)
+            trust = torch.empty(count, per_ray, views)
+            tensors = (samples.features, samples.statistics, prior.contiguous(), hidden, shared, weight, inputs, trust)
+            arrays = [tensor.numpy() for tensor in tensors]
+            parallel_for(
+                lambda band: aggregate(band * BAND, min(count, (band + 1) * BAND), bias, *arrays), -(-count // BAND)
+            )
+            out, mean = self.sample(inputs), inputs[..., len(weight) :]
+        return AggregatedSamples(mean[..., COLOUR], mean[..., MASK], out[..., :-1], out[..., -1], trust)
+
+
+def _weighted_sum(
+    trust: Float[Tensor, "ray sample view"], values: Float[Tensor, "ray sample view value"]
+) -> Float[Tensor, "ray sample value"]:
+    """Sums over cameras."""
+    rays, samples, views, channels = values.shape  # all named: there may be no rays
+    summed = torch.bmm(trust.reshape(rays * samples, 1, views), values.reshape(rays * samples, views, channels))
+    return summed.view(rays, samples, channels)

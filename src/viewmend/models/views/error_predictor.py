@@ -1,0 +1,115 @@
+"""Predicts which pixels of a rendered view are wrong, from a few samples per ray."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.models.base import ErrorMap, RenderQuality
+from viewmend.models.compositing import blend
+from viewmend.models.network import Network
+from viewmend.models.views.config import STATISTICS
+from viewmend.models.views.grid import (
+    CELL_PX,
+    UNet,
+    concatenate_channels,
+    downsample2x,
+    nearest_depth,
+    rim_depth,
+    scatter_to_image,
+    upsample2x,
+)
+from viewmend.models.views.pyramids import SceneScale, SourceCameras
+from viewmend.models.views.sampler import Rays, sample_rays
+from viewmend.types import CompletedView, IncompleteView
+
+IMAGE_CHANNELS = 7
+"""RGB, M, whether a pixel is coloured, its largest source weight, and its depth in subject sizes."""
+DEEPEST = 2.0
+"""Depths are clamped to this many subject sizes around the median."""
+BEHIND = (0.0, 0.012, 0.03, 0.06, 0.11, 0.2, 0.36)
+"""Samples on the rays of cells of 4 x 4 pixels: z-depth behind the proxy, in subject sizes."""
+BEHIND_CHANNELS = 24
+"""Features kept of these samples."""
+LARGE_PX = 128
+"""Root of the area from which on a subject is judged at half the resolution, if nothing is re-synthesised."""
+
+
+def fallback_view(
+    view: IncompleteView, fades: Bool[Tensor, "height width"], fill: Float[Tensor, "3 height width"] | None = None
+) -> CompletedView:
+    """The view without a prediction: background is attenuated, and holes get `fill` with a confidence of 0."""
+    E, filled = view.error, view.holes if fill is not None else torch.zeros_like(view.holes)
+    rgb = view.rgb.new_zeros(view.rgb.shape) if fill is None else fill * filled
+    return CompletedView(
+        view,
+        blend(view.rgb, E, rgb, (fades | filled).to(E)),
+        torch.where(fades, (1 - E) * view.mask, view.mask),
+        torch.where(filled, (1 - E) * view.mask, view.mask),
+        view.depth,
+    )
+
+
+class ErrorPredictor(Network):
+    """Convolutions over the rendered view and the statistics of ray samples at the proxy and behind it."""
+
+    def __init__(self, features: int) -> None:
+        """`features` is the number of channels at half the resolution."""
+        super().__init__()
+        self.behind = nn.Sequential(
+            *(nn.Linear(len(BEHIND) * STATISTICS, 32), nn.ReLU(), nn.Linear(32, BEHIND_CHANNELS)),
+        )
+        self.unet = UNet(CELL_PX**2 * IMAGE_CHANNELS + STATISTICS + BEHIND_CHANNELS, features)
+        self.head = nn.Conv2d(features, CELL_PX**2 * len(ErrorMap._fields), 1)
+
+    def forward(self, view: IncompleteView, sources: SourceCameras, scale: SceneScale | None = None) -> ErrorMap:
+        """Predicted errors of a view's pixels; its E is not used.
+
+        Args:
+            view: the rendered view, or a crop of it.
+            sources: the source cameras.
+            scale: of the whole view; None if `view` is the whole.
+        """
+        scale, depth = scale or SceneScale.of(view), rim_depth(view.depth)
+        height, width = depth.shape
+        depth = F.pad(depth, (0, -width % (2 * CELL_PX), 0, -height % (2 * CELL_PX)))
+        near = nearest_depth(depth)
+        relative = torch.where(depth > 0, ((depth - scale.depth_m) / scale.size_m).clamp(-DEEPEST, DEEPEST), 0.0)
+        coloured = (view.weights.sum(0) > 0).to(depth)
+        image = torch.cat([view.rgb, torch.stack([view.mask, coloured, view.weights.amax(0)])])
+        image = F.pad(image, (0, depth.shape[1] - width, 0, depth.shape[0] - height))
+        inputs = [F.pixel_unshuffle(torch.cat([image, relative[None]]), CELL_PX)]
+        inputs.append(self._statistics(view, sources, scale, near, (0.0,), CELL_PX))
+        with self.autocast():
+            behind = self._statistics(view, sources, scale, nearest_depth(near), BEHIND, 2 * CELL_PX, self.behind)
+            inputs.append(F.interpolate(behind[None].float(), scale_factor=2, mode="nearest")[0])
+            out = self.head(self.unet(concatenate_channels(*inputs)))
+        out = F.pixel_shuffle(out.float().sigmoid(), CELL_PX)[0, :, :height, :width]
+        return ErrorMap(*torch.where(depth[:height, :width] > 0, out, 0.0))
+
+    def predict(self, view: IncompleteView, sources: SourceCameras, quality: RenderQuality) -> ErrorMap:
+        """Predicted errors of a whole view; of a large subject at half the resolution if nothing is re-synthesised."""
+        if quality.refine_fraction != 0 or int((view.mask > 0).sum()) < LARGE_PX**2:
+            return self(view, sources)
+        rim, small = rim_depth(view.depth) > 0, downsample2x(view)
+        errors = torch.stack(self(small, sources))
+        return ErrorMap(*torch.where(rim, upsample2x(errors, rim_depth(small.depth) > 0, view.mask.shape), 0.0))
+
+    @staticmethod
+    def _statistics(
+        view: IncompleteView,
+        sources: SourceCameras,
+        scale: SceneScale,
+        near: Float[Tensor, "rows columns"],
+        behind: Sequence[float],
+        cell_px: int,
+        layers: nn.Module | None = None,
+    ) -> Float[Tensor, "channel rows columns"]:
+        """An image of the statistics of samples in cells of this side, `behind` their nearest depth."""
+        cells = torch.nonzero(near > 0)
+        z = near[tuple(cells.T)][:, None] + scale.size_m * near.new_tensor(behind)
+        rays = Rays(view.camera, cell_px * (cells.flip(1).double() + 0.5), z)
+        statistics = sample_rays(rays, sources, view.source_views, float(cell_px), scale).statistics.flatten(1)
+        return scatter_to_image(statistics if layers is None else layers(statistics), cells, near.shape)

@@ -1,0 +1,259 @@
+"""Images at full resolution and on a grid of 2 x 2 pixel cells, and the convolutions over them."""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, Shaped
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.types import RIM_PX, IncompleteView
+
+CELL_PX = 2
+"""Side of the cells in which depth hypotheses are judged."""
+BEYOND_M = 1e30
+"""Farther than anything. Not infinite: ONNX Runtime's pooling turns infinity into its largest number."""
+TILE_PX = 32
+"""Side of the tiles of `run_tiled`; a multiple of a cell's."""
+AT_ONCE = (8, 4, 2, 1)
+"""Numbers of tiles that pass the layers together: few, since convolutions are compiled for each."""
+WIDER = 16
+"""Channels that the U-Net adds at each coarser scale."""
+
+
+def rim_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """The depth, metres, extended by `RIM_PX` around the proxy with the smallest depth nearby; 0 elsewhere."""
+    far = torch.where(depth > 0, depth, BEYOND_M)
+    side = 2 * RIM_PX + 1
+    cpu = depth.device.type == "cpu" and depth.dtype == torch.float32
+    if cpu and not torch.compiler.is_exporting():  # ten times as fast as PyTorch
+        import cv2
+
+        window, border = np.ones((side, side), np.uint8), {"borderType": cv2.BORDER_CONSTANT, "borderValue": BEYOND_M}
+        near = torch.from_numpy(cv2.erode(far.numpy(), window, **border))
+    else:
+        near = -F.max_pool2d(-far[None], side, 1, RIM_PX)[0]
+    return torch.where(near < BEYOND_M, torch.where(depth > 0, depth, near), 0.0)
+
+
+def downsample2x(view: IncompleteView) -> IncompleteView:
+    """The view at half its resolution: means over the covered pixels of each cell, at their nearest depth.
+
+    All that the proxy covers becomes E.
+    """
+    height, width = view.mask.shape
+    right, below = width % 2, height % 2
+    camera = view.camera.cropped(0, 0, width + right, height + below)
+    covered = F.pad(view.mask, (0, right, 0, below))[None]
+    share = F.avg_pool2d(covered, 2).clamp(min=1e-6)
+
+    def mean(images: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
+        return F.avg_pool2d(F.pad(images, (0, right, 0, below)) * covered, 2) / share
+
+    mask = (share[0] > 1e-6).to(covered)
+    return IncompleteView(
+        camera.resized((width + right) // 2, (height + below) // 2),
+        mean(view.rgb),
+        mask,
+        mask,
+        nearest_depth(view.depth),
+        view.source_views,
+        mean(view.weights),
+        view.time,
+        view.candidate_views,
+        view.silhouettes,
+    )
+
+
+def upsample2x(
+    image: Float[Tensor, "channel rows columns"], inside: Bool[Tensor, "rows columns"], shape: Sequence[int]
+) -> Float[Tensor, "channel height width"]:
+    """The image at twice its resolution, cut to `shape`, interpolated between values inside only."""
+    known = inside.to(image)[None]
+    large = F.interpolate(torch.cat([image * known, known])[None], scale_factor=2, mode="bilinear")[0]
+    large = large[:, : shape[0], : shape[1]]
+    return large[:-1] / large[-1:].clamp(min=1e-6)
+
+
+def nearest_depth(depth: Float[Tensor, "height width"]) -> Float[Tensor, "rows columns"]:
+    """The smallest depth in each cell, metres, of the pixels that have one; 0 where none has."""
+    height, width = depth.shape
+    far = F.pad(torch.where(depth > 0, depth, BEYOND_M), (0, width % 2, 0, height % 2), value=BEYOND_M)
+    nearest = -F.max_pool2d(-far[None], CELL_PX)[0]
+    return torch.where(nearest < BEYOND_M, nearest, 0.0)
+
+
+def cell_means(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel rows columns"]:
+    """The mean of each cell, or of the part of it that the image has."""
+    height, width = image.shape[1:]
+    return F.avg_pool2d(F.pad(image[None], (0, width % 2, 0, height % 2), mode="replicate"), CELL_PX)[0]
+
+
+def scatter_to_image(
+    values: Shaped[Tensor, "point channel"], at: Int[Tensor, "point 2"], shape: torch.Size
+) -> Shaped[Tensor, "channel rows columns"]:
+    """An image of this shape with the values at rows and columns, zeros elsewhere."""
+    image = values.new_zeros(shape[0] * shape[1], values.shape[1])
+    return image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
+
+
+def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:
+    """An image with the index of the point at each row and column; -1 where there is none."""
+    image = torch.full(shape, -1, dtype=torch.long, device=at.device)
+    image[tuple(at.T)] = torch.arange(at.shape[0], device=at.device)
+    return image
+
+
+def concatenate_channels(*images: Shaped[Tensor, "_channel rows columns"]) -> Shaped[Tensor, "1 channel rows columns"]:
+    """Images in one batch of one, channels last in memory as `scatter_to_image` has them: nothing is transposed."""
+    return torch.cat([image.movedim(0, 2) for image in images], 2)[None].movedim(3, 1)
+
+
+def crop_to(image: Float[Tensor, "channel rows columns"], shape: torch.Size) -> Float[Tensor, "channel height width"]:
+    """The first rows and columns of an image.
+
+    `torch.export` would assume that a slice cuts off none, or some; so they are gathered while it traces.
+    """
+    if torch.compiler.is_exporting():
+        rows, columns = (torch.arange(length, device=image.device) for length in shape)
+        return image.index_select(1, rows).index_select(2, columns)
+    return image[:, : shape[0], : shape[1]]
+
+
+class UNet(nn.Module):
+    """Convolutions at four scales (Ronneberger et al., MICCAI 2015), with skip connections that add features."""
+
+    def __init__(self, channels: int, width: int) -> None:
+        super().__init__()
+        widths = tuple(width + WIDER * scale for scale in range(4))
+        self.enter = nn.Conv2d(channels, width, 1)
+        self.first = nn.Sequential(
+            nn.Conv2d(width, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, width, 3, padding=1)
+        )
+        self.down = nn.ModuleList(_halving(fine, coarse) for fine, coarse in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
+        self.join = nn.ModuleList(nn.Conv2d(fine, fine, 3, padding=1) for fine in widths[:-1])
+
+    def forward(self, image: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 feature height width"]:
+        """Features of the same resolution."""
+        return self._scales(F.relu(self.enter(image.contiguous(memory_format=torch.channels_last))))
+
+    def forward_points(
+        self,
+        values: Float[Tensor, "point first_channel"],
+        at: Int[Tensor, "point 2"],
+        image: Float[Tensor, "1 other_channel height width"],
+    ) -> Float[Tensor, "1 feature height width"]:
+        """`forward` of an image whose first channels are `values` at rows and columns, and zeros elsewhere.
+
+        The first layer has a kernel of one pixel, so it runs on those channels at the points only.
+        """
+        own, weight = values.shape[1], self.enter.weight
+        x = F.conv2d(image.contiguous(memory_format=torch.channels_last), weight[:, own:], self.enter.bias)
+        at_points = F.linear(values, weight[:, :own, 0, 0]).to(x.dtype)
+        return self._scales(F.relu(x + scatter_to_image(at_points, at, image.shape[2:])))
+
+    def _scales(self, x: Float[Tensor, "1 feature height width"]) -> Float[Tensor, "1 feature height width"]:
+        """All but the first layer."""
+        scales = [F.relu(x + self.first(x))]
+        for layer in self.down:
+            scales.append(layer(scales[-1]))
+        x = scales.pop()
+        for scale, up, join in reversed(list(zip(scales, self.up, self.join, strict=True))):
+            coarse = F.interpolate(up(x), size=scale.shape[2:], mode="bilinear", align_corners=False)
+            x = F.relu(scale + join(F.relu(coarse + scale)))
+        return x
+
+
+def _halving(fine: int, coarse: int) -> nn.Sequential:
+    return nn.Sequential(
+        *(nn.Conv2d(fine, coarse, 3, stride=2, padding=1), nn.ReLU()),
+        *(nn.Conv2d(coarse, coarse, 3, padding=1), nn.ReLU()),
+    )
+
+
+def run_tiled(
+    layers: nn.Sequential,
+    cells: Float[Tensor, "1 feature rows columns"],
+    values: Float[Tensor, "pixel input"],
+    pixels: Int[Tensor, "pixel 2"],
+    shape: torch.Size,
+) -> Float[Tensor, "pixel output"]:
+    """The output of layers at some pixels of an image, from the tiles around these pixels only.
+
+    The image's first channels are `cells`, upsampled bilinearly; the others are `values` at the pixels, else zeros.
+
+    Args:
+        layers: convolutions of odd kernels that keep the size, and layers that act on single pixels.
+        cells: features at half the resolution.
+        values: of each pixel.
+        pixels: row and column.
+        shape: height and width of the image.
+    """
+    halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
+    across = -(-shape[1] // TILE_PX)
+    number = pixels[:, 0] // TILE_PX * across + pixels[:, 1] // TILE_PX
+    tiles, own = number.unique(return_inverse=True)
+    rows, columns = tiles // across * TILE_PX, tiles % across * TILE_PX
+    end = TILE_PX + halo
+    border = bool(((rows < halo) | (columns < halo) | (rows + end > shape[0]) | (columns + end > shape[1])).any())
+    cell_halo = -(-halo // CELL_PX) + 1
+    index = _windows(F.pad(index_image(pixels, shape)[None], _frame(shape, halo, TILE_PX), value=-1), halo, TILE_PX)
+    frame = _frame(cells.shape[2:], cell_halo, TILE_PX // CELL_PX)
+    near = _windows(F.pad(cells, frame, mode="replicate")[0], cell_halo, TILE_PX // CELL_PX)
+    values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
+    outputs = []
+    for part in _parts(len(tiles)):
+        at = rows[part] // TILE_PX, columns[part] // TILE_PX
+        fine = F.interpolate(near[:, *at].movedim(0, 1), scale_factor=CELL_PX, mode="bilinear", align_corners=False)
+        cut = CELL_PX * cell_halo - halo
+        fine = fine[:, :, cut:-cut, cut:-cut].to(values)
+        x = torch.cat([fine.movedim(1, 3), values[index[0, *at]]], 3).movedim(3, 1)
+        inside = _inside(rows[part], columns[part], halo, shape).to(x) if border else None
+        outputs.append(_run_unpadded(layers, x, inside))
+    return torch.cat(outputs)[own, :, pixels[:, 0] % TILE_PX, pixels[:, 1] % TILE_PX]
+
+
+def _frame(shape: Sequence[int], halo: int, tile: int) -> tuple[int, int, int, int]:
+    """Padding of an image by a halo, and to whole tiles."""
+    below, right = (halo + -length % tile for length in shape)
+    return halo, right, halo, below
+
+
+def _windows(image: Shaped[Tensor, "channel height width"], halo: int, tile: int) -> Tensor:
+    """The windows of all tiles with their halos, [channel, tile row, tile column, height, width]."""
+    return image.unfold(1, tile + 2 * halo, tile).unfold(2, tile + 2 * halo, tile)
+
+
+def _parts(count: int) -> Iterator[slice]:
+    first = 0
+    for size in AT_ONCE:
+        while count - first >= size:
+            yield slice(first, first + size)
+            first += size
+
+
+def _inside(
+    rows: Int[Tensor, "tile"], columns: Int[Tensor, "tile"], halo: int, shape: torch.Size
+) -> Float[Tensor, "tile 1 height width"]:
+    """1 where a tile with its halo is in the image; beyond it, layers must get zeros."""
+    reach = torch.arange(-halo, TILE_PX + halo, device=rows.device)
+    down, right = rows[:, None] + reach, columns[:, None] + reach
+    down, right = (down >= 0) & (down < shape[0]), (right >= 0) & (right < shape[1])
+    return (down[:, None, :, None] & right[:, None, None, :]).float()
+
+
+def _run_unpadded(layers: nn.Sequential, x: Tensor, inside: Tensor | None) -> Tensor:
+    x = x if inside is None else x * inside
+    for layer in layers:
+        if not isinstance(layer, nn.Conv2d):
+            x = layer(x)
+            continue
+        x = F.conv2d(x, layer.weight, layer.bias)
+        lost = layer.kernel_size[0] // 2
+        if inside is not None and lost:
+            inside = inside[:, :, lost:-lost, lost:-lost]
+        x = x if inside is None else x * inside
+    return x

@@ -1,0 +1,140 @@
+"""The depth distribution and the prediction of `ViewSynthNet`, and the calibration of its alpha."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.models.compositing import blend
+from viewmend.models.views.aggregation import AggregatedSamples
+from viewmend.models.views.grid import CELL_PX, scatter_to_image
+from viewmend.types import CompletedView, IncompleteView
+
+LEAST_MASK = 0.1
+"""Lower bound of the mask by which colours on black are divided."""
+HOLE_GUESS = 0.7
+"""Weight of `RayFill` in holes; `ViewSynthNet`, which saw few holes in training, has the rest."""
+SLOPES = tuple(0.5 + 0.05 * step for step in range(15))
+"""Candidate factors on the logits of alpha: 1 keeps alpha, less makes it softer."""
+FAINTEST = 1e-4
+"""Alpha is clamped to this distance from 0 and 1 before its logit is taken."""
+
+
+class DepthDistribution(NamedTuple):
+    """The depth hypotheses of the cells of a view, judged by their samples and their neighbours."""
+
+    cells: Int[Tensor, "cell 2"]
+    """Row and column."""
+    cell_index: Int[Tensor, "rows columns"]
+    """Index of the cell at each row and column; -1 where there is none."""
+    depth: Float[Tensor, "rows columns"]
+    """The proxy's nearest z-depth in each cell, metres; 0 where there is no cell."""
+    logits: Float[Tensor, "cell sample"]
+    """Of the surface being at each depth hypothesis."""
+    samples: AggregatedSamples
+    features: Float[Tensor, "1 feature rows columns"]
+    """Output of the U-Net."""
+
+    def interpolate(
+        self, values: Float[Tensor, "cell channel"], pixels: Int[Tensor, "pixel 2"]
+    ) -> Float[Tensor, "pixel channel"]:
+        """The cells' values at pixels (row, column), bilinearly between existing cells."""
+        padded = F.pad(F.pad(values, (0, 1), value=1.0), (0, 0, 0, 1))  # the last row stands for missing cells
+        own = pixels // CELL_PX
+        next_to = own + 2 * (pixels % CELL_PX) - 1  # a pixel's centre is a quarter of a cell off its cell's
+        last = torch.tensor(self.cell_index.shape, device=own.device) - 1
+        near = ((3 / 4, own), (1 / 4, torch.minimum(next_to.clamp(min=0), last)))
+        parts = [a * b * padded[self.cell_index[rows[:, 0], columns[:, 1]]] for a, rows in near for b, columns in near]
+        at = torch.stack(parts).sum(0)
+        return at[:, :-1] / at[:, -1:].clamp_min(1e-6)
+
+
+class ViewPrediction(NamedTuple):
+    """The prediction for some pixels of a view."""
+
+    pixels: Int[Tensor, "pixel 2"]
+    """Row and column."""
+    rgb: Float[Tensor, "pixel 3"]
+    """In [0, 1], on black."""
+    alpha: Float[Tensor, "pixel"]
+    confidence: Float[Tensor, "pixel"]
+    """Probability that no channel is off by more than a tenth."""
+    depth: Float[Tensor, "pixel"]
+    """z-depth, metres."""
+    trust: Float[Tensor, "pixel view"]
+    """Weights of the cameras."""
+    distribution: DepthDistribution
+
+    def composite_into(
+        self,
+        view: IncompleteView,
+        predicted: Bool[Tensor, "height width"],
+        fades: Bool[Tensor, "height width"],
+        alpha_slope: float | Float[Tensor, ""],
+        fill: Float[Tensor, "3 height width"] | None = None,
+    ) -> CompletedView:
+        """The view with this prediction: Fhat = E Ftilde + (1 - E) F.
+
+        Args:
+            view: the rendered view.
+            predicted: pixels of this prediction.
+            fades: pixels that are background in part; they are attenuated by E.
+            alpha_slope: factor on the logits of alpha.
+            fill: the output of `RayFill`, to blend into holes; None without.
+        """
+        E = view.error
+        rgb, alpha, confidence, depth = (
+            scatter_to_image(values, self.pixels, view.mask.shape)
+            for values in (self.rgb, self.alpha[:, None], self.confidence[:, None], self.depth[:, None])
+        )
+        soft = scale_logits(alpha, alpha_slope)
+        rgb, alpha = repremultiply(rgb, alpha[0], soft[0]), soft
+        if fill is not None:
+            rgb = torch.where(predicted & view.holes, HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb, rgb)
+        return CompletedView(
+            view,
+            blend(view.rgb, E, rgb, (predicted | fades).to(E)),
+            torch.where(predicted | fades, E * alpha[0] + (1 - E) * view.mask, view.mask),
+            torch.where(predicted, E * confidence[0] + (1 - E), view.mask),
+            torch.where(predicted, depth[0] * (alpha[0] > 0.5), view.depth),
+        )
+
+
+def unpremultiply(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
+    """Colours on black, divided by their mask."""
+    return (colour / mask.clamp_min(LEAST_MASK)).clamp(0, 1)
+
+
+def scale_logits(alpha: Float[Tensor, "*pixel"], slope: float | Float[Tensor, ""]) -> Float[Tensor, "*pixel"]:
+    """Alpha with its logits multiplied by `slope`; 0 stays 0."""
+    scaled = (slope * alpha.clamp(FAINTEST, 1 - FAINTEST).logit()).sigmoid()
+    return torch.where(alpha > 0, scaled, 0.0)
+
+
+def repremultiply(
+    rgb: Float[Tensor, "channel *pixel"], alpha: Float[Tensor, "*pixel"], new_alpha: Float[Tensor, "*pixel"]
+) -> Float[Tensor, "channel *pixel"]:
+    """Colours on black, for another alpha."""
+    return new_alpha * (rgb / alpha.clamp_min(FAINTEST)).clamp(0, 1)
+
+
+def fit_alpha_slope(
+    views: Sequence[tuple[Float[Tensor, "3 _pixel"], Float[Tensor, "_pixel"], Float[Tensor, "3 _pixel"]]],
+) -> float:
+    """The slope for which the squared error of colours on black is smallest.
+
+    A network is as sure of outlines as the calibration and the masks of its training data allow; those of a real rig
+    are worse. As temperature scaling (Guo et al., ICML 2017), one factor corrects that.
+
+    Args:
+        views: predicted colours on black, their alpha, and the true colours on black, of the pixels of held-out views.
+            Each view has the same weight, however many pixels it has.
+    """
+    errors = torch.zeros(len(SLOPES), dtype=torch.double)
+    for rgb, alpha, truth in views:
+        images = (repremultiply(rgb, alpha, scale_logits(alpha, slope)) for slope in SLOPES)
+        errors += torch.stack([(image - truth).square().double().mean().cpu() for image in images]).nan_to_num()
+    return SLOPES[int(errors.argmin())] if bool((errors > 0).any()) else 1.0

@@ -1,0 +1,288 @@
+"""Source cameras with image pyramids: samples are taken at the level that matches the footprint of a pixel."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.threads import parallel_for
+from viewmend.models.base import ContextProvider
+from viewmend.models.views.config import AROUND
+from viewmend.types import ContextViews, IncompleteView, Silhouettes
+
+SMALLEST_PX = 4
+"""Levels are halved until a side is no longer than this."""
+AREA_LEVEL = 2
+"""Level at which the subject's area is measured."""
+CPU_RAYS, GPU_RAYS = 1024, 16384
+"""Rays per chunk: on the CPU the samples of more rays do not fit the cache, on a GPU memory is the limit."""
+
+
+@dataclass(frozen=True)
+class SceneScale:
+    """Units of a view's lengths; a crop of a view uses those of the whole view."""
+
+    size_m: float | Float[Tensor, ""]
+    """Size of the subject in metres: the root of its area at its median depth."""
+    depth_m: float | Float[Tensor, ""]
+    """Median z-depth of the proxy in metres. Both are tensors while `torch.export` traces."""
+
+    @classmethod
+    def of(cls, view: IncompleteView) -> "SceneScale":
+        """The scale of a view; 1 for both if the proxy covers nothing."""
+        covered = view.depth > 0
+        count = covered.sum()
+        if torch.compiler.is_exporting():
+            ordered = torch.where(covered, view.depth, torch.inf).flatten().sort().values
+            median = ordered[((count - 1).clamp_min(0) // 2)]
+        elif not count:
+            return cls(1.0, 1.0)
+        else:
+            median = view.depth[covered].median()
+        focal_px = (view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]).sqrt()
+        size = (view.mask > 0).sum().clamp_min(1).sqrt() * median / focal_px
+        if torch.compiler.is_exporting():
+            return cls(*(torch.where(count > 0, value, 1.0) for value in (size, median)))
+        return cls(float(size), float(median))
+
+
+class MipLevels(NamedTuple):
+    """One image per camera, as rows of pixels one after the other; each image has a border of one black pixel."""
+
+    pixels: Shaped[Tensor, "pixel channel"]
+    """0 to 255, or metres."""
+    first: Int[Tensor, "view"]
+    """Index of each image's first pixel."""
+    columns: Int[Tensor, "view"]
+    """Pixels per row, with the border."""
+    scale: Float[Tensor, "view"]
+    """Factor from positions in the camera's image to positions in this one."""
+
+    @classmethod
+    def of(cls, pyramids: Sequence["Pyramid"], levels: Sequence[int]) -> "MipLevels":
+        """One level of each pyramid."""
+        images = [pyramid.levels[level] for pyramid, level in zip(pyramids, levels, strict=True)]
+        sizes, device = [image.shape[0] * image.shape[1] for image in images], images[0].device
+        first, columns = torch.tensor([0, *sizes[:-1]]).cumsum(0), torch.tensor([image.shape[1] for image in images])
+        scale = torch.tensor([0.5**level for level in levels], dtype=torch.double)
+        pixels = torch.cat([image.flatten(0, 1) for image in images])
+        return cls(pixels, first.to(device), columns.to(device), scale.to(device))
+
+    @classmethod
+    def full(cls, images: Shaped[Tensor, "view channel height width"]) -> "MipLevels":
+        """Images at full resolution, which get their borders."""
+        bordered, device = F.pad(images, (1, 1, 1, 1)), images.device
+        rows, columns = bordered.shape[2:]
+        view = torch.arange(images.shape[0], device=device)
+        pixels = bordered.movedim(1, 3).flatten(0, 2)
+        return cls(pixels, view * (rows * columns), 0 * view + columns, torch.ones_like(view, dtype=torch.double))
+
+
+def choose_levels(
+    cameras: Cameras,
+    last: Int[Tensor, "view"],
+    subject_px: Float[Tensor, "view"],
+    viewer: Cameras,
+    step_px: float,
+    scale: SceneScale,
+) -> tuple[Int[Tensor, "view"], Int[Tensor, "view"]]:
+    """The fine and the wide pyramid level of each camera.
+
+    Args:
+        cameras: the source cameras.
+        last: the coarsest level of each.
+        subject_px: root of the subject's area in each camera.
+        viewer: camera of the novel view (one view).
+        step_px: distance between neighbouring rays in the novel view, pixels.
+        scale: of the novel view.
+    """
+    pose, depth_m = viewer.world_from_camera[0].double(), torch.as_tensor(scale.depth_m, dtype=torch.double)
+    distance_m = (cameras.centers - (pose[:3, 3] + depth_m * pose[:3, 2])).square().sum(-1).sqrt().clamp_min(1e-6)
+    footprint_px = step_px * depth_m / viewer.K[0, 0, 0] * cameras.K[:, 0, 0] / distance_m
+    fine, wide = (
+        torch.minimum(px.clamp_min(1).log2().round().long(), last) for px in (footprint_px, AROUND * subject_px)
+    )
+    return fine, torch.maximum(fine, wide)
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """A camera's image at all scales, each half of the one before, with a border of one black pixel."""
+
+    levels: tuple[UInt8[Tensor, "_rows _columns channel"], ...]
+    subject_px: float
+    """Root of the subject's area."""
+
+
+@dataclass(frozen=True)
+class SourceCameras:
+    """Source cameras of one frame with their pyramids, and the silhouettes of the whole rig with theirs."""
+
+    views: ContextViews
+    pyramids: tuple[Pyramid, ...]
+    """RGB on black, mask, and coverage by the proxy, of each of `views`."""
+    silhouettes: Silhouettes
+    silhouette_pyramids: tuple[Pyramid, ...]
+
+    @classmethod
+    def of(
+        cls, views: ContextViews, silhouettes: Silhouettes | None, context: ContextProvider | None = None
+    ) -> "SourceCameras":
+        """Cameras with their pyramids.
+
+        Args:
+            views: the source cameras.
+            silhouettes: masks of the whole rig; None takes those of `views`.
+            context: caches pyramids, and has those of earlier views of the frame.
+        """
+        if silhouettes is None:
+            silhouettes = Silhouettes(_masks(views), views.frame.cameras)
+        if context is None:
+            return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
+        time, names, all_names = views.frame.time, views.frame.cameras.names, silhouettes.cameras.names
+        pyramids = context.remembered(time, "views", names, lambda new: view_pyramids(views.select(new)))
+        masks = context.remembered(
+            time, "silhouettes", all_names, lambda new: silhouette_pyramids(silhouettes.select(new))
+        )
+        return cls(views, tuple(pyramids), silhouettes, tuple(masks))
+
+    @classmethod
+    def closest_to(cls, view: IncompleteView, context: ContextProvider, count: int) -> "SourceCameras | None":
+        """The source views of a view and the closest others, `count` in all; None if none is available."""
+        names = view.closest_views(count)
+        views = context(view.time, names) if names else None
+        return None if views is None else cls.of(views, view.silhouettes, context)
+
+    def first(self, count: int) -> "SourceCameras":
+        """The first `count` cameras; all silhouettes stay."""
+        names = self.views.frame.cameras.names[:count]
+        return replace(self, views=self.views.select(names), pyramids=self.pyramids[: len(names)])
+
+    @property
+    def use_kernels(self) -> bool:
+        """Whether compiled kernels can sample them."""
+        return self.silhouettes.mask.device.type == "cpu"
+
+    @property
+    def rays_at_once(self) -> int | None:
+        """Rays per chunk; None for all."""
+        return CPU_RAYS if self.use_kernels else GPU_RAYS
+
+    @property
+    def cameras(self) -> Cameras:
+        """The source cameras."""
+        return self.views.frame.cameras
+
+    @property
+    def depth(self) -> Float[Tensor, "view height width"]:
+        """z-depth of the proxy in each source camera, metres; 0 where it is not seen."""
+        return self.views.depth
+
+    @property
+    def images(self) -> UInt8[Tensor, "view 5 height width"]:
+        """RGB on black, mask and coverage by the proxy, of each source camera."""
+        return source_images(self.views.frame.rgb, _masks(self.views), self.views.depth)
+
+    def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
+        """Which source cameras have one of these names."""
+        own = self.cameras.names
+        return torch.tensor([name in names for name in own], device=self.silhouettes.mask.device)
+
+    def levels(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[list[list[int]]]:
+        """Fine and wide level of each source camera, and of each silhouette; see `choose_levels`."""
+        found = []
+        for cameras, pyramids in self._parts:
+            last = cameras.K.new_tensor([len(pyramid.levels) - 1 for pyramid in pyramids], dtype=torch.long)
+            subject_px = cameras.K.new_tensor([pyramid.subject_px for pyramid in pyramids])
+            levels = choose_levels(cameras, last, subject_px, viewer, step_px, scale)
+            found.append(torch.stack(levels, 1).tolist())
+        return found
+
+    def mips(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[MipLevels]:
+        """The fine and the wide level of the source cameras, then those of the silhouettes."""
+        chosen = zip(self._parts, self.levels(viewer, step_px, scale), strict=True)
+        return [MipLevels.of(own, level) for (_, own), levels in chosen for level in zip(*levels, strict=True)]
+
+    @property
+    def _parts(self) -> list[tuple[Cameras, tuple[Pyramid, ...]]]:
+        return [(self.cameras, self.pyramids), (self.silhouettes.cameras, self.silhouette_pyramids)]
+
+
+def source_images(
+    rgb: UInt8[Tensor, "view 3 height width"],
+    mask: UInt8[Tensor, "view height width"],
+    depth: Float[Tensor, "view height width"],
+) -> UInt8[Tensor, "view 5 height width"]:
+    """RGB on black, mask, and coverage by the proxy."""
+    black = (rgb.int() * mask[:, None].int() + 127) // 255
+    return torch.cat([black.to(torch.uint8), mask[:, None], 255 * (depth > 0)[:, None].to(torch.uint8)], 1)
+
+
+def view_pyramids(views: ContextViews) -> tuple[Pyramid, ...]:
+    """The pyramids of the `source_images` of every camera."""
+    rgb, depth = views.frame.per_camera("rgb"), views.per_camera("depth")
+    mask = views.frame.per_camera("mask") or _masks(views)
+
+    def base(view: int, width: int, height: int) -> UInt8[Tensor, "rows columns 5"]:
+        own = slice(height), slice(width)
+        parts = rgb[view][:, *own], mask[view][own], depth[view][own]
+        if parts[0].device.type != "cpu":
+            return F.pad(source_images(*(part[None] for part in parts))[0].permute(1, 2, 0), (0, 0, 1, 1, 1, 1))
+        from viewmend.models.views._sampler_numba import premultiply
+
+        image = torch.zeros(height + 2, width + 2, 5, dtype=torch.uint8)
+        premultiply(parts[0].numpy(), parts[1].numpy(), parts[2].numpy(), image.numpy())
+        return image
+
+    return _pyramids(views.frame.cameras, base, 3)
+
+
+def silhouette_pyramids(silhouettes: Silhouettes) -> tuple[Pyramid, ...]:
+    """The pyramids of the masks of every camera."""
+
+    def base(view: int, width: int, height: int) -> UInt8[Tensor, "rows columns 1"]:
+        return F.pad(silhouettes.mask[view, :height, :width, None], (0, 0, 1, 1, 1, 1))
+
+    return _pyramids(silhouettes.cameras, base, 0)
+
+
+def downsample2x(image: UInt8[Tensor, "rows columns channel"]) -> UInt8[Tensor, "_rows _columns channel"]:
+    """Rounded means of 2 x 2 pixels; both images have a border of one black pixel, which also completes odd sides."""
+    rows, columns, channels = image.shape
+    if image.device.type == "cpu":
+        from viewmend.models.views._sampler_numba import halve
+
+        half = torch.zeros((rows - 1) // 2 + 2, (columns - 1) // 2 + 2, channels, dtype=torch.uint8)
+        halve(image.numpy(), half.numpy())
+        return half
+    inner = F.pad(image[1:-1, 1:-1].permute(2, 0, 1).float(), (0, columns % 2, 0, rows % 2))
+    means = (F.avg_pool2d(inner[None], 2)[0] + 0.5).floor()
+    return F.pad(means.to(torch.uint8).permute(1, 2, 0), (0, 0, 1, 1, 1, 1))
+
+
+def _masks(views: ContextViews) -> UInt8[Tensor, "view height width"]:
+    """The views' masks; what the proxy covers if they have none."""
+    return (255 * (views.depth > 0)).to(torch.uint8) if views.frame.mask is None else views.frame.mask
+
+
+def _pyramids(cameras: Cameras, base: Callable[[int, int, int], Tensor], mask: int) -> tuple[Pyramid, ...]:
+    """The pyramid of every camera, whose finest level is base(view, width, height); `mask` is the mask's channel."""
+    made: dict[int, Pyramid] = {}
+    sizes = cameras.size_px.tolist()
+
+    def work(view: int) -> None:
+        levels = [base(view, *sizes[view])]
+        while min(levels[-1].shape[:2]) - 2 > SMALLEST_PX:
+            levels.append(downsample2x(levels[-1]))
+        level = min(AREA_LEVEL, len(levels) - 1)
+        area_px = float(levels[level][..., mask].sum(dtype=torch.long)) / 255 * 4**level
+        made[view] = Pyramid(tuple(levels), max(1.0, math.sqrt(area_px)))
+
+    parallel_for(work, len(sizes))
+    return tuple(made[view] for view in range(len(sizes)))

@@ -1,0 +1,262 @@
+"""Fills holes pixel by pixel from the source cameras: the model `rays`, and the first guess of the default model.
+
+The true surface in a hole is at the proxy or behind it, and cameras that see it agree on its colour. So each missing
+pixel becomes a convex mix of candidates: the colours that the cameras have at points along its ray, a smooth fill, and
+background. The network only weighs the candidates.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.geometry.threads import heavy_operations, light_operations
+from viewmend.models.base import ContextProvider
+from viewmend.models.smooth_fill import CoarseFill, fill, pull_push
+from viewmend.models.views.config import CONTRAST, RaysConfig
+from viewmend.models.views.pyramids import SceneScale, SourceCameras
+from viewmend.models.views.sampler import (
+    CAMERA_CHANNELS,
+    BoxSums,
+    CameraFeatures,
+    Rays,
+    RaySamples,
+    box_side_px,
+    sample_fill_rays,
+)
+from viewmend.types import IncompleteView
+
+OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
+"""Points on a ray: z-depth behind the proxy, in subject sizes."""
+RADIUS_PX = 5
+"""Radius of the window around a pixel in the view."""
+WINDOW_CHANNELS = 8
+"""RGB, M, E of the view, and RGB of the smooth fill."""
+CELLS = (0.03, 0.06)
+"""Sides, in subject sizes, of the square cells of a pixel's wider neighbourhood."""
+CELLS_AROUND = 5
+"""Cells to each side."""
+CELL_CHANNELS = 6
+"""RGB of the smooth fill, M, E and depth."""
+COLOUR_CHANNELS = 7
+"""What cameras that see a point agree about: colour, mean colour and mean coverage."""
+POINT_FEATURES = 16
+"""Features kept of each point of a ray."""
+PIXELS_AT_ONCE = 512
+"""Pixels per chunk without gradients: buffers for more are so large that the system allocates them page by page each
+time, which takes longer than the computation."""
+PIXELS_STEP = 64
+"""Layers get a multiple of this many pixels: convolutions and GELUs are compiled and kept for each number, which would
+be slow, and fragment the memory of a server."""
+
+
+class RayInputs(NamedTuple):
+    """Inputs of the network for some missing pixels."""
+
+    features: Float[Tensor, "pixel point view 14"]
+    """`CameraFeatures`, stacked."""
+    smallest_masks: Float[Tensor, "pixel point 4"]
+    """The two smallest masks of the rig at a point, and the two smallest averaged masks."""
+    window: Float[Tensor, "pixel 8 11 11"]
+    """The view around each pixel: RGB, M, E, and RGB of the smooth fill."""
+    neighbourhoods: Float[Tensor, "neighbourhood 12 11 11"]
+    """Means over cells of both sizes in `CELLS` around each different cell: `CELL_CHANNELS` each."""
+    neighbourhood_index: Int[Tensor, "pixel"]
+    """Index of each pixel's neighbourhood; pixels of one cell share it."""
+
+    @staticmethod
+    def cat(parts: Sequence["RayInputs"]) -> "RayInputs":
+        """Concatenation over pixels; missing cameras are padded as out of view."""
+        most = max(part.features.shape[2] for part in parts)
+        first, padded = 0, []
+        for part in parts:
+            features = F.pad(part.features, (0, 0, 0, most - part.features.shape[2]))
+            padded.append(part._replace(features=features, neighbourhood_index=part.neighbourhood_index + first))
+            first += len(part.neighbourhoods)
+        return RayInputs(*(torch.cat(values) for values in zip(*padded, strict=True)))
+
+
+class RayFill(CoarseFill):
+    """Weighs the candidates of each missing pixel."""
+
+    config: RaysConfig  # pyright: ignore
+
+    def __init__(self, config: RaysConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or RaysConfig()  # pyright: ignore[reportIncompatibleVariableOverride]
+        width = config.width
+        points = len(OFFSETS)
+        self.look = nn.Sequential(nn.Linear(sum(CAMERA_CHANNELS), width), nn.GELU())
+        self.compare = nn.Sequential(
+            nn.Linear(width + sum(CAMERA_CHANNELS) + 2 * COLOUR_CHANNELS + 3, width),
+            nn.GELU(),
+            nn.Linear(width, width),
+            nn.GELU(),
+        )
+        self.trust = nn.Linear(width, 1)
+        self.point = nn.Sequential(
+            nn.Linear(width + 2 * COLOUR_CHANNELS + 5, width), nn.GELU(), nn.Linear(width, POINT_FEATURES)
+        )
+        widths = (WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), 2 * width)
+        layers = [(nn.Conv2d(before, after, 3), nn.GELU()) for before, after in pairwise(widths)]
+        self.around = nn.Sequential(*(part for layer in layers for part in layer))
+        sizes, deep = len(CELLS), 2 * width
+        self.far = nn.Sequential(
+            *(nn.Conv2d(sizes * CELL_CHANNELS, sizes * 24, 3, groups=sizes), nn.GELU()),
+            *(nn.Conv2d(sizes * 24, sizes * width, 3, stride=2, groups=sizes), nn.GELU()),
+            *(nn.Conv2d(sizes * width, sizes * deep, 4, groups=sizes), nn.GELU()),
+        )
+        inputs = points * POINT_FEATURES + (1 + sizes) * deep
+        # Runs once per pixel, not once per point and camera: width is cheap here.
+        self.head = nn.Sequential(
+            *(nn.Linear(inputs, 22 * width), nn.GELU()), *(nn.Linear(22 * width, 20 * width), nn.GELU())
+        )
+        self.choose = nn.Linear(20 * width, points + 2)
+
+    @light_operations()
+    def forward(self, view: IncompleteView, sources: SourceCameras | None) -> Float[Tensor, "3 height width"]:
+        """The view's image with all of E filled; None for `sources` leaves the smooth fill."""
+        guess = fill(view.rgb, view.error > 0, view.mask > 0)
+        pixels = torch.nonzero((view.error > 0) & (view.depth > 0).any())
+        colours = self.mix(gather_ray_inputs(view, sources, pixels, guess))
+        return guess.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
+
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
+        """The view's image with all of E filled; other pixels are unchanged, bit for bit."""
+        return self(view, SourceCameras.closest_to(view, context, self.config.num_views))
+
+    @heavy_operations()
+    def mix(self, inputs: RayInputs) -> Float[Tensor, "pixel 3"]:
+        """The mixed colour of each pixel."""
+        features, smallest, window, neighbourhoods, index = inputs
+        if torch.compiler.is_exporting():
+            return self._mix(features, smallest, window, self.far(neighbourhoods).flatten(1)[index])
+        size = max(1, len(index)) if torch.is_grad_enabled() else PIXELS_AT_ONCE
+        with self.autocast():
+            far = [self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in neighbourhoods.split(size)]
+            per_pixel = features, smallest, window, torch.cat(far)[index]
+            chunks = zip(*(values.split(size) for values in per_pixel), strict=True)
+            return torch.cat([self._mix(*map(_rounded_up, chunk))[: len(chunk[0])] for chunk in chunks])
+
+    def _mix(
+        self,
+        features: Float[Tensor, "pixel point view 14"],
+        smallest_masks: Float[Tensor, "pixel point 4"],
+        window: Float[Tensor, "pixel 8 11 11"],
+        far: Float[Tensor, "pixel feature"],
+    ) -> Float[Tensor, "pixel 3"]:
+        colours, points = self._points(features, smallest_masks)
+        hidden = self.head(torch.cat([points.flatten(1), self.around(window).flatten(1), far], 1))
+        candidate = F.pad(CameraFeatures.unstack(features).in_view.amax((2, 3)) > 0, (0, 2), value=True)
+        weights = self.choose(hidden).float().masked_fill(~candidate, -torch.inf).softmax(1)
+        smooth = window[:, None, -3:, RADIUS_PX, RADIUS_PX]
+        return (weights[..., None] * torch.cat([colours, smooth, 0 * smooth], 1)).sum(1)
+
+    def _points(
+        self, features: Float[Tensor, "pixel point view 14"], smallest_masks: Float[Tensor, "pixel point 4"]
+    ) -> tuple[Float[Tensor, "pixel point 3"], Float[Tensor, "pixel point feature"]]:
+        """Each point's colour, by the cameras that seem to see it, and evidence for the surface being there."""
+        at = CameraFeatures.unstack(features)
+        colours = torch.cat([at.colour, at.mean_colour, at.mean_coverage], -1)
+        # Initial weights: cameras near the viewer that do not have the point far behind the proxy.
+        prior = at.in_view * (4 * at.viewing_cosine).exp() * (-4 * at.depth_difference).sigmoid()
+        prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
+        mean = (prior * colours).sum(2, keepdim=True)
+        variance = CONTRAST * (prior * (colours - mean) ** 2).sum(2, keepdim=True)
+        features = torch.cat([*at[:7], at.mean_mask, at.mean_colour, at.mean_coverage], -1)  # the order it learned
+        looked = self.look(features)
+        together = looked + (prior * looked).sum(2, keepdim=True)
+        smallest = smallest_masks[:, :, None, ::2].expand(*prior.shape[:-1], -1)
+        inputs = [features, mean.expand_as(colours), variance.expand_as(colours), together, smallest, prior]
+        compared = self.compare(torch.cat(inputs, -1))
+        scores = self.trust(compared).float() + (prior + 1e-4).log()
+        trust = at.in_view * scores.masked_fill(at.in_view == 0, -1e4).softmax(2)
+        agreed = (trust * colours).sum(2)
+        spread = CONTRAST * (trust * (colours - agreed[:, :, None]) ** 2).sum(2)
+        point = [(trust * compared).sum(2), agreed, spread, smallest_masks, (trust**2).sum(2)]
+        return agreed[..., :3], self.point(torch.cat(point, -1))
+
+
+def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_pixels *feature"]:
+    """The values, padded with zeros to a multiple of `PIXELS_STEP` pixels."""
+    return F.pad(values, (0, 0) * (values.ndim - 1) + (0, -len(values) % PIXELS_STEP))
+
+
+def gather_ray_inputs(
+    view: IncompleteView,
+    sources: SourceCameras | None,
+    pixels: Int[Tensor, "pixel 2"],
+    guess: Float[Tensor, "3 height width"] | None = None,
+) -> RayInputs:
+    """The network's inputs for pixels (row, column) of a view.
+
+    Args:
+        view: the rendered view.
+        sources: the source cameras; None if there are none.
+        pixels: to be filled.
+        guess: the view with E filled smoothly; None to make it here.
+    """
+    guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
+    if sources is None:
+        shape = (len(pixels), len(OFFSETS))
+        features, smallest = view.depth.new_zeros(*shape, 1, sum(CAMERA_CHANNELS)), view.depth.new_ones(*shape, 4)
+    else:
+        features, _, statistics = sample_behind_proxy(view, pixels, sources)
+        smallest = statistics[..., -4:]
+    window = windows(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), pixels, RADIUS_PX)
+    return RayInputs(features, smallest, window, *multi_scale_context(view, guess, pixels))
+
+
+def sample_behind_proxy(
+    view: IncompleteView, pixels: Int[Tensor, "pixel 2"], sources: SourceCameras, offsets: Sequence[float] = OFFSETS
+) -> RaySamples:
+    """`sample_fill_rays` at points `offsets` behind the proxy, on the rays of pixels (row, column).
+
+    A pixel without a depth takes it from its surroundings; the view must have a depth somewhere.
+    """
+    scale, depth = SceneScale.of(view), view.depth[pixels[:, 0], pixels[:, 1]]
+    if torch.compiler.is_exporting():
+        depth = torch.where(depth > 0, depth, scale.depth_m)
+    elif not bool((depth > 0).all()):
+        depth = pull_push(view.depth[None], view.depth > 0)[0][pixels[:, 0], pixels[:, 1]]
+    z = depth[:, None] + scale.size_m * depth.new_tensor(offsets)
+    return sample_fill_rays(Rays(view.camera, pixels.flip(1) + 0.5, z), sources, view.source_views, scale)
+
+
+def multi_scale_context(
+    view: IncompleteView, guess: Float[Tensor, "3 height width"], pixels: Int[Tensor, "pixel 2"]
+) -> tuple[Float[Tensor, "neighbourhood 12 11 11"], Int[Tensor, "pixel"]]:
+    """`RayInputs.neighbourhoods` of pixels (row, column), and the index of each pixel's neighbourhood.
+
+    Depth is relative: 0.5 at the subject's median, growing with distance, 0 where there is none. Cells meet at the
+    principal point, so that a crop of a view has the same cells.
+    """
+    scale = SceneScale.of(view)
+    depth = (0.5 + 0.5 * ((view.depth - scale.depth_m) / scale.size_m).tanh()) * (view.depth > 0)
+    sums = BoxSums.of(torch.cat([guess, view.mask[None], view.error[None], depth[None]])[None])
+    subject_px = (view.mask > 0).sum().sqrt().double()
+    middle = view.camera.K[0, :2, 2].floor().long().flip(0)
+    sides = [box_side_px(size, subject_px) for size in CELLS]
+    cells = torch.cat([(pixels + -middle % side) // side for side in sides], 1)
+    if torch.compiler.is_exporting():
+        index = torch.arange(pixels.shape[0])
+    else:
+        cells, index = cells.unique(dim=0, return_inverse=True)
+    reach, means = torch.arange(-CELLS_AROUND, CELLS_AROUND + 2, device=pixels.device), []
+    for side, cell in zip(sides, cells.split(2, 1), strict=True):
+        rows, columns = ((cell[:, :, None] + reach) * side - (-middle % side)[:, None]).split(1, 1)
+        means.append((sums.boxes(rows, columns)[:, 0] / side**2).float().movedim(-1, 1))
+    return torch.cat(means, 1), index
+
+
+def windows(
+    image: Float[Tensor, "channel height width"], pixels: Int[Tensor, "pixel 2"], radius: int
+) -> Float[Tensor, "pixel channel window window"]:
+    """The square around each pixel, zeros outside the image."""
+    padded, reach = F.pad(image, (radius,) * 4), torch.arange(2 * radius + 1, device=image.device)
+    rows, columns = (pixels[:, axis, None] + reach for axis in (0, 1))
+    return padded[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()

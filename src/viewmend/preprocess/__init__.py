@@ -1,0 +1,1 @@
+"""Masks, calibration and colour matching."""

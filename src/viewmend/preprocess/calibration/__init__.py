@@ -1,0 +1,1 @@
+"""Camera calibration from a board, refined by silhouettes."""

@@ -1,0 +1,1 @@
+"""Foreground masks for captures that have none; one method per file."""

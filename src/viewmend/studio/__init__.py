@@ -1,1 +1,0 @@
-"""A capture stage in software that gives exact truth."""

@@ -1,0 +1,422 @@
+"""Training of the default model, `views`: its options, its views, its loss and its validation.
+
+Colours give three labels per pixel. The studio also knows which sample along the ray is the surface, which cameras see
+it, and how much of the pixel the subject covers. Captures have no true depth; their views skip the terms that need it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count, islice
+from pathlib import Path
+from random import Random
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from viewmend.geometry.cameras import project, unproject
+from viewmend.geometry.sampling import in_view
+from viewmend.metrics.image_quality import psnr
+from viewmend.models.checkpoint import load_network
+from viewmend.models.network import set_compute_dtype
+from viewmend.models.views.config import OFFSETS, ViewsConfig
+from viewmend.models.views.grid import CELL_PX, nearest_depth, rim_depth, scatter_to_image
+from viewmend.models.views.model import ViewSynthNet
+from viewmend.models.views.prediction import ViewPrediction
+from viewmend.models.views.pyramids import Pyramid, SceneScale, SourceCameras
+from viewmend.models.views.ray_fill import RayFill
+from viewmend.rendering.crop import Crop, subject_crop
+from viewmend.rendering.error_mask import attenuate_background
+from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
+from viewmend.training.objective import MIN_SQUARE, ImageLoss, Objective, StepOutput, load_start, write_rows
+from viewmend.training.samples import Sample, to_device
+from viewmend.training.scenes import rig_source, validation_scenes
+from viewmend.training.shards import storable
+from viewmend.training.stored_scenes import StoredSamples, StoredScene, StoredSceneMaker
+from viewmend.types import IncompleteView
+
+CROP_PX = 112
+"""Side of the square crops of a view that are trained on."""
+MARGIN_PX = 16
+"""Margin around the subject that is kept of a view."""
+MIN_SUBJECT_PX = 200
+"""Views of a smaller subject are skipped."""
+MIN_VIEWS = 3
+"""Smallest number of cameras after some were removed at random."""
+FEWER_VIEWS, SPARSE, RECOLOURED, SMOOTH_GUESS = 0.6, 0.3, 0.7, 0.3
+"""Fractions of crops with fewer cameras, of crops whose pixels are only partly predicted, of views with changed
+colours, and of views whose holes are guessed from their surroundings only."""
+MIN_GAIN = 0.6
+"""Smallest factor by which changed colours are darkened."""
+WRONG = 0.08
+"""Difference of a channel, in [0, 1], from which a rendered pixel counts as erroneous when crops are drawn."""
+CORRECT = 0.1
+"""Largest difference of a channel with which a pixel counts as correct for confidence and error prediction."""
+VISIBLE = 0.02
+"""A camera sees a point if its true depth there differs by less, in subject sizes."""
+GAIN_WEIGHT = 4.0
+"""Weight of the cross-entropy of gains, which are small numbers."""
+REFINED_FRACTION = 0.15
+"""Fraction of the proxy's pixels that validation refines by predicted errors."""
+for kind in (SourceCameras, SceneScale, Pyramid):
+    storable(kind)  # parts of a `TrainingView`, which is written if a loss is not finite
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewsLossWeights:
+    """Weights of the terms of the loss; 0 disables a term."""
+
+    colour: Annotated[float, HIDDEN] = 1.0
+    """L1 of colours on black."""
+    holes: float = 2.0
+    """Additional weight of pixels that no source view colours."""
+    log_error: float = 0.15
+    """Weight of log10 of the squared error of a crop."""
+    gradient: float = 0.5
+    """Weight of L1 of differences between neighbouring pixels, which keeps textures sharp."""
+    cell_colour: Annotated[float, HIDDEN] = 0.5
+    """L1 of the mean colour over the samples of a ray."""
+    alpha: Annotated[float, HIDDEN] = 0.5
+    """L1 of alpha, plus 0.3 of its cross-entropy."""
+    depth: Annotated[float, HIDDEN] = 0.1
+    """Cross-entropy of the surface's sample along the ray."""
+    visibility: Annotated[float, HIDDEN] = 0.1
+    """Negative log of the weight given to cameras that see the surface."""
+    errors: Annotated[float, HIDDEN] = 0.5
+    """Cross-entropies of the error predictor."""
+    confidence: Annotated[float, HIDDEN] = 0.05
+    """Cross-entropy of whether a pixel is correct."""
+
+
+def initial_model(config: "ViewsObjectiveConfig", precision: str) -> ViewSynthNet:
+    """The untrained model, with the ray fill of another one.
+
+    Raises:
+        WeightsError: the other model does not exist, or is damaged.
+        ValueError: it has no ray fill, or one of other sizes.
+    """
+    net = ViewSynthNet(config.model)
+    if isinstance(net.coarse, RayFill):
+        source = load_network(config.coarse_from)
+        fill = source.coarse if isinstance(source, ViewSynthNet) else source
+        weights = fill.state_dict() if isinstance(fill, RayFill) else {}
+        if {k: v.shape for k, v in weights.items()} != {k: v.shape for k, v in net.coarse.state_dict().items()}:
+            raise ValueError(
+                f"expected a model with a ray fill of the recipe's sizes, got '{config.coarse_from}'; name another "
+                "one by --coarse-from"
+            )
+        net.coarse.load_state_dict(weights)
+    set_compute_dtype(net, torch.bfloat16 if precision == "bfloat16" else torch.float32)
+    return net
+
+
+@storable
+@dataclass(frozen=True)
+class TrainingView:
+    """A rendered view around the subject, its cameras as image pyramids, and the ground truth."""
+
+    view: IncompleteView
+    sources: SourceCameras
+    scale: SceneScale
+    guess: Float[Tensor, "3 height width"]
+    """`ViewSynthNet.coarse_guess` of the whole view."""
+    truth: UInt8[Tensor, "3 height width"]
+    """F*, on black."""
+    alpha: UInt8[Tensor, "height width"]
+    """True coverage of each pixel by the subject, in 255ths."""
+    depth: Float[Tensor, "height width"] | None
+    """True z-depth in metres, 0 where there is no surface; None if unavailable."""
+
+    @classmethod
+    def of(cls, sample: Sample, net: ViewSynthNet, smooth_guess: bool = False) -> "TrainingView":
+        """The view of a sample with alpha and `ray_views`; holes are guessed by `net`, or from their surroundings."""
+        assert sample.ray_views and sample.alpha is not None, "stored scenes have both"
+        view, truth, alpha, depth = sample.view, sample.truth, sample.alpha, sample.depth
+        scale, sources = SceneScale.of(view), SourceCameras.of(sample.ray_views, view.silhouettes)
+        crop = subject_crop(view, MARGIN_PX)
+        view = crop.of_view(view)
+        truth, alpha = crop.of_image(truth).contiguous(), crop.of_image(alpha).contiguous()
+        depth = None if depth is None else crop.of_image(depth).contiguous()
+        return cls(view, sources, scale, net.coarse_guess(view, sources, smooth_guess), truth, alpha, depth)
+
+    def cropped(self, crop: Crop) -> "TrainingView":
+        """A part of the view, with the same cameras."""
+        guess, truth, alpha = (crop.of_image(image) for image in (self.guess, self.truth, self.alpha))
+        depth = None if self.depth is None else crop.of_image(self.depth)
+        return replace(self, view=crop.of_view(self.view), guess=guess, truth=truth, alpha=alpha, depth=depth)
+
+    @property
+    def wrong(self) -> Bool[Tensor, "height width"]:
+        """Pixels of the proxy and its rim with an erroneous colour."""
+        return ((self.view.rgb - self.truth / 255).abs().amax(0) > WRONG) & (rim_depth(self.view.depth) > 0)
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """The samples of a source as `TrainingView`s, most with changed colours."""
+
+    scenes: SceneSource[Sample]
+    seed: str
+    net: ViewSynthNet
+    smooth_guess: float = SMOOTH_GUESS
+    """Fraction of views whose holes are guessed without `net`."""
+
+    def scene(self, number: int) -> list[TrainingView]:
+        """The views of scene `number` with a large enough subject."""
+        random, guesses = (Random(f"{self.seed}/{kind}/{number}") for kind in ("colours", "guesses"))
+        samples = [s for s in self.scenes.scene(number) if int((s.view.mask > 0).sum()) >= MIN_SUBJECT_PX]
+        samples = [recolour(s, random) if random.random() < RECOLOURED else s for s in samples]
+        return [TrainingView.of(s, self.net, guesses.random() < self.smooth_guess) for s in samples]
+
+
+def recolour(sample: Sample, random: Random) -> Sample:
+    """The sample with permuted colour channels, darkened by a random factor."""
+    assert sample.ray_views is not None, "stored scenes have cameras"
+    channels, gain = random.sample(range(3), 3), random.uniform(MIN_GAIN, 1)
+    frame = sample.ray_views.frame
+    rgb, truth = (
+        (gain * image.float()).round().to(torch.uint8) for image in (frame.rgb[:, channels], sample.truth[channels])
+    )
+    view = replace(sample.view, rgb=gain * sample.view.rgb[channels])
+    return replace(sample, view=view, ray_views=replace(sample.ray_views, frame=replace(frame, rgb=rgb)), truth=truth)
+
+
+def random_crop(whole: TrainingView) -> TrainingView:
+    """A crop of the view, half of the time around an erroneous pixel; mostly with fewer cameras."""
+    wrong = torch.nonzero(whole.wrong)
+    pixels = wrong if len(wrong) and bool(torch.rand(()) < 0.5) else torch.nonzero(whole.view.mask > 0)
+    height, width = whole.view.mask.shape
+    row, column = pixels[int(torch.randint(len(pixels), ()))].tolist()
+    top, bottom = _crop_side(row, height)
+    left, right = _crop_side(column, width)
+    crop = whole.cropped(Crop(left, top, right, bottom))
+    num_views = len(whole.sources.pyramids)
+    if num_views > MIN_VIEWS and bool(torch.rand(()) < FEWER_VIEWS):
+        crop = replace(crop, sources=whole.sources.first(int(torch.randint(MIN_VIEWS, num_views, ()))))
+    return crop
+
+
+def random_selection(crop: TrainingView) -> Bool[Tensor, "height width"] | None:
+    """Pixels to predict: sometimes only those around erroneous ones, as an error rule would select; None for all."""
+    if float(torch.rand(())) > SPARSE:
+        return None
+    scattered = torch.rand(crop.view.mask.shape) < 0.01 * float(torch.rand(()))
+    radius = int(torch.randint(5, ()))
+    seeds = (crop.wrong | crop.view.holes | scattered).float()
+    selected = (F.max_pool2d(seeds[None], 2 * radius + 1, 1, radius)[0] > 0) & (rim_depth(crop.view.depth) > 0)
+    return selected if bool(selected.any()) else None
+
+
+def _crop_side(center: int, size: int) -> tuple[int, int]:
+    """First and last (exclusive) pixel of a crop that contains a pixel; even, and within the image."""
+    if size <= CROP_PX:
+        return 0, size
+    first = center - int(torch.randint(CROP_PX, ()))
+    first = min(max(0, first), size - CROP_PX) // 2 * 2
+    return first, first + CROP_PX
+
+
+class ViewsObjective(Objective[ViewSynthNet]):
+    """The loss of `ViewSynthNet` on a random crop of each view of a batch."""
+
+    loss_summary = "L1 of colours with terms of gradients, alpha, depth, visibility, confidence and predicted errors"
+
+    def __init__(self, config: TrainConfig, options: "ViewsObjectiveConfig", start: nn.Module | None) -> None:
+        super().__init__(config, initial_model(options, config.precision))
+        load_start(self.model, start, kept="coarse.", optional="errors.")
+        self.options, self.weights = options, options.loss
+        self.validation = ViewsValidation(config, options)
+        if options.train_params == "errors":
+            if self.model.errors is None or start is None:
+                raise ValueError("expected a trained model for --train-params errors, got none; give --from MODEL")
+            self.model.requires_grad_(False)
+            self.model.errors.requires_grad_(True)
+
+    def training_scenes(self, seed: str) -> SceneSource[TrainingView]:
+        """See `Objective.training_scenes`."""
+        samples = StoredSamples(super().training_scenes(seed), self.options.sampling, seed)
+        return TrainingViews(samples, seed, initial_model(self.options, self.config.precision))
+
+    def forward(self, batch: Sequence[TrainingView]) -> StepOutput:
+        """The mean terms of the batch."""
+        terms = [self._terms(random_crop(view)) for view in batch]
+        image = ImageLoss(*(torch.stack(values).mean() for values in zip(*(own[1:] for own in terms), strict=True)))
+        return StepOutput(image, torch.stack([own[0] for own in terms]).mean())
+
+    def _terms(self, crop: TrainingView) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The weighted sum, L1 in the holes, L1 of all pixels, and the logarithmic error."""
+        made = self.model(crop.view, crop.sources, crop.scale, random_selection(crop), crop.guess)
+        at, weights = tuple(made.pixels.T), self.weights
+        truth, alpha = crop.truth / 255, crop.alpha[at] / 255
+        off = made.rgb - truth[:, at[0], at[1]].T
+        hole = crop.view.holes[at].float()
+        weight = 1 + weights.holes * hole
+        colour = (weight * off.abs().mean(1)).sum() / weight.sum()
+        log_error = (off.square().mean() + MIN_SQUARE).log10()
+        correct = (off.detach().abs().amax(1) < CORRECT).float()
+        total = weights.colour * colour + weights.log_error * log_error
+        total = total + weights.gradient * _gradient_loss(made, off, crop.view.mask.shape)
+        total = total + weights.alpha * ((made.alpha - alpha).abs().mean() + 0.3 * _cross_entropy(made.alpha, alpha))
+        total = total + weights.confidence * _cross_entropy(made.confidence, correct)
+        total = total + self._cell_terms(crop, made)
+        total = total + weights.errors * self._error_terms(crop, made, off)
+        inside = (hole * off.detach().abs().mean(1)).sum() / hole.sum().clamp_min(1)
+        return total, inside, colour.detach(), log_error.detach()
+
+    def _error_terms(
+        self, crop: TrainingView, made: ViewPrediction, off: Float[Tensor, "pixel 3"]
+    ) -> Float[Tensor, ""]:
+        """Cross-entropies of the error predictor, at the pixels that were predicted."""
+        if self.model.errors is None:
+            return off.new_zeros(())
+        at = tuple(made.pixels.T)
+        found = self.model.errors(crop.view, crop.sources, crop.scale)
+        rendered, predicted = crop.view.rgb[:, *at].T, made.rgb.detach()
+        wrong = ((rendered - (predicted - off.detach())).abs().amax(1) > CORRECT).float()
+        alpha = found.alpha[at]
+        gain, rest = ((k * rendered - predicted).square().mean(1) for k in (1.0, alpha.detach()[:, None]))
+        gains = _cross_entropy(found.gain[at], gain) + _cross_entropy(found.rest[at], rest)
+        other = _cross_entropy(found.wrong[at], wrong) + _cross_entropy(alpha, made.alpha.detach())
+        return other + GAIN_WEIGHT * gains
+
+    def _cell_terms(self, crop: TrainingView, made: ViewPrediction) -> Float[Tensor, ""]:
+        """The terms of cells: their mean colour and, where true depth is available, depth and visibility."""
+        distribution, weights = made.distribution, self.weights
+        cells = tuple(distribution.cells.T)
+        shares = distribution.logits.softmax(1)[..., None]
+        truth = F.avg_pool2d(crop.truth[None] / 255, CELL_PX, ceil_mode=True)[0, :, cells[0], cells[1]].T
+        total = weights.cell_colour * ((shares * distribution.samples.colour).sum(1) - truth).abs().mean()
+        if crop.depth is None:
+            return total
+        alpha = F.avg_pool2d(crop.alpha[None] / 255, CELL_PX, ceil_mode=True)[0][cells]
+        z = nearest_depth(crop.depth)[cells]
+        offsets = z.new_tensor(OFFSETS)
+        offset = (z - distribution.depth[cells]) / crop.scale.size_m
+        known = (z > 0) & (alpha > 0.5) & (offset > offsets[0] - VISIBLE) & (offset < offsets[-1] + 0.1)
+        upper = torch.searchsorted(offsets, offset.contiguous()).clamp(1, len(OFFSETS) - 1)
+        part = ((offset - offsets[upper - 1]) / (offsets[upper] - offsets[upper - 1])).clamp(0, 1)
+        chance = distribution.logits.log_softmax(1)
+        lower_log, upper_log = (chance.gather(1, index[:, None])[:, 0] for index in (upper - 1, upper))
+        depth = -_masked_mean((1 - part) * lower_log + part * upper_log, known)
+        seen = visible_cameras(crop, made, z)
+        nearest = upper - (part < 0.5).long()
+        trust = distribution.samples.trust[torch.arange(len(nearest)), nearest]
+        visibility = -_masked_mean(((trust * seen).sum(1) + 1e-3).log(), known & seen.any(1))
+        return total + weights.depth * depth + weights.visibility * visibility
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewsObjectiveConfig(ObjectiveConfig):
+    """Trains `ViewSynthNet`."""
+
+    model: Annotated[ViewsConfig, HIDDEN] = field(
+        default_factory=lambda: ViewsConfig(coarse_fill="rays", error_features=24)
+    )
+    sampling: Annotated[SamplingConfig, HIDDEN] = field(default_factory=lambda: SamplingConfig(num_ray_views=8))
+    train_params: Literal["all", "errors"] = "all"
+    """Parameters to train: all but those of the ray fill, or only the error predictor of the model given by --from."""
+    coarse_from: str = "rays"
+    """Name or folder of the model whose ray fill completes holes; its weights are copied and stay fixed."""
+    loss: ViewsLossWeights = field(default_factory=ViewsLossWeights)
+    objective = ViewsObjective
+    item = StoredScene
+    whole_shards = False
+    shard_size = 16
+
+    def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[StoredScene]:
+        """See `ObjectiveConfig.make_scenes`."""
+        return StoredSceneMaker(rig_source(scenes, self.sampling.frames, seed), scenes)
+
+
+def _gradient_loss(made: ViewPrediction, off: Float[Tensor, "pixel 3"], shape: torch.Size) -> Float[Tensor, ""]:
+    """Mean difference between the errors of neighbouring predicted pixels."""
+    image = scatter_to_image(F.pad(off, (0, 1), value=1.0), made.pixels, shape)
+    total, number = image.new_zeros(()), image.new_zeros(())
+    for axis in (1, 2):
+        one, other = image.narrow(axis, 1, image.shape[axis] - 1), image.narrow(axis, 0, image.shape[axis] - 1)
+        both = one[3] * other[3]
+        total, number = total + (both * (one[:3] - other[:3]).abs().mean(0)).sum(), number + both.sum()
+    return total / number.clamp_min(1)
+
+
+def visible_cameras(crop: TrainingView, made: ViewPrediction, z: Float[Tensor, "cell"]) -> Bool[Tensor, "cell view"]:
+    """Which cameras see the true surface of each cell, at z-depth `z` in metres."""
+    centers = CELL_PX * (made.distribution.cells.flip(1).float() + 0.5)
+    points = unproject(centers[None], z[None], crop.view.camera)[0]
+    frame = crop.sources.views.frame
+    assert frame.depth is not None, "scenes with true depth have it for all cameras"
+    at, depth = project(points, frame.cameras)
+    column, row = at.long().clamp_min(0).unbind(-1)
+    height, width = frame.depth.shape[1:]
+    there = frame.depth.flatten(1).gather(1, row.clamp_max(height - 1) * width + column.clamp_max(width - 1))
+    near = (depth - there).abs() < VISIBLE * crop.scale.size_m
+    return (in_view(at, depth, frame.cameras) & (there > 0) & near).T
+
+
+def _cross_entropy(chance: Float[Tensor, "pixel"], truth: Float[Tensor, "pixel"]) -> Float[Tensor, ""]:
+    return F.binary_cross_entropy(chance.clamp(1e-4, 1 - 1e-4), truth.clamp(0, 1))
+
+
+def _masked_mean(values: Float[Tensor, "cell"], where: Bool[Tensor, "cell"]) -> Float[Tensor, ""]:
+    """The mean of the values at `where`; 0 if there are none."""
+    return (values * where).sum() / where.sum().clamp_min(1)
+
+
+@dataclass
+class ViewsValidation:
+    """Views of procedural people that training never uses, made at the first validation.
+
+    The scores are PSNR in the subject's box, on black: as rendered, with all pixels predicted ("completed"), the same
+    on the true silhouette ("subject") and in holes ("holes"), and with only the `REFINED_FRACTION` of highest predicted
+    gain ("refined").
+    """
+
+    config: TrainConfig
+    options: "ViewsObjectiveConfig"
+    _views: list[TrainingView] = field(default_factory=list)
+
+    @torch.no_grad()
+    def __call__(self, model: nn.Module, image: Path) -> dict[str, float | None]:
+        """Score a model."""
+        assert isinstance(model, ViewSynthNet)
+        self._views = self._views or self._make_views()
+        device = next(model.parameters()).device
+        scores, rows = [], []
+        for own in self._views:
+            own = to_device(own, device)
+            view, truth = own.view, own.truth / 255
+            made = model(view, own.sources, own.scale, guess=own.guess)
+            rgb = scatter_to_image(made.rgb, made.pixels, view.mask.shape)
+            subject, holes = own.alpha > 127, (view.mask > 0) & (view.weights.sum(0) == 0)
+            row = {"rendered": _psnr(view.rgb, truth), "completed": _psnr(rgb, truth)}
+            row |= {"subject": _psnr(rgb, truth, subject), "holes": _psnr(rgb, truth, holes)}
+            if model.errors is not None:
+                rim = replace(view, error=(rim_depth(view.depth) > 0).to(view.error))
+                part = attenuate_background(rim, model.errors(view, own.sources, own.scale), REFINED_FRACTION)
+                row["refined"] = _psnr(torch.where(part.refine_mask, rgb, (1 - part.error) * view.rgb), truth)
+            scores.append(row)
+            rows.append(torch.cat([view.rgb, rgb, truth], 2).cpu())
+        write_rows(rows, image)
+        means = {name: float(torch.tensor([row[name] for row in scores]).nanmean()) for name in scores[0]}
+        return {name: None if math.isnan(mean) else mean for name, mean in means.items()}
+
+    def _make_views(self) -> list[TrainingView]:
+        scenes = validation_scenes(self.config.scenes, self.options.sampling)
+        samples = StoredSamples(StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation")
+        net = initial_model(self.options, self.config.precision)
+        source = TrainingViews(samples, "validation", net, smooth_guess=0.0)
+        views = (view for number in count() for view in source.scene(number))
+        return list(islice(views, self.config.validation_views))
+
+
+def _psnr(
+    image: Float[Tensor, "3 height width"],
+    truth: Float[Tensor, "3 height width"],
+    where: Bool[Tensor, "height width"] | None = None,
+) -> float:
+    """NaN if there are no such pixels."""
+    score = psnr(image, truth, torch.ones_like(truth[0], dtype=torch.bool) if where is None else where)
+    return float("nan") if score is None else score

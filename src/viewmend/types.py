@@ -1,0 +1,338 @@
+"""The data that the stages of the pipeline exchange.
+
+    MultiViewFrame   what the cameras of a rig captured in one frame
+    ContextViews     some of these cameras, with the geometry proxy's depth: what an inpainter samples
+    IncompleteView   a rendered novel view with its error mask: what an inpainter completes
+    CompletedView    the completed view, with alpha, confidence and depth where the model predicts them
+
+All are frozen. Images are tensors of shape (channel, height, width) or (height, width); colours are RGB. Novel views
+are in [0, 1] and on black, that is, multiplied by alpha. Camera axes are OpenCV's, pixel centres are at +0.5, lengths
+are in metres. The symbols I, M, F, E and G, and the section numbers, are those of the paper.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.geometry.cameras import Cameras
+
+RIM_PX = 2
+"""How far the subject may extend beyond the proxy, pixels: silhouettes and grids cut off up to this much."""
+FAINT = 1 / 16
+"""Opacity below which a pixel's colour divided by its opacity is noise."""
+NEAR_PX = 4
+"""Radius within which faint pixels take the colour of their neighbours."""
+
+
+class _LazyStacks:
+    """Image fields that are given camera by camera, and stacked into one tensor when they are first read.
+
+    Selecting cameras this way copies nothing: a view that needs a few pixels of each camera need not pay for the rest.
+    """
+
+    _parts: dict[str, Sequence[Tensor]]
+
+    @classmethod
+    def _of_parts(cls, parts: Mapping[str, Sequence[Tensor]], **fields: Any) -> Any:
+        """An instance with these fields, of which those in `parts` are not stacked yet."""
+        made = object.__new__(cls)
+        vars(made).update(fields, _parts=dict(parts))
+        return made
+
+    def per_camera(self, field: str) -> Sequence[Tensor]:
+        """The images of a field, one per camera, without copying; empty if the field is None."""
+        if field not in vars(self):
+            return vars(self)["_parts"][field]
+        images = vars(self)[field]
+        return () if images is None else images.unbind()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields, stacked: what is pickled."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
+
+    if not TYPE_CHECKING:  # to a type checker, all fields are attributes
+
+        def __getattr__(self, name: str) -> Tensor:
+            """The stack of a field that is read for the first time."""
+            if name not in vars(self).get("_parts", {}):
+                raise AttributeError(f"{type(self).__name__} has no attribute {name}")
+            vars(self)[name] = torch.stack(tuple(self._parts[name]))
+            return vars(self)[name]
+
+
+@dataclass(frozen=True)
+class MultiViewFrame(_LazyStacks):
+    """The images of all cameras of a rig in one frame: I[i,t] and M[i,t] of section 1.
+
+    Images are undistorted, 8 bit, and padded with zeros at the right and bottom to the largest one;
+    `cameras.size_px` has the size of each. A camera without an image in this frame is absent.
+
+    Examples:
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> frame.rgb.shape, frame.time, len(frame.without(frame.cameras.names[:1]).cameras)
+        (torch.Size([4, 3, 64, 64]), 0, 3)
+    """
+
+    cameras: Cameras
+    rgb: UInt8[Tensor, "view 3 height width"]
+    mask: UInt8[Tensor, "view height width"] | None
+    """Foreground, 0 to 255, soft in between; None for a capture without masks."""
+    time: int
+    """Index of the frame in its capture or stream."""
+    depth: Float[Tensor, "view height width"] | None = None
+    """Ground-truth z-depth in metres, if known (synthetic captures); 0 where there is no surface."""
+
+    def select(self, names: Sequence[str]) -> "MultiViewFrame":
+        """The same frame with only these cameras, in this order; ValueError for an unknown name.
+
+        Nothing is copied until `rgb` or `mask` is read.
+        """
+        if tuple(names) == self.cameras.names:
+            return self
+        cameras = self.cameras.select(names)
+        index = [self.cameras.names.index(name) for name in names]
+        if not names:
+            mask, depth = (None if image is None else image[:0] for image in (self.mask, self.depth))
+            return replace(self, cameras=cameras, rgb=self.rgb[:0], mask=mask, depth=depth)
+        width, height = cameras.max_size_px  # a stack is as large as its largest image
+        found = {
+            name: [images[i][..., :height, :width] for i in index]
+            for name in ("rgb", "mask", "depth")
+            if (images := self.per_camera(name))
+        }
+        depth = torch.stack(found.pop("depth")) if "depth" in found else None
+        absent = {} if "mask" in found else {"mask": None}
+        return MultiViewFrame._of_parts(found, cameras=cameras, time=self.time, depth=depth, **absent)
+
+    def without(self, names: Sequence[str]) -> "MultiViewFrame":
+        """The same frame without these cameras; names that are not in the frame are ignored."""
+        return self.select([n for n in self.cameras.names if n not in names])
+
+    def to(self, device: torch.device | str) -> "MultiViewFrame":
+        """The same frame on `device`."""
+        return replace(
+            self,
+            cameras=self.cameras.to(device),
+            rgb=self.rgb.to(device),
+            mask=None if self.mask is None else self.mask.to(device),
+            depth=None if self.depth is None else self.depth.to(device),
+        )
+
+
+@dataclass(frozen=True)
+class WindowPart:
+    """Where images are windows of larger ones, as in training: what the model needs to know about the whole images."""
+
+    whole_size_px: tuple[int, int]
+    """Width and height of the whole image, of the first if there are several."""
+    reference_m: Float[Tensor, "view"]
+    """Median depth of each whole image, metres."""
+    inner: Bool[Tensor, "view height width"]
+    """Only patches inside this region count; the pixels around it are there for the encoder."""
+
+    def select(self, index: Int[Tensor, "view"], height: int, width: int) -> "WindowPart":
+        """The parts of some images, cut to this size."""
+        return replace(self, reference_m=self.reference_m[index], inner=self.inner[index, :height, :width])
+
+
+@dataclass(frozen=True)
+class ContextViews(_LazyStacks):
+    """Camera images of one frame, with the geometry proxy's depth in each: everything an inpainter knows about a rig.
+
+    Examples:
+        >>> from viewmend import Stream, make_method
+        >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
+        >>> frame = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).read(0)
+        >>> Stream(make_method("telea")).add_frame(frame).context(frame.cameras.names[:2]).depth.shape
+        torch.Size([2, 64, 64])
+    """
+
+    frame: MultiViewFrame
+    depth: Float[Tensor, "view height width"]
+    """z-depth of G[t] in each camera, metres; 0 where the camera does not see the proxy."""
+    part: WindowPart | None = None
+    """Set if each image is a window of a larger one."""
+
+    @classmethod
+    def of_depths(
+        cls, frame: MultiViewFrame, depths: Sequence[Float[Tensor, "_height _width"]], part: WindowPart | None = None
+    ) -> "ContextViews":
+        """A frame with one depth image per camera, at least as large as the frame's images, without copying."""
+        height, width = frame.per_camera("rgb")[0].shape[1:]
+        return cls._of_parts({"depth": [depth[:height, :width] for depth in depths]}, frame=frame, part=part)
+
+    def to(self, device: torch.device | str) -> "ContextViews":
+        """The same on `device`."""
+        return replace(self, frame=self.frame.to(device), depth=self.depth.to(device))
+
+    def select(self, names: Sequence[str]) -> "ContextViews":
+        """Those of these cameras that are present, in the order of `names`, without copying."""
+        own = self.frame.cameras.names
+        frame = self.frame.select([name for name in names if name in own])
+        if not len(frame.cameras):
+            return ContextViews(frame, self.depth[:0])
+        index, depths = [own.index(name) for name in frame.cameras.names], self.per_camera("depth")
+        part = self.part and self.part.select(torch.tensor(index, device=depths[0].device), *frame.rgb.shape[2:])
+        return ContextViews.of_depths(frame, [depths[i] for i in index], part)
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """The masks of a rig in one frame, without its images.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import Cameras, Silhouettes, pinhole
+        >>> Silhouettes(torch.zeros(1, 48, 64, dtype=torch.uint8), pinhole(0.8, 64, 48, torch.eye(4))).mask.shape
+        torch.Size([1, 48, 64])
+    """
+
+    mask: UInt8[Tensor, "view height width"]
+    """Foreground, 0 to 255."""
+    cameras: Cameras
+
+    def select(self, names: Sequence[str]) -> "Silhouettes":
+        """The masks of these cameras, in this order; ValueError for an unknown name."""
+        index = [self.cameras.names.index(name) for name in names]
+        return Silhouettes(self.mask[index], self.cameras.select(names))
+
+    def to(self, device: torch.device | str) -> "Silhouettes":
+        """The same on `device`."""
+        return Silhouettes(self.mask.to(device), self.cameras.to(device))
+
+
+@dataclass(frozen=True)
+class IncompleteView:
+    """A rendered novel view and its error mask: F[t], M[t] and E[t] of section 1.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import IncompleteView, pinhole
+        >>> camera = pinhole(0.8, 64, 48, torch.eye(4))
+        >>> rgb, ones, weights = torch.zeros(3, 48, 64), torch.ones(48, 64), torch.zeros(1, 48, 64)
+        >>> view = IncompleteView(camera, rgb, ones, ones, 2 * ones, source_views=("left",), weights=weights, time=0)
+        >>> int(view.holes.sum())
+        3072
+    """
+
+    camera: Cameras
+    """The novel view's camera (one view)."""
+    rgb: Float[Tensor, "3 height width"]
+    """F, in [0, 1]; black where no camera colours the pixel and where there is no subject."""
+    mask: Float[Tensor, "height width"]
+    """M, in [0, 1]: 1 where the geometry proxy covers the pixel."""
+    error: Float[Tensor, "height width"]
+    """E, in [0, 1]: 1 where the pixel must be inpainted, 0 where it must not change. With some error rules, pixels to
+    inpaint already have a colour, which may be wrong."""
+    depth: Float[Tensor, "height width"]
+    """z-depth of the proxy, metres; 0 where there is none."""
+    source_views: tuple[str, ...]
+    """Names of the cameras that coloured the view, the closest first."""
+    weights: Float[Tensor, "source height width"]
+    """Blend weight of each source view in each pixel; they sum to 1 where a pixel is coloured, else to 0."""
+    time: int
+    """Index of the frame."""
+    candidate_views: tuple[str, ...] = ()
+    """Names of all cameras that an inpainter may use, the closest first; () if the renderer does not name them."""
+    silhouettes: Silhouettes | None = None
+    """The masks of these cameras in the same frame, which bound the subject more exactly than the proxy; None if the
+    renderer does not provide them."""
+    fade: Float[Tensor, "height width"] | None = None
+    """Predicted background fraction, in [0, 1], of pixels with E > 0 that are only attenuated; 0 where a pixel is to be
+    re-synthesised. None: all pixels with E > 0 are."""
+    part: WindowPart | None = None
+    """Set if the view is a window of a larger one."""
+
+    @property
+    def refine_mask(self) -> Bool[Tensor, "height width"]:
+        """Pixels to re-synthesise: those with E > 0 that are not only attenuated."""
+        return self.error > 0 if self.fade is None else (self.error > 0) & (self.fade == 0)
+
+    @property
+    def holes(self) -> Bool[Tensor, "height width"]:
+        """Pixels of the proxy that no source view colours: the paper's E, whatever the error rule."""
+        return (self.mask > 0) & ~(self.weights.sum(0) > 0)  # seven times faster than `any` along an axis
+
+    def closest_views(self, count: int) -> tuple[str, ...]:
+        """Names of up to `count` cameras: the source views, then the closest other candidates."""
+        return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
+
+    def check_cameras(self, known: Sequence[str]) -> None:
+        """ValueError if the view names cameras that are not among these."""
+        unknown = sorted({*self.source_views, *self.candidate_views} - set(known))
+        if unknown:
+            raise ValueError(
+                f"expected a view of cameras among {list(known)}, got {unknown}; correct source_views and "
+                "candidate_views"
+            )
+
+
+@dataclass(frozen=True)
+class CompletedView:
+    """A completed novel view: Fhat = E * Ftilde + (1 - E) * F (section 1).
+
+    Examples:
+        >>> import torch
+        >>> from viewmend import CompletedView, IncompleteView, pinhole
+        >>> camera = pinhole(0.8, 64, 48, torch.eye(4))
+        >>> rgb, ones, weights = torch.zeros(3, 48, 64), torch.ones(48, 64), torch.zeros(1, 48, 64)
+        >>> view = IncompleteView(camera, rgb, ones, ones, 2 * ones, source_views=("left",), weights=weights, time=0)
+        >>> completed = CompletedView(view, rgb + 0.5)
+        >>> torch.equal(completed.opacity, view.mask), list(completed.images)
+        (True, ['rgb'])
+    """
+
+    view: IncompleteView
+    rgb: Float[Tensor, "3 height width"]
+    """Fhat, in [0, 1], on black; equal to `view.rgb` bit for bit where E is 0."""
+    alpha: Float[Tensor, "height width"] | None = None
+    """Coverage of each pixel by the subject, in [0, 1]; `rgb` is multiplied by it. None if the model does not predict
+    it: the subject is M then."""
+    confidence: Float[Tensor, "height width"] | None = None
+    """Confidence of the model in each pixel, in [0, 1]; 0 where there is no subject. None if it predicts none."""
+    depth: Float[Tensor, "height width"] | None = None
+    """Refined z-depth of the subject, metres, 0 where there is none. None if the model predicts none."""
+
+    def check_finite(self, by: str) -> None:
+        """Check that all images contain finite numbers only.
+
+        Raises:
+            ValueError: one does not; the message names the model, `by`.
+        """
+        if not all(bool(image.isfinite().all()) for image in self.images.values()):
+            raise ValueError(f"expected finite colours from {by}, got others; use another model, or train it again")
+
+    @property
+    def opacity(self) -> Float[Tensor, "height width"]:
+        """`alpha`, or M if the model predicts none."""
+        return self.view.mask if self.alpha is None else self.alpha
+
+    @property
+    def surface_depth(self) -> Float[Tensor, "height width"]:
+        """`depth`, or the proxy's if the model predicts none; metres, 0 where there is no subject."""
+        return self.view.depth if self.depth is None else self.depth
+
+    @property
+    def straight_rgb(self) -> Float[Tensor, "3 height width"]:
+        """Fhat divided by `opacity`, in [0, 1]: straight (not premultiplied) colours.
+
+        Pixels of almost no opacity take the colour of their neighbours, so that no dark fringe appears when the image
+        is scaled or compressed; far from the subject the image is black.
+        """
+        opacity = self.opacity[None]
+        near = F.avg_pool2d(torch.cat([self.rgb, opacity])[None], 2 * NEAR_PX + 1, 1, NEAR_PX)[0]
+        tiny = torch.finfo(near.dtype).tiny
+        spread, own = near[:3] / near[3:].clamp(min=tiny), self.rgb / opacity.clamp(min=FAINT)
+        return torch.where(opacity < FAINT, spread, own).clamp(0, 1)
+
+    @property
+    def images(self) -> dict[str, Float[Tensor, "*channel height width"]]:
+        """All images that are not None, by the names of their fields."""
+        found = {name: getattr(self, name) for name in ("rgb", "alpha", "confidence", "depth")}
+        return {name: image for name, image in found.items() if image is not None}

@@ -1,0 +1,1 @@
+"""Files, JSON, logging, plugins and timing."""

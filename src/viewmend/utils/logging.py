@@ -1,0 +1,46 @@
+"""Terminal output that is safe to print: names come from untrusted files and networks."""
+
+import logging
+import sys
+import traceback
+
+
+def printable(text: str) -> str:
+    """Escape everything that is not a printable character, so that no name can move the cursor or hide a line."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def escaped_traceback(error: BaseException) -> str:
+    """Format a traceback with each error message escaped onto a single line."""
+    parts = traceback.TracebackException.from_exception(error)
+    lines = [line for part in parts.format() for line in _escaped(part)]
+    return "\n".join(lines)
+
+
+def log_to_terminal() -> None:
+    """Log warnings and errors of this process to standard error, one line per message.
+
+    Does nothing if the root logger already has a handler.
+    """
+    if not logging.getLogger().handlers:
+        logging.getLogger().addHandler(_Lines(logging.WARNING))
+
+
+class _Lines(logging.Handler):
+    """Writes records to the current standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            text = printable(record.getMessage())
+            if record.exc_info and record.exc_info[1] is not None:
+                text += "\n" + escaped_traceback(record.exc_info[1])
+            print(text, file=sys.stderr, flush=True)
+        except Exception:  # logging must never raise
+            self.handleError(record)
+
+
+def _escaped(part: str) -> list[str]:
+    """Lines of one part of a traceback; an error message becomes one line."""
+    ours = ("File ", "Traceback ", "The above exception ", "During handling ")
+    whole = part.strip("\n")
+    return [printable(line) for line in (whole.split("\n") if whole.lstrip(" |+-").startswith(ours) else [whole])]

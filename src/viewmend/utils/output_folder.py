@@ -1,0 +1,167 @@
+"""Output folders of commands: one run at a time, and only files that earlier runs wrote are ever replaced."""
+
+import contextlib
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+import msgspec
+from filelock import FileLock, Timeout
+
+from viewmend.utils.atomic_writes import defer_signals, remove_partial_files, write_text
+
+HIDDEN = ".viewmend"
+"""Subfolder for the lock, the manifest and unfinished files."""
+
+
+class _Manifest(msgspec.Struct):
+    files: dict[str, list[str]]
+
+
+class OutputFolder:
+    """Context manager: a folder that only this run writes to.
+
+    A manifest lists the files that runs created, with their hashes. A file that is in the way and not listed, or was
+    changed since, belongs to the user: the run refuses to overwrite it. Leftovers of killed runs are removed on entry.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.draft = path / HIDDEN / "draft"
+        """Subfolder for unfinished files; empty on entry, removed on exit."""
+        self._manifest = path / HIDDEN / "files.json"
+        self._lock = FileLock(path / HIDDEN / "lock")
+        self._new = False
+
+    def __enter__(self) -> "OutputFolder":
+        """Create and lock the folder.
+
+        Raises:
+            ValueError: another run is using it, it is a file, or its hidden subfolder is a link or a file.
+            OSError: it cannot be created.
+        """
+        if self.path.exists() and not self.path.is_dir():
+            raise ValueError(f"{self.path}: expected a folder for the results, got a file; choose another --out")
+        if (hidden := self.path / HIDDEN).is_symlink() or (hidden.exists() and not hidden.is_dir()):
+            raise ValueError(f"{hidden}: expected a folder that a run has made, got something else; move it away")
+        self._new = not self.path.exists()
+        (self.path / HIDDEN).mkdir(parents=True, exist_ok=True)
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise ValueError(
+                f"{self.path}: expected a folder that no other run is using, got one in use; wait for that run to "
+                "finish, or choose another folder"
+            ) from None
+        shutil.rmtree(self.draft, ignore_errors=True)
+        remove_partial_files(self.path)
+        self.draft.mkdir()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with defer_signals():
+            self._end()
+
+    def _end(self) -> None:
+        shutil.rmtree(self.draft, ignore_errors=True)
+        # While still locked, so that files of the next run are never removed.
+        if self._new and [entry.name for entry in self.path.iterdir()] == [HIDDEN]:
+            shutil.rmtree(self.path, ignore_errors=True)
+        elif not self._manifest.exists():
+            shutil.rmtree(self.path / HIDDEN, ignore_errors=True)
+        self._lock.release()
+
+    @property
+    def listed(self) -> bool:
+        """Whether the manifest lists any file."""
+        return bool(self._read())
+
+    def check_own_files(self, *patterns: str) -> None:
+        """Check that all files matching these names, or in matching folders, were written by earlier runs.
+
+        Raises:
+            ValueError: one was not, or was changed since.
+        """
+        known = self._read()
+        for file in self._files(patterns):
+            name = file.relative_to(self.path).as_posix()
+            digests = known.get(name, _any(known, name))
+            if digests != [] and (digests is None or _digest(file) not in digests):
+                raise ValueError(
+                    f"{file}: expected no such file, or an unchanged one from an earlier run, got a file of yours; "
+                    "move it away, or choose another folder"
+                )
+
+    def made(self, *patterns: str, changing: bool = False) -> None:
+        """Record files in the manifest, by hash; with `changing`, by pattern only, before they exist.
+
+        A pattern that was recorded as changing is replaced by the hashes of its files when recorded again.
+        """
+        if changing:
+            others = {n: value for n, value in self._read().items() if not any(fnmatch(n, p) for p in patterns)}
+            self._write(others | {pattern: [] for pattern in patterns})
+            return
+        found = {file.relative_to(self.path).as_posix(): [_digest(file)] for file in self._files(patterns)}
+        known = {name: value for name, value in self._read().items() if name not in patterns}
+        kept = {name: value for name, value in known.items() if value == [] or (self.path / name).is_file()}
+        self._write(kept | found)
+
+    def publish(self, *names: str) -> None:
+        """Move these files or folders from the draft to their place, replacing those of earlier runs.
+
+        Raises:
+            ValueError: a file that no run wrote is in the way.
+        """
+        self.check_own_files(*names)
+        known, new = self._read(), {}
+        for file in _below(self.draft, names):
+            new[file.relative_to(self.draft).as_posix()] = [_digest(file)]
+        # If killed in between, the folder holds files of both runs, all of them in the manifest.
+        self._write({name: known.get(name, []) + new.get(name, []) for name in known | new})
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                (self.path / name).rename(self.draft / f"old-{name}")
+            with contextlib.suppress(FileNotFoundError):
+                (self.draft / name).rename(self.path / name)
+        gone = {name for name in known if any(name == n or name.startswith(f"{n}/") for n in names)} - new.keys()
+        self._write({name: value for name, value in (known | new).items() if name not in gone})
+
+    def _files(self, patterns: Iterable[str]) -> Iterator[Path]:
+        for pattern in patterns:
+            for found in sorted(path for path in self.path.glob(pattern) if path.name != HIDDEN):
+                yield from _below(self.path, [found.relative_to(self.path).as_posix()])
+
+    def _read(self) -> dict[str, list[str]]:
+        try:
+            return msgspec.json.decode(self._manifest.read_bytes(), type=_Manifest).files
+        except (OSError, msgspec.MsgspecError, RecursionError):
+            return {}  # no readable manifest: own nothing
+
+    def _write(self, files: dict[str, list[str]]) -> None:
+        text = json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True)
+        write_text(self._manifest, text)
+
+
+def _any(known: dict[str, list[str]], name: str) -> list[str] | None:
+    """An empty list if a pattern of changing files matches the name, else None."""
+    return [] if any(value == [] and fnmatch(name, pattern) for pattern, value in known.items()) else None
+
+
+def _below(root: Path, names: Iterable[str]) -> Iterator[Path]:
+    """Files with these names and files in folders with these names; links are not followed."""
+    for name in names:
+        path = root / name
+        if path.is_dir() and not path.is_symlink():
+            yield from (file for file in sorted(path.rglob("*")) if file.is_symlink() or not file.is_dir())
+        elif path.is_symlink() or path.exists():
+            yield path
+
+
+def _digest(file: Path) -> str:
+    if file.is_symlink() or not file.is_file():
+        return "no file"
+    with file.open("rb") as data:
+        return hashlib.file_digest(data, "sha256").hexdigest()[:32]

@@ -1,0 +1,127 @@
+"""Strict loading of network weights: no code is executed, and every name and shape must match."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from viewmend.utils.untrusted_input import InputError
+
+WRAPPER = "netG"
+"""Checkpoints of a GAN's generator may be {"netG": weights}; all others are the weights themselves."""
+COUNTER = "num_batches_tracked"
+"""Files from before batch norms counted their batches lack these entries, which inference does not need."""
+
+FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+"""Accepted number formats; smaller ones would need scales as well."""
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class WeightsError(InputError):
+    """Weights that cannot be loaded: the file, what was expected, what was found, the next step."""
+
+
+class MissingWeightsError(WeightsError):
+    """Published weights that are not installed: names, hash, the folders searched, where to get them."""
+
+
+class DamagedWeightsError(WeightsError):
+    """An unreadable or truncated file."""
+
+
+class MismatchedWeightsError(WeightsError):
+    """A file that does not hold weights, or holds those of another network."""
+
+
+def load_weights(
+    network: Network,
+    path: str | Path,
+    device: torch.device | str = "cpu",
+    spare: Sequence[str] = (),
+) -> Network:
+    """Load the weights of a file into a network, move it to `device` and set evaluation mode.
+
+    Args:
+        network: modified in place and returned.
+        path: a .safetensors file, or a PyTorch file, read with `weights_only=True`.
+        device: where the network computes.
+        spare: prefixes of additional names that the file may contain.
+
+    Raises:
+        DamagedWeightsError: the file is missing, unreadable or truncated.
+        MismatchedWeightsError: a tensor is missing, unknown, of another shape or dtype, or not finite.
+    """
+    path, weights, own = Path(path), read_weights(path), network.state_dict()
+    weights = {key: value for key, value in weights.items() if key in own or not key.startswith(tuple(spare))}
+    reshaped = [
+        f"{key} {tuple(value.shape)} for {tuple(own[key].shape)}"
+        for key, value in sorted(weights.items())
+        if key in own and value.shape != own[key].shape
+    ]
+    wrong = {
+        "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),
+        "unknown": sorted(weights.keys() - own.keys()),
+        "of another shape": reshaped,
+        "of another kind of number": _of_other_numbers(weights, own),
+        "not finite": sorted(key for key, value in weights.items() if key in own and not _is_finite(value, own[key])),
+    }
+    if any(wrong.values()):
+        counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
+        name = type(network).__name__
+        raise MismatchedWeightsError(
+            f"{path}: expected the {len(own)} tensors of {name}, got {len(weights)}: {counts}; give the weights that "
+            f"belong to {name}"
+        )
+    network.load_state_dict(weights, strict=False)
+    return network.to(device).eval()
+
+
+def _of_other_numbers(weights: dict[str, Tensor], own: dict[str, Tensor]) -> list[str]:
+    kinds = {
+        key: value.dtype in FLOATS if own[key].is_floating_point() else not _has_a_point(value)
+        for key, value in weights.items()
+        if key in own
+    }
+    return sorted(key for key, fits in kinds.items() if not fits)
+
+
+def _has_a_point(value: Tensor) -> bool:
+    return value.is_floating_point() or value.is_complex()
+
+
+def _is_finite(value: Tensor, own: Tensor) -> bool:
+    """Whether the values are finite in the precision of the network's own tensor."""
+    return value.dtype not in FLOATS or bool(value.to(own.dtype).isfinite().all())
+
+
+def read_weights(path: str | Path) -> dict[str, Tensor]:
+    """Read the tensors of a file by name, on the CPU, without a wrapping dictionary.
+
+    Raises:
+        DamagedWeightsError: the file is missing, unreadable or truncated.
+        MismatchedWeightsError: it holds something other than tensors.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DamagedWeightsError(f"{path}: expected a file of weights, found none; check the path")
+    try:
+        found = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+    except Exception as error:  # damaged files raise almost any exception
+        said = f"{type(error).__name__}: {' '.join(str(error).split()).split('. ')[0][:120]}"
+        raise DamagedWeightsError(
+            f"{path}: expected a whole file of tensors alone, got {path.stat().st_size} bytes that do not read "
+            f"({said}); get the file again"
+        ) from error
+    if isinstance(found, dict) and isinstance(found.get(WRAPPER), dict):
+        found = found[WRAPPER]
+    if not isinstance(found, dict) or not all(isinstance(k, str) and isinstance(v, Tensor) for k, v in found.items()):
+        kind = f"a dictionary of {list(found)[:4]}" if isinstance(found, dict) else type(found).__name__
+        raise MismatchedWeightsError(
+            f"{path}: expected a dictionary of tensors, plain or under '{WRAPPER}', got {kind}; give the "
+            "network's weights"
+        )
+    return found

@@ -1,0 +1,89 @@
+"""Baselines by name: what each name runs, with which weights, and never with random ones."""
+
+import os
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from viewmend.contrib.baselines.dstt import DSTT
+from viewmend.contrib.baselines.e2fgvi import E2FGVIHQ
+from viewmend.contrib.baselines.online import OnlineInpainter
+from viewmend.contrib.baselines.published import NETWORKS, make_baseline
+from viewmend.contrib.baselines.riftcast import RiftCast
+from viewmend.metrics.weights import FOLDERS_VARIABLE
+from viewmend.models.registry import MethodMissing, make_method
+from viewmend.utils.weight_files import MissingWeightsError, WeightsError
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """A folder with DSTT's weights, its authors' and ours, and E2FGVI-HQ's."""
+    folder = tmp_path_factory.mktemp("weights")
+    (folder / "finetuned" / "dstt").mkdir(parents=True)
+    torch.manual_seed(0)
+    torch.save({"netG": DSTT().state_dict()}, folder / "DSTT.pth")
+    torch.save(E2FGVIHQ().state_dict(), folder / "E2FGVI-HQ-CVPR22.pth")
+    save_file(DSTT().state_dict(), folder / "finetuned" / "dstt" / "model.safetensors")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def places(weights, tmp_path, monkeypatch):
+    monkeypatch.setenv(FOLDERS_VARIABLE, os.pathsep.join([str(tmp_path), str(weights)]))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+
+
+@pytest.mark.parametrize("variant", ["o", "om"])
+@pytest.mark.parametrize("framing", ["def", "win", "mul"])
+def test_a_name_says_how_a_network_is_run(variant, framing):
+    inpainter = make_baseline(f"dstt-{variant}-{framing}")
+    assert isinstance(inpainter, OnlineInpainter) and isinstance(inpainter.network, DSTT)
+    assert inpainter.config.framing == framing and inpainter.config.memory == (variant == "om")
+    assert inpainter.config.sampling.grid == "absolute" and inpainter.config.size_px == (240, 432)
+
+
+def test_names_say_which_weights(weights):
+    official = torch.load(weights / "DSTT.pth", weights_only=True)["netG"]["encoder.0.weight"]
+    tuned, relative = make_baseline("dstt-o-win-finetuned"), make_baseline("dstt-om-mul-relative-finetuned")
+    for inpainter in (tuned, relative):
+        assert not torch.equal(inpainter.network.encoder[0].weight, official)
+    assert relative.config.sampling.grid == "relative"
+    for name in ("dstt-o-def", f"dstt-o-def@{weights / 'DSTT.pth'}"):
+        assert torch.equal(make_baseline(name).network.encoder[0].weight, official)
+    by_folder = make_baseline(f"dstt-o-def@{weights / 'finetuned' / 'dstt'}")
+    assert torch.equal(by_folder.network.encoder[0].weight, tuned.network.encoder[0].weight)
+    assert isinstance(make_baseline("e2fgvi-hq-om-win").network, E2FGVIHQ)
+
+
+def test_riftcast_is_dstt_right_and_as_published():
+    right, published = make_baseline("riftcast"), make_baseline("riftcast-published")
+    assert isinstance(right, RiftCast) and isinstance(published, RiftCast)
+    assert (right.as_published, published.as_published) == (False, True)
+
+
+@pytest.mark.parametrize("name", ["fuseformer-o-def", "e2fgvi-om-mul-relative", "e2fgvi-hq-o-win-finetuned"])
+def test_without_weights_nothing_is_made(name, tmp_path):
+    with pytest.raises(MissingWeightsError, match="found none; get it from") as said:
+        make_baseline(name)
+    assert str(tmp_path) in str(said.value)
+
+
+def test_another_networks_weights_are_refused(weights):
+    with pytest.raises(WeightsError, match="the 243 tensors of E2FGVI, got 244"):
+        make_baseline(f"e2fgvi-o-def@{weights / 'E2FGVI-HQ-CVPR22.pth'}")
+    with pytest.raises(WeightsError, match="found none; check the path"):
+        make_baseline(f"dstt-o-def@{weights / 'absent'}")
+
+
+@pytest.mark.parametrize("name", ["dstt", "dstt-o", "dstt-x-def", "dstt-o-all", "sttn-o-def", "dstt-o-def@", "telea"])
+def test_other_names_are_none(name):
+    with pytest.raises(ValueError, match="expected a name like dstt-o-def"):
+        make_baseline(name)
+
+
+@pytest.mark.parametrize("network", sorted(set(NETWORKS) - {"dstt"}))
+def test_every_network_is_reached_through_the_registry(network):
+    with pytest.raises(MethodMissing, match="found none; get it from"):
+        make_method(f"{network}-om-mul-relative-finetuned")

@@ -1,0 +1,224 @@
+"""RGVI: what the past saw is pulled into the holes along flow; the rest is filled; nothing else changes."""
+
+import sys
+from dataclasses import replace
+from importlib.machinery import ModuleSpec
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import avg_pool2d
+
+from viewmend.contrib.baselines.diffusion_fill import find_diffusion
+from viewmend.contrib.baselines.raft import Raft
+from viewmend.contrib.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, make_rgvi
+from viewmend.contrib.baselines.rgvi_flow import dis_flow, disagreeing, pull
+from viewmend.geometry.cameras import Cameras
+from viewmend.metrics import weights
+from viewmend.metrics.weights import KnownWeights
+from viewmend.models.base import ContextProvider, Inpainter
+from viewmend.types import IncompleteView
+from viewmend.utils.weight_files import WeightsError
+
+SIZE = 96
+MOTION = (3, 2)
+"""Of the picture from one time to the next, pixels right and down."""
+
+
+@pytest.fixture
+def texture(rng):
+    """A smooth picture, larger than the views of it."""
+    return avg_pool2d(torch.rand(1, 3, SIZE + 109, SIZE + 109, generator=rng), 9, 1)[0] * 4 % 1
+
+
+def at(texture, time):
+    """The moving picture at a time."""
+    x, y = 60 - MOTION[0] * time, 60 - MOTION[1] * time
+    return texture[:, y : y + SIZE, x : x + SIZE]
+
+
+def view(truth, time, hole=(slice(30, 50), slice(40, 60))):
+    error = torch.zeros(SIZE, SIZE)
+    error[hole] = 1
+    camera = Cameras(("c",), torch.eye(3)[None], torch.eye(4)[None], torch.tensor([[SIZE, SIZE]]))
+    ones = torch.ones(SIZE, SIZE)
+    return IncompleteView(camera, truth * (error == 0), ones, error, ones, (), torch.zeros(0, SIZE, SIZE), time)
+
+
+def constant(x, y):
+    return torch.tensor([float(x), float(y)])[:, None, None].expand(2, SIZE, SIZE)
+
+
+def known_flow(image, other):
+    """To the time before, or the one after: whichever explains the picture."""
+    ways = [constant(-MOTION[0], -MOTION[1]), constant(*MOTION)]
+    return min(ways, key=lambda way: float((pull(other, way)[0] - image)[:, 60:-20, 20:-20].abs().mean()))
+
+
+@ContextProvider
+def no_context(time, names):
+    raise AssertionError("RGVI knows no cameras")
+
+
+def stream(inpainter, texture, times, hole=(slice(30, 50), slice(40, 60)), shown=True):
+    state = inpainter.initial_state()
+    for time in range(times):
+        completed, state = inpainter.step(view(at(texture, time), time, hole), no_context, state)
+        if shown:
+            state = inpainter.reveal_truth(state, at(texture, time))
+    return completed, state
+
+
+def in_hole(completed, truth):
+    return float((completed.rgb - truth)[:, completed.view.error > 0].abs().mean())
+
+
+def test_it_is_an_inpainter_that_sees_the_truth():
+    assert isinstance(Rgvi(), Inpainter)
+
+
+def test_dis_flow_points_to_where_the_pixel_was(texture):
+    flow = dis_flow(at(texture, 1), at(texture, 0))[:, 20:-20, 20:-20]
+    assert (flow.flatten(1).median(1).values + torch.tensor(MOTION).float()).abs().max() < 0.5
+
+
+def test_pulling_moves_and_knows_its_borders(texture):
+    pulled, inside = pull(at(texture, 0), constant(-MOTION[0], -MOTION[1]))
+    torch.testing.assert_close(pulled[:, inside], at(texture, 1)[:, inside], rtol=0, atol=1e-5)
+    assert not inside[: MOTION[1]].any() and not inside[:, : MOTION[0]].any()
+    assert inside[MOTION[1] :, MOTION[0] :].all()
+
+
+def test_flow_that_does_not_lead_home_disagrees():
+    right = constant(3, 2)
+    assert not disagreeing(right, -right)[:-2, :-3].any()
+    assert disagreeing(right, -right)[-2:].all() and disagreeing(right, -right)[:, -3:].all()  # out of the picture
+    assert disagreeing(right, right).all() and not disagreeing(right, -right + 0.4)[:-2, :-3].any()
+    wrong = right.clone()
+    wrong[:, 10, 20] = 9
+    assert (disagreeing(wrong, -right) & ~disagreeing(right, -right)).nonzero().tolist() == [[10, 20]]
+
+
+def test_a_hole_takes_what_was_there_before(texture):
+    exact, _ = stream(Rgvi(RgviParts(flow=known_flow)), texture, 3)
+    assert in_hole(exact, at(texture, 2)) < 1e-5
+    first, _ = stream(Rgvi(), texture, 1)
+    later, _ = stream(Rgvi(), texture, 3)
+    assert in_hole(later, at(texture, 2)) < 0.4 * in_hole(first, at(texture, 0))
+    kept = later.view.error == 0
+    assert torch.equal(later.rgb[:, kept], later.view.rgb[:, kept])
+
+
+def test_flow_adds_up_over_several_frames(texture):
+    """A hole at the border, through which the picture comes in: only what was in sight before can be pulled."""
+    parts = RgviParts(flow=known_flow, reference=lambda image, missing, subject: torch.where(missing, 0.0, image))
+    completed, _ = stream(Rgvi(parts), texture, 3, (slice(0, 20), slice(0, 20)))
+    truth = at(texture, 2)
+    seen = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    seen[MOTION[1] : 20, MOTION[0] : 20] = True
+    torch.testing.assert_close(completed.rgb[:, seen], truth[:, seen], rtol=0, atol=1e-5)
+    corner = completed.view.error.bool() & ~seen
+    assert not completed.rgb[:, corner].any()
+
+    away = replace(parts, flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow)
+    lost, _ = stream(Rgvi(away), texture, 3)
+    assert not lost.rgb[:, lost.view.error > 0].any()
+
+
+def test_the_reference_frame_is_the_newest_and_the_rest_is_what_it_leaves(texture):
+    away = RgviParts(flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow)
+    asked = []
+
+    def half(image, missing, subject):
+        asked.append(int(missing.sum()))
+        above = torch.arange(SIZE)[:, None] < SIZE // 2
+        return torch.where(missing & above, 0.25, torch.where(missing, torch.nan, image))
+
+    def rest(image, missing, subject):
+        assert not image.isnan().any()
+        return torch.where(missing, 0.75, image)
+
+    completed, _ = stream(Rgvi(replace(away, reference=half, rest=rest)), texture, 3)
+    hole = completed.view.error > 0
+    assert asked == [int(hole.sum())] * 3
+    assert set(completed.rgb[:, hole].unique().tolist()) <= {0.25, 0.75}
+
+
+def test_the_past_is_bounded_and_its_own_where_nobody_shows_the_truth(texture):
+    _, state = stream(Rgvi(RgviParts(flow=known_flow)), texture, PAST_FRAMES + 4)
+    assert isinstance(state, RgviState)
+    assert (len(state.past), len(state.flows)) == (PAST_FRAMES, PAST_FRAMES - 1)
+    assert torch.equal(state.past[0], at(texture, PAST_FRAMES + 3))
+    completed, state = stream(Rgvi(), texture, 2, shown=False)
+    assert isinstance(state, RgviState) and torch.equal(state.past[0], completed.rgb)
+
+
+def test_a_view_of_another_size_starts_anew(texture):
+    _, state = stream(Rgvi(), texture, 2)
+    small = view(at(texture, 2), 2)
+    rgb, weights = small.rgb[:, :64], small.weights[:, :64]
+    part = IncompleteView(small.camera, rgb, small.mask[:64], small.error[:64], small.depth[:64], (), weights, 2)
+    completed, state = Rgvi().step(part, no_context, state)
+    assert isinstance(state, RgviState) and len(state.past) == 1 and completed.rgb.shape == (3, 64, SIZE)
+
+
+def test_without_holes_it_leaves_the_view_alone(texture):
+    completed, _ = stream(Rgvi(), texture, 2, (slice(0, 0), slice(0, 0)))
+    assert torch.equal(completed.rgb, at(texture, 1))
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    for name in ("VIEWMEND_WEIGHTS", "XDG_CACHE_HOME", "TORCH_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    return tmp_path
+
+
+def test_parts_are_what_is_there(places, monkeypatch):
+    assert make_rgvi().parts == RgviParts()
+    (places / "raft.pth").write_bytes(b"none")
+    with pytest.raises(WeightsError, match="damaged or another"):
+        make_rgvi()
+    network, loaded = Raft(), KnownWeights("raft", ("raft.pth",), "RAFT", "s", "l")
+    torch.save(network.state_dict(), places / "raft.pth")
+    monkeypatch.setattr(weights, "KNOWN", (loaded,))
+    parts = make_rgvi().parts
+    assert isinstance(parts.flow, Raft) and torch.equal(
+        parts.flow.state_dict()["mask_predictor.conv.bias"], network.mask_predictor.conv.bias
+    )
+
+
+def test_diffusion_makes_the_reference_where_it_is_installed(places, monkeypatch, texture):
+    """Called through a stand-in: what `diffusers` is given, and that nothing but the hole is taken from it."""
+    given = {}
+
+    class Pipeline:
+        @classmethod
+        def from_pretrained(cls, folder, **how):
+            given.update(folder=folder, **how)
+            return cls()
+
+        def to(self, device):
+            return self
+
+        def __call__(self, **how):
+            given.update(how)
+            return SimpleNamespace(images=[np.full((how["height"], how["width"], 3), 0.25, np.float32)])
+
+    module = ModuleType("diffusers")
+    module.StableDiffusionInpaintPipeline = Pipeline
+    module.__spec__ = ModuleSpec("diffusers", None)
+    monkeypatch.setitem(sys.modules, "diffusers", module)
+    assert find_diffusion() is None
+    folder = places / "stable-diffusion-2-inpainting"
+    folder.mkdir()
+    (folder / "model_index.json").touch()
+    completed, _ = stream(Rgvi(RgviParts(reference=find_diffusion())), texture, 1)
+    hole = completed.view.error > 0
+    assert (completed.rgb[:, hole] - 0.25).abs().max() < 1e-6
+    assert torch.equal(completed.rgb[:, ~hole], completed.view.rgb[:, ~hole])
+    assert given["folder"] == folder and given["local_files_only"] and given["use_safetensors"]
+    assert given["image"].shape == (1, 3, SIZE, SIZE) and given["mask_image"].sum() == 400
+    later, _ = stream(Rgvi(RgviParts(flow=known_flow, reference=find_diffusion())), texture, 2)
+    assert in_hole(later, at(texture, 1)) < 1e-5

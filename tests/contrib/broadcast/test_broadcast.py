@@ -1,0 +1,362 @@
+"""One viewer controls the broadcast view, all watchers get the same video, and it is made only while it is watched."""
+
+import threading
+import urllib.error
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from io import BytesIO
+
+import numpy as np
+import pytest
+import torch
+from live.live_servers import PIPELINE, WAIT_S, FakeClock, running, wait_until
+from reference.ball import ring
+
+from viewmend.contrib.broadcast import broadcast as broadcast_module
+from viewmend.contrib.broadcast.broadcast import (
+    Broadcast,
+    BroadcastSession,
+    add_query,
+    broadcast_extension,
+    centred_camera,
+    choose_fps,
+)
+from viewmend.contrib.broadcast.hls_segmenter import PLAYLIST, FilmSegments
+from viewmend.live.client import Client
+from viewmend.live.frame_source import Span
+from viewmend.live.poses import home_view, view_camera
+from viewmend.live.protocol import Camera, Look, OnAir
+from viewmend.live.push import LiveSource
+from viewmend.live.renderer import Renderer, RenderResult
+from viewmend.live.server import ServerConfig
+from viewmend.live.service import RenderService
+from viewmend.live.sessions import PlaybackState, ViewerSession
+from viewmend.live.video import video_codecs
+from viewmend.models.base import State
+from viewmend.models.smooth_fill import SmoothFill
+from viewmend.utils.timing import StageTimes
+
+av = pytest.importorskip("av")
+pytestmark = pytest.mark.skipif("h264" not in video_codecs(), reason="PyAV has no x264 here")
+RED, GREEN, BLUE = "c80000", "00c800", "0000c8"
+SIZE = (96, 64)
+HOME = home_view(ring(4), torch.zeros(3), None)
+
+
+def broadcasting(size=SIZE, **options):
+    """A server with a broadcast of this size."""
+    return running(extensions=(partial(Broadcast, size_px=size),), **options)
+
+
+@pytest.fixture(scope="module")
+def on_air():
+    with broadcasting() as server:
+        yield server
+
+
+def get(url, path, token=None):
+    asked = urllib.request.Request(f"{url}{path}", headers={"Authorization": f"Bearer {token}"} if token else {})
+    with urllib.request.urlopen(asked, timeout=WAIT_S) as answer:
+        return answer.headers, answer.read()
+
+
+def refused(url, path, token=None):
+    with pytest.raises(urllib.error.HTTPError) as error:
+        get(url, path, token)
+    return error.value.code, error.value.read().decode()
+
+
+def playlist(server):
+    return get(server.url, "/broadcast/live.m3u8")[1].decode()
+
+
+def last_image(server):
+    """The last image of the last segment."""
+    last = playlist(server).split()[-1]
+    data = b"".join(get(server.url, f"/broadcast/{name}")[1] for name in ("init.mp4", last))
+    with av.open(BytesIO(data)) as container:
+        return list(container.decode(video=0))[-1].to_ndarray(format="rgb24")
+
+
+def wait_for_background(server, colour):
+    """Wait until the broadcast view has this background."""
+    rgb = np.array(list(bytes.fromhex(colour)))
+    wait_until(lambda: np.abs(last_image(server)[:4, :4].mean((0, 1)) - rgb).max() < 25)
+
+
+def wait_for_state(viewer, **expected):
+    """Wait for a state with these values."""
+    while any(viewer.wait_for("state").get(key) != value for key, value in expected.items()):
+        pass
+
+
+def test_the_viewer_on_air_controls_the_broadcast_view(on_air):
+    with Client(on_air.ws) as first, Client(on_air.ws) as second:
+        assert first.messages["welcome"]["broadcast"] is True
+        first.frame(first.look(width=48, height=48, background=RED))
+        second.frame(second.look(width=48, height=48, background=GREEN))
+        first.on_air()  # with the look that it has already
+        wait_for_state(first, on_air=True)
+        wait_for_state(second, on_air=False)
+        wait_for_background(on_air, RED)
+        assert last_image(on_air).shape == (*SIZE[::-1], 3)
+        wait_for_state(first, watched=True)
+        first.look(width=48, height=48, background=BLUE)
+        wait_for_background(on_air, BLUE)
+        second.on_air()
+        wait_for_state(first, on_air=False)
+        wait_for_background(on_air, GREEN)
+        first.frame(first.look(width=48, height=48, background=RED))
+        second.look(width=48, height=48, background=GREEN, moving=True)
+        second.on_air(False)
+        wait_for_state(second, on_air=False)
+        (extension,) = on_air.live.extensions
+        assert extension.session.newest_look.moving is False
+    wait_for_background(on_air, GREEN)  # the last view stays after its viewer has left
+
+
+def test_a_viewer_that_reconnects_is_on_air_again(on_air):
+    with Client(on_air.ws, again_s=WAIT_S) as viewer:
+        viewer.frame(viewer.look(width=48, height=48))
+        viewer.on_air()
+        wait_for_state(viewer, on_air=True)
+        for connection in list(on_air.connections):
+            connection.get_extra_info("socket").shutdown(2)
+        while viewer.connections < 2:
+            viewer.frame()
+        wait_for_state(viewer, on_air=True)
+
+
+def test_all_watchers_get_the_same_bytes(on_air):
+    playlist(on_air)
+
+    def watch(_):
+        files = {}
+        while len(files) < 4:
+            names = [line for line in playlist(on_air).split() if line[0] != "#"]
+            files |= {name: get(on_air.url, f"/broadcast/{name}")[1] for name in names if name not in files}
+        return files
+
+    with ThreadPoolExecutor(6) as watchers:
+        videos = list(watchers.map(watch, range(6)))
+    assert len({data for video in videos for data in video.values()}) == len(
+        {name for video in videos for name in video}
+    )
+    assert len(on_air.service._sessions) == 1, "one view is rendered for all"
+
+
+def test_http_headers_metrics_and_missing_files(on_air):
+    headers, content = get(on_air.url, "/broadcast/live.m3u8")
+    assert headers["content-type"] == "application/vnd.apple.mpegurl" and headers["cache-control"] == "max-age=1"
+    headers, segment = get(on_air.url, f"/broadcast/{content.decode().split()[-1]}")
+    assert headers["content-type"] == "video/mp4" and headers["cache-control"] == "max-age=60" and segment
+    assert refused(on_air.url, "/broadcast/1.m4s")[0] == 404
+    assert refused(on_air.url, "/broadcast/..%2Fserver.py")[0] == 404
+    _, metrics = get(on_air.url, "/metrics")
+    lines = dict(line.rsplit(" ", 1) for line in metrics.decode().splitlines() if not line.startswith("#"))
+    assert lines["viewmend_broadcast_watched"] == "1"
+    assert float(lines['viewmend_broadcast_files_total{kind="segments"}']) >= 1
+    assert float(lines["viewmend_broadcast_bytes_total"]) > len(segment)
+    assert b"watch.js" in get(on_air.url, "/watch")[1]
+
+
+def encoders():
+    return [thread for thread in threading.enumerate() if thread.name == "broadcast"]
+
+
+def test_nothing_is_rendered_or_encoded_while_nothing_is_watched():
+    others = encoders()
+    with broadcasting(size=(64, 48)) as server:
+        (extension,) = server.live.extensions
+        assert extension._thread is None and server.service.counts["frames"] == 0
+        first = playlist(server).split()[-1]
+        assert extension._thread.is_alive() and len(server.service._sessions) == 1
+        extension._requested_at -= broadcast_module.UNWATCHED_S
+        wait_until(lambda: not extension._thread.is_alive())
+        assert not server.service._sessions and extension.session.image is None
+        assert refused(server.url, f"/broadcast/{first}")[0] == 404
+        again = playlist(server)  # a new video, whose segments are numbered on
+        assert "#EXT-X-DISCONTINUITY" in again and int(again.split()[-1].removesuffix(".m4s")) > int(first[:-4])
+    wait_until(lambda: set(encoders()) <= set(others))
+
+
+def idle_service(clock=None):
+    """A service whose threads are not started."""
+    source = LiveSource()
+    return RenderService(Renderer(source, SmoothFill(), PIPELINE), source, clock or FakeClock())
+
+
+def playback(clock):
+    return PlaybackState(Span(0, 1, 1), 0.0, HOME, lambda index: True, 1)
+
+
+def test_an_image_that_is_rendered_while_the_video_ends_is_dropped(ball_view):
+    """Otherwise the next video would begin with it."""
+    service = idle_service()
+    session = BroadcastSession(service, SIZE, None)
+    result = RenderResult(0, (ball_view,), State(), StageTimes())
+    session.open()
+    request = session.next_request(service.now(), playback(service.now))
+    session.deliver(request, result)
+    assert session.image is not None
+    session.close()
+    session.deliver(request, result)  # was begun before
+    assert session.image is None
+    session.open()
+    assert session.image is None
+    session.deliver(request, result)
+    assert session.image is not None
+
+
+def test_the_playlist_is_watched_for_some_seconds():
+    clock = FakeClock()
+    made = Broadcast(idle_service(clock), ServerConfig(budget_ms=None), SIZE)
+    assert not made.is_watched
+    made._requested_at = clock()
+    assert made.is_watched
+    clock.advance(broadcast_module.UNWATCHED_S)
+    assert not made.is_watched
+
+
+def test_only_the_looks_of_the_viewer_on_air_are_shown():
+    service = idle_service()
+    made = Broadcast(service, ServerConfig(budget_ms=None), SIZE)
+    viewers = [ViewerSession(lambda _: None, lambda _: None, None, now=service.now) for _ in range(2)]
+
+    def look(viewer, colour):
+        viewer.look(Look(background=colour))
+        made.handle(viewer, viewer.newest_look)
+
+    look(viewers[0], RED)
+    assert made.session.newest_look is None
+    assert made.handle(viewers[0], OnAir(True)) and made.session.newest_look.background == RED
+    look(viewers[1], GREEN)
+    assert made.session.newest_look.background == RED
+    assert made.handle(viewers[1], OnAir(True)) and made.session.newest_look.background == GREEN
+    assert [made.state_json(viewer)["on_air"] for viewer in viewers] == [False, True]
+    made.leave(viewers[0])
+    made.handle(viewers[1], OnAir(False))
+    look(viewers[1], BLUE)
+    assert made.session.newest_look.background == GREEN, "the last view stays"
+
+
+def test_a_failing_encoder_is_started_again(monkeypatch, caplog):
+    add, failures = FilmSegments.add, []
+
+    def fail_once(self, image, index):
+        if index >= 4 and not failures and self._size_px == (64, 48):
+            failures.append(index)
+            raise RuntimeError("no more")
+        add(self, image, index)
+
+    monkeypatch.setattr(FilmSegments, "add", fail_once)
+    with broadcasting(size=(64, 48)) as server, Client(server.ws) as viewer:
+        assert playlist(server).startswith("#EXTM3U")
+        assert failures and "while encoding the broadcast" in caplog.text
+        assert viewer.frame(viewer.look(width=48, height=48)).header["width"] == 48
+
+
+def test_a_slow_encoder_leaves_frames_out(monkeypatch):
+    clock, frames = FakeClock(), []
+    made = Broadcast(idle_service(clock), ServerConfig(budget_ms=None), SIZE)
+    made._requested_at = clock()
+
+    class SlowSegments:
+        def __init__(self, size_px, fps):
+            self.start_s = clock()
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *exception):
+            pass
+
+        def add(self, image, index):
+            frames.append((index, clock() - self.start_s))
+            clock.advance(0.25)
+            if len(frames) == 12:
+                made._stopped.set()
+
+    monkeypatch.setattr(broadcast_module, "FilmSegments", SlowSegments)
+    monkeypatch.setattr(made._stopped, "wait", clock.advance)
+    made.session._image = np.zeros((64, 96, 3), np.uint8)
+    made._encode(10)
+    assert [index for index, _ in frames] == sorted({index for index, _ in frames})
+    assert all(-1e-6 <= shown_s - index / 10 < 0.1 for index, shown_s in frames), "in step with time"
+    assert frames[-1][0] >= 30, "of every three frames, two are left out"
+
+
+def test_a_video_that_does_not_begin_is_an_error(monkeypatch):
+    monkeypatch.setattr(broadcast_module, "FIRST_S", 0.5)
+    monkeypatch.setattr(FilmSegments, "add", lambda self, image, index: None)
+    with broadcasting(size=(64, 48)) as server:
+        code, text = refused(server.url, "/broadcast/live.m3u8")
+        assert code == 503 and "did not begin in time" in text
+
+
+def test_a_server_without_a_broadcast(ball):
+    assert refused(ball.url, "/broadcast/live.m3u8")[0] == 404
+    with Client(ball.ws) as viewer:
+        assert viewer.messages["welcome"]["broadcast"] is False
+        viewer.on_air()
+        assert "--broadcast" in viewer.wait_for("error")["message"]
+        assert "on_air" not in viewer.wait_for("state")
+
+
+def test_of_two_compared_modes_the_first_is_on_air():
+    service = idle_service()
+    session = BroadcastSession(service, SIZE, None)
+    session.look(Look(modes=("rendered", "mended"), moving=True, depth=True, scale=0.5))
+    request = session.next_request(service.now(), playback(service.now))
+    assert session.newest_look.modes == ("rendered",) and not request.quality.mend
+    assert tuple(request.cameras[0].size_px[0].tolist()) == SIZE
+
+
+def test_the_token_is_added_to_all_names_in_the_playlist():
+    token = "0123456789abcdef&="
+    with broadcasting(token=token) as server:
+        assert refused(server.url, "/broadcast/live.m3u8")[0] == 401
+        plain = get(server.url, "/broadcast/live.m3u8", token)[1].decode()
+        assert token not in plain and "?" not in plain
+        with av.open(f"{server.url}/broadcast/live.m3u8?token=0123456789abcdef%26%3D", timeout=WAIT_S) as container:
+            assert next(container.decode(video=0)).width == SIZE[0]
+    text = b'#EXTM3U\n#EXT-X-MAP:URI="init.mp4"\n#EXTINF:1.0,\n7.m4s\n#EXTINF:1.0,\n8.m4s\n'
+    expected = b'#EXTM3U\n#EXT-X-MAP:URI="init.mp4?token=a"\n#EXTINF:1.0,\n7.m4s?token=a\n#EXTINF:1.0,\n8.m4s?token=a\n'
+    assert add_query(text, "?token=a") == expected and add_query(text, "") == text
+
+
+def test_the_video_has_the_viewers_vertical_field_of_view():
+    camera = Camera(azimuth=20.0, fx=90.0, fy=100.0, cx=20.0, cy=70.0)
+    seen = view_camera(camera, HOME, (160, 120))
+    shown = view_camera(centred_camera(Look(camera=camera, width=160, height=120)), HOME, SIZE)
+    assert float(shown.K[0, 1, 1]) / SIZE[1] == pytest.approx(float(seen.K[0, 1, 1]) / 120, rel=1e-5)
+    assert shown.K[0, :2, 2].tolist() == [SIZE[0] / 2, SIZE[1] / 2]
+    assert shown.camera_from_world[0].tolist() == seen.camera_from_world[0].tolist()
+    assert centred_camera(Look(camera=Camera(azimuth=20.0, fov_y=33.0))).fov_y == 33.0
+    assert centred_camera(Look(eyes=(Camera(azimuth=1.0), Camera(azimuth=2.0)))).azimuth == 1.0
+
+
+@pytest.mark.parametrize(("source", "video"), [(0.0, 10), (1.0, 5), (14.985, 15), (25.0, 25), (240.0, 30)])
+def test_the_frame_rate_is_the_sources_within_bounds(source, video):
+    assert choose_fps(source) == video
+
+
+@pytest.mark.parametrize(("text", "words"), [("1280", "WIDTHxHEIGHT"), ("1280x719", "even"), ("4096x4096", "2048")])
+def test_invalid_sizes_are_refused(text, words):
+    with pytest.raises(ValueError, match=words):
+        broadcast_extension(text)
+    assert broadcast_extension("96x64").keywords == {"size_px": (96, 64)}
+
+
+def test_a_request_for_the_playlist_starts_one_encoder(monkeypatch):
+    started = []
+    monkeypatch.setattr(Broadcast, "_run", lambda self: started.append(self._stopped.wait(WAIT_S)))
+    made = Broadcast(idle_service(), ServerConfig(budget_ms=None), SIZE)
+    assert made.file("init.mp4") is None and made._thread is None
+    for _ in range(3):
+        assert made.file(PLAYLIST) is None
+    thread = made._thread
+    made._stopped.set()
+    thread.join()
+    assert started == [True] and made.file(PLAYLIST) is None and made._thread is thread, "stopped for good"

@@ -1,0 +1,116 @@
+"""`rig.toml`: what it says, and each mistake in one line."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reference.ball_rig import rig_text
+
+from viewmend.contrib.live_rig.rig_file import read_rig
+from viewmend.contrib.live_rig.worker import mask_maker
+from viewmend.data.errors import CaptureError
+
+NAMES = ("left", "right")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A calibration of two cameras, without any image."""
+    camera = {"width": 640, "height": 480, "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "dist": [0.1, 0, 0, 0, 0]}
+    camera |= {"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [0, 0, 2], "image": "{frame}.png"}
+    cameras = [camera | {"name": name} for name in NAMES]
+    rig = {"format": "plain-capture/1", "first_pixel_center": [0.5, 0.5], "up": [0, -2, 0], "frames": ["0"]}
+    (tmp_path / "take").mkdir()
+    (tmp_path / "take/cameras.json").write_text(json.dumps(rig | {"cameras": cameras}))
+    return tmp_path
+
+
+def read(folder: Path, text: str, longest_px: int | None = None):
+    (folder / "rig.toml").write_text(text)
+    return read_rig(folder / "rig.toml", longest_px)
+
+
+def test_a_rig_is_read(folder):
+    text = """
+        calibration = "take"
+        fps = 30
+        wait_ms = 100
+        [mask]
+        method = "person"
+        [[cameras]]
+        name = "right"
+        url = "/dev/video2"
+        options = {video_size = "640x480"}
+        offset_ms = -20
+        [[cameras]]
+        name = "left"
+        url = "rtsp://10.0.0.7/stream"
+        clock = "arrival"
+    """
+    rig = read(folder, text)
+    right, left = rig.cameras
+    assert (rig.name, rig.fps, rig.wait_s, rig.up.tolist()) == (folder.name, 30, 0.1, [0, -1, 0])
+    assert rig.tolerance_s == pytest.approx(1 / 60)
+    assert (right.name, right.url, right.format, right.offset_s) == ("right", "/dev/video2", "v4l2", -0.02)
+    assert (left.url, left.format, left.clock, left.is_file) == ("rtsp://10.0.0.7/stream", None, "arrival", False)
+    assert not left.calibration.dist[1:].any() and left.calibration.dist[0] == 0.1
+
+
+def test_files_lie_beside_the_rig_and_pictures_are_made_smaller(folder):
+    rig = read(folder, rig_text(NAMES), longest_px=320)
+    camera = rig.cameras[0]
+    assert camera.url == str(folder / "take/video/left.mp4") and camera.is_file
+    assert camera.plate == folder / "plates/left.png"
+    assert camera.taken_px == (640, 480) and (camera.calibration.width, camera.calibration.height) == (320, 240)
+    assert np.allclose(camera.calibration.K, [[250, 0, 160], [0, 250, 120], [0, 0, 1]])
+
+
+def test_the_calibration_may_be_named_by_its_file(folder):
+    rig = read(folder, rig_text(NAMES, calibration='"take/cameras.json"'))
+    assert len(rig.cameras) == 2
+
+
+ONE = '[[cameras]]\nname = "left"\nurl = "a.mp4"\n'
+HEAD = 'calibration = "take"\n[mask]\nmethod = "plate"\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("calibration = take", "Invalid value"),
+        ("\xff", "rig.toml: "),
+        (rig_text(NAMES, calibration=None), "calibration: expected a value, got nothing; add the key"),
+        (rig_text(NAMES, fps="0"), "fps: "),
+        (rig_text(NAMES, fps='"15"'), 'fps: expected a number, got "15"'),
+        (rig_text(NAMES, calibratoin='"x"'), "got 'calibratoin'"),
+        (HEAD + ONE, "cameras: expected a list of length >= 2"),
+        (HEAD + ONE + ONE, "expected different names, got ['left'] more than once"),
+        (HEAD + ONE + ONE.replace("left", "middle"), "cameras that"),
+        (HEAD + ONE + ONE.replace("left", "right").replace("a.mp4", "ftp://x/y"), "expected a url of rtsp"),
+        (HEAD + ONE + ONE.replace("left", "right") + "options = {a = 1}", "options: expected a text, got "),
+        (HEAD.replace("plate", "magic") + ONE + ONE.replace("left", "right"), "mask: method: expected person or plate"),
+        (HEAD + 'plates = "all.png"\n' + ONE + ONE.replace("left", "right"), "a path with {camera} in it"),
+        (rig_text(NAMES, calibration='"nowhere"'), "there is no such folder; check the path"),
+    ],
+)
+def test_each_mistake_is_one_line(folder, text, said):
+    with pytest.raises(CaptureError) as error:
+        read(folder, text)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_missing_rig_is_said(tmp_path):
+    with pytest.raises(CaptureError, match="expected a rig's TOML file, got: No such file"):
+        read_rig(tmp_path / "rig.toml")
+
+
+def test_a_clean_plate_must_be_the_cameras(folder, ball_rig):
+    camera = read(folder, rig_text(NAMES)).cameras[0]
+    with pytest.raises(CaptureError, match=r"left\.png: the clean plate of camera 'left': expected a readable file"):
+        mask_maker(camera)
+    shutil.copytree(ball_rig / "plates", folder / "plates")
+    (folder / "plates/c0.png").rename(folder / "plates/left.png")
+    with pytest.raises(CaptureError, match="expected 640 x 480 pixels as the calibration says, got 48 x 48"):
+        mask_maker(camera)

@@ -1,0 +1,148 @@
+"""`viewmend serve rig.toml`: videos as if they were live, from their files to a viewer."""
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live.live_servers import decode, get, running, wait_until
+from reference.ball import photograph
+from reference.ball_rig import CAMERAS, make_rig, rig_text
+
+from viewmend.cli import main
+from viewmend.contrib.live_rig import frames as rig_frames
+from viewmend.contrib.live_rig.frames import RigSource
+from viewmend.data.errors import CaptureError
+from viewmend.live.client import Publisher
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    pytest.importorskip("av")
+    return make_rig(tmp_path)
+
+
+def soon(true) -> None:
+    """Until something is so; the hull's kernels are compiled at first use."""
+    wait_until(true, seconds=60)
+
+
+def newest(supply):
+    return supply.read(supply.span.newest)
+
+
+@contextmanager
+def reading(supply: RigSource) -> Iterator[None]:
+    """The supply alone, without a server."""
+    supply.start()
+    try:
+        yield
+    finally:
+        supply.stop()
+
+
+def of_all(supply):
+    """A frame that all cameras are in, None while there is none."""
+    frames = map(supply.read, reversed(range(supply.span.first, supply.span.end)))
+    return next((f for f in frames if f is not None and f.cameras.names == CAMERAS.names), None)
+
+
+def test_videos_as_if_live_are_masked_and_together_and_shown(rig):
+    supply = RigSource(rig, align=False)
+    with running(supply, ready=False) as server:
+        soon(lambda: server.service.is_ready and of_all(supply) is not None)
+        frame, truth = of_all(supply), photograph(CAMERAS)
+        inside, true = frame.mask > 127, truth.mask > 127
+        assert float((inside & true).sum() / (inside | true).sum()) > 0.93
+        # One time: all videos grow darker from frame to frame, by a tenth.
+        ratios = frame.rgb.sum(1) / truth.rgb.sum(1).clamp(min=1)
+        assert np.ptp([float(ratio[mask].median()) for ratio, mask in zip(ratios, true, strict=True)]) < 0.04
+        status, _, jpeg = get(f"{server.url}/frame.jpg?azimuth=200&width=48&height=48")
+        assert status == 200 and decode(jpeg).max() > 60
+        with pytest.raises(ConnectionError, match="reads its own cameras"):
+            Publisher(CAMERAS, server.ws)
+        lines = get(f"{server.url}/metrics")[2].decode().splitlines()
+        assert 'viewmend_camera_up{camera="c0"} 1' in lines
+        assert any(line.startswith("viewmend_cameras_apart_seconds 0.0") for line in lines)
+        assert any(line.startswith('viewmend_camera_pictures_total{camera="c4",event="used"}') for line in lines)
+
+
+def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
+    caplog.set_level(logging.WARNING)
+    supply = RigSource(rig, align=False)
+    with reading(supply):
+        soon(lambda: of_all(supply) is not None)
+        before = supply.rig.number
+        rig.write_text("nonsense")
+        soon(lambda: "the rig stays as it was" in caplog.text)
+        assert supply.rig.number == before and len(supply.camera_counts()) == 6
+        supply._aligner.counts["c0"]["used"] += 1000
+        rig.write_text(rig_text(CAMERAS.names[:5]))
+        soon(lambda: supply.rig.number > before and newest(supply).cameras.names == CAMERAS.names[:5])
+        counts = supply.camera_counts()
+        assert all(c["connects"] == 1 and c["up"] for c in counts.values()) and "c5" not in counts
+        assert counts["c0"]["used"] >= 1000 > counts["c1"]["used"], "what was counted goes on, too"
+        assert supply.read(supply.span.first - 1) is not None and supply.span.first > 0, "of the other rig"
+
+
+def test_what_was_lost_since_the_last_line_is_said_and_no_more(rig, caplog, monkeypatch):
+    caplog.set_level(logging.WARNING)
+    supply = RigSource(rig, align=False)
+    for late, torn in ((3, 0), (5, 1), (5, 1), (0, 0), (1, 0)):  # then the camera was opened anew
+        told = {"c0": {"late": late, "torn": torn, "used": 90}, "c1": {"used": 90}}
+        monkeypatch.setattr(supply, "camera_counts", lambda told=told: told)
+        supply._report()
+    said = [message.split(": ", 1)[1] for message in caplog.messages]
+    assert said == ["c0 3 late", "c0 2 late, 1 torn", "c0 1 late"]
+
+
+def test_what_is_wrong_is_said_once_until_something_else_is(rig, caplog):
+    caplog.set_level(logging.WARNING)
+    supply, told = RigSource(rig, align=False), []
+    supply.changed = lambda: told.append(supply.status.error)
+    for error in ("no light", "no light", "no power"):
+        supply._is_wrong(error)
+    assert caplog.messages == ["no light", "no power"], "on the terminal"
+    assert told == ["no light", "no light", "no power"] and supply.status.state == "failing"
+
+
+def test_recordings_are_played_as_long_as_the_shortest_is(rig, monkeypatch):
+    lengths = dict(zip(CAMERAS.names, (9.0, 7.5, 8.0, 9.0, 7.0, 7.2), strict=True))
+    monkeypatch.setattr(rig_frames, "_length_s", lambda camera: lengths[camera.name])
+    assert RigSource(rig, align=False)._playback.length_s == 7.0
+
+
+def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
+    supply = RigSource(rig, align=False)
+    worker, unplugged = supply._workers["c2"], threading.Event()
+    connect = worker._connect
+
+    def through_a_plug(worker):
+        with closing(connect(worker)) as pictures:
+            for picture in pictures:
+                if unplugged.is_set():
+                    raise OSError("unplugged")
+                yield picture
+
+    worker._connect = through_a_plug
+    with reading(supply):
+        soon(lambda: of_all(supply) is not None)
+        unplugged.set()
+        soon(lambda: newest(supply).cameras.names == tuple(n for n in CAMERAS.names if n != "c2"))
+        soon(lambda: worker.error == "unplugged")
+        assert supply.status.state == "ready", "the others go on"
+        unplugged.clear()
+        soon(lambda: "c2" in newest(supply).cameras.names)
+        assert worker.counts["connects"] == 2
+
+
+def test_a_rig_that_cannot_be_is_one_line_before_any_address(rig, capsys):
+    (rig.parent / "take/video/c3.mp4").unlink()
+    assert main(["serve", str(rig), "--port", "0"]) == 2
+    said = capsys.readouterr().err
+    assert "camera 'c3': expected a video, got: No such file or directory" in said and said.count("\n") == 1
+    with pytest.raises(CaptureError, match="expected a rig's TOML file"):
+        RigSource(rig.parent / "none.toml")

@@ -1,0 +1,196 @@
+"""What comes from an address: when each picture was taken, and which are whole."""
+
+import threading
+from collections import Counter
+from contextlib import closing
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from io import BytesIO
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from reference.ball_rig import CAMERAS
+
+from viewmend.contrib.live_rig import frame_readers as pictures
+from viewmend.contrib.live_rig.frame_readers import Playback, _KernelStamps, _SenderStamps, _Stamps, _Whole, pictures_of
+from viewmend.contrib.live_rig.rig_file import read_rig
+
+FPS = 10
+
+
+class Clock:
+    """Time that passes only when somebody waits."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> bool:
+        self.now += max(0.0, seconds)
+        return False
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(pictures, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def camera(ball_rig):
+    return read_rig(ball_rig / "rig.toml").cameras[0]
+
+
+def shade(frame):
+    """Which of the ball's frames it is: they grow darker."""
+    return int(frame.to_ndarray(format="rgb24").max())
+
+
+def test_a_recording_is_played_in_time_over_and_over(camera, clock):
+    playback = Playback()
+    playback.start_s, playback.length_s = clock.now, 8 / FPS
+    with closing(pictures_of(camera, Counter(), playback, clock.wait)) as played:
+        taken = [next(played) for _ in range(20)]
+    assert [round(FPS * (p.taken_s - 1000)) for p in taken] == list(range(20))
+    shades = [shade(p.frame) for p in taken]
+    assert shades[8:16] == shades[:8] and shades[:8] == sorted(set(shades[:8]), reverse=True)
+
+
+def test_a_recording_is_joined_where_the_others_are_and_what_is_past_is_left_out(camera, clock):
+    playback = Playback()
+    playback.start_s, playback.length_s = clock.now, 8 / FPS
+    clock.now += 8 / FPS + 0.31
+    with closing(pictures_of(camera, Counter(), playback, clock.wait)) as played:
+        assert next(played).taken_s == pytest.approx(1000 + 1.2)
+        clock.now += 0.25  # somebody was slow
+        assert next(played).taken_s == pytest.approx(1000 + 1.4)
+
+
+def test_an_offset_is_taken_off(camera, clock):
+    playback = Playback()
+    playback.start_s = clock.now
+    late = replace(camera, offset_s=0.03)
+    with closing(pictures_of(late, Counter(), playback, clock.wait)) as played:
+        assert next(played).taken_s == pytest.approx(1000 - 0.03)
+
+
+@pytest.mark.parametrize(
+    ("url", "said"), [("nowhere.mp4", "No such file"), ("http://127.0.0.1:9/x?token=s", "refused")]
+)
+def test_addresses_where_nothing_is_are_said_without_their_secrets(camera, url, said):
+    with (
+        pytest.raises(OSError) as error,
+        closing(pictures_of(replace(camera, url=url), Counter(), Playback(), bool)) as p,
+    ):
+        next(p)
+    assert said in str(error.value) and "token" not in str(error.value)
+
+
+def frame_of(at_s, key=False, corrupt=False):
+    return SimpleNamespace(time=at_s, pts=at_s and round(1000 * at_s), key_frame=key, is_corrupt=corrupt)
+
+
+def packet_of(at_s):
+    return SimpleNamespace(dts=round(1000 * at_s), time_base=0.001)
+
+
+def test_the_senders_clock_is_learnt_from_packets_that_were_waited_for():
+    stamps = _SenderStamps()
+    stamps.saw(packet_of(70.0), 5.0, False)  # lay in a queue: says nothing
+    assert stamps.taken_s(frame_of(70.0), 5.0) is None
+    stamps.saw(packet_of(70.1), 5.02, True)
+    assert stamps.taken_s(frame_of(70.0), 5.0) == pytest.approx(4.92)
+
+
+def test_a_packet_that_is_given_when_a_later_one_comes_came_before():
+    stamps = _SenderStamps(lag=2)
+    for n in range(4):  # that of 70.0 is given when that of 70.2 comes
+        stamps.saw(packet_of(70 + n / 10), 5.2 + n / 10, True)
+    assert stamps.taken_s(frame_of(70.3), 5.5) == pytest.approx(5.3)
+
+
+def test_a_driver_that_keeps_the_kernels_time_is_believed(clock, monkeypatch):
+    monkeypatch.setattr(clock, "time", lambda: 5e8, raising=False)
+    stamps = _KernelStamps()
+    assert stamps.taken_s(frame_of(999.95), 1000.0) == 999.95
+    assert stamps.taken_s(frame_of(5e8 - 0.04), 1000.0) == pytest.approx(999.96)
+    assert stamps.taken_s(frame_of(3.0), 1000.0) is None, "of another clock, which is not known yet"
+
+
+def test_a_picture_of_the_same_time_is_counted_once():
+    stamps, counts = _Stamps(), Counter()
+    assert [stamps.is_new(frame_of(t), counts) for t in (0.1, 0.1, 0.2, None, None)] == [True, False, True, True, True]
+    assert counts["duplicated"] == 1
+
+
+def test_what_is_built_on_a_torn_picture_waits_for_a_key_picture():
+    counts = Counter()
+    whole = _Whole(counts)
+    assert not whole.is_good(frame_of(0, corrupt=True), False, 0.0) and not counts["torn"], "entered in its middle"
+    assert whole.is_good(frame_of(0, key=True), False, 0.1)
+    assert not whole.is_good(frame_of(0, corrupt=True), False, 0.2)
+    assert not whole.is_good(frame_of(0), False, 0.3)
+    assert whole.is_good(frame_of(0, key=True), False, 0.4) and whole.is_good(frame_of(0), False, 0.5)
+    assert not whole.is_good(frame_of(0), True, 0.6)
+    assert whole.is_good(frame_of(0), False, 2.7), "some streams have no key pictures"
+    assert counts["torn"] == 3
+
+
+def transport_stream(pictures_rgb):
+    import av
+
+    file = BytesIO()
+    with av.open(file, "w", format="mpegts") as container:
+        stream = container.add_stream("libx264", rate=FPS, options={"g": "5", "crf": "10", "tune": "zerolatency"})
+        stream.height, stream.width, stream.pix_fmt = *pictures_rgb[0].shape[:2], "yuv420p"
+        for rgb in pictures_rgb:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
+        container.mux(stream.encode())
+    return bytearray(file.getvalue())
+
+
+def test_a_damaged_stream_shows_no_damaged_picture(camera):
+    """Noise over HTTP, of which some packets are lost and others are garbage."""
+    noise = np.random.default_rng(0)
+    sent = [cv_noise(noise) for _ in range(30)]
+    stream = transport_stream(sent)
+    for at in (9, 17):  # of the second and the fourth group
+        start = len(stream) * at // 30 // 188 * 188
+        del stream[start : start + 188]
+        stream[start + 10 : start + 180] = noise.bytes(170)
+    counts, shown = Counter(), []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(stream)))
+            self.end_headers()
+            self.wfile.write(bytes(stream))
+
+        def log_message(self, *_):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.handle_request, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/"
+        network = replace(camera, url=url, clock="arrival")
+        with pytest.raises(OSError, match="ended"), closing(pictures_of(network, counts, Playback(), bool)) as received:
+            shown.extend(picture.frame.to_ndarray(format="rgb24").astype(float) for picture in received)
+    assert counts["torn"] >= 2 and 10 <= len(shown) <= 26
+    away = [min(np.abs(image - other).mean() for other in sent) for image in shown]
+    assert max(away) < 12
+
+
+def cv_noise(chance, size=(96, 96)):
+    import cv2
+
+    small = chance.integers(0, 255, (12, 12, 3), np.uint8)
+    return cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
+
+
+def test_the_rig_has_all_cameras(ball_rig):
+    assert tuple(c.name for c in read_rig(ball_rig / "rig.toml").cameras) == CAMERAS.names

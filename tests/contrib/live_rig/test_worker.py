@@ -1,0 +1,118 @@
+"""One camera's worker: it comes back, and the newest picture wins."""
+
+import itertools
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from live.live_servers import WAIT_S, wait_until
+from reference.ball_rig import CAMERAS
+
+from viewmend.contrib.live_rig import worker as workers
+from viewmend.contrib.live_rig.frame_readers import Picture
+from viewmend.contrib.live_rig.rig_file import read_rig
+from viewmend.contrib.live_rig.worker import CameraWorker, Slot, pauses
+
+SIZE = CAMERAS.max_size_px
+
+
+def frame(size=SIZE):
+    rgb = np.full((size[1], size[0], 3), 200, np.uint8)
+    return SimpleNamespace(width=size[0], height=size[1], to_ndarray=lambda **_: rgb)
+
+
+@pytest.fixture
+def camera(ball_rig):
+    return read_rig(ball_rig / "rig.toml").cameras[0]
+
+
+def test_pauses_grow_and_stay_short():
+    assert list(itertools.islice(pauses(), 6)) == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
+
+
+def test_the_newest_wins():
+    slot: Slot[int] = Slot()
+    assert slot.take(0.0) is None
+    assert [slot.put(n) for n in range(3)] == [False, True, True]
+    assert slot.take(0.0) == 2 and slot.take(0.0) is None
+
+
+def test_a_camera_that_fails_is_reached_again(camera, monkeypatch):
+    """Twice it is not there, once it ends, once its connection breaks with whatever it likes."""
+    attempts, waits = itertools.count(), []
+    here, go_on = threading.Event(), threading.Event()
+
+    def connect(worker):
+        attempt = next(attempts)
+        if attempt < 2:
+            raise OSError("nobody there")
+        yield Picture(frame(), 10.0 + attempt)
+        if attempt == 3:
+            raise ZeroDivisionError("what a decoder may raise")
+        if attempt == 4:
+            here.set()
+            go_on.wait(WAIT_S)
+            raise OSError("the stream has ended")
+
+    worker = CameraWorker(camera, connect, lambda *_: None, lambda *_: True)
+    monkeypatch.setattr(worker, "wait", lambda seconds: waits.append(round(seconds, 1)) or go_on.is_set())
+    worker.start()
+    assert here.wait(WAIT_S) and worker.up and worker.error is None
+    assert worker.counts["read"] == worker.counts["connects"] == 3
+    go_on.set()
+    worker.stop()
+    assert not worker.up and worker.error == "the stream has ended"
+    assert waits[:4] == [0.1, 0.2, 0.1, 0.1], "a camera that was there is tried at once"
+
+
+def test_pictures_of_another_size_are_refused_and_said(camera):
+    said = threading.Event()
+
+    def connect(worker):
+        for n in range(3):
+            yield Picture(frame((64, 48)), float(n))
+            wait_until(lambda n=n: worker.counts["refused"] > n)
+        yield Picture(frame(), 3.0)
+        worker.wait(WAIT_S)
+
+    worker = CameraWorker(camera, connect, lambda *_: said.set(), lambda *_: True)
+    worker.start()
+    assert said.wait(WAIT_S)
+    worker.stop()
+    assert worker.counts["refused"] == 3
+    assert worker.error == "expected pictures of 48 x 48 as the calibration says, got 64 x 48; " + (
+        "set the camera's mode in 'options'"
+    )
+
+
+def test_a_slow_mask_costs_pictures_and_never_delay(camera, monkeypatch):
+    delivered, go_on = [], threading.Event()
+
+    def connect(worker):
+        for n in range(50):
+            yield Picture(frame(), float(n))
+        go_on.set()
+        worker.wait(WAIT_S)
+
+    worker = CameraWorker(camera, connect, lambda name, taken_s, _: delivered.append(taken_s), lambda *_: True)
+    monkeypatch.setattr(worker._input, "images", lambda picture: go_on.wait(WAIT_S) and None)
+    worker.start()
+    wait_until(lambda: 49.0 in delivered)
+    worker.stop()
+    assert len(delivered) <= 2 and worker.counts["replaced"] == 50 - len(delivered)
+
+
+def test_pictures_that_nobody_wants_are_not_masked(camera):
+    wanted = []
+
+    def connect(worker):
+        for n in range(20):
+            yield Picture(frame(), n / 10)
+        worker.wait(WAIT_S)
+
+    worker = CameraWorker(camera, connect, lambda *_: None, lambda at_s, period_s: wanted.append(period_s) or False)
+    worker.start()
+    wait_until(lambda: len(wanted) == 20)
+    worker.stop()
+    assert worker.counts["thinned"] == 20 and wanted[-1] == pytest.approx(0.1) and workers.FIRST_PAUSE_S == 0.1

@@ -1,0 +1,144 @@
+"""`viewmend serve --ray`: its options, and the command with a local cluster."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from types import SimpleNamespace
+
+import pytest
+
+from viewmend.cli import main
+from viewmend.contrib.ray import cluster
+from viewmend.contrib.ray.replicas import ManyViewers, _demand_no_serve, _free_port, serving
+from viewmend.live.client import Client
+from viewmend.live.server import ServerConfig
+from viewmend.stream import StreamConfig
+
+TOKEN = "a token, long enough"
+SMALL = ["--port", "0", "--size", "96", "--cameras", "4", "--frames", "2", "--model", "nearest", "--token", TOKEN]
+HAS_IT = {"Authorization": f"Bearer {TOKEN}"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["live"], "expected a capture, rig.toml or studio with --ray, got live"),
+        (["--replicas", "0"], "--replicas"),
+        (["--replicas", "3", "--max-replicas", "2"], "--max-replicas"),
+        (["--host", "0.0.0.0"], "expected --token with --host 0.0.0.0"),
+    ],
+)
+def test_invalid_options_are_one_line(capsys, arguments, words):
+    assert main(["serve", "--ray", "local", *arguments]) == 2
+    message = capsys.readouterr().err
+    assert words in message and message.count("\n") == 1
+
+
+def test_without_ray_the_error_names_the_extra(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.setattr(os, "environ", dict(os.environ))
+    assert main(["serve", "--ray", "local"]) == 2
+    assert "install viewmend's extra 'ray'" in capsys.readouterr().err
+
+
+def test_a_local_cluster_has_a_token_and_sends_no_reports(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", ray := object())
+    monkeypatch.setattr(os, "environ", {})
+    assert cluster.find_ray("10.0.0.1:6379") is ray
+    assert "RAY_AUTH_TOKEN" not in os.environ and os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
+    assert cluster.find_ray(cluster.LOCAL) is ray
+    assert os.environ["RAY_AUTH_MODE"] == "token" and len(os.environ["RAY_AUTH_TOKEN"]) >= 32
+    assert os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] == "0" and cluster.AS_URGENT.items() <= os.environ.items()
+
+
+def test_a_port_in_use_is_an_error_before_a_cluster_is_started():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=f"port {port} of 127.0.0.1: .* choose another --port"):
+            _free_port("127.0.0.1", port)
+    assert _free_port("127.0.0.1", port) == port and _free_port("127.0.0.1", 0) > 0
+
+
+def test_a_cluster_on_which_serve_runs_is_refused():
+    def absent(name, namespace):
+        raise ValueError
+
+    _demand_no_serve(SimpleNamespace(get_actor=absent))
+    with pytest.raises(ValueError, match="on which Serve does not run"):
+        _demand_no_serve(SimpleNamespace(get_actor=lambda name, namespace: name))
+
+
+def test_replicas_of_one_machine_share_its_memory():
+    def served(most):
+        served_by = {"open_source": dict, "load_inpainter": dict, "server": ServerConfig(), "stream": StreamConfig()}
+        return ManyViewers(**served_by, device="cpu", replicas=(1, most), store_mb=1000.0)
+
+    assert 2 * served(2).replica_mb == pytest.approx(400.0) and served(100).replica_mb == served(8).replica_mb
+    with pytest.raises(OSError, match="choose another"), socket.create_server(("127.0.0.1", 0)) as taken:
+        config = ServerConfig(port=taken.getsockname()[1])
+        with serving(ManyViewers(**vars(served(2)) | {"server": config}), "local"):
+            pass
+
+
+def asked(address, path, headers):
+    """Status and body."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address + path, headers=headers), timeout=60) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as refused:
+        refused.close()
+        return refused.code, b""
+
+
+@contextlib.contextmanager
+def started(*options):
+    """The command, once it has printed its address."""
+    pytest.importorskip("ray", reason="Ray is not installed")
+    command = [sys.executable, "-m", "viewmend.cli", "serve", "--ray", "local", *options]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
+        assert server.stderr is not None
+        try:
+            line = server.stderr.readline()
+            found = re.search(r"http://127\.0\.0\.1:\d+", line)
+            assert found, line + server.stderr.read()
+            yield server, found[0]
+        finally:
+            server.send_signal(signal.SIGTERM)
+            assert server.wait(60) == 143
+
+
+@pytest.mark.slow
+def test_a_viewer_reconnects_when_its_replica_is_killed():
+    with started(*SMALL) as (_, address):
+        assert asked(address, "/frame.jpg", {})[0] == 401
+        status, picture = asked(address, "/frame.jpg?width=64&height=64", HAS_IT)
+        assert status == 200 and picture.startswith(b"\xff\xd8")
+        replicas = {json.loads(asked(address, "/health", HAS_IT)[1])["process"] for _ in range(40)}
+        assert len(replicas) == 2, "requests go to both"
+        with Client(address.replace("http", "ws"), TOKEN, again_s=60.0) as viewer:
+            look = viewer.look(camera={"azimuth": 77.0}, width=48, height=48)
+            before = viewer.frame(look)
+            for process in replicas:  # one of them serves the viewer
+                os.kill(process, signal.SIGKILL)
+            while viewer.connections == 1:
+                viewer.frame(viewer.look(camera={"azimuth": 77.0}, width=48, height=48))
+            after = viewer.frame(viewer.look(camera={"azimuth": 77.0}, width=48, height=48))
+            assert after.header["cameras"][0]["R"] == before.header["cameras"][0]["R"]
+
+
+@pytest.mark.slow
+def test_an_unusable_source_is_the_same_error_as_without_ray(tmp_path):
+    pytest.importorskip("ray", reason="Ray is not installed")
+    (tmp_path / "empty").mkdir()
+    command = [sys.executable, "-m", "viewmend.cli", "serve", str(tmp_path / "empty"), "--ray", "local", "--port", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    alone = subprocess.run([*command[:-4], "--port", "0"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == alone.returncode == 2 and alone.stderr.strip()
+    assert done.stderr == alone.stderr

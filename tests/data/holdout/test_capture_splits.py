@@ -1,0 +1,104 @@
+"""Splits of captures: subjects apart, one camera a scene, the same on every machine, refused where data changed."""
+
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference.ball import BallCapture, ring
+
+from viewmend.cli import main
+from viewmend.cli.evaluate import RunOptions, scenes_of
+from viewmend.data.holdout.capture_scenes import is_splits, make_splits, read_splits, split_scenes
+from viewmend.data.native_writer import write_capture
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    """Two takes each of three people, and one of a fourth."""
+    folder = tmp_path_factory.mktemp("data")
+    for name in ("0001_01", "0001_02", "0002_01", "0002_02", "0003_01", "0003_02", "0004_01"):
+        write_capture(BallCapture(ring(5)), folder / name, images="png")
+    return folder
+
+
+def made(captures, **options):
+    return make_splits(sorted(captures.glob("0*")), captures, subject="^(.*)_", **options)
+
+
+@settings(max_examples=8, deadline=None, database=None, derandomize=True)
+@given(st.integers(0, 10**6), st.floats(0.01, 0.9))
+def test_no_subject_is_in_both_parts(captures, seed, share):
+    splits = made(captures, seed=seed, test_fraction=share)
+    parts = {split: {s.subject for s in splits.scenes if s.split == split} for split in ("training", "test")}
+    assert parts["training"] and parts["test"] and not parts["training"] & parts["test"]
+    tested = sum(scene.split == "test" for scene in splits.scenes)
+    assert tested >= share * 7 or len(parts["training"]) == 1
+    for scene in splits.scenes:
+        assert scene.left_out not in scene.closest and len(set(scene.closest)) == 3
+
+
+def test_the_closest_are_those_beside_it_on_a_ring(captures):
+    names = ring(5).names
+    for scene in made(captures).scenes:
+        held = names.index(scene.left_out)
+        assert set(scene.closest[:2]) == {names[(held + 1) % 5], names[(held - 1) % 5]}
+
+
+def test_another_capture_changes_nobodys_camera(captures):
+    every = {scene.name: scene.left_out for scene in made(captures).scenes}
+    fewer = make_splits(sorted(captures.glob("0*"))[2:], captures, subject="^(.*)_")
+    assert all(every[scene.name] == scene.left_out for scene in fewer.scenes)
+    assert len({made(captures, seed=seed).scenes[0].left_out for seed in range(12)}) > 1
+
+
+def test_the_command_writes_what_evaluate_takes(captures, tmp_path, capsys):
+    out = captures / "splits.json"
+    try:
+        everything = [str(path) for path in sorted(captures.glob("0*"))]
+        assert main(["splits", *everything, "--out", str(out), "--subject", "^(.*)_"]) == 0
+        assert "test: " in capsys.readouterr().out and is_splits(out)
+        assert json.loads(out.read_text())["protocol"].startswith("No subject is in both splits")
+        test = [scene for scene in read_splits(out).scenes if scene.split == "test"]
+        scenes = split_scenes(out)
+        assert [scene.held for scene in scenes] == [scene.left_out for scene in test]
+        assert all(len(scene.inputs) == 4 and scene.held not in scene.inputs for scene in scenes)
+        assert scenes_of(str(out), RunOptions(out=tmp_path)) == list(scenes)
+        frame = next(iter(scenes[0].frames("cpu")))
+        assert frame.truth.cameras.names == (scenes[0].held,) and len(frame.inputs.cameras) == 4
+        assert main(["splits", *everything, "--out", str(out)]) == 2
+        assert "published splits must not change" in capsys.readouterr().err
+    finally:
+        out.unlink(missing_ok=True)
+
+
+def test_data_that_changed_are_refused(captures, tmp_path):
+    write_capture(BallCapture(ring(5)), tmp_path / "0001_01", images="png")
+    write_capture(BallCapture(ring(5)), tmp_path / "0002_01", images="png")
+    paths = [tmp_path / "0001_01", tmp_path / "0002_01"]
+    out = tmp_path / "splits.json"
+    assert main(["splits", *map(str, paths), "--out", str(out)]) == 0
+    for path in paths:
+        told = json.loads((path / "cameras.json").read_text())
+        told["cameras"][0]["t"][0] += 0.01
+        (path / "cameras.json").write_text(json.dumps(told))
+    with pytest.raises(ValueError, match=r"expected the calibration that splits\.json was made with"):
+        split_scenes(out)
+    for path in paths:
+        path.rename(path.with_name(path.name + "x"))
+    with pytest.raises(ValueError, match=r"expected the capture .*, got none; put the file where its paths hold"):
+        split_scenes(out)
+
+
+def test_what_cannot_be_split_is_refused(captures, tmp_path, capsys):
+    one = [str(captures / "0001_01"), str(captures / "0001_02")]
+    for arguments, message in (
+        ([*one, "--subject", "^(.*)_"], "two subjects or more, got the subjects ['0001']"),
+        ([one[0], one[0]], "got ['0001_01'] twice"),
+        ([*one, "--subject", "^x(.*)"], "expected a subject by --subject '^x(.*)' in '0001_01'"),
+        ([*one, "--subject", "("], "expected a regular expression for --subject"),
+        ([*one, "--test-fraction", "1"], "expected --test-fraction between 0 and 1"),
+    ):
+        assert main(["splits", *arguments, "--out", str(tmp_path / "a.json")]) == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "a.json").exists()

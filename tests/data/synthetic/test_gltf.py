@@ -1,0 +1,116 @@
+import base64
+import json
+import struct
+
+import pytest
+import torch
+from data.synthetic.tiny_performer import JOINTS, write_character
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.synthetic.gltf import load_character
+from viewmend.data.synthetic.retarget import node_matrices
+
+
+def edited(path, change):
+    """Rewrite the JSON part of a .glb."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    change(document)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    header = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(header + text + rest)
+    return path
+
+
+def test_reads_the_rest_pose(character_file):
+    character = load_character(character_file)
+    assert len(character.vertices) == 8 * len(JOINTS) and len(character.faces) == 12 * len(JOINTS)
+    world = node_matrices(character, torch.eye(4), (-1,) * len(character.nodes), torch.zeros(0, 3, 3), None)
+    place = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
+    for name, (_, position) in JOINTS.items():
+        torch.testing.assert_close(place[name], torch.tensor(position, dtype=torch.float32), atol=1e-5, rtol=0)
+    bound = world[character.node_of_joint] @ character.joint_from_bind
+    torch.testing.assert_close(bound, torch.eye(4).expand_as(bound), atol=1e-4, rtol=0)
+
+
+def test_textures_are_rgb_with_their_first_row_on_top(character_file):
+    (texture,) = load_character(character_file).textures
+    assert texture.shape == (3, 8, 16)
+    assert texture[:, 0, 0].tolist() == [1, 0, 0] and texture[:, 0, 15].tolist() == [0, 1, 0]
+
+
+def test_a_gltf_with_a_data_uri_reads_the_same(character_file):
+    data = character_file.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    document["buffers"][0]["uri"] = "data:x;base64," + base64.b64encode(data[28 + size :]).decode()
+    path = character_file.with_suffix(".gltf")
+    path.write_text(json.dumps(document))
+    a, b = load_character(character_file), load_character(path)
+    torch.testing.assert_close(a.vertices, b.vertices)
+    torch.testing.assert_close(a.joint_from_bind, b.joint_from_bind)
+
+
+def test_color_factors_tint_and_replace_textures(character_file):
+    def change(document):
+        document["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [1, 0.2140, 0, 1]}
+
+    (texture,) = load_character(edited(character_file, change)).textures
+    # 0.214 of linear light is 0.5 in sRGB.
+    torch.testing.assert_close(texture[:, 0, 0], torch.tensor([1, 0.5, 0]), atol=0.01, rtol=0)
+
+
+def test_an_unskinned_part_hangs_on_its_node(character_file):
+    def change(document):
+        hand = next(n for n in document["nodes"] if n["name"] == "LeftHand")
+        hand["children"] = [len(document["nodes"])]
+        document["nodes"].append({"name": "ring", "mesh": 0})
+
+    character = load_character(edited(character_file, change))
+    last = character.node_of_joint[character.joints[-1, 0]]
+    assert character.nodes[int(last)].name == "ring"
+    assert character.nodes[character.nodes[int(last)].parent].name == "LeftHand"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d["asset"].update(version="1.0"), "version 2.0"),
+        (lambda d: d["asset"].update(version="1" * 5000), "version 2.0"),
+        (lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]), "draco"),
+        (lambda d: d.update(extensionsRequired=["EXT_none"] * 3000), "needs extensions"),
+        (lambda d: d["nodes"][-1].pop("skin"), "no skin"),
+        (lambda d: d["nodes"][-1].pop("mesh"), "no triangles"),
+        (lambda d: d["bufferViews"][0].update(byteLength=10**7), "cut short"),
+        (lambda d: d["accessors"][0].update(count=10**5), "accessor 0"),
+        (lambda d: d["accessors"][0].update(sparse={}), "sparse"),
+        (lambda d: d["images"][0].update(bufferView=0), "JPEG or PNG"),
+        (lambda d: d["materials"].clear(), "materials number 0"),
+    ],
+)
+def test_bad_documents_say_what_is_wrong(character_file, change, message):
+    with pytest.raises(CaptureError, match=message) as caught:
+        load_character(edited(character_file, change))
+    assert "sticks.glb" in str(caught.value) and len(str(caught.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"hello", "starts with"), (b"glTF\x02\0\0\0\xff\0\0\0", "cut short"), (None, "cannot be read")],
+)
+def test_bad_containers_say_what_is_wrong(tmp_path, content, message):
+    path = tmp_path / "bad.glb"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(CaptureError, match=message):
+        load_character(path)
+
+
+def test_a_file_cut_short_is_no_character(tmp_path):
+    path = write_character(tmp_path / "whole.glb")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CaptureError, match="cut short"):
+        load_character(path)

@@ -1,0 +1,202 @@
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from viewmend.data.synthetic.performer import Performer, TexturedMesh
+from viewmend.data.synthetic.procedural import PerformerStyle, procedural_scene
+from viewmend.data.synthetic.procedural.clothing import BOTTOMS, OUTERS, TOPS, sample_outfit
+from viewmend.data.synthetic.procedural.fabric import KINDS, Canvas, sample_fabric
+from viewmend.data.synthetic.procedural.grounds import Tempo
+from viewmend.data.synthetic.procedural.head import STYLES, build_head, sample_hair
+from viewmend.data.synthetic.procedural.motion import FAMILIES, GESTURES, MOTIONS, sample_motion
+from viewmend.data.synthetic.procedural.skeleton import sample_physique
+
+SEED = 10_000
+WALKER = PerformerStyle(tempo="calm", motion="walk", people=1, holding=False, furniture=False)
+KIND_OF_TEMPO = [(tempo, kind) for tempo, kinds in MOTIONS.items() for kind in kinds]
+
+
+@pytest.fixture(scope="module")
+def walker():
+    return procedural_scene(SEED, style=WALKER)
+
+
+def tensors(scene: TexturedMesh):
+    return (scene.mesh.vertices, scene.mesh.faces, scene.normals, scene.uv, scene.texture_of_face, *scene.textures)
+
+
+def test_the_same_seed_is_the_same_bit_for_bit(walker):
+    again = procedural_scene(SEED, style=WALKER)
+    assert again.description == walker.description
+    for a, b in zip(tensors(again.pose(1.3)), tensors(walker.pose(1.3)), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_pose_depends_on_time_alone(walker):
+    first = walker.pose(0.7).mesh.vertices
+    walker.pose(3.1)
+    assert torch.equal(walker.pose(0.7).mesh.vertices, first)
+
+
+def test_other_seeds_are_other_people(walker):
+    other = procedural_scene(SEED + 1, style=WALKER)
+    assert other.description != walker.description
+    assert other.people[0].physique != walker.people[0].physique
+
+
+@pytest.mark.parametrize("seed", [SEED, SEED + 1, SEED + 2])
+def test_a_scene_is_a_whole_and_valid_mesh(seed):
+    cast: Performer = procedural_scene(seed)
+    scene = cast.pose(0.4)
+    vertices, faces = scene.mesh.vertices, scene.mesh.faces
+    assert all(torch.isfinite(t).all() for t in tensors(scene))
+    assert vertices.dtype == torch.float32
+    assert int(faces.min()) == 0 and int(faces.max()) == len(vertices) - 1
+    assert len(torch.unique(faces)) == len(vertices)
+    assert float(scene.uv.min()) >= 0 and float(scene.uv.max()) <= 1
+    torch.testing.assert_close(scene.normals.norm(dim=1), torch.ones(len(vertices)), atol=1e-4, rtol=0)
+    assert set(scene.texture_of_face.tolist()) == set(range(len(scene.textures)))
+    assert all(float(t.min()) >= 0 and float(t.max()) <= 1 for t in scene.textures)
+    assert float(vertices[:, [0, 2]].norm(dim=1).max()) < 1.5
+
+
+def test_the_size_is_human(walker):
+    person = walker.people[0]
+    bind = person.bound.mesh.vertices
+    tall = float(bind[:, 1].max() - bind[:, 1].min())
+    assert tall == pytest.approx(person.physique.height_m, rel=0.05)
+    # An A-pose: the finger tips are less far out than in a T-pose (half the height).
+    assert 0.34 < float(bind[:, 0].max()) / tall < 0.46
+    # Seven and a half heads: the chin is where anatomy has it.
+    head = build_head(person.physique, person.skeleton)
+    chin, crown = head.point(np.zeros(2), np.array([0.0, 1.0]))[:, 1] / person.physique.height_m
+    assert crown == pytest.approx(1.0, abs=1e-6)
+    assert 7.0 < 1 / (crown - chin) < 8.0
+    for seed in range(200):
+        assert 1.5 <= sample_physique(np.random.default_rng(seed)).height_m <= 1.95
+
+
+def test_normals_point_outward(walker):
+    scene = walker.pose(0.0)
+    a, b, c = scene.mesh.vertices[scene.mesh.faces].unbind(1)
+    across = torch.linalg.cross(b - a, c - a)
+    volume = (a * across).sum() / 6
+    assert 0.03 < float(volume) < 0.3
+    agree = (across * scene.normals[scene.mesh.faces[:, 0]]).sum(1) > 0
+    assert float(agree.float().mean()) > 0.97
+
+
+def moving(walker, tempo: Tempo, kind: str):
+    """The walker in another motion; the body need not be drawn anew."""
+    person = walker.people[0]
+    rng = np.random.default_rng(SEED)
+    motion = sample_motion(rng, person.physique, person.skeleton, tempo, kind, 0.1)
+    return dataclasses.replace(person, motion=motion)
+
+
+def check_smooth(person, kind: str, times: np.ndarray):
+    step = float(times[1] - times[0])
+    poses = [person.pose(float(time)).mesh.vertices for time in times]
+    lowest = torch.stack([vertices[:, 1].min() for vertices in poses])
+    velocity = torch.stack([b - a for a, b in itertools.pairwise(poses)]) / step
+    assert float(velocity.norm(dim=-1).max()) < 12.0
+    # A jump of ten centimetres in one frame is a change of 3 m/s or more.
+    assert float(velocity.diff(dim=0).norm(dim=-1).max()) < 0.1 / step
+    flies = kind in ("run", "jacks")
+    assert float(lowest.min()) > -0.01
+    assert float(lowest.max()) < (0.2 if flies else 0.01)
+
+
+@pytest.mark.parametrize(("tempo", "kind"), KIND_OF_TEMPO)
+def test_motion_is_smooth_and_stays_on_the_floor(walker, tempo, kind):
+    check_smooth(moving(walker, tempo, kind), kind, 0.2 + np.arange(4) / 40)
+
+
+@pytest.mark.parametrize("kind", ["groove", "walk", "sit"])
+def test_gestures_take_turns_without_a_jump(walker, kind):
+    motion = moving(walker, "dance", kind).motion
+    times = np.arange(0, 2 * motion.bar_s, 1 / 50)
+    arms = [arm for time in times for arm in motion.stance(float(time)).arms]
+    angles = np.array([(a.flexion, a.abduction, a.twist, a.elbow, a.curl) for a in arms]).reshape(len(times), 10)
+    assert np.abs(np.diff(angles, axis=0)).max() < 0.35
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tempo", "kind"), KIND_OF_TEMPO)
+def test_long_motion_is_smooth_and_stays_on_the_floor(walker, tempo, kind):
+    check_smooth(moving(walker, tempo, kind), kind, np.arange(200) / 40)
+
+
+def test_a_walker_stays_on_the_stage_and_plants_the_feet(walker):
+    person = walker.people[0]
+    index = torch.nonzero(person.bound.mesh.vertices[:, 1] < 0.004)[:, 0]
+    moved = []
+    for i in range(6):
+        now = person.pose(0.19 * i).mesh.vertices
+        soon = person.pose(0.19 * i + 1e-2).mesh.vertices
+        assert float(now[:, [0, 2]].norm(dim=1).max()) < 1.3
+        low = index[now[index, 1] < 0.002]
+        assert len(low) > 0
+        moved.append(float((soon[low] - now[low]).norm(dim=1).median()) / 1e-2)
+    assert float(np.median(moved)) < 0.02
+
+
+def test_a_sitter_rests_on_a_stool():
+    cast = procedural_scene(SEED, style=PerformerStyle(tempo="calm", motion="sit", people=1, furniture=False))
+    assert cast.things is not None
+    seat = cast.things.mesh.vertices
+    assert 0.35 < float(seat[:, 1].max()) < 0.55
+    assert float(seat[:, 1].min()) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_two_people_and_things():
+    cast = procedural_scene(
+        SEED, style=PerformerStyle(people=2, furniture=True, holding=True, tempo="calm", motion="talk")
+    )
+    assert len(cast.people) == 2 and cast.things is not None
+    scene = cast.pose(0.0)
+    assert len(scene.textures) == 3
+    assert len(torch.unique(scene.mesh.faces)) == len(scene.mesh.vertices)
+    assert "with a" in cast.description and "next to" in cast.description
+
+
+def test_seeds_cover_every_garment_hair_and_cloth():
+    outfits = [sample_outfit(np.random.default_rng(s), float(s % 2)) for s in range(300)]
+    assert {o.top for o in outfits} == set(TOPS)
+    assert {o.bottom for o in outfits} == set(BOTTOMS)
+    assert {o.outer for o in outfits} == set(OUTERS)
+    assert {f.kind for o in outfits for f in o.fabrics} == set(KINDS)
+    assert any(o.lettering for o in outfits)
+    hair = {sample_hair(np.random.default_rng(s), float(s % 2), False).style for s in range(300)}
+    assert hair == set(STYLES)
+    assert set().union(*GESTURES.values()) == set(FAMILIES)
+
+
+def test_seeds_cover_every_tempo_and_motion():
+    from viewmend.data.synthetic.procedural import performer
+
+    seen = set()
+    for seed in range(120):
+        rng = np.random.default_rng(seed)
+        for tempo in MOTIONS:
+            seen.add(performer._kind(rng, tempo, crowded=False))
+    assert seen == {kind for _, kind in KIND_OF_TEMPO}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_cloth_paints_colours_that_vary(kind):
+    image = sample_fabric(np.random.default_rng(3), (kind,)).paint(Canvas(0.6, 0.5, 200.0))
+    assert image.shape == (100, 120, 3)
+    assert image.min() >= 0 and image.max() <= 1
+    assert image.std() > 0.004
+
+
+def test_unknown_styles_are_refused():
+    with pytest.raises(ValueError, match="moonwalk"):
+        procedural_scene(SEED, style=PerformerStyle(motion="moonwalk"))
+    with pytest.raises(ValueError, match="1 or 2 people"):
+        procedural_scene(SEED, style=PerformerStyle(people=7))
+    assert dataclasses.is_dataclass(PerformerStyle)

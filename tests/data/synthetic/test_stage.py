@@ -1,0 +1,188 @@
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from data.synthetic.tiny_performer import write_character, write_motion
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.synthetic.gltf_performer import GltfPerformer
+from viewmend.data.synthetic.imperfections import Imperfections
+from viewmend.data.synthetic.rigs import orbit, ring_rig
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.geometry.cameras import project
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Two characters and two motions to pick from."""
+    (tmp_path / "people").mkdir()
+    (tmp_path / "moves").mkdir()
+    for name in ("a", "b"):
+        write_character(tmp_path / "people" / f"{name}.glb")
+        write_motion(tmp_path / "moves" / f"{name}.bvh", {"LeftShoulder": (70, 0, 0), "Hips": (0, 0, 40)}, frames=30)
+    return {"performers": tmp_path / "people", "motions": tmp_path / "moves"}
+
+
+def config(folders, **changes) -> StudioConfig:
+    return StudioConfig(**{"seed": 3, "cameras": 4, "frames": 5, "size_px": 48} | folders | changes)
+
+
+def test_frames_are_what_the_capture_says(folders):
+    studio = Studio(config(folders, size_px=(64, 48)))
+    frame = studio.read(2)
+    assert studio.frame_ids == tuple(f"{n:06d}" for n in range(5)) and studio.fps == 30.0
+    assert frame.time == 2 and frame.cameras.names == studio.cameras.names
+    assert frame.rgb.shape == (4, 3, 48, 64) and frame.rgb.dtype == torch.uint8
+    assert frame.mask is not None and frame.depth is not None
+    assert 0.02 < float((frame.mask > 127).float().mean()) < 0.5
+    seen = frame.depth > 0
+    assert float(((frame.mask > 0) != seen).float().mean()) < 0.05
+    assert float(frame.depth[seen].min()) > 1.5 and float(frame.depth.max()) < 5
+    outside = frame.mask == 0
+    assert int(frame.rgb.permute(0, 2, 3, 1)[outside].sum()) == 0
+
+
+def test_the_same_seed_gives_the_same_capture_in_any_order(folders):
+    wrong = Imperfections.typical()
+    a = Studio(config(folders, imperfections=wrong, background="stage"))
+    b = Studio(config(folders, imperfections=wrong, background="stage"))
+    b.truth(orbit([0.3], (32, 32)), 1)
+    frames = {t: b.read(t) for t in (4, 0, 2)}
+    for t in (0, 2, 4):
+        x, y = a.read(t), frames[t]
+        assert torch.equal(x.rgb, y.rgb) and torch.equal(x.mask, y.mask) and torch.equal(x.depth, y.depth)
+    assert torch.equal(a.cameras.camera_from_world, b.cameras.camera_from_world)
+    other = Studio(config(folders, seed=4, imperfections=wrong, background="stage"))
+    assert not torch.equal(a.read(0).rgb, other.read(0).rgb)
+
+
+def test_the_truth_of_an_input_camera_is_its_image(folders):
+    studio = Studio(config(folders))
+    frame, truth = studio.read(1), studio.truth(studio.cameras[2], 1)
+    assert torch.equal(truth.rgb[0], frame.rgb[2]) and torch.equal(truth.mask[0], frame.mask[2])
+    assert torch.equal(truth.depth[0], frame.depth[2])
+
+
+def test_imperfections_leave_the_truth_alone(folders):
+    plain, wrong = Studio(config(folders)), Studio(config(folders, imperfections=Imperfections.typical()))
+    view = orbit([1.0], (40, 40))
+    assert torch.equal(plain.truth(view, 3).rgb, wrong.truth(view, 3).rgb)
+    assert not torch.equal(plain.read(3).rgb, wrong.read(3).rgb)
+    assert torch.equal(plain.read(3).depth, wrong.read(3).depth)
+    assert not torch.equal(plain.cameras.camera_from_world, wrong.cameras.camera_from_world)
+    assert torch.equal(plain.cameras.camera_from_world, wrong.true_cameras.camera_from_world)
+
+
+def test_a_stage_stands_behind_the_subject_in_images_alone(folders):
+    studio = Studio(config(folders, background="stage"))
+    frame = studio.read(0)
+    outside = frame.mask == 0
+    assert int(frame.rgb.permute(0, 2, 3, 1)[outside].amax(-1).min()) > 5
+    assert int(studio.truth(studio.cameras, 0).rgb.permute(0, 2, 3, 1)[outside].sum()) == 0
+
+
+def test_bounds_hold_the_performer_and_up_is_up(folders):
+    studio = Studio(config(folders))
+    assert studio.bounds is not None and studio.up is not None
+    for t in range(5):
+        vertices = studio.scene(t).mesh.vertices
+        assert bool(((vertices > studio.bounds.low) & (vertices < studio.bounds.high)).all())
+    assert float(studio.bounds.size_m.max()) < 3
+    assert studio.up.tolist() == [0, 1, 0]
+
+
+def test_a_rig_may_be_given(folders):
+    ring = ring_rig(3, (40, 30), seed=5)
+    studio = Studio(config(folders, cameras=ring))
+    assert torch.equal(studio.cameras.camera_from_world, ring.camera_from_world)
+    assert studio.read(0).rgb.shape == (3, 3, 30, 40)
+    assert len(Studio(config(folders, cameras=6, rig="dome")).cameras) == 6
+
+
+def test_picks_are_seeded_and_a_file_is_taken_as_it_is(folders):
+    names = {Studio(config(folders, seed=s)).performer.description for s in range(8)}
+    assert len(names) > 1
+    one = config(folders, performers=folders["performers"] / "b.glb", motions=folders["motions"] / "a.bvh")
+    assert Studio(one).performer.description == "b doing a"
+
+
+@pytest.mark.parametrize("time", [-1, 5])
+def test_a_time_outside_the_capture(folders, time):
+    with pytest.raises(IndexError, match="0 to 4"):
+        Studio(config(folders)).read(time)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"performers": None}, "no performers"),
+        ({"motions": None}, "no motions"),
+        ({"frames": 0}, "at least one frame"),
+        ({"size_px": (0, 4)}, "positive rate and size"),
+        ({"cameras": 0}, "at least 1 camera"),
+    ],
+)
+def test_bad_configs_say_what_is_wrong(folders, changes, message):
+    with pytest.raises(ValueError, match=message):
+        Studio(config(folders, **changes))
+
+
+def test_empty_and_missing_folders_are_named(folders, tmp_path):
+    shutil.rmtree(folders["motions"])
+    with pytest.raises(CaptureError, match=r"moves.*no such folder"):
+        Studio(config(folders))
+    folders["motions"].mkdir()
+    with pytest.raises(CaptureError, match=r"moves.*no such files"):
+        Studio(config(folders))
+
+
+def test_procedural_people_need_nothing():
+    studio = Studio(StudioConfig(seed=10_001, cameras=2, frames=2, size_px=64))
+    a, b = studio.read(1), Studio(StudioConfig(seed=10_001, cameras=2, frames=2, size_px=64)).read(1)
+    assert torch.equal(a.rgb, b.rgb) and torch.equal(a.mask, b.mask)
+    assert 0.02 < float((a.mask > 127).float().mean()) < 0.5
+
+
+def test_depth_and_cameras_agree_with_the_surface(folders):
+    """Vertices that a camera sees have the depth that its image says."""
+    studio = Studio(config(folders, size_px=200))
+    frame, vertices = studio.read(0), studio.scene(0).mesh.vertices
+    uv, z = project(vertices, frame.cameras)
+    for view in range(4):
+        column, row = (uv[view] - 0.5).round().long().clamp(0, 199).unbind(1)
+        depth = frame.depth[view, row, column]
+        near = (depth > 0) & ((z[view] - depth).abs() < 0.03)
+        assert float(near.float().mean()) > 0.3
+        # Corners on an outline may miss their pixel's centre.
+        before = (z[view] - depth)[depth > 0] < -0.03
+        assert float(before.float().mean()) < 0.1, "vertices lie in front of what is seen"
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        "cmu_131_09_strut_turns",  # acclaim
+        "ad_jumping_jacks_jumping_jacks",  # cgspeed
+        "ad_dab_dab",  # humanik, a child
+        "m2m_greeting",  # rigify or mannequin
+        "m2m_pick_up",
+    ],
+)
+def test_real_people_move_as_people_do(shared, motion):
+    train = shared / "performers"
+    performer = GltfPerformer(
+        train / "train" / "Black_F_3_Casual.glb", train / "motions" / "train" / f"{motion}.bvh", 1, 1.0
+    )
+    heights, lows = [], []
+    for t in (0.0, 0.35, 0.7):
+        mesh = performer.pose(t).mesh
+        assert bool(torch.isfinite(mesh.vertices).all())
+        corners = mesh.vertices[mesh.faces]
+        # At rest this character's longest edge is 0.263 m.
+        assert float((corners - corners.roll(1, 1)).norm(dim=-1).max()) < 0.3, "exploded vertices"
+        heights.append(float(mesh.vertices[:, 1].max()))
+        lows.append(float(mesh.vertices[:, 1].min()))
+    assert all(1.2 < h < 2.4 for h in heights)
+    assert min(map(abs, lows)) < 0.06 and max(lows) < 0.35
+    assert np.ptp(heights) < 1

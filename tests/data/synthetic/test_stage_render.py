@@ -1,0 +1,213 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from data.synthetic.tiny_performer import write_motion
+
+from viewmend.data.synthetic.gltf_performer import GltfPerformer
+from viewmend.data.synthetic.performer import TexturedMesh
+from viewmend.data.synthetic.render import (
+    SHADOW_BIAS_M,
+    Lights,
+    Surface,
+    light,
+    render,
+    shade_torch,
+    stage_lights,
+    unshadowed_torch,
+    visibility,
+)
+from viewmend.data.synthetic.rigs import orbit, ring_rig
+from viewmend.data.synthetic.textures import (
+    face_levels,
+    linear_from_srgb,
+    sample_texture,
+    srgb_from_linear,
+    texture_pyramid,
+)
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
+from viewmend.geometry.mesh import Mesh, vertex_normals
+from viewmend.geometry.rasterize import rasterize
+from viewmend.geometry.rigid import look_at
+
+
+def sphere(radius: float, center=(0.0, 0.95, 0.0), rings: int = 40) -> TexturedMesh:
+    polar, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
+    points = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
+    index = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
+    a, b, c, d = (t.reshape(-1) for t in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = torch.from_numpy(np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]))
+    normals = torch.from_numpy(points.reshape(-1, 3)).float()
+    uv = torch.from_numpy(np.stack([around / (2 * np.pi), polar / np.pi], -1).reshape(-1, 2)).float()
+    mesh = Mesh(radius * normals + torch.tensor(center), faces)
+    texture = torch.rand(3, 32, 64, generator=torch.Generator().manual_seed(3))
+    return TexturedMesh(mesh, normals, uv, torch.zeros(len(faces), dtype=torch.long), (texture,))
+
+
+def lit(scene: TexturedMesh, seed: int = 0) -> Surface:
+    return light(scene, stage_lights(seed), texture_pyramid(scene.textures))
+
+
+def square(size_m: float, texture: torch.Tensor) -> TexturedMesh:
+    """Faces +z at z = 0 about (0, 0.95, 0), its texture upright as seen from +z."""
+    h = size_m / 2
+    vertices = torch.tensor([[-h, 0.95 + h, 0], [h, 0.95 + h, 0], [h, 0.95 - h, 0], [-h, 0.95 - h, 0]])
+    mesh = Mesh(vertices, torch.tensor([[0, 2, 1], [0, 3, 2]]))
+    uv = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    return TexturedMesh(mesh, vertex_normals(mesh), uv, torch.zeros(2, dtype=torch.long), (texture,))
+
+
+def front(size: int = 64, visible_m: float = 2.0) -> Cameras:
+    return orbit([0.0], (size, size), elevation_rad=0.0, visible_m=visible_m)
+
+
+def test_depth_is_the_rasterisers():
+    scene, cameras = sphere(0.5), ring_rig(3, (96, 80), seed=1)
+    torch.testing.assert_close(render(lit(scene), cameras).depth, rasterize(scene.mesh, cameras).depth, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("samples", [2, 4])
+def test_a_sphere_covers_the_pixels_that_it_should(samples):
+    radius, distance = 0.5, 3.0
+    camera = front(128)
+    mask = render(lit(sphere(radius, rings=80)), camera, samples_per_side=samples).mask[0].float() / 255
+    silhouette = float(camera.K[0, 0, 0]) * radius / math.sqrt(distance**2 - radius**2)
+    area = math.pi * silhouette**2
+    # The mesh is inscribed, by less than a thousandth; samples on the outline err to both sides.
+    assert abs(float(mask.sum()) - area) / area < 0.004
+    y, x = torch.meshgrid(*(torch.arange(128) + 0.5 - 64,) * 2, indexing="ij")
+    outside, inside = (x**2 + y**2).sqrt() > silhouette + 1, (x**2 + y**2).sqrt() < silhouette - 1
+    assert float(mask[outside].max()) == 0 and float(mask[inside].min()) == 1
+    steps = (mask * samples**2).round() / samples**2
+    torch.testing.assert_close(mask, steps, atol=0.003, rtol=0)
+    assert len(mask.unique()) > samples
+
+
+def test_textures_are_upright_and_not_mirrored():
+    texture = torch.zeros(3, 16, 16)
+    texture[0, :8, :8] = 1  # red at the top left
+    texture[1, :8, 8:] = 1  # green at the top right
+    texture[2, 8:] = 1  # blue below
+    rgb = render(lit(square(1.0, texture)), front()).rgb[0]
+    for row, column, channel in ((24, 24, 0), (24, 40, 1), (40, 24, 2), (40, 40, 2)):
+        assert int(rgb[:, row, column].argmax()) == channel and int(rgb[channel, row, column]) > 100
+
+
+def test_the_left_hand_is_at_the_images_right(character_file, tmp_path):
+    """Seen from the front, the character's left (red) is at the right side of the image, and its head on top."""
+    performer = GltfPerformer(character_file, write_motion(tmp_path / "still.bvh"), seed=1)
+    performer._stage_from_motion = torch.eye(3)
+    rgb = render(lit(performer.pose(0.0)), front(96)).rgb[0].int()
+    columns = torch.arange(96).float()
+    red, green = ((rgb[a] - rgb[b]).clamp(min=0).float() for a, b in ((0, 1), (1, 0)))
+    assert float((red.sum(0) * columns).sum() / red.sum()) > float((green.sum(0) * columns).sum() / green.sum()) + 10
+    top = int((rgb.sum(0) > 0).any(1).nonzero()[0])
+    assert int(green[top].sum()) > 0 and top < 30
+
+
+def test_numba_and_torch_shade_alike():
+    scene = sphere(0.6)
+    cameras = concatenate_cameras([ring_rig(2, (60, 44), seed=2), pinhole(1.0, 50, 48, look_at_subject(0.8), "near")])
+    surface = lit(scene)
+    background = torch.rand(3, 3, 48, 60, generator=torch.Generator().manual_seed(1))
+    fast = render(surface, cameras, background)
+    K = cameras.K * torch.tensor([2.0, 2.0, 1.0])[:, None]
+    fine = Cameras(cameras.names, K, cameras.camera_from_world, cameras.size_px * 2)
+    rgb, mask = shade_torch(surface, fine, rasterize(scene.mesh, fine).triangle, background)
+    assert torch.equal(mask, fast.mask)
+    # Rounding to 8 bit may fall to either side.
+    assert int((rgb.int() - fast.rgb.int()).abs().max()) <= 1
+    assert float((rgb != fast.rgb).float().mean()) < 1e-3
+
+
+def look_at_subject(distance: float) -> torch.Tensor:
+    eye = torch.tensor([distance, 1.2, 0.4])
+    return look_at(eye, torch.tensor([0.0, 0.95, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+
+
+def test_shadow_lookups_agree():
+    generator = torch.Generator().manual_seed(0)
+    scene, lights = sphere(0.4), stage_lights(0)
+    fast = visibility(scene.mesh, scene.normals, lights)
+    facing = scene.normals @ lights.toward.T
+    assert float(fast[facing > 0.2].min()) > 0.99, "a convex body does not shade what faces the light"
+    assert float(fast[facing < -0.4].max()) < 0.5, "what faces away is in its own shadow"
+    pixels = 140 * torch.rand(2, 500, 2, generator=generator) - 6
+    z, depth = torch.rand(2, 500, generator=generator), torch.rand(2, 128, 128, generator=generator)
+    from viewmend.data.synthetic import _shade_numba
+
+    slow, seen = unshadowed_torch(pixels, z, depth), torch.zeros(2, 500)
+    for n in range(2):
+        arrays = (pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
+        _shade_numba.unshadowed(*arrays)
+    torch.testing.assert_close(seen, slow, atol=1e-5, rtol=0)
+
+
+def test_a_roof_shades_what_is_under_it():
+    ball = sphere(0.2, (0.0, 0.5, 0.0))
+    roof = sphere(0.5, (0.0, 1.5, 0.0))
+    vertices = torch.cat([ball.mesh.vertices, roof.mesh.vertices])
+    faces = torch.cat([ball.mesh.faces, roof.mesh.faces + len(ball.mesh.vertices)])
+    up = Lights(torch.tensor([[0.0, 1, 0]]), torch.ones(1, 3), torch.zeros(0, 3), torch.zeros(0, 3))
+    both = visibility(Mesh(vertices, faces), torch.cat([ball.normals, roof.normals]), up)[: len(ball.normals)]
+    alone = visibility(ball.mesh, ball.normals, up)
+    top = ball.normals[:, 1] > 0.5
+    assert float(both[top].max()) == 0 and float(alone[top].min()) > 0.99
+
+
+def test_lights_are_much_the_same_from_all_sides_and_a_little_not():
+    for seed in range(5):
+        lights = stage_lights(seed)
+        heading = torch.arange(8) * math.pi / 4
+        walls = torch.stack([heading.cos(), torch.zeros(8), heading.sin()], -1)
+        bright = ((walls @ lights.toward.T).clamp(min=0) @ lights.strength).mean(1)
+        assert 0.85 < float(bright.mean()) < 1.05
+        assert 0.03 < float(bright.max() - bright.min()) < 0.7
+    assert not torch.equal(stage_lights(0).strength, stage_lights(1).strength)
+
+
+def test_small_images_of_fine_patterns_are_grey():
+    """Without smaller texture levels, a checkerboard finer than the pixels would shimmer."""
+    checks = ((torch.arange(512)[:, None] + torch.arange(512)[None]) % 2).float().expand(3, -1, -1).contiguous()
+    rgb = render(lit(square(1.0, checks)), front(32)).rgb[0, 1, 10:22, 10:22].float()
+    assert float(rgb.std()) < 6 and 100 < float(rgb.mean()) < 230
+
+
+def test_levels_follow_the_distance():
+    scene = square(1.0, torch.rand(3, 256, 256, generator=torch.Generator().manual_seed(0)))
+    pyramid = texture_pyramid(scene.textures)
+    near, far = front(256, visible_m=1.0), front(64, visible_m=1.0)
+    torch.testing.assert_close(face_levels(scene, near, pyramid), torch.zeros(1, 2), atol=0.01, rtol=0)
+    torch.testing.assert_close(face_levels(scene, far, pyramid), torch.full((1, 2), 2.0), atol=0.01, rtol=0)
+
+
+def test_texture_lookup_at_texel_centres_and_between():
+    texture = torch.rand(3, 4, 8, generator=torch.Generator().manual_seed(0))
+    pyramid = texture_pyramid((torch.zeros(3, 2, 2), texture))
+    which, zero = torch.ones(3, dtype=torch.long), torch.zeros(3)
+    uv = torch.tensor([[2.5 / 8, 1.5 / 4], [3.0 / 8, 1.5 / 4], [0.0, 1.0]])
+    linear = linear_from_srgb(texture)
+    expected = torch.stack([linear[:, 1, 2], (linear[:, 1, 2] + linear[:, 1, 3]) / 2, linear[:, 3, 0]])
+    torch.testing.assert_close(sample_texture(pyramid, which, uv, zero), expected)
+    last = sample_texture(pyramid, which, uv, torch.full((3,), 3.0))
+    torch.testing.assert_close(last, linear.mean((1, 2)).expand(3, 3), atol=1e-6, rtol=1e-5)
+
+
+def test_srgb_round_trip():
+    values = torch.linspace(0, 1, 101)
+    torch.testing.assert_close(srgb_from_linear(linear_from_srgb(values)), values, atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.gpu
+def test_cuda_draws_what_the_cpu_draws():
+    scene, cameras = sphere(0.5), ring_rig(3, (96, 80), seed=1)
+    a = render(lit(scene), cameras)
+    moved = TexturedMesh(
+        scene.mesh.to("cuda"), scene.normals.cuda(), scene.uv.cuda(), scene.texture_of_face.cuda(), scene.textures
+    )
+    surface = light(moved, stage_lights(0).to("cuda"), texture_pyramid(scene.textures).to("cuda"))
+    b = render(surface, cameras.to("cuda"))
+    # Outline samples may fall to either side.
+    assert float((a.mask != b.mask.cpu()).float().mean()) < 1e-3
+    assert float((a.rgb.int() - b.rgb.cpu().int()).abs().float().mean()) < 0.05

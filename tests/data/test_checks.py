@@ -1,0 +1,540 @@
+"""Checks of a capture: each common mistake is named, good captures have no issues."""
+
+import json
+import logging
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from reference.ball import BallCapture, photograph, ring
+
+from viewmend.cli import main
+from viewmend.data.checks import diagnosis, leave_one_out
+from viewmend.data.checks.calibration import HULL_ONLY, MASK_ONLY, check_calibration, draw_check
+from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
+from viewmend.data.checks.leave_one_out import (
+    LeaveOneOut,
+    check_image_mask_sync,
+    describe_delay,
+    find_outlier_by_hull,
+    find_outlier_by_outlines,
+)
+from viewmend.data.native_capture import open_capture
+from viewmend.data.native_writer import write_capture
+from viewmend.data.prepare import prepare
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.cameras import Cameras
+from viewmend.types import MultiViewFrame
+from viewmend.utils.contact_sheet import GAP_PX, LABEL_PX
+
+WHITE = (255, 255, 255)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    path = tmp_path_factory.mktemp("diagnosis") / "studio"
+    write_capture(Studio(StudioConfig(seed=2, cameras=8, frames=2, size_px=96)), path, images="png")
+    return path
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory):
+    path = tmp_path_factory.mktemp("moving") / "studio"
+    write_capture(Studio(StudioConfig(seed=2, cameras=8, frames=7, fps=10, size_px=128)), path, images="png")
+    return path
+
+
+@pytest.fixture
+def folder(good, tmp_path):
+    return shutil.copytree(good, tmp_path / "studio")
+
+
+def edit(folder, change):
+    """Change the content of cameras.json in place."""
+    content = json.loads((folder / "cameras.json").read_text())
+    change(content)
+    (folder / "cameras.json").write_text(json.dumps(content))
+
+
+def names_of(folder):
+    return [camera["name"] for camera in json.loads((folder / "cameras.json").read_text())["cameras"]]
+
+
+def change_poses(folder, change, names=None):
+    def apply(content):
+        for camera in content["cameras"]:
+            if names is None or camera["name"] in names:
+                R, t = change(np.array(camera["R"]), np.array(camera["t"]))
+                camera["R"], camera["t"] = R.tolist(), t.tolist()
+
+    edit(folder, apply)
+
+
+def change_images(folder, change, camera="*", kind="mask"):
+    for file in folder.glob(f"{kind}/{camera}/*.png"):
+        cv2.imwrite(str(file), change(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
+
+
+def empty(mask):
+    return 0 * mask
+
+
+def invert(mask):
+    return 255 - mask
+
+
+def flip(R, t):
+    return np.diag([1, -1, -1]) @ R, np.diag([1, -1, -1]) @ t
+
+
+# Mistakes in the calibration. Each makes hull and masks disagree, and each is fatal.
+
+
+def swap_calibrations(content):
+    a, b = content["cameras"][0], content["cameras"][2]
+    for key in ("K", "R", "t"):
+        a[key], b[key] = b[key], a[key]
+
+
+def double_intrinsics(content):
+    for camera in content["cameras"]:
+        camera["K"] = [[2 * x for x in row] for row in camera["K"][:2]] + [[0, 0, 1]]
+
+
+FATAL = {
+    "camera-to-world;": lambda f: change_poses(f, lambda R, t: (R.T, -R.T @ t)),
+    "OpenGL axes": lambda f: change_poses(f, flip),
+    "camera-to-world with OpenGL axes": lambda f: change_poses(f, lambda R, t: (R.T @ np.diag([1, -1, -1]), -R.T @ t)),
+    "R is camera-to-world (transposed)": lambda f: change_poses(f, lambda R, t: (R.T, t)),
+    "t is the camera's centre": lambda f: change_poses(f, lambda R, t: (R, -R.T @ t)),
+    "check metres_per_unit": lambda f: change_poses(f, lambda R, t: (R, 100 * t)),
+    "are swapped; exchange their files": lambda f: edit(f, swap_calibrations),
+    "K is for images 2 times as large; scale fx, fy, cx, cy and the skew by 0.5": lambda f: edit(f, double_intrinsics),
+    "they are inverted": lambda f: change_images(f, invert),
+}
+
+
+def test_good_captures_have_no_issues(good, moving, tmp_path):
+    capture = open_capture(good)
+    assert diagnose(capture.read(0), capture.bounds) == ()
+    assert warnings_of(moving, tmp_path) == []
+
+
+@pytest.mark.parametrize("words", FATAL)
+def test_fatal_mistakes_are_explained(folder, words):
+    FATAL[words](folder)
+    capture = open_capture(folder)
+    found = [issue.text for issue in diagnose(capture.read(0), capture.bounds) if issue.fatal]
+    assert len(found) == 1 and words in found[0]
+    with pytest.raises(ValueError) as refused:
+        prepare(capture)
+    assert found[0] in str(refused.value)
+
+
+def test_all_commands_report_the_same(folder, capsys):
+    change_poses(folder, flip)
+    assert main(["mend", str(folder), "--out", str(folder / "out"), "--path", "orbit", "--model", "telea"]) == 2
+    message = capsys.readouterr().err
+    assert main(["serve", str(folder), "--port", "0", "--model", "telea"]) == 2
+    assert capsys.readouterr().err == message and "http" not in message
+    main(["check", str(folder)])
+    issue = capsys.readouterr().out.splitlines()[-1].removeprefix("  - ")
+    assert "OpenGL axes" in issue and issue in message
+
+
+# Faults of single cameras.
+
+
+@pytest.mark.parametrize(("words", "change"), [("empty", empty), ("inverted", invert)])
+def test_a_bad_mask_is_reported_once_and_its_camera_left_out(folder, caplog, words, change):
+    name = names_of(folder)[3]
+    change_images(folder, change, name)
+    with caplog.at_level(logging.WARNING):
+        capture = prepare(open_capture(folder), align=False)
+        frames = [capture.read(0), capture.read(1)]
+    assert all(name not in frame.cameras.names and len(frame.cameras) == 7 for frame in frames)
+    assert len(caplog.messages) == 1 and f"camera '{name}': its mask is {words}" in caplog.messages[0]
+
+
+@pytest.mark.parametrize("damaged", [0, 1])
+def test_a_mask_that_is_empty_once_affects_only_its_frame(folder, damaged):
+    name = names_of(folder)[3]
+    cv2.imwrite(str(sorted(folder.glob(f"mask/{name}/*.png"))[damaged]), np.zeros((96, 96), np.uint8))
+    capture = prepare(open_capture(folder), align=False)
+    assert [name in capture.read(time).cameras.names for time in (0, 1)] == [damaged != 0, damaged != 1]
+
+
+def test_an_empty_mask_is_correct_if_the_subject_is_out_of_view(folder):
+    name = names_of(folder)[3]
+    change_images(folder, empty, name)
+    turn = np.diag([-1, 1, -1])
+    change_poses(folder, lambda R, t: (turn @ R, turn @ t), [name])
+    assert name in prepare(open_capture(folder), align=False).read(0).cameras.names
+
+
+def test_a_camera_with_another_pose_is_left_out(folder, caplog):
+    name = names_of(folder)[5]
+    change_poses(folder, flip, [name])
+    assert name not in prepare(open_capture(folder), align=False).read(1).cameras.names
+    assert f"camera '{name}' disagrees" in caplog.text
+
+
+def test_a_held_out_camera_affects_no_other(folder, caplog):
+    held, *inputs = names_of(folder)
+    before = prepare(open_capture(folder), inputs, align=False).read(0)
+    change_images(folder, empty, held)
+    assert held in prepare(open_capture(folder), inputs, align=False).read(0).cameras.names and not caplog.messages
+    change_images(folder, lambda mask: 0 * mask + 255, held)
+    after = prepare(open_capture(folder), inputs, align=False).read(0)
+    assert before.cameras.names == after.cameras.names and "scores against it are meaningless" in caplog.text
+    assert torch.equal(before.without([held]).mask, after.without([held]).mask)
+
+
+def test_half_of_the_inputs_inverted_is_fatal(folder):
+    held, *others = names_of(folder)
+    change_images(folder, empty, held)
+    for name in others[:2]:
+        change_images(folder, invert, name)
+    capture = open_capture(folder)
+    issues = find_bad_masks(capture.read(0), others[:3], capture.bounds)
+    assert [issue.fatal for issue in issues] == [True], "two of three"
+
+
+def test_a_wrong_unit_is_reported(folder, caplog):
+    edit(folder, lambda content: content.update(metres_per_unit=0.01))
+    prepare(open_capture(folder), align=False)
+    assert "check metres_per_unit" in caplog.text
+
+
+def delay(*kinds):
+    """Repeat two frames of camera 3, so that it is late."""
+
+    def change(folder):
+        for kind in kinds:
+            files = sorted((folder / kind / names_of(folder)[3]).glob("*.png"))
+            data = [file.read_bytes() for file in files]
+            for time, file in enumerate(files):
+                file.write_bytes(data[max(0, time - 2)])
+
+    return change
+
+
+def spoil(change, kind="image"):
+    return lambda folder: change_images(folder, change, names_of(folder)[3], kind)
+
+
+def remove_upper_half(mask):
+    rows = np.flatnonzero(mask.any(1))
+    mask[: (rows[0] + rows[-1]) // 2] = 0
+    return mask
+
+
+def exchange_images(folder):
+    first, second = (folder / "image" / names_of(folder)[view] for view in (3, 5))
+    first.rename(folder / "aside")
+    second.rename(first)
+    (folder / "aside").rename(second)
+
+
+def to_grey(image):
+    return image.mean(-1, keepdims=True).repeat(3, -1).astype(np.uint8)
+
+
+FAULTS = {
+    "late": (delay("image", "mask"), "late by about 2 frames"),
+    "late images": (delay("image"), "the images of camera '{}': late by about 2 frames"),
+    "late masks": (delay("mask"), "camera '{}': late by about 2 frames"),
+    "half a mask": (spoil(remove_upper_half, "mask"), "'{}'"),
+    "wide mask": (spoil(lambda mask: cv2.dilate(mask, np.ones((13, 13))), "mask"), "'{}'"),
+    "negative": (spoil(lambda image: 255 - image), "do not match those of the other cameras"),
+    "upside down": (spoil(lambda image: image[::-1]), "fit much better upside down"),
+    "mirrored": (spoil(lambda image: image[:, ::-1]), "fit much better mirrored"),
+    "blurred": (spoil(lambda image: cv2.GaussianBlur(image, (0, 0), 4)), "'{}'"),
+    "grey": (spoil(to_grey), "are grey"),
+    "exchanged images": (exchange_images, "do not match those of the other cameras"),
+}
+
+
+def warnings_of(path, tmp_path, change=lambda folder: None):
+    """The warnings while a changed copy of a capture is prepared."""
+    folder = shutil.copytree(path, tmp_path / "changed")
+    change(folder)
+    records = []
+    handler = logging.Handler()
+    handler.emit = lambda record: records.append(record.getMessage())
+    logging.getLogger("viewmend").addHandler(handler)
+    try:
+        prepare(open_capture(folder), first=3)
+    finally:
+        logging.getLogger("viewmend").removeHandler(handler)
+    return records
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_camera_is_named(moving, tmp_path, fault):
+    change, words = FAULTS[fault]
+    found = warnings_of(moving, tmp_path, change)
+    name = names_of(moving)[3]
+    assert any(words.format(name) in text and f"'{name}'" in text for text in found), found
+
+
+# EXIF orientation.
+
+
+def to_jpeg(folder, orientation, crop=96):
+    """Replace the images of camera 3 by JPEGs with this EXIF orientation."""
+    name = names_of(folder)[3]
+    for path in folder.glob(f"image/{name}/*.png"):
+        _, data = cv2.imencode(".jpg", cv2.imread(str(path))[:crop])
+        tiff = b"Exif\0\0MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0" + bytes([orientation]) + b"\0\0\0\0\0\0"
+        head = b"\xff\xd8\xff\xe1" + (len(tiff) + 2).to_bytes(2, "big") + tiff
+        path.with_suffix(".jpg").write_bytes(head + data.tobytes()[2:])
+    edit(folder, lambda content: content["cameras"][3].update(image=f"image/{name}/{{frame}}.jpg"))
+
+
+@pytest.mark.parametrize(("orientation", "words"), [(3, "turned by 180 degrees"), (2, "mirrored")])
+def test_exif_rotation_is_reported_once(folder, caplog, orientation, words):
+    to_jpeg(folder, orientation)
+    capture = open_capture(folder)
+    capture.read(0)
+    capture.read(1)
+    found = [text for text in caplog.messages if "EXIF" in text]
+    assert len(found) == 1 and words in found[0] and f"'{names_of(folder)[3]}'" in found[0] and "exiftran" in found[0]
+
+
+def test_exif_rotation_explains_a_wrong_size(folder):
+    to_jpeg(folder, 6, crop=64)
+    message = r"expected 96 x 96 .* got 96 x 64; EXIF says that it should be turned by 90"
+    with pytest.raises(ValueError, match=message):
+        open_capture(folder).read(0)
+
+
+# Thresholds.
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return photograph(ring(8))
+
+
+def outliers(monkeypatch, ball, outside, removed):
+    found = LeaveOneOut(torch.zeros(8, 1, 1, dtype=torch.bool), torch.tensor(removed), torch.tensor(outside))
+    monkeypatch.setattr(leave_one_out, "leave_one_out", lambda frame, bounds: found)
+    return [(issue.text, issue.camera) for issue in find_outlier_by_hull(ball, None)]
+
+
+@pytest.mark.parametrize(
+    ("typical", "own", "found"),
+    [(0.1, 0.44, False), (0.1, 0.46, True), (0.0, 0.14, False), (0.0, 0.16, True), (0.0, 0.31, True)],
+)
+def test_masks_outside_the_hull_are_compared_with_the_median(monkeypatch, ball, typical, own, found):
+    issues = outliers(monkeypatch, ball, [typical] * 3 + [own] + [typical] * 4, [0.0] * 8)
+    assert len(issues) == found
+    for text, left_out in issues:
+        assert f"'c3': {100 * own:.0f} % of its mask" in text
+        assert left_out == ("c3" if own > 0.3 else None) and ("it is left out" in text) == (own > 0.3)
+
+
+@pytest.mark.parametrize(
+    ("typical", "own", "found"), [(0.02, 0.033, False), (0.02, 0.035, True), (0.0, 0.005, True), (-0.02, 0.005, True)]
+)
+def test_masks_that_remove_the_subject_are_compared_with_the_mean(monkeypatch, ball, typical, own, found):
+    issues = outliers(monkeypatch, ball, [0.0] * 8, [typical] * 5 + [own] + [typical] * 2)
+    assert len(issues) == found and all("'c5' alone removes" in text and camera is None for text, camera in issues)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 8])
+def test_inverted_masks_are_fatal_from_half_of_them_on(ball, count):
+    mask = ball.mask.clone()
+    mask[:count] = 255 - mask[:count]
+    issues = find_bad_masks(replace(ball, mask=mask), ball.cameras.names, None)
+    if count < 4:
+        assert [issue.camera for issue in issues] == list(ball.cameras.names[:count])
+        assert not any(issue.fatal for issue in issues)
+    else:
+        assert len(issues) == 1 and issues[0].fatal and f"in {count} of 8 cameras" in issues[0].text
+
+
+def test_a_camera_with_a_small_mask_does_not_decide_on_the_rig(monkeypatch, ball):
+    iou = torch.tensor([0.95] * 7 + [0.2])
+    monkeypatch.setattr(diagnosis, "silhouette_iou", lambda covered, mask: iou)
+    assert diagnosis._agreement(ball, ball.cameras, None)[0] == pytest.approx(0.2)
+    wide = replace(ball.cameras, K=ball.cameras.K.clone())
+    wide.K[7, [0, 1], [0, 1]] /= 3  # its subject has a ninth of the others' area
+    assert diagnosis._agreement(photograph(wide), wide, None)[0] == pytest.approx(float(iou.mean()))
+
+
+# Synchronisation of images and masks.
+
+
+def chequered(times, delay=0, view=1, size=64):
+    """A square in front of a wall, moving two pixels per frame. The images of one camera are delayed."""
+    grid = torch.arange(size) // 4 % 2
+    wall = 40 * (grid[:, None] ^ grid[None]).byte()
+
+    def square(time):
+        inside = torch.zeros(size, size, dtype=torch.bool)
+        inside[20:44, 10 + 2 * time : 26 + 2 * time] = True
+        return inside
+
+    frames = []
+    for time in times:
+        shown = torch.stack([square(time), square(time)])
+        masks = 255 * shown.byte()
+        shown[view] = square(time - delay)
+        rgb = torch.where(shown, 200, wall).byte()[:, None].repeat(1, 3, 1, 1)
+        frames.append(MultiViewFrame(ring(2, size), rgb, masks, time))
+    return frames
+
+
+@pytest.mark.parametrize(("delay", "view"), [(-3, 0), (-1, 1), (1, 0), (2, 1), (4, 0)])
+def test_delayed_images_are_reported(delay, view):
+    (issue,) = check_image_mask_sync(chequered(range(9), delay, view))
+    assert f"'c{view}': {describe_delay(delay)} compared with its masks" in issue.text
+    assert not issue.camera and not issue.fatal
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9])
+def test_images_in_sync_are_not_reported(count):
+    assert check_image_mask_sync(chequered(range(count))) == ()
+    assert check_image_mask_sync([BallCapture(ring(4)).read(0)] * count) == ()
+
+
+def test_sync_needs_four_frames_with_masks_and_tolerates_a_damaged_image():
+    assert check_image_mask_sync(chequered(range(3), 1)) == ()
+    assert len(check_image_mask_sync(chequered(range(4), 1))) == 1
+    assert check_image_mask_sync([replace(frame, mask=None) for frame in chequered(range(9), 2)]) == ()
+    frames = chequered(range(5))
+    frames[2].rgb[1] //= 8
+    assert check_image_mask_sync(frames) == ()
+
+
+@pytest.mark.parametrize(("frames", "words"), [(1, "late by about 1 frame"), (-3, "early by about 3 frames")])
+def test_delays_are_described(frames, words):
+    assert describe_delay(frames) == words
+
+
+# Agreement of outlines.
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Studio(StudioConfig(seed=10002, cameras=8, frames=1, size_px=192))
+
+
+def displace(frame, name, step_m):
+    """Move the centre of one camera."""
+    pose = frame.cameras.camera_from_world.clone()
+    pose[frame.cameras.names.index(name), :3, 3] += torch.tensor(step_m)
+    return replace(frame, cameras=replace(frame.cameras, camera_from_world=pose))
+
+
+def roughen(frame, px, seed):
+    """Add noise to all principal points."""
+    K = frame.cameras.K.clone()
+    K[:, :2, 2] += px * torch.randn(len(K), 2, generator=torch.Generator().manual_seed(seed))
+    return replace(frame, cameras=replace(frame.cameras, K=K))
+
+
+@pytest.mark.parametrize("name", ["cam00", "cam03", "cam06"])
+@pytest.mark.parametrize("step_m", [(0.06, 0.0, 0.0), (0.0, -0.05, 0.0), (-0.04, 0.04, 0.0)])
+def test_a_displaced_camera_is_found_by_outlines(studio, name, step_m):
+    found = find_outlier_by_outlines(displace(studio.read(0), name, step_m), studio.bounds)
+    assert found is not None and found[0] == (name,) and found[1] > 4
+
+
+@pytest.mark.parametrize(("seed", "name"), [(1, "cam00"), (2, "cam03")])
+def test_a_displaced_camera_is_found_in_a_rough_rig(studio, seed, name):
+    frame = displace(roughen(studio.read(0), 0.5, seed), name, (0.04, 0.0, 0.0))
+    found = find_outlier_by_outlines(frame, studio.bounds)
+    assert found is not None and name in found[0] and 1.5 < found[1] < 2
+
+
+@pytest.mark.parametrize(("px", "seed"), [(0.5, 0), (0.5, 1), (1.0, 2), (1.0, 0)])
+def test_a_rough_rig_has_no_outlier(studio, px, seed):
+    assert find_outlier_by_outlines(roughen(studio.read(0), px, seed), studio.bounds) is None
+
+
+@pytest.mark.parametrize("seed", [10002, 10022, 10030])
+def test_a_clean_rig_has_no_outlier(seed):
+    """In the last two the outline of one camera stands out among small residuals."""
+    scene = Studio(StudioConfig(seed=seed, cameras=8, frames=1, size_px=192))
+    assert find_outlier_by_outlines(scene.read(0), scene.bounds) is None
+
+
+def test_common_shifts_small_rigs_and_missing_outlines_have_no_outlier(studio):
+    frame = studio.read(0)
+    moved = displace(frame, "cam00", (0.06, 0.0, 0.0))
+    for other in (
+        replace(frame, cameras=frame.cameras.moved(1.5, -1.0)),
+        moved.select(frame.cameras.names[:7:2]),
+        replace(moved, mask=torch.zeros_like(frame.mask)),
+        replace(moved, mask=torch.full_like(frame.mask, 255)),
+        replace(moved, mask=None),
+    ):
+        assert find_outlier_by_outlines(other, studio.bounds) is None
+
+
+@pytest.mark.parametrize(("step_m", "words"), [(0.06, "alone removes"), (0.02, "outlines of the other cameras agree")])
+def test_a_displaced_camera_is_diagnosed_once(studio, step_m, words):
+    """A large step shows in the hull; a small one only in the outlines."""
+    issues = diagnose(displace(studio.read(0), "cam03", (step_m, 0.0, 0.0)), studio.bounds)
+    assert len(issues) == 1 and "'cam03'" in issues[0].text and words in issues[0].text
+
+
+# The picture of the calibration check.
+
+
+@pytest.fixture
+def cube():
+    """Two cameras three metres from a cube of 0.8 m, which fills a square of 30 pixels in both."""
+    K = torch.tensor([[110.0, 0, 50], [0, 110.0, 40], [0, 0, 1]])
+    front = torch.eye(4)
+    front[2, 3] = 3
+    side = torch.tensor([[0.0, 0, -1, 0], [0, 1, 0, 0], [1, 0, 0, 3], [0, 0, 0, 1]])
+    cameras = Cameras(("front", "side"), K.expand(2, 3, 3), torch.stack([front, side]), torch.tensor([[100, 80]] * 2))
+    mask = torch.zeros(2, 80, 100, dtype=torch.uint8)
+    mask[:, 25:55, 35:65] = 255
+    return MultiViewFrame(cameras, torch.full((2, 3, 80, 100), 100, dtype=torch.uint8), mask, 0)
+
+
+def tiles_of(check, up=None):
+    sheet, top = draw_check(check, up, tile_width=100), GAP_PX + LABEL_PX
+    return [sheet[top : top + 80, left : left + 100].astype(int) for left in (GAP_PX, 100 + 2 * GAP_PX)]
+
+
+def near(tile, colour):
+    return (np.abs(tile - colour) < 60).all(-1)
+
+
+def test_disagreement_is_scored_and_drawn(cube):
+    assert min(check_calibration(cube, None).iou.values()) > 0.9
+    cube.mask[1] = cube.mask[1].roll(12, 0)  # as if the second camera were rotated
+    check = check_calibration(cube, Bounds(-torch.ones(3), torch.ones(3)))
+    assert max(check.iou.values()) < 0.75
+    front, side = tiles_of(check)
+    assert near(front, MASK_ONLY)[27:33, 38:62].mean() > 0.5  # the top of the front mask is carved away
+    assert near(side, MASK_ONLY)[59:65, 38:62].mean() > 0.5  # and the bottom of the side mask
+    assert near(front, HULL_ONLY).mean() < 0.02
+
+
+def test_bounds_and_up_are_drawn_where_they_project(cube):
+    front, _ = tiles_of(check_calibration(cube, Bounds(-torch.ones(3) * 0.6, torch.ones(3) * 0.6)))
+    left, top = round(50 - 110 * 0.6 / 3.6), round(40 - 110 * 0.6 / 3.6)
+    row, column = near(front, WHITE)[top - 1 : top + 2, 40:60], near(front, WHITE)[30:50, left - 1 : left + 2]
+    assert row.any(0).all() and column.any(1).all() and not near(front, WHITE)[45:50, 36:48].any()
+    check = check_calibration(cube, None)
+    with_up, without = (tiles_of(check, up)[0] for up in (torch.tensor([0.0, -1.0, 0.0]), None))
+    rows = np.argwhere((with_up != without).any(-1))[:, 0]
+    assert len(rows) and rows.max() <= 43  # from the centre of the cube towards smaller y
+
+
+def test_a_capture_without_masks_is_drawn(cube):
+    check = check_calibration(replace(cube, mask=None), None)
+    assert (check.iou, check.proxy, check.silhouettes) == ({}, None, None)
+    torch.testing.assert_close(check.bounds.center, torch.zeros(3), atol=0.05, rtol=0)
+    assert near(tiles_of(check)[0], WHITE).any()

@@ -1,0 +1,127 @@
+"""Cameras of unlike colours are matched to one another; those that agree, and those left out, stay as they are."""
+
+import shutil
+from dataclasses import replace
+
+import pytest
+import torch
+
+from viewmend.cli import main
+from viewmend.data.colour_matching import MIN_CAMERAS, SurfaceColours, SurfacePoints, match_colours
+from viewmend.data.native_writer import write_capture
+from viewmend.data.prepare import prepare
+from viewmend.data.source import CaptureWrapper
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+
+CAMERAS = 8
+PRECISION, WORST = 0.012, 0.04
+"""Of a camera's gain in a channel, mean and worst; highlights and the hull alone are 0.009 and 0.018 of it."""
+
+
+class Tinted(CaptureWrapper):
+    """A studio whose cameras have gains of their own; the first shows grey if a test wants."""
+
+    def __init__(self, source, strength=0.2, spoiled=False):
+        self.source, self.spoiled = source, spoiled
+        random = torch.Generator().manual_seed(3)
+        gains = torch.exp(strength * torch.randn(len(source.cameras), 3, generator=random).clamp(-1.5, 1.5))
+        self.gains = gains / gains.mean(0)
+
+    def read(self, time):
+        frame = self.source.read(time)
+        rgb = (0.8 * frame.rgb * self.gains[..., None, None]).round().clamp(0, 255).to(torch.uint8)
+        if self.spoiled:
+            rgb[0] = rgb[0].float().mean(0, keepdim=True).to(torch.uint8)
+        return replace(frame, rgb=rgb)
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Studio(StudioConfig(seed=4, cameras=CAMERAS, frames=1, size_px=192))
+
+
+def gains_left(match, tinted):
+    """The gains of each camera for grey, after the match, beside the mean camera's."""
+    grey = 0.3 * tinted.gains.max()
+    values = torch.cat([grey * tinted.gains, torch.ones(CAMERAS, 1)], 1)
+    left = torch.einsum("vck,vk->vc", match.maps, values) / grey
+    return left / left.mean(0)
+
+
+def test_known_gains_are_recovered(studio):
+    tinted = Tinted(studio)
+    match = match_colours(tinted.read(0), studio.bounds)
+    assert match.helps and match.after < 0.5 * match.before
+    off, given = ((gains - 1).abs() for gains in (gains_left(match, tinted), tinted.gains))
+    assert given.mean() > 0.08 and off.mean() < PRECISION and off.max() < WORST
+
+
+def test_the_mean_camera_stays(studio):
+    match = match_colours(Tinted(studio).read(0), studio.bounds)
+    assert torch.allclose(match.maps.mean(0), torch.eye(3, 4), atol=1e-4)
+
+
+def test_cameras_that_agree_stay_as_they_are(studio):
+    assert not match_colours(studio.read(0), studio.bounds).helps
+    prepared = prepare(studio, align=False)
+    assert prepared.colours is None and torch.equal(prepared.read(0).rgb, studio.read(0).rgb)
+
+
+def surface(monkeypatch, rgb):
+    """Every camera sees these points."""
+    seen = torch.ones(rgb.shape[:2], dtype=torch.bool)
+    monkeypatch.setattr(SurfacePoints, "colours", lambda points, images: SurfaceColours(rgb, seen))
+
+
+def test_what_is_clipped_is_no_measurement(studio, monkeypatch, rng):
+    """A third of the surface is brighter than the sensors of half of the cameras can say."""
+    gains = torch.linspace(0.9, 1.1, CAMERAS)[:, None, None].expand(-1, 1, 3)
+    true = 0.3 + 0.4 * torch.rand(1, 1500, 3, generator=rng)
+    true[:, ::3] = 0.98 + 0.1 * torch.rand(1, 500, 3, generator=rng)
+    surface(monkeypatch, (gains * true).clamp(max=1))
+    match = match_colours(studio.read(0), studio.bounds)
+    left = match.maps @ torch.cat([0.5 * gains[:, 0], torch.ones(CAMERAS, 1)], 1)[..., None]
+    assert match.helps and float((left / left.mean(0) - 1).abs().max()) < 0.002
+
+
+def test_what_maps_bring_is_judged_where_they_were_not_fitted(studio, monkeypatch, rng):
+    """Gains that are other ones from part to part: what three parts say makes the fourth worse."""
+    gain = torch.tensor([1.0, -1.0, 1.0, -1.0]).repeat_interleave(300) * torch.linspace(-0.05, 0.05, CAMERAS)[:, None]
+    surface(monkeypatch, (1 + gain[..., None]) * (0.3 + 0.4 * torch.rand(1, 1200, 3, generator=rng)))
+    match = match_colours(studio.read(0), studio.bounds)
+    assert match.after > 1.1 * match.before and not match.helps
+
+
+def test_a_few_cameras_or_none_that_share_surface_are_left_alone(studio):
+    frame = Tinted(studio).read(0)
+    few = frame.select(frame.cameras.names[: MIN_CAMERAS - 1])
+    assert match_colours(few, studio.bounds) is None
+    assert match_colours(replace(frame, mask=None), studio.bounds) is None
+
+
+def test_a_camera_that_is_left_out_is_not_looked_at_and_stays(studio):
+    inputs = studio.cameras.names[1:]
+    clean, spoiled = (prepare(Tinted(studio, spoiled=s), inputs, align=False) for s in (False, True))
+    assert clean.colours is not None and torch.equal(clean.colours.maps, spoiled.colours.maps)
+    raw, matched = Tinted(studio).read(0), clean.read(0)
+    assert torch.equal(raw.rgb[0], matched.rgb[0]) and not torch.equal(raw.rgb[1:], matched.rgb[1:])
+    assert torch.equal(raw.mask, matched.mask)
+    assert torch.equal(prepare(Tinted(studio), inputs, align=False, match_colours=False).read(0).rgb, raw.rgb)
+
+
+def test_reduced_images_are_matched_alike(studio):
+    small = prepare(Tinted(studio), longest_px=64, align=False)
+    assert torch.equal(small.colours.maps, prepare(Tinted(studio), align=False).colours.maps)
+    full = torch.nn.functional.avg_pool2d(prepare(Tinted(studio), align=False).read(0).rgb.float(), 3)
+    assert (small.read(0).rgb.float() - full).abs().mean() < 1.0
+
+
+def test_mend_says_that_colours_are_matched(studio, tmp_path, capsys):
+    write_capture(Tinted(studio), tmp_path / "take", images="png")
+    take, out = str(tmp_path / "take"), str(tmp_path / "out")
+    arguments = ["mend", take, "--leave-out", studio.cameras.names[0], "--model", "telea", "--no-align", "--out", out]
+    assert main(arguments) == 0
+    assert "matched the colours of 7 cameras" in capsys.readouterr().err
+    shutil.rmtree(tmp_path / "out")
+    assert main([*arguments, "--no-match-colours"]) == 0
+    assert "matched" not in capsys.readouterr().err

@@ -1,0 +1,102 @@
+"""Everybody's frames: aligned on the input cameras alone, and no larger than wanted."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from reference.ball import BallCapture, camera_at, photograph, ring
+
+from viewmend.data import prepare as preparing
+from viewmend.data.prepare import prepare
+from viewmend.data.resize import limit_size
+from viewmend.geometry.cameras import concatenate_cameras
+
+SHIFT_PX = 0.8
+
+
+class Shifted(BallCapture):
+    """A rig that states principal points beside the true ones; camera `c0` sees whatever a test wants."""
+
+    def __init__(self, spoiled: bool = False):
+        heights = (0.3, 0.0, 1.2, -0.8, 0.6, 1.4, -1.0)
+        self.true_cameras = concatenate_cameras(
+            [camera_at(51 * n, f"c{n}", size=96, height_m=height) for n, height in enumerate(heights)]
+        )
+        super().__init__(self.true_cameras.moved(-SHIFT_PX, 0.0))
+        self.spoiled = spoiled
+
+    def read(self, time):
+        frame = replace(photograph(self.true_cameras, time), cameras=self.cameras, depth=None)
+        if self.spoiled:
+            frame.rgb[0], frame.mask[0] = 200, frame.mask[0].roll(2, -1)  # too little for its camera to be left out
+        return frame
+
+
+def test_a_shift_of_all_images_is_undone_for_inputs_and_the_camera_left_out():
+    capture = Shifted()
+    prepared = prepare(capture, capture.cameras.names[1:])
+    moved = prepared.cameras.K[:, 0, 2] - capture.cameras.K[:, 0, 2]
+    assert moved.tolist() == pytest.approx([SHIFT_PX] * 7, abs=0.35)
+    assert torch.equal(prepared.read(1).cameras.K, prepared.cameras.K)
+    assert torch.equal(prepare(capture, align=False).cameras.K, capture.cameras.K)
+
+
+def test_what_the_camera_left_out_saw_does_not_move_the_inputs():
+    inputs = Shifted().cameras.names[1:]
+    clean, spoiled = (prepare(Shifted(spoiled), inputs).alignment for spoiled in (False, True))
+    assert clean == spoiled != prepare(Shifted(spoiled=True)).alignment
+
+
+def test_colours_are_matched_where_the_moved_cameras_look(monkeypatch):
+    """At full size, by the inputs' images alone."""
+    looked = []
+    monkeypatch.setattr(preparing, "match_colours", lambda frame, bounds: looked.append(frame))
+    capture = Shifted()
+    prepared = prepare(capture, capture.cameras.names[1:], longest_px=48)
+    [frame] = looked
+    assert prepared.colours is None and frame.cameras.names == capture.cameras.names[1:]
+    x_px, y_px = prepared.alignment.offset_px
+    expected = capture.cameras.select(frame.cameras.names).moved(x_px, y_px)
+    assert x_px > 0.4 and torch.equal(frame.cameras.K, expected.K) and frame.rgb.shape[-1] == 96
+
+
+def test_images_are_reduced_with_their_cameras_and_never_enlarged():
+    sizes = torch.tensor([[48, 48], [40, 48], [48, 30], [20, 24]])
+    cameras = replace(ring(4), size_px=sizes)
+    frame = replace(photograph(cameras), cameras=cameras)
+    small = limit_size(frame, 24)
+    assert small.cameras.size_px.tolist() == [[24, 24], [20, 24], [24, 15], [20, 24]] and small.depth is None
+    assert int(small.rgb[1, :, :, 20:].max()) == 0 and int(small.mask[2, 15:].max()) == 0
+    assert torch.equal(small.rgb[3, :, :24, :20], frame.rgb[3, :, :24, :20])
+    like = photograph(small.cameras[0])
+    assert float((like.rgb[0].float() - small.rgb[0].float()).abs().mean()) < 5
+    assert limit_size(frame, None) is frame and limit_size(frame, 48) is frame
+    assert limit_size(replace(frame, mask=None), 24).mask is None
+
+
+def test_a_reduced_capture_states_the_cameras_of_its_frames():
+    prepared = prepare(BallCapture(ring(6)), longest_px=32, align=False)
+    frame = prepared.read(0)
+    assert frame.rgb.shape == (6, 3, 32, 32) and prepared.cameras.max_size_px == (32, 32)
+    assert torch.equal(frame.cameras.K, prepared.cameras.K)
+
+
+class Absent(BallCapture):
+    """A rig of which camera `c1` has nothing at time 1."""
+
+    def read(self, time):
+        frame = super().read(time)
+        return frame.without(["c1"]) if time == 1 else frame
+
+
+def test_a_camera_without_a_file_is_said_once_and_is_absent_there(caplog):
+    prepared = prepare(Absent(ring(6)), align=False)
+    assert [len(prepared.read(time).cameras) for time in (0, 1, 1)] == [6, 5, 5]
+    said = [record.getMessage() for record in caplog.records if "'c1'" in record.getMessage()]
+    assert len(said) == 1 and "has no image or no mask and is absent; check its files" in said[0]
+
+
+def test_a_camera_that_is_no_input_may_be_absent(caplog):
+    names = [name for name in ring(6).names if name != "c1"]
+    assert len(prepare(Absent(ring(6)), names, align=False).read(1).cameras) == 5
+    assert not [record for record in caplog.records if "'c1'" in record.getMessage()]

@@ -1,0 +1,58 @@
+"""The smooth fill against its slow reference."""
+
+import pytest
+import torch
+from reference.prefill_twin import fill_twin, pull_push_twin
+
+from viewmend.models.smooth_fill import fill, pull_push
+
+
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (13, 9), (5, 30)])
+@pytest.mark.parametrize("share", [0.9, 0.3, 0.02])
+def test_pull_push_equals_its_reference_and_keeps_known_pixels(size, share, rng):
+    rgb, known = torch.rand(3, *size, generator=rng), torch.rand(size, generator=rng) < share
+    filled = pull_push(rgb, known)
+    assert torch.equal(filled[:, known], rgb[:, known])
+    assert torch.allclose(filled[:, ~known], pull_push_twin(rgb * known, known)[:, ~known], atol=1e-5)
+
+
+def test_a_hole_in_a_uniform_image_takes_its_colour():
+    rgb, known = torch.full((3, 20, 33), 0.7), torch.ones(20, 33, dtype=torch.bool)
+    known[4:15, 3:30] = False
+    assert torch.allclose(pull_push(rgb * known, known), rgb, atol=1e-6)
+    assert not pull_push(rgb, torch.zeros_like(known)).any()
+
+
+def picture_with_holes() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A grey subject on black, a thin hole along its right edge and a wide one at its left edge."""
+    subject = torch.zeros(40, 40, dtype=torch.bool)
+    subject[5:35, 8:32] = True
+    missing = torch.zeros_like(subject)
+    missing[10:30, 31] = True
+    missing[10:30, 8:20] = True
+    return 0.8 * (subject & ~missing).expand(3, -1, -1).float(), missing, subject
+
+
+def test_fill_treats_thin_and_wide_holes_differently():
+    rgb, missing, subject = picture_with_holes()
+    filled = fill(rgb, missing, subject)
+    assert torch.equal(filled[:, ~missing], rgb[:, ~missing])
+    thin, wide = filled[:, 15:25, 31], filled[:, 12:28, 8:20]
+    assert float(thin.max()) < 0.6 and float(thin.min()) > 0.2, "half background"
+    assert torch.allclose(wide, torch.tensor(0.8), atol=1e-5), "background does not bleed into wide holes"
+
+
+def test_fill_without_known_pixels_is_black():
+    everywhere = torch.ones(12, 12, dtype=torch.bool)
+    assert not fill(torch.zeros(3, 12, 12), everywhere, everywhere).any()
+
+
+@pytest.mark.parametrize("share", [0.15, 0.5, 0.8])
+@pytest.mark.parametrize("size", [(24, 31), (9, 40)])
+def test_fill_equals_its_reference(size, share, rng):
+    coarse = torch.rand(1, 1, size[0] // 4, size[1] // 4, generator=rng)
+    missing = torch.nn.functional.interpolate(coarse, size=size, mode="bilinear")[0, 0] < share
+    missing |= torch.rand(size, generator=rng) < 0.05
+    subject = torch.rand(size, generator=rng) < 0.8
+    rgb = torch.rand(3, *size, generator=rng) * ~missing
+    assert torch.allclose(fill(rgb, missing, subject), fill_twin(rgb, missing, subject), atol=1e-5)

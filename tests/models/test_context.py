@@ -1,0 +1,70 @@
+"""The temporal window, and what a context provider requests and remembers."""
+
+from dataclasses import replace
+
+from hypothesis import given
+from hypothesis import strategies as st
+from models.plates import NAMES, Rig, tiny, view
+
+from viewmend.models.base import REMEMBERED_FRAMES, ContextProvider, RenderQuality
+from viewmend.models.paper.config import paper
+from viewmend.models.paper.context_tokens import window_times
+
+
+def test_the_papers_window():
+    assert window_times(100, paper()) == (100, 99, 98, 97, 90, 80, 70)
+    assert window_times(12, paper()) == (12, 11, 10, 9, 2)
+    assert window_times(0, paper()) == (0,)
+
+
+@given(n_c=st.integers(0, 4), n_w=st.integers(0, 4), k_w=st.integers(1, 12), time=st.integers(0, 90))
+def test_windows_are_causal_and_short(n_c, n_w, k_w, time):
+    times = window_times(time, replace(paper(), n_c=n_c, n_w=n_w, k_w=k_w))
+    assert times[0] == time and min(times) >= 0
+    assert list(times) == sorted(set(times), reverse=True)
+    assert len(times) <= 1 + n_c + n_w
+
+
+def test_only_missing_frames_are_requested():
+    net, rig = tiny(), Rig()
+    net.step(view(8), rig, net.initial_state())
+    assert rig.asked == [(t, NAMES) for t in window_times(8, net.config)]
+    rig.asked.clear()
+    net.step(replace(view(8), source_views=("left", "third")), rig, net.initial_state())
+    assert rig.asked == [(t, ("third",)) for t in window_times(8, net.config)]
+    rig.asked.clear()
+    net.step(view(9), rig, net.initial_state())
+    assert rig.asked == [(9, NAMES), (5, NAMES), (1, NAMES)]
+
+
+def test_a_providers_own_memory_is_bounded():
+    context, encoded = Rig(), []
+
+    def encode(many):
+        encoded.extend(views.frame.time for views in many)
+        return [[(name, views.frame.time) for name in views.frame.cameras.names] for views in many]
+
+    for time in range(3 * REMEMBERED_FRAMES):
+        times = (time, time - 30) if time >= 30 else (time,)
+        assert context.encoded(times, ("left",), encode) == [("left", t) for t in times]
+    assert encoded == list(range(3 * REMEMBERED_FRAMES)), "each frame is encoded once"
+    context.encoded((0,), ("left",), encode)
+    assert encoded[-1] == 0, "the oldest frame was evicted"
+
+
+def test_excluded_cameras_are_never_provided():
+    rig = Rig()
+    context = ContextProvider(rig, exclude=("left",))
+    assert context(3, NAMES).frame.cameras.names == ("right",) and context(3, ("left",)) is None
+    assert context.encoded((3,), NAMES, lambda many: [v.frame.cameras.names for v in many]) == ["right"]
+    shared = {"left": "encoded for another viewer"}
+    context = ContextProvider(rig, exclude=("left",), memory=lambda time: shared)
+    assert context.encoded((3,), ("left",), lambda many: []) == []
+
+
+def test_lower_quality_uses_less_of_the_window():
+    net = tiny()
+    for count, times in ((None, window_times(8, net.config)), (2, (8, 7)), (1, (8,)), (0, ())):
+        rig = Rig()
+        net.step(view(8), ContextProvider(rig, RenderQuality(context_times=count)), net.initial_state())
+        assert [time for time, _ in rig.asked] == list(times)

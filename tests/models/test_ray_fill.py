@@ -1,0 +1,122 @@
+"""The ray fill: its inputs, and that it only fills holes, with colours of its candidates."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from models.plates import Rig, context, tiny_rays, view
+from reference.rays_reference import neighbourhoods_reference
+
+from viewmend.models.base import ContextProvider
+from viewmend.models.compositing import blend
+from viewmend.models.smooth_fill import fill
+from viewmend.models.views import ray_fill
+from viewmend.models.views.pyramids import SourceCameras
+from viewmend.models.views.ray_fill import (
+    CELLS,
+    CELLS_AROUND,
+    PIXELS_STEP,
+    RADIUS_PX,
+    gather_ray_inputs,
+    multi_scale_context,
+    windows,
+)
+
+SOURCES = SourceCameras.of(context(5), None)
+
+
+def smooth(view):
+    return fill(view.rgb, view.error > 0, view.mask > 0)
+
+
+def test_neighbourhoods_equal_the_reference(rng):
+    incomplete = view(5)
+    ripples = 0.3 * torch.rand(incomplete.depth.shape, generator=rng)
+    holed = (incomplete.depth + ripples) * (torch.rand(incomplete.depth.shape, generator=rng) > 0.1)
+    incomplete, guess = replace(incomplete, depth=holed), torch.rand(incomplete.rgb.shape, generator=rng)
+    corners = torch.tensor([[0, 0], [3, incomplete.rgb.shape[2] - 1]])
+    pixels = torch.cat([torch.nonzero(incomplete.error > 0)[::60], corners])
+    expected = neighbourhoods_reference(incomplete, guess, pixels, CELLS, CELLS_AROUND)
+    found, index = multi_scale_context(incomplete, guess, pixels)
+    assert torch.allclose(found[index].double(), torch.from_numpy(expected), atol=1e-4)
+    again, where = multi_scale_context(incomplete, guess, pixels.repeat(2, 1))
+    assert torch.equal(again, found) and torch.equal(where, index.repeat(2)), "pixels of one cell share it"
+
+
+def test_windows_are_zero_outside_the_image():
+    image = torch.arange(2 * 5 * 6.0).reshape(2, 5, 6)
+    corner, middle = windows(image, torch.tensor([[0, 0], [2, 3]]), 1)
+    assert torch.equal(middle, image[:, 1:4, 2:5])
+    assert torch.equal(corner[:, 1:, 1:], image[:, :2, :2]) and not corner[:, 0].any() and not corner[:, :, 0].any()
+
+
+@torch.no_grad()
+def test_known_pixels_stay_and_a_step_blends_the_rest():
+    net, incomplete, missing = tiny_rays(), view(5), view(5).error > 0
+    filled = net(incomplete, SourceCameras.of(context(5, ("left", "right", "third")), None))
+    assert torch.equal(filled[:, ~missing], incomplete.rgb[:, ~missing])
+    assert float(filled.min()) >= 0 and float(filled.max()) <= 1 and not torch.equal(filled, smooth(incomplete))
+    candidates = replace(incomplete, candidate_views=("third", "left", "novel", "right"))
+    rig = Rig()
+    completed, _ = net.step(candidates, rig, net.initial_state())
+    assert rig.asked[0] == (5, ("left", "right", "third")), "the source views, then the closest others"
+    assert torch.equal(completed.rgb, blend(incomplete.rgb, incomplete.error, filled, torch.ones_like(incomplete.mask)))
+    whole, rig = view(5, hole=None), Rig()
+    assert net.step(whole, rig, net.initial_state())[0].rgb is whole.rgb and not rig.asked
+
+
+@torch.no_grad()
+def test_depth_in_holes_is_optional():
+    """It is taken from the surroundings; without any depth the smooth fill decides."""
+    net, incomplete = tiny_rays(), view(5)
+    holed = replace(incomplete, depth=incomplete.depth * (incomplete.error == 0))
+    flat = replace(incomplete, depth=torch.zeros_like(incomplete.depth))
+    maskless = replace(incomplete, mask=0 * incomplete.mask, depth=2.0 * (incomplete.depth > 0))
+    assert torch.allclose(net(incomplete, SOURCES), net(holed, SOURCES), atol=1e-3), "the plate is flat"
+    assert torch.equal(net(flat, SOURCES), smooth(incomplete))
+    for odd in (flat, maskless):
+        assert net.step(odd, Rig(), net.initial_state())[0].rgb.isfinite().all()
+    blind = net.step(incomplete, ContextProvider(lambda *_: None), net.initial_state())[0]
+    assert torch.allclose(blind.rgb, net(incomplete, None) * incomplete.error + (1 - incomplete.error) * incomplete.rgb)
+
+
+@torch.no_grad()
+def test_chunks_of_pixels_give_the_same_in_few_sizes(monkeypatch):
+    """Layers are compiled and kept for each size: many sizes would fragment the memory of a server."""
+    net, incomplete, sizes = tiny_rays(), view(5), set()
+    whole = net(incomplete, SOURCES)
+    monkeypatch.setattr(ray_fill, "PIXELS_AT_ONCE", 7)
+    assert torch.allclose(whole, net(incomplete, SOURCES), atol=1e-6)
+    for layer in net.modules():
+        if not list(layer.children()):
+            layer.register_forward_hook(lambda _, given, __: sizes.add(len(given[0])))
+    missing = torch.nonzero(incomplete.error > 0)
+    for pixels in (1, 7, 65, len(missing)):
+        net.mix(gather_ray_inputs(incomplete, SOURCES, missing[:pixels]))
+    assert len(missing) > 65 and sizes and all(size % PIXELS_STEP == 0 for size in sizes)
+
+
+@torch.no_grad()
+def test_a_point_that_no_camera_sees_is_no_candidate():
+    """Whatever its weight: such a point has no colour, and would be black."""
+    net, incomplete = tiny_rays(), view(5)
+    inputs = gather_ray_inputs(incomplete, SOURCES, torch.nonzero(incomplete.error > 0))
+    net.choose.weight.zero_()
+    net.choose.bias.zero_()
+    net.choose.bias[:-2], net.choose.bias[-2] = 100, 50  # points, then the smooth fill, then black
+    guess = inputs.window[:, -3:, RADIUS_PX, RADIUS_PX]
+    assert float(guess.mean()) > 0.1
+    assert torch.allclose(net.mix(inputs._replace(features=0 * inputs.features)), guess, atol=1e-3)
+    assert not torch.allclose(net.mix(inputs), guess, atol=1e-2)
+
+
+@pytest.mark.parametrize("views", [0, 2])
+def test_inputs_of_several_views_are_padded_to_the_same_cameras(views):
+    pixels = torch.nonzero(view(5).error > 0)[:3]
+    one = gather_ray_inputs(view(5), SOURCES if views else None, pixels)
+    three = gather_ray_inputs(view(5), SourceCameras.of(context(5, ("left", "third", "right")), None), pixels)
+    both = ray_fill.RayInputs.cat([one, three])
+    assert both.features.shape[2] == 3 and not bool(both.features[:3, :, views:].any())
+    assert torch.equal(
+        both.neighbourhoods[both.neighbourhood_index[3:]], three.neighbourhoods[three.neighbourhood_index]
+    )

@@ -1,0 +1,148 @@
+"""Ray samples: compiled kernels and PyTorch agree with each other, and with slow reference implementations."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from models.plates import camera, context, look, view
+from reference.rays_reference import sample_fill_reference
+
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.geometry.cameras import Cameras
+from viewmend.models.views import pyramids
+from viewmend.models.views.config import AROUND, FAR, NEAR, OFFSETS
+from viewmend.models.views.pyramids import SceneScale, SourceCameras, choose_levels, downsample2x, silhouette_pyramids
+from viewmend.models.views.ray_fill import OFFSETS as FILL_OFFSETS
+from viewmend.models.views.ray_fill import sample_behind_proxy
+from viewmend.models.views.sampler import PATCH, CameraFeatures, Rays, sample_rays, sample_rays_torch
+from viewmend.types import Silhouettes
+
+
+def rays_of(view):
+    pixels = torch.nonzero(view.mask > 0)
+    z = view.depth[tuple(pixels.T)][:, None] + SceneScale.of(view).size_m * torch.tensor(OFFSETS)
+    return pixels, Rays(view.camera, pixels.flip(1).double() + 0.5, z)
+
+
+def rotated(cameras: Cameras, angle: float) -> Cameras:
+    """The cameras rotated about their own vertical axis, so that their z-depths differ."""
+    turn = torch.eye(4)
+    c, s = torch.tensor(angle).cos(), torch.tensor(angle).sin()
+    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = c, s, -s, c
+    return replace(cameras, camera_from_world=turn @ cameras.camera_from_world)
+
+
+@pytest.mark.parametrize("kernels", [True, False])
+def test_fill_samples_equal_the_reference(rng, kernels, monkeypatch):
+    monkeypatch.setattr(SourceCameras, "use_kernels", kernels)
+    incomplete, seen = view(5), context(5, ("left", "third", "right"))
+    depth = seen.depth + 0.2 * torch.rand(seen.depth.shape, generator=rng) * (seen.depth > 0)
+    masks = (torch.rand(depth.shape, generator=rng) * 256).byte()
+    seen = replace(seen, frame=replace(seen.frame, cameras=rotated(seen.frame.cameras, 0.55), mask=masks), depth=depth)
+    rig = context(5, ("left", "third", "right", "novel")).frame
+    outlines = (torch.rand(rig.rgb[:, 0].shape, generator=rng) * 64).byte()
+    incomplete = replace(incomplete, silhouettes=Silhouettes(outlines, rotated(rig.cameras, 0.55)))
+    pixels = torch.nonzero(incomplete.error > 0)
+    pixels = pixels[torch.randperm(len(pixels), generator=rng)[:25]]
+    sources = SourceCameras.of(seen, incomplete.silhouettes)
+    samples = sample_behind_proxy(incomplete, pixels, sources)
+    features, smallest = sample_fill_reference(incomplete, pixels, seen, FILL_OFFSETS, NEAR, FAR, AROUND, PATCH)
+    assert 0 < CameraFeatures.unstack(samples.features).in_view.mean() < 1, "some samples are out of view"
+    assert torch.allclose(samples.features.double(), torch.from_numpy(features), atol=3e-3)
+    assert torch.allclose(samples.statistics[..., -4:].double(), torch.from_numpy(smallest), atol=2e-3)
+    assert 0.05 < (samples.statistics[..., -3] < 0.5).float().mean() < 0.95
+    one = sample_behind_proxy(incomplete, pixels, sources, offsets=(0.09,)).features
+    assert torch.allclose(one[:, 0], samples.features[:, FILL_OFFSETS.index(0.09)], atol=1e-6)
+
+
+@pytest.mark.parametrize("step_px", [1.0, 5.0])
+def test_both_implementations_take_the_same_samples(scene, step_px):
+    _, view, sources = scene
+    _, rays = rays_of(view)
+    rays = rays._replace(z_m=torch.where(torch.rand(rays.z_m.shape) < 0.1, 0.0, rays.z_m))
+    given = rays, sources, view.source_views, step_px, SceneScale.of(view)
+    fast, slow = sample_rays(*given), sample_rays_torch(*given)
+    levels = sources.levels(view.camera, step_px, SceneScale.of(view))
+    assert min(level for part in levels for pair in part for level in pair) == {1.0: 0, 5.0: 2}[step_px]
+    for name, one, other in zip(fast._fields, fast, slow, strict=True):
+        off = (one - other).abs()
+        flips = (off > 1e-3).float().mean()  # of the proxy's nearest pixel, where a position is between two
+        assert float(flips) < 2e-3 and float(off.median()) < 1e-6, name
+    assert float(fast.prior.sum(2).max()) <= 1 + 1e-5 and float(fast.statistics[..., 3:6].max()) > 0.1
+
+
+def test_at_the_finest_level_both_networks_see_the_same(scene, monkeypatch):
+    _, view, sources = scene
+    monkeypatch.setattr(pyramids, "choose_levels", lambda cameras, last, *_: (0 * last, last))
+    pixels, rays = rays_of(view)
+    found = sample_rays(rays, sources, view.source_views, 1.0, SceneScale.of(view))
+    wanted = sample_behind_proxy(view, pixels, sources, OFFSETS)
+    assert len(pixels) > 500
+    for channels in (slice(4), slice(6, 9)):
+        torch.testing.assert_close(found.features[..., channels], wanted.features[..., channels], atol=1e-4, rtol=0)
+    torch.testing.assert_close(found.statistics[..., 6:8], wanted.statistics[..., 6:8], atol=1e-4, rtol=0)
+
+
+def test_positions_stay_exact_under_autocast(scene):
+    _, view, sources = scene
+    given = rays_of(view)[1], sources, view.source_views, 2.0, SceneScale.of(view)
+    with torch.autocast("cpu", torch.bfloat16):
+        again = sample_rays(*given)
+    assert all(torch.equal(one, other) for one, other in zip(sample_rays(*given), again, strict=True))
+
+
+def test_levels_are_means_with_a_black_border():
+    image = torch.zeros(7, 9, 1, dtype=torch.uint8)
+    image[1:-1, 1:-1, 0] = torch.randint(0, 256, (5, 7), dtype=torch.uint8)
+    half, inner = downsample2x(image), image[..., 0].int()
+    assert half.shape == (5, 6, 1) and int(half[0].sum() + half[-1].sum() + half[:, 0].sum() + half[:, -1].sum()) == 0
+    assert int(half[1, 1, 0]) == (int(inner[1:3, 1:3].sum()) + 2) // 4
+    assert int(half[3, 4, 0]) == (int(inner[5, 7]) + 2) // 4, "an odd side is completed with black"
+
+
+def test_levels_match_the_footprint_of_a_ray():
+    mask = torch.zeros(1, 64, 64, dtype=torch.uint8)
+    mask[0, 8:40, 16:48] = 255
+    cameras = Studio(StudioConfig(cameras=4, frames=1, size_px=64)).cameras.select(["cam00"])
+    (pyramid,) = silhouette_pyramids(Silhouettes(mask, cameras))
+    assert pyramid.subject_px == pytest.approx(32)
+    last, subject_px = torch.tensor([len(pyramid.levels) - 1]), torch.tensor([100.0])
+    scale = SceneScale(1.0, 2.0)  # the viewer stands where the camera is: footprints are as large as rays are apart
+    chosen = [choose_levels(cameras, last, subject_px, cameras, px, scale) for px in (0.3, 1.0, 1.5, 4.0, 1e9)]
+    assert [int(fine) for fine, _ in chosen] == [0, 0, 1, 2, int(last)]
+    assert [int(wide) for _, wide in chosen] == [3, 3, 3, 3, int(last)]
+
+
+def test_without_silhouettes_the_source_masks_count():
+    incomplete, seen = view(5), context(5)
+    pixels = torch.nonzero(incomplete.error > 0)[::20]
+    parts = SourceCameras.of(seen, None), SourceCameras.of(seen, Silhouettes(seen.frame.mask, seen.frame.cameras))
+    without, given = (sample_behind_proxy(incomplete, pixels, part).statistics for part in parts)
+    assert torch.equal(without, given)
+
+
+def test_cameras_agree_on_the_colour_of_a_surface_point():
+    pixels, sources = torch.tensor([[30, 40], [25, 33]]), SourceCameras.of(context(5), None)
+    found = CameraFeatures.unstack(sample_behind_proxy(view(5), pixels, sources, offsets=(0.0,)).features)
+    truth = look(camera("novel"), 5)[0][:, pixels[:, 0], pixels[:, 1]].T[:, None, None]
+    assert torch.allclose(found.colour, truth.expand_as(found.colour), atol=0.05)
+    for behind in (found.depth_difference, found.coarse_depth_difference):
+        assert torch.allclose(behind, torch.zeros_like(behind), atol=1e-4), "at the proxy, not behind it"
+
+
+@pytest.mark.parametrize("unit", [0.001, 10.0])
+def test_the_unit_of_length_does_not_matter(unit):
+    def scaled(cameras):
+        pose = cameras.camera_from_world.clone()
+        pose[:, :3, 3] *= unit
+        return replace(cameras, camera_from_world=pose)
+
+    incomplete, seen = view(5), context(5)
+    pixels = torch.nonzero(incomplete.error > 0)[::40]
+    other = replace(incomplete, camera=scaled(incomplete.camera), depth=incomplete.depth * unit)
+    frame = replace(seen.frame, cameras=scaled(seen.frame.cameras))
+    after = sample_behind_proxy(
+        other, pixels, SourceCameras.of(replace(seen, frame=frame, depth=seen.depth * unit), None)
+    )
+    before = sample_behind_proxy(incomplete, pixels, SourceCameras.of(seen, None))
+    assert torch.allclose(after.features, before.features, atol=1e-3)

@@ -1,0 +1,223 @@
+"""The default model: it changes E only, and predicts colours from the source cameras, with alpha and depth."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from viewmend.models.base import ContextProvider, HeldOutView, RenderQuality, State
+from viewmend.models.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
+from viewmend.models.views import pyramids
+from viewmend.models.views.config import OFFSETS, ViewsConfig
+from viewmend.models.views.grid import rim_depth, scatter_to_image
+from viewmend.models.views.model import ViewSynthNet
+from viewmend.models.views.prediction import SLOPES, fit_alpha_slope, repremultiply, scale_logits
+from viewmend.models.views.pyramids import SceneScale, SourceCameras
+from viewmend.rendering.crop import Crop
+from viewmend.stream import Stream
+
+
+def context_of(stream, quality=None):
+    return ContextProvider(lambda _, names: stream.cached_frame().context(names), quality)
+
+
+def image_of(prediction, view):
+    return scatter_to_image(prediction.rgb, prediction.pixels, view.mask.shape)
+
+
+def test_only_e_changes(scene):
+    stream, view, _ = scene
+    torch.manual_seed(0)
+    error = view.error * (torch.rand_like(view.error) < 0.3)
+    completed = stream.mend(replace(view, error=error)).completed
+    kept = error == 0
+    assert torch.equal(completed.rgb[:, kept], view.rgb[:, kept])
+    assert bool((completed.rgb[:, ~kept] != view.rgb[:, ~kept]).any())
+    assert torch.equal(completed.alpha[kept], view.mask[kept]) and torch.equal(completed.depth[kept], view.depth[kept])
+    for image in (completed.rgb, completed.alpha, completed.confidence):
+        assert float(image.min()) >= 0 and float(image.max()) <= 1 + 1e-6
+    assert float(completed.confidence[kept & (view.mask == 0)].abs().max()) == 0
+    subject = ~kept & (completed.alpha > 0.5)
+    moved, size = completed.depth[subject] - rim_depth(view.depth)[subject], SceneScale.of(view).size_m
+    within = (moved > (OFFSETS[0] - 0.04) * size) & (moved < (OFFSETS[-1] + 0.04) * size)
+    assert float(within.float().mean()) > 0.95, "except where a cell belongs to a nearer surface"
+
+
+def test_soft_e_blends(scene):
+    stream, view, _ = scene
+    whole, half, none = (stream.mend(replace(view, error=share * view.error)).completed for share in (1.0, 0.5, 0.0))
+    torch.testing.assert_close(half.rgb, (whole.rgb + view.rgb) / 2)
+    torch.testing.assert_close(half.alpha, (whole.alpha + view.mask) / 2)
+    assert none.rgb is view.rgb and none.alpha is None
+
+
+@torch.no_grad()
+def test_a_crop_has_the_scale_of_the_whole_view(scene):
+    stream, view, sources = scene
+    net, scale, crop = stream.inpainter, SceneScale.of(view), Crop(0, 16, 96, 83)
+    whole, part, other = (
+        net(v, sources, s) for v, s in ((view, scale), (crop.of_view(view), scale), (crop.of_view(view), None))
+    )
+    depth = scatter_to_image(whole.depth[:, None], whole.pixels, view.mask.shape)[0, 32:]
+    own = scatter_to_image(part.depth[:, None], part.pixels, torch.Size((67, 96)))[0, 16:]
+    assert float((depth - own).abs().median()) < 1e-3 * scale.size_m
+    assert not torch.equal(other.depth, part.depth)
+
+
+@torch.no_grad()
+def test_colours_come_from_the_source_cameras(scene):
+    stream, view, sources = scene
+    green = torch.zeros_like(sources.views.frame.rgb)
+    green[:, 1] = 255
+    frame = replace(sources.views.frame, rgb=green)
+    other = SourceCameras.of(replace(sources.views, frame=frame), view.silhouettes)
+    found = stream.inpainter(replace(view, rgb=torch.zeros_like(view.rgb)), other)
+    assert float(found.rgb[:, 0].max()) == 0 and float(found.rgb[:, 1].mean()) > 5 * float(found.rgb[:, 2].max())
+
+
+def test_without_cameras_the_view_stays(scene):
+    stream, view, _ = scene
+    completed, state = stream.inpainter.step(view, ContextProvider(lambda *_: None), State())
+    assert completed.rgb is view.rgb and completed.alpha is None and state == State()
+
+
+@torch.no_grad()
+def test_chunks_of_rays_give_the_same(scene, monkeypatch):
+    stream, view, sources = scene
+    whole = stream.inpainter(view, sources)
+    monkeypatch.setattr(pyramids, "CPU_RAYS", 29)
+    torch.testing.assert_close(stream.inpainter(view, sources).rgb, whole.rgb, atol=1e-5, rtol=0)
+
+
+def test_a_saved_model_loads(scene, small_views, tmp_path):
+    stream, view, sources = scene
+    save_inpainter(stream.inpainter, tmp_path / "model", "# card")
+    again = load_inpainter(tmp_path / "model", precision="float32")
+    assert isinstance(again, ViewSynthNet) and again.config == small_views
+    assert torch.equal(again(view, sources).rgb, stream.inpainter(view, sources).rgb)
+    config = tmp_path / "model" / "config.json"
+    config.write_text(config.read_text().replace('"views"', '"sweeping"'))
+    with pytest.raises(MismatchedWeightsError, match="got 'sweeping'"):
+        load_inpainter(tmp_path / "model")
+
+
+@pytest.mark.parametrize("values", [{"width": 0}, {"width": 2.5}, {"depth": 3}, {"features": True}, {"width": 10**9}])
+def test_impossible_sizes_are_refused(values):
+    with pytest.raises(ValueError, match="expected"):
+        ViewsConfig.from_dict(values)
+
+
+@pytest.mark.gpu
+def test_cuda_predicts_what_the_cpu_predicts(scene):
+    import copy
+
+    from viewmend.training.samples import to_device
+
+    stream, view, sources = scene
+    on_gpu = to_device(view, "cuda")
+    found = copy.deepcopy(stream.inpainter).cuda()(
+        on_gpu, SourceCameras.of(sources.views.to("cuda"), on_gpu.silhouettes)
+    )
+    off = (found.rgb.cpu() - stream.inpainter(view, sources).rgb).abs().amax(1)
+    assert float((off > 0.02).float().mean()) < 0.01
+
+
+@torch.no_grad()
+def test_the_rim_is_predicted_too(scene):
+    """The subject may extend beyond the proxy: the rim gets an alpha of its own."""
+    stream, view, sources = scene
+    rim = (view.mask == 0) & (view.error > 0)
+    assert int(rim.sum()) > 50 and torch.equal(rim, (rim_depth(view.depth) > 0) & (view.mask == 0))
+    found = stream.inpainter(view, sources)
+    assert int(rim[tuple(found.pixels.T)].sum()) == int(rim.sum())
+    completed = stream.mend(view).completed
+    assert bool((completed.alpha[rim] > 0).all()) and not bool((completed.alpha[~rim & (view.mask == 0)] > 0).any())
+
+
+def test_pyramids_of_a_frame_are_computed_once_for_all_views(scene, monkeypatch):
+    stream, view, _ = scene
+    stream = Stream(stream.inpainter, stream.config)
+    cached = stream.add_frame(scene[0].cached_frame().frame)
+    before, halvings, whole = cached.size, [], pyramids.downsample2x
+    monkeypatch.setattr(pyramids, "downsample2x", lambda image: halvings.append(image.shape) or whole(image))
+    first = stream.mend(view).completed
+    made = len(halvings)
+    assert made > 4 and cached.size > before + 1.3 * view.silhouettes.mask.numel(), "and its memory is counted"
+    assert torch.equal(stream.mend(view).completed.rgb, first.rgb) and len(halvings) == made
+    stream.mend(replace(view, candidate_views=view.candidate_views[::-1]))
+    assert made < len(halvings) < 2 * made, "only the camera that no view needed before"
+
+
+@torch.no_grad()
+def test_holes_are_mostly_the_ray_fill(scene, small_views):
+    """Not if they were guessed from their surroundings, for a model that predicts a part of E only."""
+    stream, view, _ = scene
+    net = ViewSynthNet(replace(small_views, coarse_fill="rays")).eval()
+    left = torch.arange(view.mask.shape[1]) < 48
+    holed = replace(view, weights=torch.where((view.mask > 0) & left, 0, view.weights))
+    holes, where = holed.holes, view.error > 0
+    assert int(holes.sum()) > 100
+    sources = SourceCameras.of(stream.cached_frame().context(holed.closest_views(4)), holed.silhouettes)
+    guess = net.coarse_guess(holed, sources)
+    assert torch.equal(guess, net.coarse(replace(holed, error=holes.float()), sources))
+    own = image_of(net(holed, sources, guess=guess, where=where), view)
+    found = net.step(holed, context_of(stream), State())[0].rgb
+    wanted = torch.where(holes, 0.7 * guess + 0.3 * own, own)
+    torch.testing.assert_close(found[:, where], wanted[:, where], atol=1e-4, rtol=0)
+    guess = net.coarse_guess(holed, sources, quick=True)
+    own = image_of(net(holed, sources, guess=guess, where=where), view)
+    found = net.step(holed, context_of(stream, RenderQuality(refine_fraction=0.5)), State())[0].rgb
+    torch.testing.assert_close(found[:, where], own[:, where], atol=1e-4, rtol=0)
+
+
+def test_a_slope_softens_alpha_and_keeps_straight_colours(scene, monkeypatch):
+    stream, view, _ = scene
+    plain, _ = stream.inpainter.step(view, context_of(stream), State())
+    monkeypatch.setattr(stream.inpainter, "alpha_slope", 0.5)
+    soft, _ = stream.inpainter.step(view, context_of(stream), State())
+    at = (view.error > 0) & (plain.alpha > 0.001) & (plain.alpha < 0.999)
+    assert int(at.sum()) > 50
+    torch.testing.assert_close(soft.alpha[at], (0.5 * plain.alpha[at].logit()).sigmoid(), atol=1e-5, rtol=0)
+    straight = (own.rgb[:, at] / own.alpha[at] for own in (soft, plain))
+    torch.testing.assert_close(*straight, atol=1e-3, rtol=0)
+    assert torch.equal(soft.rgb[:, view.error == 0], view.rgb[:, view.error == 0])
+
+
+def test_calibration_to_a_rig_finds_the_slope_of_its_cameras(scene, monkeypatch):
+    stream, view, _ = scene
+    net, context = stream.inpainter, context_of(stream)
+    with monkeypatch.context() as patch:
+        patch.setattr(net, "alpha_slope", 0.6)
+        truth = net.step(view, context, State())[0].rgb
+    fitted = net.calibrate_to_rig([HeldOutView(view, context, truth)])
+    assert fitted.alpha_slope == pytest.approx(0.6) and net.alpha_slope == 1.0
+    assert fitted.calibrate_to_rig([HeldOutView(view, context, truth)]).alpha_slope == pytest.approx(0.6)
+    assert next(fitted.parameters()) is next(net.parameters())
+
+
+def test_scaled_logits():
+    alpha = torch.linspace(0, 1, 101)
+    assert (scale_logits(alpha, 1.0) - alpha).abs().max() < 2e-4
+    softer = scale_logits(alpha, 0.5)
+    assert softer[0] == 0 and softer[50] == pytest.approx(0.5, abs=1e-6)
+    assert (softer[1:50] > alpha[1:50]).all() and (softer[51:100] < alpha[51:100]).all()
+    assert softer[20] == pytest.approx(1 / 3, abs=1e-5)  # the logit of 0.2 is log(1 / 4); half of it is log(1 / 2)
+    straight, alpha = torch.rand(3, 50), torch.linspace(0.05, 1, 50)
+    torch.testing.assert_close(repremultiply(alpha * straight, alpha, softer[:50]), softer[:50] * straight)
+
+
+@pytest.mark.parametrize("slope", [0.55, 1.0, 1.15])
+def test_a_known_slope_is_found_with_equal_weight_of_views(slope, rng):
+    true = torch.rand(4000, generator=rng).clamp(0.02, 0.98)
+    alpha, straight = (true.logit() / slope).sigmoid(), torch.rand(3, 4000, generator=rng)
+    truth = true * straight + 0.05 * torch.randn(3, 4000, generator=rng)
+    whole = alpha * straight, alpha, truth
+    assert fit_alpha_slope([whole]) == pytest.approx(slope, abs=1e-9) and fit_alpha_slope([whole]) in SLOPES
+    even, sure = torch.full((1000,), 0.8), scale_logits(torch.full((1000,), 0.8), 1.2)
+    soft = scale_logits(even, slope)
+    views = [
+        tuple(part[..., :count] for part in (even.expand(3, -1), even, alpha.expand(3, -1)))
+        for count, alpha in ((1000, sure), (10, soft), (1000, soft))
+    ]
+    assert fit_alpha_slope([views[0], views[1]]) == fit_alpha_slope([views[0], views[2]])
+    assert fit_alpha_slope([]) == 1.0 == fit_alpha_slope([(torch.zeros(3, 0), torch.zeros(0), torch.zeros(3, 0))])

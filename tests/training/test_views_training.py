@@ -1,0 +1,347 @@
+"""Training of `views`: stored scenes, crops, the loss, captures, and the error predictor."""
+
+import json
+import zlib
+from dataclasses import replace
+from random import Random
+
+import pytest
+import torch
+from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES
+
+from viewmend.data.holdout.scenes import LeaveOneOut
+from viewmend.data.native_writer import write_capture
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.geometry.cameras import project, unproject
+from viewmend.models.checkpoint import load_network, save_inpainter
+from viewmend.models.smooth_fill import fill
+from viewmend.models.views.config import ViewsConfig
+from viewmend.models.views.grid import nearest_depth, rim_depth
+from viewmend.models.views.model import ViewSynthNet
+from viewmend.stream import Stream, StreamConfig
+from viewmend.training.config import TrainConfig
+from viewmend.training.loop import train
+from viewmend.training.scenes import Scene, StudioRigs, rig_source
+from viewmend.training.shards import ShardError, ShardScenes, sample_from_bytes, sample_to_bytes, write_shards
+from viewmend.training.stored_scenes import StoredSamples, StoredScene, StoredSceneMaker, store_scene
+from viewmend.training.views import (
+    CROP_PX,
+    TrainingView,
+    TrainingViews,
+    ViewsLossWeights,
+    ViewsObjectiveConfig,
+    initial_model,
+    random_crop,
+    random_selection,
+    recolour,
+    visible_cameras,
+)
+
+OPTIONS = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
+
+
+@pytest.fixture(scope="module")
+def studio():
+    return Studio(StudioConfig(seed=3, cameras=6, frames=1, size_px=(160, 149)))
+
+
+def scene_of(studio):
+    def truth(held, time):
+        return studio.truth(studio.true_cameras.select([held]), time)
+
+    return Scene(LeaveOneOut({0: studio.read(0)}, true_view=truth), Random(0))
+
+
+@pytest.fixture(scope="module")
+def stored(studio):
+    return store_scene(scene_of(studio), replace(VIEWS_SCENES, num_holdout_views=6))
+
+
+@pytest.fixture(scope="module")
+def view(stored):
+    return TrainingView.of(stored.sample(0, VIEWS_RENDER, 4), ViewSynthNet(VIEWS_MODEL))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "mine"
+    write_capture(Studio(StudioConfig(seed=5, cameras=5, frames=2, size_px=128)), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def view_shards(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("view-shards")
+    maker = StoredSceneMaker(StudioRigs(VIEWS_SCENES, (0,), "tests"), VIEWS_SCENES)
+    list(write_shards((maker.scene(number)[0] for number in range(3)), folder, shard_size=2))
+    return folder
+
+
+@pytest.fixture
+def tiny_views(view_shards) -> TrainConfig:
+    return TrainConfig(name="views", objective=OPTIONS, scenes=VIEWS_SCENES, shards=view_shards, **RUN)
+
+
+def test_a_stored_scene_is_the_rig_without_a_camera(studio, stored):
+    frame = studio.read(0)
+    assert sorted(view.name for view in stored.held) == sorted(frame.cameras.names)
+    assert len(zlib.compress(sample_to_bytes(stored), 1)) < 0.3 * frame.rgb.numel() * len(stored.held)
+    again = sample_from_bytes(sample_to_bytes(stored))
+    for number in (0, 3):
+        name = stored.held[number].name
+        stream = Stream(ViewSynthNet(VIEWS_MODEL), StreamConfig(render=VIEWS_RENDER, memory_mb=None))
+        stream.add_frame(frame.without([name]), None)
+        expected = stream.render(frame.cameras.select([name]))
+        sample = again.sample(number, VIEWS_RENDER, 4)
+        view = sample.view
+        assert name not in view.candidate_views and view.source_views == expected.source_views
+        # The stored hull is coarser, and its vertices are quantised.
+        both = (view.mask > 0) & (expected.mask > 0)
+        assert float(both.sum() / ((view.mask > 0) | (expected.mask > 0)).sum()) > 0.93
+        assert float((view.rgb - expected.rgb).abs()[:, both].median()) < 0.02
+        true = studio.truth(studio.true_cameras.select([name]), 0)
+        assert torch.equal(sample.alpha, true.mask[0])
+        assert float((sample.depth - true.depth[0]).abs().max()) < 1e-4
+        black = (true.rgb[0] * (true.mask[0] / 255)).round()
+        assert float((sample.truth - black).abs().max()) <= 1
+        near = sample.ray_views.frame
+        assert near.cameras.names == view.closest_views(4)
+        own = frame.select(near.cameras.names)
+        inside = own.mask > 0
+        assert torch.equal(near.mask, own.mask)
+        assert torch.equal(near.rgb.movedim(1, -1)[inside], own.rgb.movedim(1, -1)[inside])
+        both = (near.depth > 0) & (own.depth > 0)
+        assert float((near.depth - own.depth)[both].abs().median()) < 0.01, "of every second pixel"
+
+
+def test_stored_hulls_have_the_configured_resolution(studio):
+    scenes = [replace(VIEWS_SCENES, hull_resolution=n) for n in (16, 48)]
+    sizes = [sum(len(view.faces) for view in store_scene(scene_of(studio), s).held) for s in scenes]
+    assert 4 * sizes[0] < sizes[1]
+
+
+def test_a_crop_is_a_part_of_the_view_and_of_its_truth(view):
+    torch.manual_seed(1)
+    num_cameras = set()
+    for _ in range(30):
+        crop = random_crop(view)
+        height, width = crop.view.mask.shape
+        assert height <= CROP_PX and width <= CROP_PX and int((crop.view.mask > 0).sum()) > 0
+        assert crop.truth.shape[1:] == crop.alpha.shape == crop.depth.shape == (height, width)
+        assert crop.scale == view.scale
+        names = crop.sources.views.frame.cameras.names
+        assert names == view.sources.views.frame.cameras.names[: len(names)] and len(crop.sources.pyramids) == len(
+            names
+        )
+        num_cameras.add(len(names))
+        # The camera of the crop sees the same points at the same pixels.
+        at = torch.tensor([[[width / 2, height / 2]]])
+        point = unproject(at, torch.tensor([[2.0]]), crop.view.camera)[0]
+        uv, _ = project(point, view.view.camera)
+        left, top = (uv[0, 0] - at[0, 0]).round().int().tolist()
+        assert torch.equal(view.truth[:, top : top + height, left : left + width], crop.truth)
+        assert torch.equal(view.view.rgb[:, top : top + height, left : left + width], crop.view.rgb)
+    assert num_cameras == {3, 4}, "all four, or three of them"
+
+
+def test_a_selection_of_pixels_is_on_the_subject_and_contains_the_holes(view):
+    torch.manual_seed(0)
+    selections = [found for _ in range(40) if (found := random_selection(view)) is not None]
+    assert 4 < len(selections) < 24
+    assert all(bool((rim_depth(view.view.depth)[found] > 0).all()) for found in selections)
+    assert all(bool(found[view.view.holes].all()) for found in selections)
+
+
+def test_colours_change_alike_in_cameras_view_and_truth(stored):
+    sample = stored.sample(0, VIEWS_RENDER, 4)
+    other = recolour(sample, Random(2))
+    gains = []
+    for before, after in (
+        (sample.view.rgb, other.view.rgb),
+        (sample.truth / 255, other.truth / 255),
+        (sample.ray_views.frame.rgb[0] / 255, other.ray_views.frame.rgb[0] / 255),
+    ):
+        means, changed = before.mean((1, 2)).sort().values, after.mean((1, 2)).sort().values
+        gains.append(changed / means)
+    assert 0.55 < float(gains[0].mean()) < 1
+    for gain in gains[1:]:
+        torch.testing.assert_close(gain, gains[0], atol=0.02, rtol=0)
+
+
+def test_visible_cameras_see_the_true_surface(view):
+    torch.manual_seed(0)
+    net = ViewSynthNet(VIEWS_MODEL)
+    with torch.no_grad():
+        made = net(view.view, view.sources, view.scale)
+    cells = tuple(made.distribution.cells.T)
+    z = nearest_depth(view.depth)[cells]
+    seen = visible_cameras(view, made, z)
+    assert seen.shape == (len(z), 4) and 0.2 < float(seen[z > 0].float().mean()) < 0.95
+    assert not bool(seen[z == 0].any())
+    # The camera closest in angle sees most of it, and nearly none of a surface moved away.
+    assert float(seen[:, 0].float().mean()) >= float(seen[:, 3].float().mean()) - 0.05
+    behind = visible_cameras(view, made, z + 0.3 * view.scale.size_m)
+    assert int(behind.sum()) < 0.3 * int(seen.sum())
+
+
+def test_holes_are_guessed_by_the_ray_fill_of_another_model(stored, tmp_path):
+    """It fills the whole view, not its crops, and is not trained."""
+    options = replace(OPTIONS, model=replace(VIEWS_MODEL, num_views=8, coarse_fill="rays"))
+    net, rays = initial_model(options, "float32"), load_network("rays")
+    assert torch.equal(net.coarse.choose.weight, rays.choose.weight)
+    assert not any(weight.requires_grad for weight in net.coarse.parameters())
+    assert all(weight.requires_grad for name, weight in net.named_parameters() if not name.startswith("coarse."))
+    sample = stored.sample(0, VIEWS_RENDER, 4)
+    view = TrainingView.of(sample, net)
+    holes = view.view.holes
+    assert int(holes.sum()) > 30 and torch.equal(view.guess[:, ~holes], view.view.rgb[:, ~holes])
+    expected = rays(replace(view.view, error=holes.float()), view.sources)
+    torch.testing.assert_close(view.guess, expected, atol=1e-5, rtol=0)
+    torch.manual_seed(3)
+    crop = random_crop(view)
+    height, width = crop.guess.shape[1:]
+    parts = view.guess.unfold(1, height, 1).unfold(2, width, 1)
+    assert bool((parts == crop.guess[:, None, None]).all(-1).all(-1).all(0).any())
+    save_inpainter(ViewSynthNet(VIEWS_MODEL), tmp_path, "")
+    with pytest.raises(ValueError, match="expected a model with a ray fill"):
+        initial_model(replace(options, coarse_from=str(tmp_path)), "float32")
+
+
+@pytest.mark.parametrize(
+    "term", ["colour", "log_error", "gradient", "cell_colour", "alpha", "depth", "visibility", "errors"]
+)
+def test_each_term_alone_can_be_minimised(view, term):
+    weights = ViewsLossWeights(**dict.fromkeys(vars(ViewsLossWeights()), 0.0) | {term: 1.0})
+    objective = make_objective(replace(OPTIONS, loss=weights))
+    optimizer, losses = torch.optim.Adam(objective.parameters(), 3e-3), []
+    for _ in range(24):
+        torch.manual_seed(5)
+        optimizer.zero_grad()
+        loss = objective([view]).total
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert min(losses) < losses[0] - 0.02 * abs(losses[0]), losses
+
+
+def make_objective(options, start=None):
+    torch.manual_seed(0)
+    return options.objective(TrainConfig(name="views", objective=options, **RUN), options, start)
+
+
+def test_every_parameter_gets_a_gradient(view):
+    objective = make_objective(OPTIONS)
+    output = objective([view, view])
+    output.total.backward()
+    still = [n for n, p in objective.model.named_parameters() if p.grad is None or float(p.grad.abs().sum()) == 0]
+    assert still == []
+    assert float(output.image.outside) > 0 and float(output.image.log_error) < 0
+
+
+def test_the_error_predictor_can_be_trained_alone(tiny_views, tmp_path):
+    config = replace(tiny_views, objective=replace(OPTIONS, train_params="errors"), steps=3, batch=1)
+    with pytest.raises(ValueError, match="expected a trained model for --train-params errors"):
+        train(config, tmp_path / "none")
+    torch.manual_seed(0)
+    start = ViewSynthNet(replace(VIEWS_MODEL, error_features=0))
+    trained = load_network(train(config, tmp_path / "run", start=start))
+    assert all(torch.equal(trained.state_dict()[name], weight) for name, weight in start.state_dict().items())
+    again = load_network(train(replace(config, steps=1), tmp_path / "more", start=trained))
+    moved = [
+        float((a - b).abs().max())
+        for a, b in zip(again.errors.state_dict().values(), trained.errors.state_dict().values(), strict=True)
+    ]
+    assert 0 < max(moved) < 0.1, "it starts from the trained predictor"
+
+
+def test_a_model_of_other_sizes_cannot_be_started_from(tiny_views, tmp_path):
+    with pytest.raises(ValueError, match="expected a ViewSynthNet of the recipe's sizes"):
+        train(tiny_views, tmp_path, start=ViewSynthNet(replace(VIEWS_MODEL, width=12)))
+
+
+def test_a_run_resumes_and_is_validated(tiny_views, tmp_path):
+    config = replace(tiny_views, validate_every=4, validation_views=1)
+    once = train(config, tmp_path / "once")
+    train(replace(config, steps=2), tmp_path / "twice")
+    twice = train(config, tmp_path / "twice")
+    logs = [[json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()] for run in (once, twice)]
+    scores = next(line["validation"] for line in logs[0] if "validation" in line)
+    assert scores["rendered"] > 10 and scores["completed"] > 5 and (once / "validation-000004.png").exists()
+    losses = [[line["losses"]["total"] for line in run if "losses" in line] for run in logs]
+    assert len(losses[0]) == len(losses[1]) == 4 and losses[0][:2] == losses[1][:2]
+
+
+def test_captures_are_trained_on(capture, tmp_path):
+    """Their held-out cameras are targets, without true depth; the card names them."""
+    scenes = replace(VIEWS_SCENES, captures=(capture,), captures_fraction=1.0)
+    config = TrainConfig(name="views", objective=OPTIONS, scenes=scenes, **RUN)
+    found = make_objective(OPTIONS)
+    found.config = config
+    [first, *_] = found.training_scenes("0").scene(0)
+    assert first.depth is None and first.sources.views.frame.depth is None
+    assert sorted(first.sources.silhouettes.cameras.names + first.view.camera.names) == [
+        f"cam{n:02d}" for n in range(5)
+    ]
+    loss = found([first])
+    loss.total.backward()
+    assert torch.isfinite(loss.total)
+    out = train(config, tmp_path / "run")
+    assert "100% of the scenes from captures (mine)" in (out / "README.md").read_text()
+    stored = OPTIONS.make_scenes(scenes, "0").scene(0)[0]
+    again = sample_from_bytes(sample_to_bytes(stored))
+    assert again.depth is None and again.sample(0, VIEWS_RENDER, 4).depth is None
+
+
+def test_captures_and_studio_are_mixed(capture):
+    source = rig_source(replace(SCENES, captures=(capture,), captures_fraction=0.5), (0,), "0")
+    names = {type(source.rig(number).rig.true_view).__name__ for number in range(6)}
+    assert names == {"NoneType", "function"}, "captures have no rendered truth"
+
+
+def test_stored_scenes_are_numbered_through_all_shards(view_shards, tmp_path):
+    shards = ShardScenes(view_shards, "0", StoredScene, whole=False)
+    scenes = [shards.scene(number) for number in range(4)]
+    assert sorted(map(len, scenes)) == [0, 1, 1, 1], "the last shard is shorter"
+    made = {sample_to_bytes(scene[0]) for scene in scenes if scene}
+    assert len(made) == 3
+    assert {sample_to_bytes(s) for n in range(4, 8) for s in shards.scene(n)} == made
+    with pytest.raises(ShardError, match="expected tar files, found none"):
+        ShardScenes(tmp_path, "0", StoredScene, whole=False)
+
+
+def training_views(view_shards, seed, net, **options):
+    scenes = ShardScenes(view_shards, "0", StoredScene, whole=False)
+    return TrainingViews(StoredSamples(scenes, VIEWS_SAMPLING, seed), seed, net, **options)
+
+
+def test_a_number_always_gives_the_same_views(view_shards):
+    source, other = (training_views(view_shards, seed, ViewSynthNet(VIEWS_MODEL)) for seed in ("0", "1"))
+    first, again, third = source.scene(1), source.scene(1), other.scene(1)
+    assert len(first) == 2
+    assert all(
+        torch.equal(a.view.rgb, b.view.rgb) and torch.equal(a.truth, b.truth) for a, b in zip(first, again, strict=True)
+    )
+    assert any(not torch.equal(a.truth, b.truth) for a, b in zip(first, third, strict=True))
+
+
+def test_some_holes_are_guessed_from_their_surroundings_only(view_shards):
+    """As at run time with a small budget; colours do not depend on it."""
+    net = ViewSynthNet(
+        ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_features=8, coarse_fill="rays")
+    )
+
+    def guesses(smooth):
+        scenes = training_views(view_shards, "0", net, smooth_guess=smooth)
+        return [own for number in range(1, 4) for own in scenes.scene(number)]
+
+    by_net, smooth, mixed = guesses(0.0), guesses(1.0), guesses(0.5)
+    assert all(torch.equal(a.truth, b.truth) for a, b in zip(by_net, smooth, strict=True))
+    kinds = set()
+    for a, b, own in zip(by_net, smooth, mixed, strict=True):
+        holes = a.view.holes
+        assert torch.equal(a.guess[:, ~holes], b.guess[:, ~holes])
+        if bool(holes.any()):
+            assert torch.equal(b.guess, fill(b.view.rgb, holes, b.view.mask > 0))
+            assert not torch.equal(a.guess, b.guess)
+            kinds.add(torch.equal(own.guess, b.guess))
+    assert kinds == {True, False}
