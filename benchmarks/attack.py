@@ -1,12 +1,11 @@
-"""A server under a thousand connections of strangers: what a viewer with the token still gets, and what memory does.
+"""A server under a thousand unauthenticated connections: python benchmarks/attack.py [--each] [--rounds 4] [--write].
 
-Run: `python benchmarks/attack.py [--each] [--rounds 4] [--write]`. A server in a process of its own; a viewer; kinds of
-strangers in waves of five, 200 of each, opened anew as soon as the server ends them; with `--each` one kind after the
-other, 1000 of it; with `--rounds` each wave again and again, and first as often nobody at all. Prints JSON: the
-viewer's frames a second meanwhile, their share of those before and after, its longest wait, and what the server's
-memory grew by at its highest and 30 seconds after. The strangers' own programs take the same processor: on few cores
-the share says how much of it they leave, too. At last eight viewers ask for all that they may, 2.1 million pixels each,
-mended, at once and again and again: the longest that one of them waited.
+Starts a server, one viewer with the token, and waves of five kinds of hostile clients, 200 of each, which reconnect as
+soon as the server closes them. `--each` sends one kind at a time, 1000 of it; `--rounds` repeats each wave and first
+measures as often without any. Prints JSON: the viewer's frame rate during the wave, its share of that before and after,
+the viewer's longest wait, and the server's memory growth at its peak and 30 seconds later. The hostile clients use the
+same processor, which lowers the share on few cores. Finally eight viewers request the largest views in a loop, and the
+longest wait is printed.
 """
 
 import argparse
@@ -22,14 +21,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from measure import write
-from strangers import KINDS, begin
+from unauthenticated_load import KINDS, begin
 
 from viewmend.live.client import Client
 
-TOKEN = "a token of the benchmark"
+TOKEN = "a token for the benchmark"
 EACH = 200
 SIDE_PX = 1448
-"""Of the largest square picture that a viewer may ask for."""
+"""Side of the largest square view that a viewer may request."""
 
 
 def megabytes(process: int) -> float:
@@ -40,22 +39,22 @@ def megabytes(process: int) -> float:
 
 @dataclass
 class Outcome:
-    """What a viewer with the token had beside strangers, and what they cost."""
+    """A viewer's frame rate during a wave, and the server's memory."""
 
     kinds: list[str]
     connections: int = 0
     frames_per_s: float = 0.0
     slowest_s: float = 0.0
     share: float = 0.0
-    """Of the mean of its frames before and after."""
+    """Frame rate relative to the mean of before and after."""
     highest_mb: float = 0.0
     after_30_s_mb: float = 0.0
     resident_mb: float = 0.0
-    """Then, in all: of the same wave's rounds the second and on add nothing, or it is a leak."""
+    """Total after 30 s; if it grows from the second round of a wave on, there is a leak."""
 
 
 def look_on(viewer: Client, seconds: float) -> tuple[float, float]:
-    """Frames a second, and the longest wait, of a viewer who asks for the next view once the last has come."""
+    """Frame rate and longest wait of a viewer that requests the next view when the last has arrived."""
     count, end, slowest = 0, time.monotonic() + seconds, 0.0
     while time.monotonic() < end:
         asked = time.monotonic()
@@ -65,7 +64,7 @@ def look_on(viewer: Client, seconds: float) -> tuple[float, float]:
 
 
 def attack(viewer: Client, port: int, server: int, kinds: list[str], seconds: float) -> Outcome:
-    """Let strangers of these kinds come, 1000 in all; of no kinds, nobody: what memory does by itself."""
+    """Run a wave of these kinds, 1000 connections in all; without kinds, measure the server alone."""
     outcome = Outcome(kinds)
     ended = threading.Event()
     each = 5 * EACH // max(1, len(kinds))
@@ -84,14 +83,14 @@ def attack(viewer: Client, port: int, server: int, kinds: list[str], seconds: fl
     ended.set()
     watcher.join()
     outcome.share = outcome.frames_per_s / ((before + look_on(viewer, seconds)[0]) / 2)
-    look_on(viewer, 30)  # who does not read for so long is put out
+    look_on(viewer, 30)  # connections that are not read for this long are closed
     outcome.resident_mb = megabytes(server)
     outcome.after_30_s_mb = outcome.resident_mb - memory
     return outcome
 
 
 def full_house(url: str, seconds: float, viewers: int = 8) -> dict[str, float]:
-    """The longest wait of viewers who all ask for the largest pictures, and how many pictures they got in all."""
+    """Longest wait and number of images when all viewers request the largest views."""
     waits: list[float] = []
 
     def look(seat: int) -> None:
@@ -114,13 +113,11 @@ def full_house(url: str, seconds: float, viewers: int = 8) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each look")
-    parser.add_argument("--rounds", type=int, default=1, help="of each wave; with several, as many with nobody first")
-    parser.add_argument("--each", action="store_true", help="one kind after the other, instead of five at a time")
-    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
-    parser.add_argument(
-        "--model", default="small", help="of the full house; strangers' viewer looks at what is rendered"
-    )
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of each measurement")
+    parser.add_argument("--rounds", type=int, default=1, help="repetitions of each wave")
+    parser.add_argument("--each", action="store_true", help="one kind at a time instead of five")
+    parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
+    parser.add_argument("--model", default="views", help="model of the final test; waves use rendered views")
     given = parser.parse_args()
     names = list(KINDS)
     waves = [[name] for name in names] if given.each else [names[n : n + 5] for n in range(0, len(names), 5)]
@@ -136,10 +133,10 @@ def main() -> None:
         threading.Thread(target=lambda: said.extend(server.stderr or []), daemon=True).start()
         outcomes: list[Outcome] = []
         with contextlib.ExitStack() as ends, Client(f"ws{address[1]}", TOKEN, timeout_s=120) as viewer:
-            ends.callback(server.terminate)  # else who fails here waits for ever
+            ends.callback(server.terminate)  # otherwise a failure here would wait forever
             look_on(viewer, 10)
-            nobody: list[list[str]] = [[]] * (given.rounds if given.rounds > 1 else 0)
-            for kinds in nobody + [kinds for kinds in waves for _ in range(given.rounds)]:
+            idle: list[list[str]] = [[]] * (given.rounds if given.rounds > 1 else 0)
+            for kinds in idle + [kinds for kinds in waves for _ in range(given.rounds)]:
                 outcomes.append(attack(viewer, int(address[2]), server.pid, kinds, given.seconds))
                 print(json.dumps(asdict(outcomes[-1])), flush=True)
             viewer.__exit__()
@@ -150,7 +147,7 @@ def main() -> None:
     report |= {"exit_code": code, "lines_said": len(said)}
     report["seconds_to_end"] = round(time.monotonic() - began, 1)
     if given.write:
-        print(write("attack", "cpu", {"strangers": 5 * EACH, "seconds": given.seconds, "model": given.model}, report))
+        print(write("attack", "cpu", {"connections": 5 * EACH, "seconds": given.seconds, "model": given.model}, report))
     print(json.dumps({key: report[key] for key in report if key != "waves"}))
 
 

@@ -1,7 +1,7 @@
-"""Is an exported model the model, and what does it take: python benchmarks/exported.py MODEL.pt2 MODEL.onnx [--write].
+"""Compare exported models with the Python model: python benchmarks/exported.py MODEL.pt2 MODEL.onnx [--write].
 
-Each file mends random views of random people, sizes and rigs, beside the model itself; then one view of 320 x 320
-pixels by eight cameras is timed, on one thread.
+Each file completes random views of random people, sizes and rigs; its outputs are compared with the Python model's.
+Then one view of 320 x 320 pixels with eight cameras is timed on one thread.
 """
 
 import argparse
@@ -19,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from reference.random_views import holed, images, mended, random_view
 
 from viewmend import Stream, StreamConfig, load_inpainter
-from viewmend.deployment.view_inputs import ViewInputs, ViewOutputs
-from viewmend.inpainting.protocol import ContextProvider
-from viewmend.inpainting.sweep.sweep_net import SweepNet
-from viewmend.studio.rigs import orbit
-from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.data.synthetic.rigs import orbit
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.export.model_inputs import ViewInputs, ViewOutputs
+from viewmend.models.base import ContextProvider
+from viewmend.models.views.model import ViewSynthNet
 
 TOLERANCE = 1e-3
 Runner = Callable[[ViewInputs], Sequence[torch.Tensor]]
@@ -31,15 +31,15 @@ Runner = Callable[[ViewInputs], Sequence[torch.Tensor]]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("files", nargs="+", type=Path, help="what viewmend export wrote of --model")
-    parser.add_argument("--model", default="views", help="the model that they were made of")
-    parser.add_argument("--scenes", type=int, default=50, help="how many random views")
-    parser.add_argument("--runs", type=int, default=10, help="how often the timed view is mended")
-    parser.add_argument("--write", action="store_true", help="keep the result under benchmarks/results")
+    parser.add_argument("files", nargs="+", type=Path, help="files written by viewmend export from --model")
+    parser.add_argument("--model", default="views", help="the exported model")
+    parser.add_argument("--scenes", type=int, default=50, help="number of random views")
+    parser.add_argument("--runs", type=int, default=10, help="repetitions of the timed view")
+    parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
     torch.set_num_threads(1)
     net = load_inpainter(options.model, precision="float32")
-    assert isinstance(net, SweepNet)
+    assert isinstance(net, ViewSynthNet)
     runners = {file.suffix[1:]: runner_of(file) for file in options.files}
     found = {name: {"apart": apart} for name, apart in compared(net, runners, options.scenes).items()}
     for name, taken in times(net, runners, options.runs).items():
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def runner_of(file: Path) -> Runner:
-    """What mends by a file, on one thread."""
+    """A function that runs the file on one thread."""
     if file.suffix == ".pt2":
         package = torch._inductor.aoti_load_package(str(file))
         return lambda given: package(*given)
@@ -62,8 +62,8 @@ def runner_of(file: Path) -> Runner:
     ]
 
 
-def compared(net: SweepNet, runners: dict[str, Runner], scenes: int) -> dict[str, dict[str, float]]:
-    """By how much each file's outputs differ from the model's, over all pixels of all views."""
+def compared(net: ViewSynthNet, runners: dict[str, Runner], scenes: int) -> dict[str, dict[str, float]]:
+    """Largest differences of each file's outputs from the model's, over all pixels of all views."""
     furthest: dict[str, dict[str, list[float]]] = {name: {} for name in runners}
     over, pixels, views = dict.fromkeys(runners, 0), 0, dict.fromkeys(runners, 0)
     for seed in range(scenes):
@@ -91,11 +91,11 @@ def compared(net: SweepNet, runners: dict[str, Runner], scenes: int) -> dict[str
     }
 
 
-def times(net: SweepNet, runners: dict[str, Runner], runs: int) -> dict[str, dict[str, float]]:
-    """Milliseconds of a view, by the model and by each file."""
+def times(net: ViewSynthNet, runners: dict[str, Runner], runs: int) -> dict[str, dict[str, float]]:
+    """Milliseconds per view of the model and of each file."""
     frame = Studio(StudioConfig(seed=10003, cameras=8, frames=1, size_px=320)).read(0)
-    stream = Stream(net, StreamConfig(fit_rig=False))
-    seen = stream.push(frame)
+    stream = Stream(net, StreamConfig())
+    seen = stream.add_frame(frame)
     view = stream.render(orbit([0.4], (320, 320), elevation_rad=0.2))
     given = ViewInputs.of(view, ContextProvider(lambda _, names: seen.context(names)), net.config.num_views)
     work: dict[str, Callable[[], object]] = {

@@ -1,6 +1,6 @@
-"""How fast the geometry is: python benchmarks/geometry.py [--device cuda] [--runs 30] [--write].
+"""Time hull, surface and depth: python benchmarks/geometry.py [--device cuda] [--runs 30] [--write].
 
-The subject is a figure of ellipsoids, 1.75 m tall, in cameras of 512 x 612 on a ring.
+The subject is a figure of ellipsoids, 1.75 m tall; cameras of 512 x 612 form a ring.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def ring(count: int) -> Cameras:
 
 
 def silhouettes(cameras: Cameras) -> torch.Tensor:
-    """255 where a pixel's ray meets one of the figure's ellipsoids."""
+    """255 where a pixel's ray hits one of the figure's ellipsoids."""
     pixels = pixel_centers(WIDTH, HEIGHT).reshape(1, -1, 2)
     masks = []
     for view in range(len(cameras)):
@@ -77,7 +77,7 @@ def hull_figures(views: int, config: HullConfig, device: str, runs: int) -> dict
 
 
 def frame_figures(config: HullConfig, device: str, runs: int) -> dict[str, object]:
-    """A frame of eight cameras: hull, surface and normals, and depth in the eight and in a novel view."""
+    """A frame of eight cameras: hull, surface, normals, and depth in the eight cameras and a novel view."""
     cameras, nine = ring(8).to(device), ring(9).to(device)
     masks = silhouettes(ring(8)).to(device)
     middle = torch.tensor([0.0, 0.9, 0.0], device=device)
@@ -99,7 +99,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--runs", type=int, default=30)
-    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     parser.add_argument("--resolution", type=int, default=HullConfig().resolution)
     options = parser.parse_args()
     config = HullConfig(resolution=options.resolution)

@@ -1,7 +1,7 @@
-"""Latency, rate and size of live views: python benchmarks/live.py [--device cuda] [--write].
+"""Latency, frame rate and size of live views: python benchmarks/live.py [--device cuda] [--write].
 
-Starts a server of its own per size and walks around the studio's scene with the Python client: from a look sent to its
-frame decoded, at a moving pose, while time goes on. Then the cost of 1 to 8 viewers of the same times.
+Starts a server for each size and moves around a studio scene with the Python client while the scene plays. Latency is
+measured from a request to its decoded frame. Then 1 to 8 viewers share the same frames.
 """
 
 import argparse
@@ -11,18 +11,18 @@ import os
 import threading
 import time
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as `viewmend serve` does, before torch is loaded
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as in `viewmend serve`; must be set before torch is loaded
 
 from measure import summarise, write
 
-from viewmend.inpainting.checkpoint import load_inpainter
+from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.client import Client
-from viewmend.live.frames import ReadAhead
+from viewmend.live.frame_source import RecordedSource
 from viewmend.live.listener import Server
 from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig
 from viewmend.live.service import RenderService
-from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.models.checkpoint import load_inpainter
 
 SEED, CAMERAS, FRAMES, FPS = 10008, 8, 30, 15.0
 SIZES = ((320, 320), (512, 612))
@@ -31,24 +31,24 @@ VIEWERS = (1, 2, 4, 8)
 
 @contextlib.contextmanager
 def served(size: tuple[int, int], budget_ms: float | None, device: str, model: str, **config: object):
-    """The address of a server whose frames are all made, and its service; `config` as `ServerConfig` has it."""
+    """The address and service of a server whose frames are all generated; `config` holds fields of `ServerConfig`."""
     scene = StudioConfig(seed=SEED, cameras=CAMERAS, frames=FRAMES, size_px=size, fps=FPS)
-    supply = ReadAhead(lambda: Studio(scene), generated=True)
+    supply = RecordedSource(lambda: Studio(scene), generated=True)
     renderer = Renderer(supply, load_inpainter(model, device), device=device)
     service, settings = RenderService(renderer, supply), ServerConfig(port=0, budget_ms=budget_ms, **config)
     server = Server(LiveServer(service, settings), settings)
-    with server.bound() as url:
-        thread = threading.Thread(target=server.run_bound)
+    with server.bind() as url:
+        thread = threading.Thread(target=server.run)
         thread.start()
-        while not (service.ready and supply.span.complete):
+        while not (service.is_ready and supply.span.complete):
             time.sleep(0.1)
         yield url.replace("http", "ws"), service
-        server.should_exit = True
+        server.stop()
         thread.join()
 
 
 def walk(url: str, size: tuple[int, int], seconds: float, start: float, out: list[dict[str, object]]) -> None:
-    """RenderRequest from a pose that moves, for some seconds; what was seen is added to `out`."""
+    """Request views from a moving pose for some seconds, and append a summary to `out`."""
     with Client(url) as viewer:
         frames, begun = [], time.perf_counter()
         while time.perf_counter() - begun < seconds:
@@ -71,7 +71,7 @@ def walk(url: str, size: tuple[int, int], seconds: float, start: float, out: lis
 
 
 def crowd(url: str, size: tuple[int, int], viewers: int, seconds: float) -> dict[str, object]:
-    """Several viewers at once, all following the edge: what each gets, and what a view costs."""
+    """Several viewers following the live edge: what each receives, and the cost per view."""
     seen: list[dict[str, object]] = []
     threads = [
         threading.Thread(target=walk, args=(url, size, seconds, 360.0 * n / viewers, seen)) for n in range(viewers)
@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--model", default="views", help="a shipped model's name, or a folder")
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--budget-ms", type=float, nargs="*", default=[100.0, 0.0], help="0: none")
-    parser.add_argument("--write", action="store_true", help="write the file in benchmarks/results")
+    parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
     figures: dict[str, object] = {}
     for size in SIZES:

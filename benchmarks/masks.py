@@ -1,11 +1,11 @@
-"""IoU of masks that `viewmend masks` made with the masks that a capture has: benchmarks/masks.py CAPTURE MADE."""
+"""IoU of masks from `viewmend masks` with a capture's own: python benchmarks/masks.py CAPTURE MASKED."""
 
 import json
 import sys
 
 import numpy as np
 
-from viewmend.capture.plain import open_capture
+from viewmend.data.native_capture import open_capture
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The one way to time: warm up, synchronise, take median and 95th percentile; and to write down what was measured."""
+"""Timing (warm-up, synchronisation, median and 95th percentile) and result files, shared by all benchmarks."""
 
 import json
 import os
@@ -16,7 +16,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def timed(work: Callable[[], object], runs: int = 30, warm_up: int = 3, device: str = "cpu") -> dict[str, float]:
-    """Milliseconds of `work()`, summarised over `runs`, after `warm_up` runs that do not count."""
+    """Milliseconds of `work()` over `runs` calls, after `warm_up` calls that are not counted."""
     taken = []
     for run in range(-warm_up, runs):
         synchronise(device)
@@ -29,7 +29,7 @@ def timed(work: Callable[[], object], runs: int = 30, warm_up: int = 3, device: 
 
 
 def summarise(taken_ms: Sequence[float]) -> dict[str, float]:
-    """Median, 95th percentile and smallest of some times."""
+    """Median, 95th percentile and minimum."""
     ordered = sorted(taken_ms)
     return {
         "median_ms": round(statistics.median(ordered), 2),
@@ -39,7 +39,7 @@ def summarise(taken_ms: Sequence[float]) -> dict[str, float]:
 
 
 def machine(device: str) -> dict[str, object]:
-    """Where and with what versions something was measured, and how busy the machine was."""
+    """The machine, its load, and the versions of Python, torch and this repository."""
     return {
         "device": torch.cuda.get_device_name() if device.startswith("cuda") else processor(),
         "threads": torch.get_num_threads(),
@@ -51,7 +51,7 @@ def machine(device: str) -> dict[str, object]:
 
 
 def write(what: str, device: str, config: object, results: object) -> Path:
-    """Write results/<what>--<device>--<date>.json with everything that a figure's value depends on."""
+    """Write results/<what>--<device>--<date>.json with everything that the figures depend on; return its path."""
     today = date.today().isoformat()
     entry = {"what": what, "date": today, **machine(device), "config": config, "results": results}
     RESULTS.mkdir(exist_ok=True)
@@ -61,7 +61,7 @@ def write(what: str, device: str, config: object, results: object) -> Path:
 
 
 def synchronise(device: str) -> None:
-    """Wait for what was started on a GPU."""
+    """Wait for pending work on a GPU."""
     if device.startswith("cuda"):
         torch.cuda.synchronize()
 

@@ -1,9 +1,8 @@
-"""How good whole views are: python benchmarks/whole_views.py [--models NAME ...] [--sets SET ...] [--sheets DIR].
+"""Score whole views: python benchmarks/whole_views.py [--models NAME ...] [--sets SET ...] [--background white].
 
-One time of scenes in which a camera is left out. Each model is asked for what it is made for; NAME@0.15 is the model
-asked by the rule `wrong` for at most that part of the proxy, NAME@0 the model as it moves live, when nothing is read,
-and NAME! the model that is not fitted to the rig. SET is P, Q:PERFORMERS, or CAPTURE:INPUTS, e.g.
-../shared/captures/wd2:8.
+One frame of scenes in which a camera is left out. Each model runs with its own error rule. NAME@0.15 restricts it with
+the rule `predicted` to that share of the hull, NAME@0 samples no camera, as in a moving live view, and NAME! is not
+calibrated to the rig. SET is P, Q:PERFORMERS, or CAPTURE:INPUTS, for example ../shared/captures/wd2:8.
 """
 
 import argparse
@@ -16,16 +15,17 @@ import torch
 from measure import write
 from torch import Tensor
 
-from viewmend.contact_sheet import Tile, contact_sheet, picture
-from viewmend.evaluation.frame_scores import FrameScores, TrueView, score_frame, true_view
-from viewmend.inpainting.protocol import RenderQuality
-from viewmend.leave_one_out.capture_scenes import capture_set
-from viewmend.leave_one_out.scenes import LeaveOneOutScene
-from viewmend.leave_one_out.studio_scenes import performer_set, procedural_set
-from viewmend.methods import make_method
+from viewmend.data.holdout.capture_scenes import capture_set
+from viewmend.data.holdout.scenes import LeaveOneOutScene
+from viewmend.data.holdout.studio_scenes import performer_set, procedural_set
+from viewmend.evaluation.scores import Scorers, TrueView, ViewScores, score_view, true_view
+from viewmend.models.base import RenderQuality
+from viewmend.models.compositing import Background
+from viewmend.models.registry import make_method
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
-from viewmend.views import CompletedView
+from viewmend.types import CompletedView
+from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 
 SHOWN = ("psnr_whole", "ssim_whole", "psnr_subject", "psnr_holes", "alpha_iou")
 PADDING_PX = 16
@@ -34,23 +34,24 @@ PADDING_PX = 16
 def main() -> None:
     """Score every model on every set, and print a table of means."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--models", nargs="+", default=["unfilled", "small", "views", "views@0.15"])
+    parser.add_argument("--models", nargs="+", default=["unfilled", "telea", "rays", "views"])
     parser.add_argument("--sets", nargs="+", default=["P"])
-    parser.add_argument("--views", type=int, default=8, help="so many of each set, evenly taken")
+    parser.add_argument("--views", type=int, default=8, help="number of views per set, evenly spaced")
     parser.add_argument("--size", type=int, default=320, help="width and height of the views of P and Q")
-    parser.add_argument("--sheets", type=Path, help="folder for a picture of each view: each model, and the truth")
-    parser.add_argument("--write", action="store_true", help="keep the result under benchmarks/results")
+    parser.add_argument(
+        "--background", choices=("black", "white"), default="black", help="background of views and truth"
+    )
+    parser.add_argument("--sheets", type=Path, help="folder for a picture of each view by each model")
+    parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
-    found = {
-        name: judge(some(name, options.size, options.views), options.models, options.sheets) for name in options.sets
-    }
+    found = {name: judge(some(name, options.size, options.views), options) for name in options.sets}
     if options.write:
-        config = {key: getattr(options, key) for key in ("models", "sets", "views", "size")}
+        config = {key: getattr(options, key) for key in ("models", "sets", "views", "size", "background")}
         print(write("whole_views", "cpu", config, found))
 
 
 def some(name: str, size_px: int, count: int) -> Sequence[LeaveOneOutScene]:
-    """The scenes of a set that are looked at."""
+    """The chosen scenes of a set."""
     kind, _, rest = name.partition(":")
     if kind == "P":
         scenes: Sequence[LeaveOneOutScene] = procedural_set(1, size_px)
@@ -61,19 +62,18 @@ def some(name: str, size_px: int, count: int) -> Sequence[LeaveOneOutScene]:
     return [scenes[len(scenes) * n // count] for n in range(min(count, len(scenes)))]
 
 
-def judge(
-    scenes: Sequence[LeaveOneOutScene], models: Sequence[str], sheets: Path | None
-) -> dict[str, dict[str, float | None]]:
-    """Mean scores by model, which are also printed."""
-    scores: dict[str, list[FrameScores]] = {model: [] for model in models}
+def judge(scenes: Sequence[LeaveOneOutScene], options: argparse.Namespace) -> dict[str, dict[str, float | None]]:
+    """Print and return the mean scores of each model."""
+    scores: dict[str, list[ViewScores]] = {model: [] for model in options.models}
+    scorers = Scorers(options.background)
     for scene in scenes:
         shown = {}
-        for model, completed, truth in mended(scene, models):
-            scores[model].append(score_frame(completed, truth, None, 0.0))
+        for model, completed, truth in completed_views(scene, options.models, options.background):
+            scores[model].append(score_view(completed, truth, scorers))
             shown[f"{model} {scores[model][-1].psnr_whole:.2f} dB"] = completed.rgb
             shown["truth"] = shown.pop("truth", truth.rgb)  # at the end
-        if sheets:
-            save(shown, sheets / f"{scene.name}.png")
+        if options.sheets:
+            save(shown, options.sheets / f"{scene.name}.png")
     means = {model: mean_scores(own) for model, own in scores.items()}
     print(f"{scenes[0].set}, {len(scenes)} views: {', '.join(SHOWN)}")
     for model, own in means.items():
@@ -81,30 +81,33 @@ def judge(
     return means
 
 
-def mended(scene: LeaveOneOutScene, models: Sequence[str]) -> Iterator[tuple[str, CompletedView, TrueView]]:
-    """The first time of a scene by each model, and what it should look like."""
+def completed_views(
+    scene: LeaveOneOutScene, models: Sequence[str], background: Background
+) -> Iterator[tuple[str, CompletedView, TrueView]]:
+    """The first frame of a scene by each model, and the truth."""
     frame = next(iter(scene.frames("cpu")))
-    truth = true_view(frame.truth, None)
+    truth = true_view(frame.truth, background)
     for model in models:
         name, _, fraction = model.rstrip("!").partition("@")
         part = float(fraction or 0)
-        rule = RenderConfig(error_rule="wrong", wrong_fraction=part) if part else RenderConfig()
-        stream = Stream(
-            make_method(name), StreamConfig(memory_mb=None, render=rule, fit_rig=model[-1] != "!"), frame.bounds
-        )
-        stream.push(frame.inputs)
-        quality = RenderQuality(read_fraction=0.0 if fraction and not part else None)
+        rule = RenderConfig(error_rule="predicted", refine_fraction=part) if part else RenderConfig()
+        config = StreamConfig(memory_mb=None, render=rule, background=background)
+        stream = Stream(make_method(name), config, frame.bounds)
+        if model[-1] != "!":
+            stream.calibrate(frame.inputs)
+        stream.add_frame(frame.inputs)
+        quality = RenderQuality(refine_fraction=0.0 if fraction and not part else None)
         yield model, stream.view(frame.truth.cameras, quality=quality).completed, truth
 
 
-def mean_scores(scores: Sequence[FrameScores]) -> dict[str, float | None]:
-    """Means over the views that have the score."""
+def mean_scores(scores: Sequence[ViewScores]) -> dict[str, float | None]:
+    """Means over the views that have a score."""
     found = {key: [v for s in scores if (v := getattr(s, key)) is not None] for key in SHOWN}
     return {key: round(fmean(values), 4) if values else None for key, values in found.items()}
 
 
 def save(shown: dict[str, Tensor], path: Path) -> None:
-    """The pictures side by side, cut to where any of them shows something."""
+    """Write the images side by side, cropped to the subject."""
     there = torch.stack([image.amax(0) > 0 for image in shown.values()]).any(0)
     (top, bottom), (left, right) = ((int(at.min()), int(at.max()) + 1) for at in torch.nonzero(there).T)
     part = slice(max(0, top - PADDING_PX), bottom + PADDING_PX), slice(max(0, left - PADDING_PX), right + PADDING_PX)

@@ -1,11 +1,10 @@
-"""A method of your own in an evaluation, in one file: a class with `initial_state` and `step`.
+"""A method of your own in one file: a subclass of `Inpainter` with a `step`.
 
     viewmend evaluate P --methods telea,examples/new_method.py:Afterimage --out out/mine
 
-`Afterimage` fills a hole with the colours that it saw at the same pixels in the last views, darker the longer ago, and
-with the mean colour of the view where it never saw any. It asks no camera; one that does asks
-`context(time, view.source_views)` for their images and the geometry's depth in them, for any
-`time` up to the view's own.
+`Afterimage` fills a hole with the colours of the same pixels in previous views, darkened, and otherwise with the mean
+colour of the view. It uses no camera; a method that does calls `context(time, view.source_views)`, which returns
+their images and the hull's depth in them for any `time` up to the view's own.
 """
 
 from dataclasses import dataclass, replace
@@ -13,20 +12,20 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from viewmend.inpainting.protocol import ContextProvider, State
-from viewmend.views import CompletedView, IncompleteView
+from viewmend.models.base import ContextProvider, Inpainter, State
+from viewmend.types import CompletedView, IncompleteView
 
 
 @dataclass(frozen=True)
 class Memory(State):
-    """What one stream carries from view to view: a value, so that streams cannot interfere."""
+    """State that a stream carries from view to view. It is a value, so streams cannot interfere."""
 
     rgb: Tensor | None = None
     seen: Tensor | None = None
 
 
-class Afterimage:
-    """Made from the device. All that its output depends on is an attribute: by these, results are remembered."""
+class Afterimage(Inpainter):
+    """Created with the device. Everything its output depends on is an attribute, by which results are cached."""
 
     def __init__(self, device: str, fading: float = 0.9) -> None:
         self.fading = fading
@@ -41,6 +40,6 @@ class Afterimage:
         if isinstance(state, Memory) and state.rgb is not None and state.rgb.shape == view.rgb.shape:
             seen = state.seen
             fill = torch.where(seen, self.fading * state.rgb, fill)
-        # Pixels with E = 0 stay as they are, bit for bit: the evaluation checks that.
+        # Pixels with an error of 0 must not change; the evaluation checks that.
         completed = torch.where(view.error > 0, view.error * fill + (1 - view.error) * view.rgb, view.rgb)
         return CompletedView(view, completed), replace(Memory(), rgb=completed, seen=whole | seen)

@@ -1,9 +1,9 @@
-"""Mend the views of a renderer that is not ours: `python examples/own_renderer.py [OUT.png]`.
+"""Complete the views of another renderer: `python examples/own_renderer.py [OUT.png]`.
 
-A renderer of your own needs to say, of each view: its colours, which pixels show the subject, which of these it could
-not colour, and their depth. The inpainter asks for nothing else but the camera images, and your geometry's depth in
-them. Here the renderer splats points: all six depth sensors of a rig say where the surface is, but only the nearest
-camera gives it colour. What that one does not see is missing.
+For each view a renderer provides colours, the subject's mask, which of its pixels it could not colour, and their depth.
+The inpainter also needs the camera images, and the depth of the renderer's geometry in these cameras. Here the renderer
+splats points: depth sensors of all six cameras provide the surface, but only the nearest camera provides colour. What
+that camera does not see is missing.
 """
 
 import math
@@ -13,18 +13,18 @@ from pathlib import Path
 import torch
 
 from viewmend import Stream
-from viewmend.capture.images import write_image
+from viewmend.data.images import write_image
+from viewmend.data.synthetic.rigs import orbit
+from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
-from viewmend.inpainting.checkpoint import load_inpainter
-from viewmend.inpainting.protocol import ViewInpainter
-from viewmend.rendering.selection import select_closest
-from viewmend.studio.rigs import orbit
-from viewmend.studio.stage import Studio, StudioConfig
-from viewmend.views import CompletedView, IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.models.base import Inpainter
+from viewmend.models.checkpoint import load_inpainter
+from viewmend.rendering.view import select_closest
+from viewmend.types import CompletedView, IncompleteView, MultiViewFrame, Silhouettes
 
 
 class DepthSensors:
-    """Our own geometry: what each camera's depth sensor measured. `depth(cameras)` is all that a stream wants of it."""
+    """Geometry of our own, from each camera's depth sensor. A stream only calls `depth(cameras)`."""
 
     def __init__(self, frame: MultiViewFrame) -> None:
         self.frame = frame
@@ -37,9 +37,9 @@ class DepthSensors:
 
 
 def splat(frame: MultiViewFrame, target: Cameras, coloured: tuple[str, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-    """The nearest point in each pixel of the target: its colour (3, h, w) and depth (h, w); 0 where there is none.
+    """Splat all pixels of the named cameras as squares of 3 x 3 pixels.
 
-    The points are all pixels of the cameras named, each drawn as a square of 3 x 3 pixels.
+    Returns colour (3, h, w) and depth (h, w) of the nearest point in each pixel; 0 where there is none.
     """
     seen = frame.select(coloured)
     assert seen.depth is not None
@@ -64,13 +64,13 @@ def splat(frame: MultiViewFrame, target: Cameras, coloured: tuple[str, ...]) -> 
 
 
 def render(frame: MultiViewFrame, target: Cameras, center: torch.Tensor) -> IncompleteView:
-    """A view as our renderer makes it: the surface of all sensors, the colours of the nearest camera."""
+    """Render a view: the surface of all sensors with the colours of the nearest camera."""
     nearest = select_closest(target, frame.cameras, center, len(frame.cameras))
     chosen = nearest[:1]
     _, surface = splat(frame, target, nearest)
     rgb, depth = splat(frame, target, chosen)
     mask = (surface > 0).float()
-    # Coloured where that camera's points are the front-most surface, missing elsewhere on the subject.
+    # Correct where that camera's points are the front-most surface, missing elsewhere on the subject.
     right = (depth > 0) & (depth <= surface + 0.03) & (surface > 0)
     error = mask * (~right).float()
     weights = right.float()[None]
@@ -78,8 +78,8 @@ def render(frame: MultiViewFrame, target: Cameras, center: torch.Tensor) -> Inco
     return IncompleteView(target, rgb * right, mask, error, surface, chosen, weights, frame.time, nearest, masks)
 
 
-def run(inpainter: ViewInpainter, frames: int = 4, size: int = 256, cameras: int = 6):
-    """Mend a view of each time; the last one, rendered and mended, and what a camera there would see."""
+def run(inpainter: Inpainter, frames: int = 4, size: int = 256, cameras: int = 6):
+    """Complete a view of each frame; the last one, and the image a real camera would take."""
     studio = Studio(StudioConfig(seed=10003, cameras=cameras, frames=frames, size_px=size))
     target = orbit([0.5], (size, size), elevation_rad=0.3)
     center = torch.tensor([0.0, 0.95, 0.0])
@@ -87,7 +87,7 @@ def run(inpainter: ViewInpainter, frames: int = 4, size: int = 256, cameras: int
     viewer, mended = None, None
     for time in range(frames):
         frame = studio.read(time)
-        stream.push(frame, DepthSensors(frame))
+        stream.add_frame(frame, DepthSensors(frame))
         mended = stream.mend(render(frame, target, center), viewer)
         viewer = mended.viewer
     assert mended is not None
@@ -97,23 +97,23 @@ def run(inpainter: ViewInpainter, frames: int = 4, size: int = 256, cameras: int
 BACKGROUND = torch.tensor([0.85, 0.88, 0.92])
 
 
-def laid_over(completed: CompletedView, background: torch.Tensor) -> torch.Tensor:
-    """The view upon a colour, (3, h, w). Its own colours lie upon black: none of them spills over the outline."""
+def composite(completed: CompletedView, background: torch.Tensor) -> torch.Tensor:
+    """The view on a background colour, (3, h, w). Its colours are on black, so none spills over the outline."""
     return completed.rgb + (1 - completed.opacity) * background[:, None, None]
 
 
 def main() -> None:
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/own_renderer.png")
-    completed, truth = run(load_inpainter("small"))
+    completed, truth = run(load_inpainter("views"))
     assert truth.mask is not None
     black = truth.rgb[0] / 255 * (truth.mask[0] / 255)
-    pictures = torch.cat([completed.view.rgb, completed.rgb, laid_over(completed, BACKGROUND), black], 2)
+    pictures = torch.cat([completed.view.rgb, completed.rgb, composite(completed, BACKGROUND), black], 2)
     write_image(out, (pictures.clamp(0, 1) * 255).byte().movedim(0, -1).contiguous().numpy())
     holes = completed.view.error > 0
-    for name, rgb in (("left black", completed.view.rgb), ("mended", completed.rgb)):
+    for name, rgb in (("rendered", completed.view.rgb), ("completed", completed.rgb)):
         error = (rgb - black)[:, holes].square().mean()
         print(f"{name}: {-10 * math.log10(float(error)):.1f} dB in {int(holes.sum())} missing pixels")
-    print(f"wrote {out}: rendered, mended, upon a background of one's own, truth")
+    print(f"wrote {out}: rendered, completed, on a background, truth")
 
 
 if __name__ == "__main__":

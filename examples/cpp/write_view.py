@@ -7,19 +7,19 @@ import sys
 from pathlib import Path
 
 from viewmend import Stream, StreamConfig, load_inpainter
-from viewmend.atomic_writes import write_tensors
-from viewmend.deployment.view_inputs import ViewInputs
-from viewmend.inpainting.protocol import ContextProvider
-from viewmend.studio.rigs import orbit
-from viewmend.studio.stage import Studio, StudioConfig
+from viewmend.data.synthetic.rigs import orbit
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.export.model_inputs import ViewInputs
+from viewmend.models.base import ContextProvider
+from viewmend.utils.atomic_writes import write_tensors
 
 
 def studio_view(seed: int = 10003, cameras: int = 8, size: int = 256) -> ViewInputs:
     """A view between the cameras of a procedural scene, rendered as `viewmend mend` does, and the rig."""
     frame = Studio(StudioConfig(seed=seed, cameras=cameras, frames=1, size_px=size)).read(0)
     net = load_inpainter("views", precision="float32")
-    stream = Stream(net, StreamConfig(fit_rig=False))
-    seen = stream.push(frame)
+    stream = Stream(net, StreamConfig())
+    seen = stream.add_frame(frame)
     view = stream.render(orbit([0.4], (size, size), elevation_rad=0.2))
     return ViewInputs.of(view, ContextProvider(lambda _, names: seen.context(names)), num_views=8)
 
