@@ -60,8 +60,17 @@ def test_the_same_seed_gives_the_same_capture_in_any_order(folders):
 def test_the_truth_of_an_input_camera_is_its_image(folders):
     studio = Studio(config(folders))
     frame, truth = studio.read(1), studio.truth(studio.cameras[2], 1)
-    assert torch.equal(truth.rgb[0], frame.rgb[2]) and torch.equal(truth.mask[0], frame.mask[2])
-    assert torch.equal(truth.depth[0], frame.depth[2])
+    assert torch.equal(truth.mask[0], frame.mask[2]) and torch.equal(truth.depth[0], frame.depth[2])
+    inside = frame.mask[2] == 255
+    assert torch.equal(truth.rgb[0][:, inside], frame.rgb[2][:, inside])
+
+
+def test_the_truth_is_not_darkened_at_outlines(folders):
+    truth = Studio(config(folders)).truth(orbit([0.3], (96, 96)), 0)
+    edge = (truth.mask[0] > 0) & (truth.mask[0] < 255)
+    inside = truth.mask[0] == 255
+    levels = [float(truth.rgb[0].float().mean(0)[where].mean()) for where in (edge, inside)]
+    assert abs(levels[0] - levels[1]) < 0.25 * levels[1]
 
 
 def test_imperfections_leave_the_truth_alone(folders):
@@ -186,3 +195,13 @@ def test_real_people_move_as_people_do(shared, motion):
     assert all(1.2 < h < 2.4 for h in heights)
     assert min(map(abs, lows)) < 0.06 and max(lows) < 0.35
     assert np.ptp(heights) < 1
+
+
+def test_real_people_change_their_clothes(shared):
+    people = shared / "performers"
+    files = people / "train" / "Black_F_3_Casual.glb", people / "motions" / "train" / "m2m_greeting.bvh"
+    plain, varied = (GltfPerformer(*files, 4, 1.0, variety) for variety in (0.0, 1.0))
+    one, other = (performer.pose(0.0) for performer in (plain, varied))
+    assert torch.equal(one.mesh.vertices, other.mesh.vertices)
+    changed = [float((a - b).abs().mean()) for a, b in zip(one.textures, other.textures, strict=True)]
+    assert max(changed) > 0.02

@@ -66,11 +66,15 @@ class StudioScene(LeaveOneOutScene):
     def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """Renders them, one at a time. Of those before the first that is scored, only what a context needs is made."""
         studio = self.studio(device)
+
+        def true_view(held: str, time: int) -> MultiViewFrame:
+            return studio.truth(studio.true_cameras.select([held]), time)
+
         before: MultiViewFrame | None = None
         surfaces: dict[int, TrueSurface] = {}
         for time in range(self.config.frames):
             drawn = studio.read(time)
-            frame = LeaveOneOut({time: drawn}).frame(self.held, time)
+            frame = LeaveOneOut({time: drawn}, true_view=true_view).frame(self.held, time)
             scored = time >= self.scored_from
             if self.scored_from:
                 mesh = studio.scene(time).mesh

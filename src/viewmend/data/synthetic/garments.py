@@ -215,8 +215,8 @@ def _garments(
     for n, where in itertools.product(range(label.max() + 1), (~below, below & (limb < FEET), limb == FEET)):
         part = inside & (label == n) & where
         if part.sum() > LEAST_SHARE * inside.sum():
-            around = (_smooth(part, 2 * MARGIN_PX + 1) > 0) & ~shown
-            covers.append((part | around).astype(np.float32))
+            margin = (_smooth(part, 2 * MARGIN_PX + 1) > 0) & ~shown
+            covers.append((part | margin).astype(np.float32))
             dress.append(n)
             shoes.append(bool((limb[part] == FEET).any()))
     return Garments(np.stack(covers), shown, bare, around, along, tuple(dress), tuple(shoes)) if covers else None

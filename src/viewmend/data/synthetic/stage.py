@@ -14,7 +14,7 @@ from viewmend.data.synthetic.imperfections import Imperfections, imperfect_camer
 from viewmend.data.synthetic.performer import Performer, TexturedMesh
 from viewmend.data.synthetic.render import Surface, light, render, stage_backdrop, stage_lights
 from viewmend.data.synthetic.rigs import dome_rig, ring_rig
-from viewmend.data.synthetic.textures import TexturePyramid, texture_pyramid
+from viewmend.data.synthetic.textures import TexturePyramid, linear_from_srgb, srgb_from_linear, texture_pyramid
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.types import MultiViewFrame
@@ -148,8 +148,15 @@ class Studio:
         return replace(frame, cameras=self._cameras)
 
     def truth(self, cameras: Cameras, time: int) -> MultiViewFrame:
-        """What perfect cameras anywhere would see at index `time`, before black, with exact mask and depth."""
-        return self._draw(cameras.to(self.config.device), time, None)
+        """What perfect cameras anywhere would see at index `time`, with exact mask and depth.
+
+        Colours are the subject's own, not darkened where the mask is soft: times the mask, they are the view on black.
+        """
+        frame = self._draw(cameras.to(self.config.device), time, None)
+        assert frame.mask is not None, "the studio draws masks"
+        share = (frame.mask[:, None].float() / 255).clamp_min(1 / 255)
+        straight = srgb_from_linear((linear_from_srgb(frame.rgb.float() / 255) / share).clamp(0, 1))
+        return replace(frame, rgb=(255 * straight).round().to(torch.uint8))
 
     def _draw(
         self, cameras: Cameras, time: int, backdrop: Float[Tensor, "view 3 height width"] | None
