@@ -27,9 +27,16 @@ from measure import RESULTS, summarise, synchronise, write
 from stream_adapter import STREAMED, Streamed
 from torch import Tensor
 
-from viewmend.contrib.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
 from viewmend.contrib.baselines.framing import Canvas, Window, window_canvas, windows_over
-from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter, OnlineState
+from viewmend.contrib.baselines.online import (
+    Clip,
+    Frames,
+    OnlineConfig,
+    OnlineInpainter,
+    OnlineNetwork,
+    OnlineState,
+    Sampling,
+)
 from viewmend.contrib.baselines.published import NETWORKS
 from viewmend.data.synthetic.rigs import orbit
 from viewmend.data.synthetic.stage import Studio, StudioConfig

@@ -12,10 +12,9 @@ from reference.baselines_twin import (
 )
 from torch.nn import functional as F
 
-from viewmend.contrib.baselines.deformable_convolution import deform_conv2d
-from viewmend.contrib.baselines.focal_attention import FocalAttention, FocalTokens, pooled_places, window_places
-from viewmend.contrib.baselines.soft_split import FusionFeedForward, SoftComposition, SoftSplit
-from viewmend.contrib.baselines.spynet import SPyNet, warp
+from viewmend.contrib.baselines.e2fgvi import FocalAttention, FocalTokens, pooled_places, window_places
+from viewmend.contrib.baselines.e2fgvi_propagation import SPyNet, deform_conv2d, warp
+from viewmend.contrib.baselines.layers import FusionFeedForward, SoftComposition, SoftSplit
 
 
 def test_deformable_convolution_reads_where_it_is_told(rng):

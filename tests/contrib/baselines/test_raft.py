@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from viewmend.contrib.baselines.raft import (
+from viewmend.contrib.baselines.rgvi import (
     CELL_PX,
     LEVELS,
     RADIUS,

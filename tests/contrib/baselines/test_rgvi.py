@@ -1,19 +1,19 @@
 """RGVI: what the past saw is pulled into the holes along flow; the rest is filled; nothing else changes."""
 
-import sys
-from dataclasses import replace
-from importlib.machinery import ModuleSpec
-from types import ModuleType, SimpleNamespace
-
-import numpy as np
 import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from viewmend.contrib.baselines.diffusion_fill import find_diffusion
-from viewmend.contrib.baselines.raft import Raft
-from viewmend.contrib.baselines.rgvi import PAST_FRAMES, Rgvi, RgviParts, RgviState, make_rgvi
-from viewmend.contrib.baselines.rgvi_flow import dis_flow, disagreeing, pull
+from viewmend.contrib.baselines.rgvi import (
+    PAST_FRAMES,
+    Raft,
+    Rgvi,
+    RgviState,
+    dis_flow,
+    disagreeing,
+    make_rgvi,
+    pull,
+)
 from viewmend.geometry.cameras import Cameras
 from viewmend.metrics import weights
 from viewmend.metrics.weights import KnownWeights
@@ -101,7 +101,7 @@ def test_flow_that_does_not_lead_home_disagrees():
 
 
 def test_a_hole_takes_what_was_there_before(texture):
-    exact, _ = stream(Rgvi(RgviParts(flow=known_flow)), texture, 3)
+    exact, _ = stream(Rgvi(known_flow), texture, 3)
     assert in_hole(exact, at(texture, 2)) < 1e-5
     first, _ = stream(Rgvi(), texture, 1)
     later, _ = stream(Rgvi(), texture, 3)
@@ -112,8 +112,11 @@ def test_a_hole_takes_what_was_there_before(texture):
 
 def test_flow_adds_up_over_several_frames(texture):
     """A hole at the border, through which the picture comes in: only what was in sight before can be pulled."""
-    parts = RgviParts(flow=known_flow, reference=lambda image, missing, subject: torch.where(missing, 0.0, image))
-    completed, _ = stream(Rgvi(parts), texture, 3, (slice(0, 20), slice(0, 20)))
+
+    def black(image, missing, subject):
+        return torch.where(missing, 0.0, image)
+
+    completed, _ = stream(Rgvi(known_flow, complete=black), texture, 3, (slice(0, 20), slice(0, 20)))
     truth = at(texture, 2)
     seen = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     seen[MOTION[1] : 20, MOTION[0] : 20] = True
@@ -121,32 +124,13 @@ def test_flow_adds_up_over_several_frames(texture):
     corner = completed.view.error.bool() & ~seen
     assert not completed.rgb[:, corner].any()
 
-    away = replace(parts, flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow)
-    lost, _ = stream(Rgvi(away), texture, 3)
+    away = Rgvi(lambda image, other: constant(999, 999), lambda flow, *_: flow, black)
+    lost, _ = stream(away, texture, 3)
     assert not lost.rgb[:, lost.view.error > 0].any()
 
 
-def test_the_reference_frame_is_the_newest_and_the_rest_is_what_it_leaves(texture):
-    away = RgviParts(flow=lambda image, other: constant(999, 999), complete_flow=lambda flow, *_: flow)
-    asked = []
-
-    def half(image, missing, subject):
-        asked.append(int(missing.sum()))
-        above = torch.arange(SIZE)[:, None] < SIZE // 2
-        return torch.where(missing & above, 0.25, torch.where(missing, torch.nan, image))
-
-    def rest(image, missing, subject):
-        assert not image.isnan().any()
-        return torch.where(missing, 0.75, image)
-
-    completed, _ = stream(Rgvi(replace(away, reference=half, rest=rest)), texture, 3)
-    hole = completed.view.error > 0
-    assert asked == [int(hole.sum())] * 3
-    assert set(completed.rgb[:, hole].unique().tolist()) <= {0.25, 0.75}
-
-
-def test_the_past_is_bounded_and_its_own_where_nobody_shows_the_truth(texture):
-    _, state = stream(Rgvi(RgviParts(flow=known_flow)), texture, PAST_FRAMES + 4)
+def test_the_past_is_bounded_and_its_own_without_the_truth(texture):
+    _, state = stream(Rgvi(known_flow), texture, PAST_FRAMES + 4)
     assert isinstance(state, RgviState)
     assert (len(state.past), len(state.flows)) == (PAST_FRAMES, PAST_FRAMES - 1)
     assert torch.equal(state.past[0], at(texture, PAST_FRAMES + 3))
@@ -154,7 +138,7 @@ def test_the_past_is_bounded_and_its_own_where_nobody_shows_the_truth(texture):
     assert isinstance(state, RgviState) and torch.equal(state.past[0], completed.rgb)
 
 
-def test_a_view_of_another_size_starts_anew(texture):
+def test_a_view_of_another_size_starts_a_new_past(texture):
     _, state = stream(Rgvi(), texture, 2)
     small = view(at(texture, 2), 2)
     rgb, weights = small.rgb[:, :64], small.weights[:, :64]
@@ -176,49 +160,13 @@ def places(tmp_path, monkeypatch):
 
 
 def test_parts_are_what_is_there(places, monkeypatch):
-    assert make_rgvi().parts == RgviParts()
+    assert make_rgvi().flow is dis_flow
     (places / "raft.pth").write_bytes(b"none")
     with pytest.raises(WeightsError, match="damaged or another"):
         make_rgvi()
     network, loaded = Raft(), KnownWeights("raft", ("raft.pth",), "RAFT", "s", "l")
     torch.save(network.state_dict(), places / "raft.pth")
     monkeypatch.setattr(weights, "KNOWN", (loaded,))
-    parts = make_rgvi().parts
-    assert isinstance(parts.flow, Raft) and torch.equal(
-        parts.flow.state_dict()["mask_predictor.conv.bias"], network.mask_predictor.conv.bias
-    )
-
-
-def test_diffusion_makes_the_reference_where_it_is_installed(places, monkeypatch, texture):
-    """Called through a stand-in: what `diffusers` is given, and that nothing but the hole is taken from it."""
-    given = {}
-
-    class Pipeline:
-        @classmethod
-        def from_pretrained(cls, folder, **how):
-            given.update(folder=folder, **how)
-            return cls()
-
-        def to(self, device):
-            return self
-
-        def __call__(self, **how):
-            given.update(how)
-            return SimpleNamespace(images=[np.full((how["height"], how["width"], 3), 0.25, np.float32)])
-
-    module = ModuleType("diffusers")
-    module.StableDiffusionInpaintPipeline = Pipeline
-    module.__spec__ = ModuleSpec("diffusers", None)
-    monkeypatch.setitem(sys.modules, "diffusers", module)
-    assert find_diffusion() is None
-    folder = places / "stable-diffusion-2-inpainting"
-    folder.mkdir()
-    (folder / "model_index.json").touch()
-    completed, _ = stream(Rgvi(RgviParts(reference=find_diffusion())), texture, 1)
-    hole = completed.view.error > 0
-    assert (completed.rgb[:, hole] - 0.25).abs().max() < 1e-6
-    assert torch.equal(completed.rgb[:, ~hole], completed.view.rgb[:, ~hole])
-    assert given["folder"] == folder and given["local_files_only"] and given["use_safetensors"]
-    assert given["image"].shape == (1, 3, SIZE, SIZE) and given["mask_image"].sum() == 400
-    later, _ = stream(Rgvi(RgviParts(flow=known_flow, reference=find_diffusion())), texture, 2)
-    assert in_hole(later, at(texture, 1)) < 1e-5
+    flow = make_rgvi().flow
+    assert isinstance(flow, Raft)
+    assert torch.equal(flow.state_dict()["mask_predictor.conv.bias"], network.mask_predictor.conv.bias)

@@ -9,7 +9,7 @@ from models.plates import view as plate
 from torch import nn
 
 from viewmend.contrib.baselines.dstt import DSTT
-from viewmend.contrib.baselines.riftcast import RiftCast
+from viewmend.contrib.baselines.published import RiftCast
 
 
 class Counter(DSTT):

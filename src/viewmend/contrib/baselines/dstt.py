@@ -5,8 +5,18 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from viewmend.contrib.baselines.frame_coder import FEATURES, DeepLayers, FrameDecoder, shallow_layers
-from viewmend.contrib.baselines.soft_split import DIM, MARGIN_CELLS, PATCH_CELLS, STEP_CELLS, STEP_PX, SoftComposition
+from viewmend.contrib.baselines.layers import (
+    DIM,
+    FEATURES,
+    MARGIN_CELLS,
+    PATCH_CELLS,
+    STEP_CELLS,
+    STEP_PX,
+    DeepLayers,
+    FrameDecoder,
+    SoftComposition,
+    shallow_layers,
+)
 from viewmend.contrib.baselines.token_transformer import BLOCKS, TokenBlock, TokenClips, TokenTransformer, initialise
 
 ZONES = 2

@@ -1,22 +1,146 @@
-"""E2FGVI's flow-guided propagation: features travel from frame to frame, backward in time and then forward."""
+"""E2FGVI's optical flow (SPyNet), and the propagation of features along it, backward in time and then forward."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
 
 import torch
-from einops import repeat
+from einops import rearrange, repeat
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from viewmend.contrib.baselines.deformable_convolution import deform_conv2d
-from viewmend.contrib.baselines.spynet import warp
+from viewmend.geometry.cameras import pixel_centers
+from viewmend.geometry.sampling import sample_bilinear
+
+LEVELS = 6
+CHANNELS = (8, 32, 64, 32, 16, 2)
+"""Channels of one level: from both images and the flow so far to the flow's correction."""
+MULTIPLE = 2 ** (LEVELS - 1)
+"""Sizes that halve at each level."""
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+def warp(
+    image: Float[Tensor, "sample channel height width"],
+    flow: Float[Tensor, "sample 2 height width"],
+    padding: Literal["zeros", "border"] = "zeros",
+) -> Float[Tensor, "sample channel height width"]:
+    """`image` at x + flow(x): bilinear, flow in pixels as (right, down).
+
+    `padding` is what lies outside: "zeros", or "border" for the nearest edge pixel.
+    """
+    height, width = image.shape[-2:]
+    # Positions of a hundred pixels need more digits than half precision has.
+    with torch.autocast(image.device.type, enabled=False):
+        at = pixel_centers(width, height, flow.device) + flow.float().movedim(1, -1)
+        read = sample_bilinear(image.float(), at.flatten(1, 2), padding)
+    return read.movedim(-1, 1).unflatten(2, (height, width)).to(image.dtype)
+
+
+class SPyNet(nn.Module):
+    """Flow from each image to another, refined from 1/32 of the size to the whole; 1,440,300 parameters."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.basic_module = nn.ModuleList(_Level() for _ in range(LEVELS))
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
+
+    def forward(
+        self, images: Float[Tensor, "sample 3 height width"], others: Float[Tensor, "sample 3 height width"]
+    ) -> Float[Tensor, "sample 2 height width"]:
+        """Flow in pixels, (right, down): `warp(others, flow)` looks like `images`. RGB in [0, 1], any size."""
+        height, width = images.shape[-2:]
+        size = tuple(-(-side // MULTIPLE) * MULTIPLE for side in (height, width))
+        flow = self._refine(_resize(images, size), _resize(others, size))
+        scale = flow.new_tensor([width / size[1], height / size[0]]).view(2, 1, 1)
+        return _resize(flow, (height, width)) * scale
+
+    def _refine(
+        self, images: Float[Tensor, "sample 3 height width"], others: Float[Tensor, "sample 3 height width"]
+    ) -> Float[Tensor, "sample 2 height width"]:
+        """The flow of images whose sides are multiples of 32."""
+        pairs = [((images - self.mean) / self.std, (others - self.mean) / self.std)]
+        for _ in range(LEVELS - 1):
+            image, other = pairs[-1]
+            pairs.append((F.avg_pool2d(image, 2), F.avg_pool2d(other, 2)))
+        flow = images.new_zeros(len(images), 2, *pairs[-1][0].shape[-2:])
+        for level, (image, other) in zip(self.basic_module, reversed(pairs), strict=True):
+            if flow.shape[-1] != image.shape[-1]:
+                flow = 2 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=True)
+            flow = flow + level(torch.cat([image, warp(other, flow, "border"), flow], 1))
+        return flow
+
+
+class _Level(nn.Module):
+    """Five convolutions of 7 x 7; the nesting is that of the published checkpoints' names."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.basic_module = nn.ModuleList(
+            nn.ModuleDict({"conv": nn.Conv2d(a, b, 7, padding=3)}) for a, b in pairwise(CHANNELS)
+        )
+
+    def forward(self, x: Float[Tensor, "sample 8 height width"]) -> Float[Tensor, "sample 2 height width"]:
+        for number, step in enumerate(self.basic_module):
+            assert isinstance(step, nn.ModuleDict)
+            x = step["conv"](x.relu() if number else x)
+        return x
+
+
+def _resize(images: Float[Tensor, "sample channel _h _w"], size: tuple[int, ...]) -> Float[Tensor, "..."]:
+    return F.interpolate(images, size=size, mode="bilinear", align_corners=False)
+
+
+def deform_conv2d(
+    x: Float[Tensor, "sample channel height width"],
+    offsets: Float[Tensor, "sample offset height width"],
+    masks: Float[Tensor, "sample point height width"],
+    weight: Float[Tensor, "out channel kernel kernel"],
+    bias: Float[Tensor, "out"] | None,
+) -> Float[Tensor, "sample out height width"]:
+    """A convolution of stride 1 that keeps the size, its kernel points displaced and weighted pixel by pixel.
+
+    Args:
+        x: its channels fall into as many groups, in order, as the offsets have.
+        offsets: pixels; per group and kernel point (row by row), first down, then right.
+        masks: per group and kernel point, the weight of the sample.
+        weight: odd kernel; zero offsets and unit masks make this `conv2d` with padding kernel // 2.
+        bias: per output channel.
+
+    Sampling is bilinear; zero outside of the image.
+    """
+    kernel, (height, width) = weight.shape[-1], x.shape[-2:]
+    points = kernel * kernel
+    groups = masks.shape[1] // points
+    # Positions of a hundred pixels need more digits than half precision has.
+    with torch.autocast(x.device.type, enabled=False):
+        shift = rearrange(offsets.float(), "b (g k yx) h w -> yx (b g) k h w", k=points, yx=2)
+        place = torch.arange(kernel, device=x.device) - kernel // 2
+        kernel_points = torch.stack([place.repeat(kernel), place.repeat_interleave(kernel)], -1)[:, None, None]
+        at = pixel_centers(width, height, x.device) + kernel_points + shift.flip(0).movedim(0, -1)
+        images = rearrange(x.float(), "b (g c) h w -> (b g) c h w", g=groups)
+        read = sample_bilinear(images, rearrange(at, "n k h w xy -> n (k h w) xy"))
+        read = rearrange(read, "(b g) (k n) c -> b g c k n", g=groups, k=points)
+        read = read * rearrange(masks.float(), "b (g k) h w -> b g 1 k (h w)", k=points)
+    # Back to what the layers around it compute in, then the convolution is one product of matrices.
+    out = weight.flatten(1) @ rearrange(read, "b g c k n -> b (g c k) n").to(weight.dtype)
+    out = rearrange(out, "b o (h w) -> b o h w", h=height)
+    return out if bias is None else out + bias.view(-1, 1, 1)
+
 
 GROUPS = 16
 """Groups of channels with offsets of their own."""
 POINTS = 9
 """Points of a 3 x 3 kernel."""
 REACH_PX = 10.0
-"""How far a kernel point may move away from where the flow leads."""
+"""Largest displacement of a kernel point from the flow's target."""
 
 Feature = Float[Tensor, "sample channel height width"]
 Flow = Float[Tensor, "sample 2 height width"]
@@ -24,7 +148,7 @@ Flow = Float[Tensor, "sample 2 height width"]
 
 @dataclass(frozen=True)
 class Propagated:
-    """What one direction hands on from frame to frame: the last two results and the flows between them."""
+    """State of one direction: the last two results and the flow between them."""
 
     features: tuple[Feature, ...] = ()
     """At most two results, the latest last."""
@@ -33,7 +157,7 @@ class Propagated:
 
 
 class AlignedConvolution(nn.Module):
-    """Brings two earlier results to the current frame: deformable, led by flow, corrected by what the features say."""
+    """Aligns two earlier results with the current frame: a deformable convolution along corrected flow."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -60,7 +184,7 @@ class AlignedConvolution(nn.Module):
         flow1: Flow,
         flow2: Flow,
     ) -> Feature:
-        """Two results side by side, what the frames say of them, and the flows to each."""
+        """The two results, aligned and merged; `earlier` and `current` are concatenated features."""
         raw = self.conv_offset(torch.cat([current, flow1, flow2], 1))
         offsets, masks = raw.float().split([2 * GROUPS * POINTS, GROUPS * POINTS], 1)
         # Flows are (right, down); the offsets of a kernel point (down, right).
@@ -70,7 +194,7 @@ class AlignedConvolution(nn.Module):
 
 
 class Propagation(nn.Module):
-    """Second-order propagation in both directions; the forward one also sees what the backward one found."""
+    """Second-order propagation in both directions; the forward one also takes the backward one's results."""
 
     def __init__(self, channels: int = 128) -> None:
         super().__init__()
@@ -95,15 +219,15 @@ class Propagation(nn.Module):
     ) -> Float[Tensor, "sample frame channel height width"]:
         """Features of consecutive frames, given the flow of each pair, (right, down) in their pixels."""
         frames = features.unbind(1)
-        # The published networks were trained with the pairs' flows in the order of time here too, although this sweep
-        # meets the last pair first; in any other order their weights compute something else.
+        # The flows are in the order of time although this sweep starts at the last pair: the published weights were
+        # trained this way.
         backward = self._sweep("backward_", [(x,) for x in reversed(frames)], to_next.unbind(1))
         known = list(zip(frames, reversed(backward), strict=True))
         forward = self._sweep("forward_", known, to_previous.unbind(1))
         return torch.stack([self._fuse(x, back, ahead) for (x, back), ahead in zip(known, forward, strict=True)], 1)
 
     def follow(self, current: Feature, flow: Flow | None, state: Propagated) -> tuple[Feature, Propagated]:
-        """The latest frame of a stream by itself: the forward sweep goes on, the backward one starts here.
+        """One step of a stream: the forward sweep continues, the backward one starts here.
 
         Args:
             current: the frame's features.
@@ -127,11 +251,11 @@ class Propagation(nn.Module):
     def step(
         self, way: str, seen: tuple[Feature, ...], flow: Flow | None, state: Propagated
     ) -> tuple[Feature, Propagated]:
-        """One frame further: the result at a frame, and what the next one needs.
+        """The result at one frame, and the state for the next.
 
         Args:
             way: "backward_" or "forward_".
-            seen: the frame's own features first, then what other directions found in it.
+            seen: the frame's own features, then other directions' results for it.
             flow: from this frame to the one stepped from, None at the first.
             state: what the last step returned.
         """

@@ -1,4 +1,4 @@
-"""How a view of any size meets a network of one size: resized whole, or cut into overlapping windows."""
+"""How a view of any size is given to a network of one size, and what cameras see of a window of it."""
 
 import math
 from collections.abc import Sequence
@@ -10,12 +10,16 @@ from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d, pad
 
+from viewmend.geometry.cameras import pixel_centers, project, unproject
+from viewmend.geometry.sampling import sample_bilinear
+from viewmend.types import ContextViews, IncompleteView
+
 Image = Float[Tensor, "3 height width"]
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """A view as a network is shown it: in [-1, 1], 0 in the holes, which are dilated."""
+    """A view as input to a network: in [-1, 1], 0 in the holes, which are dilated."""
 
     image: Image
     holes: Bool[Tensor, "height width"]
@@ -24,13 +28,13 @@ class Canvas:
 
 @dataclass(frozen=True)
 class Window:
-    """Where on a canvas the network looks; its size is the network's."""
+    """The top left corner of a part of a canvas; its size is the network's."""
 
     top: int
     left: int
 
     def of(self, picture: Shaped[Tensor, "*stack height width"], size: tuple[int, int]) -> Tensor:
-        """What the picture shows there."""
+        """That part of an image."""
         return picture[..., self.top : self.top + size[0], self.left : self.left + size[1]]
 
 
@@ -51,9 +55,9 @@ def window_canvas(rgb: Image, missing: Bool[Tensor, "height width"], size: tuple
 def windows_over(holes: Bool[Tensor, "height width"], size: tuple[int, int], overlap_px: int) -> tuple[Window, ...]:
     """The windows of a grid that are needed for the holes.
 
-    The grid is the fewest windows of a size, evenly spread, that cover the canvas and overlap by so much at least: it
-    depends on sizes alone, so a stream finds the same windows at each time. A hole needs the window in whose middle it
-    is most, so both where it crosses the middle of their overlap.
+    The grid has the fewest evenly spaced windows that cover the canvas with at least this overlap. It depends on sizes
+    alone, so a stream has the same windows at each time. The middles of overlaps divide the canvas among the windows;
+    a window is needed if its part has a hole.
     """
     tops, lefts = (_starts(length, side, overlap_px) for length, side in zip(holes.shape, size, strict=True))
     rows, cols = _middles(tops, size[0], holes.shape[0]), _middles(lefts, size[1], holes.shape[1])
@@ -68,7 +72,7 @@ def windows_over(holes: Bool[Tensor, "height width"], size: tuple[int, int], ove
 def stitch(
     pieces: Sequence[Image], windows: Sequence[Window], canvas: tuple[int, int], overlap_px: int
 ) -> Float[Tensor, "3 canvasheight canvaswidth"]:
-    """The windows' pictures in one; where they overlap, each counts less towards its edge. Elsewhere 0."""
+    """The windows' images in one; in overlaps, weights fall towards each window's edge. Elsewhere 0."""
     total = pieces[0].new_zeros(3, *canvas)
     weights = pieces[0].new_zeros(canvas)
     size = (pieces[0].shape[1], pieces[0].shape[2])
@@ -111,3 +115,58 @@ def _middles(starts: list[int], side: int, length: int) -> list[int]:
 def _ramp(side: int, overlap_px: int) -> Float[Tensor, " side"]:
     place = torch.arange(side) + 0.5
     return (torch.minimum(place, side - place) / max(overlap_px, 1)).clamp(max=1)
+
+
+@dataclass(frozen=True)
+class Aim:
+    """The point in space at a window's centre, and the size of the view's pixels there."""
+
+    point: Float[Tensor, "1 3"]
+    """World coordinates, metres."""
+    pixel_m: Float[Tensor, ""]
+
+
+def aim(view: IncompleteView, window: Window, size: tuple[int, int]) -> Aim | None:
+    """The point at the window's centre and the median depth of the proxy in it, or in the view; None without any."""
+    for depth in (window.of(view.depth, size), view.depth):
+        seen = depth[depth > 0]
+        if len(seen):
+            z = seen.median()
+            centre = torch.tensor([[[window.left + size[1] / 2, window.top + size[0] / 2]]]).to(z)
+            point = unproject(centre, z[None, None], view.camera)[0]
+            return Aim(point, z / view.camera.K[0, 0, 0])
+    return None
+
+
+def foreground(views: ContextViews) -> Float[Tensor, "view 3 height width"]:
+    """The cameras' images in [0, 1], black outside of the masks, or of the proxy if there are none."""
+    mask = (views.depth > 0).float() if views.frame.mask is None else views.frame.mask.float() / 255
+    return views.frame.rgb.float() / 255 * mask[:, None]
+
+
+def camera_windows(
+    images: Float[Tensor, "view 3 height width"], views: ContextViews, at: Aim | None, size: tuple[int, int]
+) -> Float[Tensor, "view 3 windowheight windowwidth"]:
+    """The cameras' images around the aim, in [-1, 1]; black beyond the image.
+
+    Without an aim, or with one behind a camera, its whole image is resized instead.
+
+    Args:
+        images: `foreground(views)`.
+        views: whose cameras they are.
+        at: the window's aim.
+        size: height and width of a window.
+    """
+    height, width = size
+    cameras = views.frame.cameras
+    extent = cameras.size_px.to(images)
+    scale, centre = extent / extent.new_tensor([width, height]), extent / 2
+    if at is not None:
+        uv, z = project(at.point, cameras)
+        near = (cameras.K[:, 0, 0] / z[:, 0] * at.pixel_m)[:, None].expand(-1, 2)
+        before = z > 0
+        scale, centre = torch.where(before, near, scale), torch.where(before, uv[:, 0], centre)
+    offsets = pixel_centers(width, height, images.device) - extent.new_tensor([width / 2, height / 2])
+    places = centre[:, None, None] + scale[:, None, None] * offsets
+    shown = sample_bilinear(images, places.flatten(1, 2)).movedim(-1, 1).unflatten(2, size)
+    return 2 * shown - 1

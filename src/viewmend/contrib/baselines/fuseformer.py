@@ -5,12 +5,14 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from viewmend.contrib.baselines.frame_coder import STRIDE_PX, FrameDecoder, HierarchicalEncoder
-from viewmend.contrib.baselines.soft_split import (
+from viewmend.contrib.baselines.layers import (
     DIM,
     STEP_CELLS,
     STEP_PX,
+    STRIDE_PX,
+    FrameDecoder,
     FusionFeedForward,
+    HierarchicalEncoder,
     SoftComposition,
     SoftSplit,
     part_of,

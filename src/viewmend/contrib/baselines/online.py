@@ -2,17 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.contrib.baselines.camera_windows import aim, camera_windows, foreground
-from viewmend.contrib.baselines.clips import Clip, Frames, OnlineNetwork, Sampling
 from viewmend.contrib.baselines.framing import (
     Canvas,
     Window,
+    aim,
+    camera_windows,
+    foreground,
     resized,
     resized_canvas,
     stitch,
@@ -22,6 +23,82 @@ from viewmend.contrib.baselines.framing import (
 from viewmend.models.base import ContextProvider, Inpainter, State
 from viewmend.models.compositing import blend
 from viewmend.types import CompletedView, ContextViews, IncompleteView
+
+Frames = Float[Tensor, "_frame 3 height width"]
+"""Frames of one time in [-1, 1], 0 in the holes: the view, then (variant mul) the source cameras' images."""
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One window of a stream at all times that are input together (O)."""
+
+    now: Frames
+    neighbours: tuple[Frames, ...] = ()
+    """The times just before, latest first."""
+    references: tuple[Frames, ...] = ()
+    """Times further back, latest first."""
+
+
+@runtime_checkable
+class OnlineNetwork(Protocol):
+    """A published network that completes the latest frame of a stream."""
+
+    def check_size(self, height: int, width: int) -> None:
+        """ValueError for frames of a size that this network does not support."""
+        ...
+
+    def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
+        """O: the first frame of `clip.now`, filled, in [-1, 1], by a run of the unchanged network on all frames."""
+        ...
+
+    def complete_remembering(self, now: Frames, memory: tuple[Any, ...]) -> tuple[Float[Tensor, "3 height width"], Any]:
+        """OM: the first frame of `now`, filled, and what later steps remember of this time.
+
+        `memory` is what this method returned at earlier times, oldest first.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """Which past times a network uses."""
+
+    neighbours: int = 3
+    """The times just before the view's."""
+    references: int = 3
+    """Times further back, `step` apart."""
+    step: int = 10
+    """Frames between references."""
+    grid: Literal["absolute", "relative"] = "absolute"
+    """References are the latest multiples of `step` (as Thiry et al. do), or `step`, 2 `step`, ... frames back (as the
+    paper on multi-view inpainting writes)."""
+
+    def __post_init__(self) -> None:
+        if min(self.neighbours, self.references) < 0 or self.step < 1:
+            raise ValueError(f"expected neighbours and references of 0 or more and a step of 1 or more, got {self}")
+
+    def neighbour_times(self, time: int) -> tuple[int, ...]:
+        """The times just before `time`, latest first, none before 0."""
+        return tuple(range(time - 1, max(time - self.neighbours, 0) - 1, -1))
+
+    def reference_times(self, time: int) -> tuple[int, ...]:
+        """The times further back, latest first, none before 0 and none of the neighbours."""
+        if self.grid == "relative":
+            times = [time - self.step * j for j in range(1, self.references + 1)]
+            return tuple(t for t in times if 0 <= t < time - self.neighbours)
+        latest = (time - self.neighbours - 1) // self.step
+        return tuple(self.step * j for j in range(latest, latest - self.references, -1) if j >= 0)
+
+    def times(self, time: int) -> tuple[int, ...]:
+        """All past times that a view at `time` uses, latest first."""
+        return self.neighbour_times(time) + self.reference_times(time)
+
+    def is_wanted_after(self, past: int, time: int) -> bool:
+        """Whether a view later than `time` may use the time `past`."""
+        if self.grid == "relative":
+            return time - past < max(self.neighbours, self.step * self.references)
+        # The multiples only advance: a time that the next view does not use, no later one does.
+        return past in self.times(time + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +111,7 @@ class OnlineConfig:
     memory: bool = False
     """Remember tokens (OM) instead of running the network on all frames again (O)."""
     sampling: Sampling = field(default_factory=Sampling)
-    """Which past times are seen or remembered."""
+    """Which past times are input or remembered."""
     size_px: tuple[int, int] = (240, 432)
     """Height and width that the network is run at."""
     dilation_px: int = 4
@@ -42,27 +119,27 @@ class OnlineConfig:
 
     @property
     def overlap_px(self) -> int:
-        """Neighbouring windows overlap by at least so much, and are blended there: 48 at the authors' size."""
+        """Minimum overlap of neighbouring windows, in which they are blended: 48 at the authors' size."""
         return min(self.size_px) // 5
 
 
 @dataclass(frozen=True)
 class OnlineState(State):
-    """What a stream of a baseline carries: bounded by what the sampling may still look at."""
+    """Past frames of a stream that the sampling may still use."""
 
     frames: Mapping[int, Float[Tensor, "3 height width"]] = field(default_factory=dict)
     """O: past canvases by time."""
     slots: Mapping[tuple[Window, int], Any] = field(default_factory=dict)
     """OM: what the network remembers of each window at each time."""
     canvas_px: tuple[int, int] = (0, 0)
-    """The size that all this belongs to."""
+    """Height and width of the canvas that all this belongs to."""
 
 
 class OnlineInpainter(Inpainter):
     """A published network behind the protocol of all inpainters.
 
-    Only windows with holes are run, so a window remembers (OM) just the times when it had some. Pixels with E > 0
-    alone change.
+    Only windows with holes are run, so a window remembers (OM) only the times when it had some. Only pixels with
+    E > 0 change.
 
     Raises:
         ValueError: the network cannot take frames of `config.size_px`.
@@ -78,13 +155,13 @@ class OnlineInpainter(Inpainter):
 
     @torch.inference_mode()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, OnlineState]:
-        """The completed view; `context` is asked in the variant mul alone."""
+        """The completed view; only the variant mul uses `context`."""
         canvas = self._canvas(view)
         state = self._past(state, view.time, canvas)
         completed, slots = view.rgb, state.slots
         windows = self._windows_with_holes(view, canvas)
         if windows:
-            look = _Looker(self.config, view, context, {view.time: canvas.image, **state.frames})
+            look = _WindowFrames(self.config, view, context, {view.time: canvas.image, **state.frames})
             run = self._remembering if self.config.memory else self._at_once
             pieces, slots = run(windows, look, state)
             filled = self._fitted(stitch(pieces, windows, state.canvas_px, self.config.overlap_px), view)
@@ -99,7 +176,7 @@ class OnlineInpainter(Inpainter):
         return self._kept(self._past(state, view.time, canvas), view.time, canvas)
 
     def _kept(self, state: OnlineState, time: int, canvas: Canvas) -> OnlineState:
-        """What later views may look at of the past and of this time."""
+        """The parts of the past and of this time that later views may use."""
         frames = {} if self.config.memory else {time: canvas.image, **state.frames}
         wanted = self.config.sampling.is_wanted_after
         return replace(
@@ -113,7 +190,7 @@ class OnlineInpainter(Inpainter):
         return make(view.rgb, view.error > 0, self.config.size_px, self.config.dilation_px)
 
     def _past(self, state: State, time: int, canvas: Canvas) -> OnlineState:
-        """What of the state is past and of the canvas's size."""
+        """The part of the state that is past and of the canvas's size."""
         height, width = canvas.image.shape[1:]
         if not isinstance(state, OnlineState) or state.canvas_px != (height, width):
             return OnlineState(canvas_px=(height, width))
@@ -129,7 +206,7 @@ class OnlineInpainter(Inpainter):
         return list(windows_over(canvas.holes, self.config.size_px, self.config.overlap_px))
 
     def _at_once(
-        self, windows: list[Window], look: "_Looker", state: OnlineState
+        self, windows: list[Window], look: "_WindowFrames", state: OnlineState
     ) -> tuple[list[Tensor], Mapping[tuple[Window, int], Any]]:
         """O: each window by a run on all its frames."""
         time, sampling = look.view.time, self.config.sampling
@@ -141,7 +218,7 @@ class OnlineInpainter(Inpainter):
         return pieces, state.slots
 
     def _remembering(
-        self, windows: list[Window], look: "_Looker", state: OnlineState
+        self, windows: list[Window], look: "_WindowFrames", state: OnlineState
     ) -> tuple[list[Tensor], Mapping[tuple[Window, int], Any]]:
         """OM: each window by a run on its frames of this time and what it remembers."""
         time, slots = look.view.time, dict(state.slots)
@@ -163,8 +240,8 @@ class OnlineInpainter(Inpainter):
         return zero_to_one[:, :height, :width]
 
 
-class _Looker:
-    """Frames of a window at a time, the cameras' with them; images of a time are fetched once for all windows."""
+class _WindowFrames:
+    """Frames of a window at a time, with the cameras' in mul; images of a time are fetched once for all windows."""
 
     def __init__(
         self, config: OnlineConfig, view: IncompleteView, context: ContextProvider, frames: Mapping[int, Tensor]

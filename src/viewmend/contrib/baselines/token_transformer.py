@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from viewmend.contrib.baselines.clips import Clip, Frames
-from viewmend.contrib.baselines.soft_split import DIM
+from viewmend.contrib.baselines.layers import DIM
+from viewmend.contrib.baselines.online import Clip, Frames
 
 HEADS = 4
 BLOCKS = 8

@@ -15,10 +15,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import l1_loss
 
-from viewmend.contrib.baselines.camera_windows import aim, camera_windows, foreground
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, LocalFlows
-from viewmend.contrib.baselines.frame_coder import SLOPE
-from viewmend.contrib.baselines.framing import Window, dilated, resized_canvas, window_canvas, windows_over
+from viewmend.contrib.baselines.framing import (
+    Window,
+    aim,
+    camera_windows,
+    dilated,
+    foreground,
+    resized_canvas,
+    window_canvas,
+    windows_over,
+)
+from viewmend.contrib.baselines.layers import SLOPE
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter
 from viewmend.contrib.baselines.published import NETWORKS, TRAINED, load_baseline
 from viewmend.contrib.baselines.token_transformer import NATIVE_PX, TokenTransformer
