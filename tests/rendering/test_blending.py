@@ -10,9 +10,7 @@ from reference.blend_twin import blend_twin
 
 from viewmend.geometry.cameras import unproject
 from viewmend.geometry.rasterize import interpolate, rasterize
-from viewmend.rendering._blend_numba import blend_numba
-from viewmend.rendering._blend_torch import blend_torch
-from viewmend.rendering.blending import BlendConfig, blend
+from viewmend.rendering.blending import BlendConfig, blend, blend_numba, blend_torch
 from viewmend.types import ContextViews, MultiViewFrame
 
 BIAS_M = 0.01

@@ -59,8 +59,8 @@ class Options:
     """Use the calibration as it is. By default it is aligned as in `viewmend mend`."""
     match_colours: bool = True
     """Use the cameras' colours as they are. By default they are matched as in `viewmend mend`."""
-    context: int = 3
-    """Number of cameras that colour a view and are the inpainter's context."""
+    num_source_views: int = 3
+    """Number of source cameras, which colour a view and are the inpainter's context."""
     error_rule: str | None = None
     """Pixels to inpaint, as in `viewmend mend`: 'holes', 'all', 'predicted', or FILE.py:NAME. By default the rule that
     the model is made for."""
@@ -129,7 +129,7 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     """Raise a ValueError for an option that is out of range, before anything heavy is imported."""
-    positive = ("max_image_size", "context", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
+    positive = ("max_image_size", "num_source_views", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
     checks = [(name, getattr(options, name) > 0, "positive") for name in positive]
     checks += [
         ("cameras", options.source != "studio" or options.cameras >= 4, "at least 4"),
@@ -179,7 +179,7 @@ def stream_config(options: Options) -> "StreamConfig":
     from viewmend.stream import StreamConfig
 
     rule, fraction = options.error_rule, options.refine_fraction
-    render = RenderConfig(cameras=options.context, error_rule=rule, refine_fraction=fraction)
+    render = RenderConfig(cameras=options.num_source_views, error_rule=rule, refine_fraction=fraction)
     return StreamConfig(render=render, memory_mb=options.memory_mb / 2)
 
 

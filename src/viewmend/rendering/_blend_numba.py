@@ -1,66 +1,24 @@
-"""Image-based blending in numba, for the CPU; `_blend_torch` is the implementation for any device."""
+"""Kernel of image-based blending on the CPU, in numba."""
 
 from math import floor, sqrt
 from typing import no_type_check
 
 import numpy as np
-import torch
-from jaxtyping import Float
 from numba import njit
-from torch import Tensor
-
-from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.threads import parallel_for
-from viewmend.rendering.blending import GRAZING, Blend, BlendConfig
-from viewmend.types import ContextViews
-
-ROWS = 16
-"""Rows of the novel view per task of a thread; few, because the subject fills only some of them."""
 
 # No type checks: numba cannot compile functions that a type checker has wrapped.
 
 
-def blend_numba(
-    camera: Cameras,
-    depth: Float[Tensor, "height width"],
-    normals: Float[Tensor, "height width 3"],
-    sources: ContextViews,
-    bias_m: float,
-    config: BlendConfig,
-) -> Blend:
-    """`blending.blend`."""
-    frame, rig = sources.frame, sources.frame.cameras
-    height, width = depth.shape
-    rgb = torch.zeros(3, height, width)
-    weights = torch.zeros(len(rig), height, width)
-    disagreement = torch.zeros(height, width)
-
-    pose = camera.world_from_camera[0].double()
-    world_from_pixel = (pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())).numpy()
-    P = (rig.K.double() @ rig.camera_from_world[:, :3].double()).numpy()
-    mask = frame.mask if frame.mask is not None else torch.zeros(0, 0, 0, dtype=torch.uint8)
-    inputs = (
-        *(depth.numpy(), normals.numpy(), world_from_pixel, pose[:3, 3].numpy()),
-        *(frame.rgb.numpy(), mask.numpy(), sources.depth.numpy()),
-        *(P, rig.centers.double().numpy(), rig.K[:, 0, 0].double().numpy(), rig.size_px.numpy()),
-        np.array([bias_m, config.slope_px]),
-        np.array([config.normal_power, config.view_power]),
-    )
-    outputs = (rgb.numpy(), weights.numpy(), disagreement.numpy())
-
-    def work(band: int) -> None:
-        _blend_rows(band * ROWS, min(height, (band + 1) * ROWS), *inputs, *outputs)
-
-    parallel_for(work, -(-height // ROWS))
-    return Blend(rgb, weights, disagreement)
-
-
 @njit(nogil=True, cache=True, error_model="numpy")
 @no_type_check
-def _blend_rows(
+def blend_rows(
     first, end, depth, normals, world_from_pixel, viewer, images, masks, depths, P, centers, focal, sizes,
     tolerance, powers, rgb, weights, disagreement,
 ):  # fmt: skip
+    """Blends rows `first` to `end` of a novel view into `rgb`, `weights` and `disagreement`; see `blending.blend`.
+
+    `tolerance` holds `bias_m`, `slope_px` and the grazing cosine; `powers` the exponents of normal and view.
+    """
     count = P.shape[0]
     colour = np.zeros((count, 3))
     for row in range(first, end):
@@ -117,7 +75,7 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     if not (0 <= u < width and 0 <= v < height):
         return 0.0
 
-    per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, GRAZING)
+    per_pixel = z / focal[view] * sqrt(1 - facing * facing) / max(facing, tolerance[2])
     nearest = z - (tolerance[0] + tolerance[1] * per_pixel)
     left, top = floor(u - 0.5), floor(v - 0.5)
     right_share, bottom_share = u - 0.5 - left, v - 0.5 - top
