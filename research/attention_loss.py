@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from viewmend.models.paper.context_tokens import ContextFrame
+from viewmend.models.paper.context import ContextFrame
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.paper.patches import PATCH_PX, STEP_PX
 from viewmend.types import IncompleteView

@@ -45,7 +45,7 @@ from viewmend.models.checkpoint import build
 from viewmend.models.classical import Unfilled
 from viewmend.models.network import set_compute_dtype
 from viewmend.models.paper.config import paper, paper_small
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 from viewmend.rendering.crop import subject_crop
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig

@@ -23,7 +23,7 @@ from paper_windows import WindowScenes
 from torch import Tensor, nn
 
 from viewmend.models.paper.config import PaperConfig, paper_small
-from viewmend.models.paper.context_tokens import ContextFrame
+from viewmend.models.paper.context import ContextFrame
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.paper.patches import PATCH_PX, STEP_PX, crop, grid_shape, padded_size, split
 from viewmend.models.paper.tokenizer import EncoderInput, build_context_input, reference_depth

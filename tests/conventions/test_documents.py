@@ -55,10 +55,10 @@ def test_files_and_functions_exist():
 
 
 def test_a_missing_file_function_or_line_is_found():
-    row = "`models/paper/decoder.py: blend` | `mended = error` |"
+    row = "`models/paper/tokenizer.py: blend` | `mended = error` |"
     assert missing_names("`stream.py: Stream`") == []
     assert missing_names("`stream.py: Strom`, `nowhere.py`") == ["stream.py: Strom", "nowhere.py: "]
-    assert missing_names(row.replace("mended = error", "no such line")) == ["models/paper/decoder.py: blend"]
+    assert missing_names(row.replace("mended = error", "no such line")) == ["models/paper/tokenizer.py: blend"]
 
 
 def test_links_lead_to_files():

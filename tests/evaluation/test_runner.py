@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from viewmend.contrib.ray import evaluation as ray_evaluation
+from viewmend.contrib.ray import cluster
 from viewmend.evaluation import scene_run
 from viewmend.evaluation.result_cache import CellStore, cell_keys
 from viewmend.evaluation.runner import run_evaluation
@@ -211,6 +211,6 @@ def test_a_ray_cluster_computes_the_same_numbers(whole, small_scenes, tmp_path):
 
 def test_a_missing_cluster_is_one_clear_error(small_scenes, tmp_path, monkeypatch):
     ray = SimpleNamespace(is_initialized=lambda: False)
-    monkeypatch.setattr(ray_evaluation, "find_ray", lambda address: ray)
+    monkeypatch.setattr(cluster, "find_ray", lambda address: ray)
     with pytest.raises(ValueError, match=r"expected a Ray cluster at '127.0.0.1:1', got none .* --ray local"):
         run(small_scenes[:1], tmp_path, ray="127.0.0.1:1")

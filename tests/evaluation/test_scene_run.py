@@ -18,7 +18,7 @@ from viewmend.models.checkpoint import build, load_inpainter
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import composite
 from viewmend.models.paper.config import paper_small
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 from viewmend.stream import Stream
 
 

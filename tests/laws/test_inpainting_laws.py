@@ -10,7 +10,7 @@ from viewmend.models.base import ContextProvider, RenderQuality
 from viewmend.models.checkpoint import build
 from viewmend.models.network import set_compute_dtype
 from viewmend.models.paper.config import paper
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 from viewmend.models.paper.patches import any_in_patch
 
 

@@ -7,7 +7,7 @@ import torch
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers
 from viewmend.models.base import ContextProvider
 from viewmend.models.paper.config import PaperConfig
-from viewmend.models.paper.context_tokens import ContextFrame
+from viewmend.models.paper.context import ContextFrame
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.views.config import RaysConfig
 from viewmend.models.views.ray_fill import RayFill

@@ -7,8 +7,10 @@ import torch
 from models.plates import TINY
 from reference.attention_reference import attend_reference, rotate_reference, transformer_reference
 
-from viewmend.models.paper import attention
-from viewmend.models.paper.attention import (
+from viewmend.models.paper import transformer
+from viewmend.models.paper.transformer import (
+    TokenPositions,
+    Transformer,
     attend,
     attend_and_sum,
     attend_weighted,
@@ -18,7 +20,6 @@ from viewmend.models.paper.attention import (
     rotate,
     straight_through,
 )
-from viewmend.models.paper.transformer import TokenPositions, Transformer
 
 SCALE = 0.3
 ALL = torch.ones(2, 5, dtype=torch.bool)
@@ -47,7 +48,7 @@ def test_every_path_equals_the_reference(qkv, monkeypatch):
     assert torch.allclose(attend(Q, K, V, keep, SCALE), outs, atol=1e-5)
     assert torch.allclose(attend_weighted(Q, K, V, keep.float(), SCALE), outs, atol=1e-5)
     for entries in (1 << 22, 2 * 3 * 7 * 2):
-        monkeypatch.setattr(attention, "CHUNK_ENTRIES", entries)
+        monkeypatch.setattr(transformer, "CHUNK_ENTRIES", entries)
         attended, received = attend_and_sum(Q, K, V, keep, ALL, SCALE)
         assert torch.allclose(attended, outs, atol=1e-5)
         assert torch.allclose(received, sums, atol=1e-5)

@@ -8,7 +8,7 @@ from models.plates import NAMES, Rig, tiny, view
 
 from viewmend.models.base import REMEMBERED_FRAMES, ContextProvider, RenderQuality
 from viewmend.models.paper.config import paper
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 
 
 def test_the_papers_window():

@@ -7,8 +7,7 @@ from models.plates import DISTANCE_M, FOCAL_PX, HEIGHT, OFFSETS_M, WIDTH, camera
 from reference.ball import camera_at
 
 from viewmend.geometry.cameras import unproject
-from viewmend.models.paper.collate import Target, collate
-from viewmend.models.paper.context_tokens import ContextFrame
+from viewmend.models.paper.context import ContextFrame, Target, collate
 from viewmend.models.paper.patches import patch_depths, reproject
 
 

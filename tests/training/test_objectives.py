@@ -10,7 +10,7 @@ from training.conftest import RUN, SAMPLING, SCENES, studio_samples
 
 from viewmend.models.checkpoint import load_network
 from viewmend.models.paper.config import PaperConfig, paper, paper_small
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 from viewmend.models.views.config import RaysConfig, ViewsConfig
 from viewmend.models.views.pyramids import SourceCameras
 from viewmend.models.views.ray_fill import RayFill

@@ -18,7 +18,7 @@ from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, eval
 from viewmend.utils.logging import log_to_terminal
 from viewmend.utils.plugins import import_object
 
-CLUSTER = "viewmend.contrib.ray.evaluation:run_on_ray"
+CLUSTER = "viewmend.contrib.ray.cluster:run_on_ray"
 """MODULE:NAME of the function that runs tasks on a Ray cluster; imported on demand."""
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from viewmend.models.base import ContextProvider, Inpainter, State
 from viewmend.models.compositing import blend
 from viewmend.models.paper.config import PaperConfig
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.config import NEAR
 from viewmend.models.views.pyramids import SourceCameras

@@ -15,14 +15,15 @@ from reference.ball import ring
 
 from viewmend.contrib.broadcast import broadcast as broadcast_module
 from viewmend.contrib.broadcast.broadcast import (
+    PLAYLIST,
     Broadcast,
     BroadcastSession,
+    FilmSegments,
     add_query,
     broadcast_extension,
     centred_camera,
     choose_fps,
 )
-from viewmend.contrib.broadcast.hls_segmenter import PLAYLIST, FilmSegments
 from viewmend.live.client import Client
 from viewmend.live.frame_source import Span
 from viewmend.live.poses import home_view, view_camera

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from viewmend.contrib.live_rig.frame_sync import SPARE, Aligner, Taken
+from viewmend.contrib.live_rig.frames import SPARE, Aligner, Taken
 from viewmend.data.native_capture import CameraImages
 
 IMAGES = CameraImages(np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2), np.uint8), None)

@@ -16,8 +16,7 @@ from live.live_servers import CAMERAS, WAIT_S, running, wait_until
 from reference.ball import BallCapture, camera_at, photograph
 
 from viewmend.contrib.riftcast import service as riftcast_service
-from viewmend.contrib.riftcast.messages import camera_of, parse
-from viewmend.contrib.riftcast.service import RiftcastClient, RiftcastService, listen
+from viewmend.contrib.riftcast.service import RiftcastClient, RiftcastService, camera_of, listen, parse
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.protocol import Limits, ProtocolError
 

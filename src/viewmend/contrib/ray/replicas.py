@@ -14,9 +14,7 @@ from typing import Any
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from viewmend.contrib.ray.cluster import LOCAL, connect, find_ray
-from viewmend.contrib.ray.ingest import Ingest, SourceState
-from viewmend.contrib.ray.shared_frame import SharedFrame
-from viewmend.contrib.ray.shared_source import SharedSource
+from viewmend.contrib.ray.shared_frames import Ingest, SharedFrame, SharedSource, SourceState
 from viewmend.live.frame_source import FrameSource
 from viewmend.live.renderer import Renderer
 from viewmend.live.server import LiveServer, ServerConfig

@@ -15,7 +15,7 @@ from viewmend.data.holdout.true_visibility import TrueSurface, backward_flow, su
 from viewmend.data.synthetic.procedural import PerformerStyle, procedural_scene
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.paper.config import paper
-from viewmend.models.paper.context_tokens import window_times
+from viewmend.models.paper.context import window_times
 from viewmend.types import MultiViewFrame
 
 P_SEEDS = PROCEDURAL_SEEDS["test"][:30]

@@ -10,12 +10,10 @@ from torch import Tensor
 from viewmend.models.base import ContextProvider, State
 from viewmend.models.compositing import blend, painted_alpha
 from viewmend.models.network import Network
-from viewmend.models.paper.collate import Batch, Target, collate
 from viewmend.models.paper.config import PaperConfig
-from viewmend.models.paper.context_tokens import ContextFrame, window_times
-from viewmend.models.paper.decoder import Decoder
+from viewmend.models.paper.context import Batch, ContextFrame, Target, collate, window_times
 from viewmend.models.paper.patches import STEP_PX, any_in_patch, centers_px, lift, merge, patch_depths
-from viewmend.models.paper.tokenizer import EncoderInput, Tokeniser, build_context_input, build_target_input
+from viewmend.models.paper.tokenizer import Decoder, EncoderInput, Tokeniser, build_context_input, build_target_input
 from viewmend.models.paper.transformer import Transformer
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 
