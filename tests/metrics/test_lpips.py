@@ -1,70 +1,103 @@
-"""LPIPS against a second implementation, with random weights."""
+"""LPIPS against a second implementation and published values; with AlexNet, it needs no other files."""
 
+import numpy as np
 import pytest
 import torch
 from reference.lpips_twin import lpips_twin
 
 from viewmend.metrics import weights as weights_module
-from viewmend.metrics.lpips import Lpips, load_lpips
+from viewmend.metrics.lpips import MIN_PX, Lpips, load_lpips
 from viewmend.metrics.weights import KnownWeights
 from viewmend.utils.weight_files import MissingWeightsError, WeightsError
 
 
-def random_weights(network, rng):
-    """Weights that do not saturate the features."""
-    found = {}
-    for key, value in network.state_dict().items():
-        spread = (2 / value[0].numel()) ** 0.5 if value.dim() > 1 else 0.1
-        found[key] = spread * torch.randn(value.shape, generator=rng)
-        if key.startswith("lin"):
-            found[key] = found[key].abs()
-    return found
-
-
 @pytest.fixture
-def files(tmp_path, monkeypatch, rng):
-    """Both files of each network in a searched folder, without known hashes."""
+def random_vgg(tmp_path, monkeypatch, rng):
+    """VGG16's file with random weights that do not saturate the features, without a known hash."""
     monkeypatch.setenv("VIEWMEND_WEIGHTS", str(tmp_path))
     saved = {}
-    for backbone, names in (("alex", ("alexnet", "lpips-alex")), ("vgg", ("vgg16", "lpips-vgg"))):
-        metric = Lpips(backbone)
-        saved[backbone] = [random_weights(part, rng) for part in (metric.network, metric.heads)]
-        for name, tensors in zip(names, saved[backbone], strict=True):
-            extra = {"classifier.1.weight": torch.zeros(2, 2)} if name == "alexnet" else {}
-            torch.save(tensors | extra, tmp_path / f"{name}.pth")
-    names = ("alexnet", "vgg16", "lpips-alex", "lpips-vgg")
-    known = tuple(KnownWeights(name, (f"{name}.pth",), "w", "s", "l") for name in names)
-    monkeypatch.setattr(weights_module, "KNOWN", known)
+    for key, value in Lpips("vgg").state_dict().items():
+        spread = (2 / value[0].numel()) ** 0.5 if value.dim() > 1 else 0.1
+        saved[key] = spread * torch.randn(value.shape, generator=rng)
+        if key.startswith("heads"):
+            saved[key] = saved[key].abs()
+    torch.save(saved, tmp_path / "vgg.pth")
+    monkeypatch.setattr(weights_module, "KNOWN", (KnownWeights("lpips-vgg", ("vgg.pth",), "w", "s", "l"),))
     return saved
 
 
-@pytest.mark.parametrize(("backbone", "least"), [("alex", 63), ("vgg", 16)])
-def test_it_matches_the_reference_and_its_map_adds_up(files, rng, backbone, least):
-    truth, noise = torch.rand(2, 3, 70, 90, generator=rng)
-    image = (0.7 * truth + 0.3 * noise).clamp(0, 1)
-    metric = load_lpips(backbone)
-    expected = lpips_twin(image, truth, *files[backbone], backbone)
-    layers, seen = metric.layers(image, truth), metric(image, truth)
-    assert expected > 0.01 and seen.shape == (70, 90)
-    assert float(sum(x.double().mean() for x in layers)) == pytest.approx(expected, abs=1e-5)
-    assert float(seen.mean()) == pytest.approx(expected, rel=0.01)
-    assert not metric(truth, truth).any()
-    assert metric(torch.zeros(3, least - 1, 99), torch.zeros(3, least - 1, 99)) is None
-    assert metric(torch.zeros(3, least, 99), torch.zeros(3, least, 99)) is not None
+def images(rng, size):
+    truth, noise = torch.rand(2, 3, *size, generator=rng)
+    return (0.7 * truth + 0.3 * noise).clamp(0, 1), truth
 
 
-def test_the_map_is_large_where_images_differ(files, rng):
-    truth = torch.rand(3, 96, 96, generator=rng)
+def agrees_with_the_twin(metric, image, truth):
+    expected = lpips_twin(image, truth, metric.state_dict(), metric.backbone)
+    seen = metric.map(image, truth)
+    assert expected > 0.01 and seen.shape == image.shape[1:]
+    assert float(metric(image[None], truth[None])) == pytest.approx(expected, abs=1e-5)
+    assert float(seen.mean()) == pytest.approx(expected, abs=1e-5)
+    assert not metric.map(truth, truth).any()
+    least = MIN_PX[metric.backbone]
+    assert metric.map(torch.zeros(3, least - 1, 99), torch.zeros(3, least - 1, 99)) is None
+    assert metric.map(torch.zeros(3, least, 99), torch.zeros(3, least, 99)) is not None
+    with pytest.raises(ValueError, match=f"at least {least} pixels a side .* got 99 x {least - 1}"):
+        metric(torch.zeros(1, 3, least - 1, 99), torch.zeros(1, 3, least - 1, 99))
+
+
+def test_alexnet_ships_and_matches_the_reference(rng, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    agrees_with_the_twin(load_lpips("alex"), *images(rng, (70, 90)))
+
+
+def test_vgg_matches_the_reference(random_vgg, rng):
+    agrees_with_the_twin(load_lpips("vgg"), *images(rng, (40, 52)))
+
+
+def test_published_values():
+    rng = np.random.default_rng(0)
+    a = rng.random((3, 96, 128)).astype(np.float32)
+    b = np.clip(a + 0.2 * rng.standard_normal(a.shape), 0, 1).astype(np.float32)
+    pair = torch.stack([torch.from_numpy(b), torch.full((3, 96, 128), 0.5)])
+    expected = {"alex": (0.0644622, 1.3178893), "vgg": (0.1341660, 0.9134053)}
+    for backbone, values in expected.items():
+        try:
+            metric = load_lpips(backbone)
+        except MissingWeightsError:
+            continue  # VGG16 is optional
+        with torch.no_grad():
+            assert metric(pair, torch.from_numpy(a).expand(2, -1, -1, -1)).tolist() == pytest.approx(values, abs=2e-6)
+
+
+def test_it_is_a_training_loss(rng):
+    metric = load_lpips("alex").train()
+    image, truth = (x[None].clone() for x in images(rng, (64, 64)))
+    image[..., :32] = 0  # features of 0 must not make the gradient NaN
+    truth[..., :32] = 0
+    image.requires_grad_()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        loss = metric(image, truth)
+    assert loss.shape == (1,) and loss.dtype == torch.float32
+    before = float(loss.detach())
+    (gradient,) = torch.autograd.grad(loss.sum(), image)
+    assert gradient.isfinite().all() and gradient.abs().max() > 0
+    stepped = (image - 0.01 * gradient / gradient.abs().max()).detach()
+    assert float(metric(stepped, truth)) < before
+    assert not any(parameter.requires_grad for parameter in metric.parameters())
+
+
+def test_the_map_is_large_where_images_differ(rng):
+    truth = torch.rand(3, 128, 128, generator=rng)
     image = truth.clone()
-    image[:, 70:80, 70:80] = 1
-    seen = load_lpips("vgg")(image, truth)
-    assert seen[70:80, 70:80].mean() > 5 * seen.mean() > 0
+    image[:, 70:90, 70:90] = 1
+    seen = load_lpips("alex").map(image, truth)
+    assert seen[70:90, 70:90].mean() > 3 * seen.mean() > 0
 
 
-def test_wrong_and_missing_weights_are_refused(files, tmp_path):
-    torch.save(files["vgg"][0], tmp_path / "alexnet.pth")
-    with pytest.raises(WeightsError, match=r"alexnet.pth: expected the 10 tensors of Features"):
-        load_lpips("alex")
-    (tmp_path / "lpips-vgg.pth").unlink()
-    with pytest.raises(MissingWeightsError, match=r"lpips-vgg.pth .*in one of .*VIEWMEND_WEIGHTS"):
+def test_wrong_and_missing_weights_are_refused(random_vgg, tmp_path):
+    torch.save({"heads.0": torch.zeros(64)}, tmp_path / "vgg.pth")
+    with pytest.raises(WeightsError, match=r"vgg.pth: expected the 31 tensors of Lpips"):
+        load_lpips("vgg")
+    (tmp_path / "vgg.pth").unlink()
+    with pytest.raises(MissingWeightsError, match=r"vgg.pth .*in one of .*VIEWMEND_WEIGHTS"):
         load_lpips("vgg")

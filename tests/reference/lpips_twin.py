@@ -9,12 +9,12 @@ VGG = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 """Places of VGG16's convolutions, block by block; pooling follows each block."""
 
 
-def lpips_twin(image, truth, weights, heads, backbone):
+def lpips_twin(image, truth, weights, backbone):
     """The published number for two images in [0, 1]."""
     total = 0.0
     for layer, (a, b) in enumerate(zip(*(_features(x, weights, backbone) for x in (image, truth)), strict=True)):
         distance = 0.0
-        for channel, head in enumerate(heads[f"lin{layer}.model.1.weight"].flatten().tolist()):
+        for channel, head in enumerate(weights[f"heads.{layer}"].tolist()):
             distance += head * float((a[channel] - b[channel]).square().mean())
         total += distance
     return total

@@ -42,6 +42,7 @@ COMMANDS = (
     Command("evaluate paper-table", "viewmend.cli.paper_table", "Compute the paper's tables on your own data."),
     Command("benchmark", "viewmend.cli.benchmark", "Measure the time per view, stage by stage."),
     Command("weights", "viewmend.cli.weights", "List and check third-party weights."),
+    Command("weights get", "viewmend.cli.weights_get", "Download the networks of LPIPS (VGG16) and VFID (I3D)."),
     Command("masks", "viewmend.cli.masks", "Make masks for a capture."),
     Command("calibrate", "viewmend.cli.calibrate", "Calibrate cameras with a board, or refine them with silhouettes."),
     Command("splits", "viewmend.cli.splits", "Write a train/test split of captures."),

@@ -11,8 +11,9 @@ import tyro
 class Options:
     """List the third-party weights that metrics and baselines can use, or check files of them.
 
-    None ship with this package, and none are downloaded: metrics and baselines without weights are n/a. Put files into
-    one of the listed folders, or name a folder in VIEWMEND_WEIGHTS.
+    Metrics and baselines without weights are n/a. LPIPS with AlexNet ships with this package, and viewmend weights get
+    downloads the other metrics' networks. Put all others into one of the listed folders, or name a folder in
+    VIEWMEND_WEIGHTS.
     """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[FILE...]")] = ()

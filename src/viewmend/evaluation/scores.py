@@ -46,8 +46,8 @@ class Scorers:
 
 
 NETWORKS: dict[str, tuple[str, Callable[[str], object]]] = {
-    "lpips-alex": ("lpips_alex", lambda device: load_lpips("alex", device)),
-    "lpips-vgg": ("lpips_vgg", lambda device: load_lpips("vgg", device)),
+    "lpips-alex": ("lpips_alex", lambda device: load_lpips("alex", device).map),
+    "lpips-vgg": ("lpips_vgg", lambda device: load_lpips("vgg", device).map),
     "i3d": ("i3d", load_i3d),
 }
 """Networks of metrics: the field of `Scorers`, and the function that loads them."""

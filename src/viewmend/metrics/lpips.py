@@ -1,6 +1,6 @@
 """LPIPS (Zhang et al. 2018), version 0.1: distance between two images in the features of a network. Lower is better.
 
-Keys of the networks are those of torchvision's `alexnet` and `vgg16`, and of the `lpips` package's own small files.
+AlexNet's weights ship with the package; `viewmend weights get lpips-vgg` installs VGG16's.
 """
 
 from typing import Literal
@@ -21,84 +21,79 @@ TAPS: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8,
 CHANNELS: dict[Backbone, tuple[int, ...]] = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
 MIN_PX: dict[Backbone, int] = {"alex": 63, "vgg": 16}
 """Smaller images have no features in the last layer."""
-FILES: dict[Backbone, tuple[str, str]] = {"alex": ("alexnet", "lpips-alex"), "vgg": ("vgg16", "lpips-vgg")}
-
-
-class Features(nn.Module):
-    """The convolutions of AlexNet or VGG16."""
-
-    def __init__(self, backbone: Backbone) -> None:
-        super().__init__()
-        self.taps = TAPS[backbone]
-        self.features = _alexnet() if backbone == "alex" else _vgg16()
-
-    def forward(self, rgb: Float[Tensor, "image 3 height width"]) -> list[Float[Tensor, "image _channel _rows _cols"]]:
-        """Features of images in [0, 1], normalised to length 1 over channels."""
-        mean, deviation = rgb.new_tensor((MEAN, DEVIATION))[:, :, None, None]
-        x, found = (rgb - mean) / deviation, []
-        for index, layer in enumerate(self.features):
-            x = layer(x)
-            if index in self.taps:
-                found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
-        return found
-
-
-class Heads(nn.Module):
-    """The weight of each channel; named as in the published files."""
-
-    def __init__(self, backbone: Backbone) -> None:
-        super().__init__()
-        for number, channels in enumerate(CHANNELS[backbone]):
-            head = nn.Module()
-            head.model = nn.Sequential(nn.Dropout(), nn.Conv2d(channels, 1, 1, bias=False))
-            self.add_module(f"lin{number}", head)
 
 
 class Lpips(nn.Module):
-    """LPIPS as a map; `load_lpips` makes one with the published weights."""
+    """LPIPS as a number for each pair of images, or as a map; `load_lpips` makes one with the published weights."""
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
         self.backbone: Backbone = backbone
-        self.network, self.heads = Features(backbone), Heads(backbone)
+        self.features = _alexnet() if backbone == "alex" else _vgg16()
+        self.heads = nn.ParameterList(torch.zeros(channels) for channels in CHANNELS[backbone])
+
+    def forward(
+        self, image: Float[Tensor, "image 3 height width"], truth: Float[Tensor, "image 3 height width"]
+    ) -> Float[Tensor, "image"]:
+        """The distance of each pair of images in [0, 1], as published; differentiable, in float32.
+
+        Raises:
+            ValueError: the images are smaller than `MIN_PX`.
+        """
+        if min(image.shape[2:]) < MIN_PX[self.backbone]:
+            raise ValueError(
+                f"expected images of at least {MIN_PX[self.backbone]} pixels a side for LPIPS ({self.backbone}), got "
+                f"{image.shape[3]} x {image.shape[2]}; use larger crops"
+            )
+        return torch.stack([layer.mean((1, 2)) for layer in self._layers(image, truth)]).sum(0)
 
     @torch.no_grad()
-    def forward(
+    def map(
         self, image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"]
     ) -> Float[Tensor, "height width"] | None:
         """The distance around each pixel of images in [0, 1]; None for images that are too small.
 
-        Its mean is LPIPS as published to within 1e-5; the layers' maps are resampled before they are averaged.
+        Each layer's map is enlarged bilinearly and scaled so that the mean is the published number.
         """
-        layers = self.layers(image, truth)
-        if layers is None:
-            return None
-        size = image.shape[1:]
-        return torch.stack([interpolate(x[None, None], size, mode="bilinear")[0, 0] for x in layers]).sum(0)
-
-    def layers(
-        self, image: Float[Tensor, "3 height width"], truth: Float[Tensor, "3 height width"]
-    ) -> list[Float[Tensor, "_rows _cols"]] | None:
-        """The distance map of each layer; the sum of their means is LPIPS as published."""
         if min(image.shape[1:]) < MIN_PX[self.backbone]:
             return None
-        pairs = self.network(torch.stack([image, truth]).float())
-        weights = self.heads.state_dict().values()
-        return [(weight[0] * (x[0] - x[1]).square()).sum(0) for x, weight in zip(pairs, weights, strict=True)]
+        total = image.new_zeros(image.shape[1:], dtype=torch.float32)
+        for layer in self._layers(image[None], truth[None]):
+            enlarged = interpolate(layer[None], total.shape, mode="bilinear")[0, 0]
+            total += enlarged * (layer.mean() / enlarged.mean().clamp_min(1e-30))
+        return total
+
+    def _layers(self, image: Tensor, truth: Tensor) -> list[Float[Tensor, "image _rows _columns"]]:
+        """The distance map of each layer."""
+        with torch.autocast(image.device.type, enabled=False):
+            x = torch.cat([image, truth]).float()
+            mean, deviation = x.new_tensor((MEAN, DEVIATION))[:, :, None, None]
+            x, found = (x - mean) / deviation, []
+            for index, layer in enumerate(self.features):
+                x = layer(x)
+                if index in TAPS[self.backbone]:
+                    unit = x / (x.square().sum(1, keepdim=True) + 1e-20).sqrt()  # its gradient is finite at 0, too
+                    a, b = unit.chunk(2)
+                    found.append(torch.einsum("c,nchw->nhw", self.heads[len(found)], (a - b).square()))
+            return found
 
 
-def load_lpips(backbone: Backbone, device: torch.device | str = "cpu") -> Lpips:
-    """LPIPS with the published weights.
+def load_lpips(backbone: Backbone = "alex", device: torch.device | str = "cpu") -> Lpips:
+    """LPIPS with the published weights, frozen: a metric, or a part of a training loss.
 
     Raises:
-        MissingWeightsError: one of its two files is not installed.
-        WeightsError: a file is damaged or a different one.
+        MissingWeightsError: the weights of VGG16 are not installed.
+        WeightsError: the file is damaged or a different one.
+
+    Examples:
+        >>> import torch
+        >>> from viewmend.metrics.lpips import load_lpips
+        >>> distance = load_lpips("alex")
+        >>> distance(torch.zeros(2, 3, 64, 64), torch.zeros(2, 3, 64, 64)).tolist()
+        [0.0, 0.0]
     """
-    metric = Lpips(backbone)
-    layers, heads = (checked_weights(known_weights(name)) for name in FILES[backbone])
-    load_weights(metric.network, layers, spare=("classifier.",))
-    load_weights(metric.heads, heads)
-    return metric.to(device).requires_grad_(False)
+    path = checked_weights(known_weights(f"lpips-{backbone}"))
+    return load_weights(Lpips(backbone), path, device).requires_grad_(False)
 
 
 def _alexnet() -> nn.Sequential:

