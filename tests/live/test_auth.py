@@ -1,5 +1,7 @@
 """Requests need the token, and must not come from other sites' pages; messages are limited in rate."""
 
+import re
+
 import pytest
 from live.live_servers import FakeClock, exchange, get, open_websocket, running, say_hello
 from starlette.requests import HTTPConnection
@@ -7,6 +9,7 @@ from websockets.exceptions import InvalidStatus
 
 from viewmend.live.auth import AccessControl, RateLimit
 from viewmend.live.client import Client
+from viewmend.live.responses import page_files
 
 TOKEN = "open sesame, open"
 
@@ -59,6 +62,32 @@ def test_hosts_are_parsed_and_not_matched(ball, host):
 def test_all_names_of_this_machine_are_accepted(ball, host):
     assert get(f"{ball.url}/health", {"Host": host, "Origin": f"http://{host.lower()}"})[0] == 200
     assert get(f"{ball.url}/health", {"Host": host, "Origin": f"http://{host}.evil.com"})[0] == 403
+
+
+def test_a_proxy_serves_the_page_under_a_public_name_and_path():
+    public = {"Host": "rig.example.org", "Origin": "https://rig.example.org", "Sec-Fetch-Site": "same-origin"}
+    with running(token=TOKEN) as server:  # with a token, any host name is accepted
+        health = f"{server.url}/health?token=open+sesame,+open"
+        assert get(health, public)[0] == 200
+        assert get(health, public | {"Origin": "https://evil.example"})[0] == 403
+    with running(token=TOKEN, public_url="https://rig.example.org/mend/") as server:
+        for prefix in ("", "/mend"):  # whether or not the proxy removes it
+            status, _, page = get(f"{server.url}{prefix}/", public)
+            links = re.findall(r'(?:href|src)="([^"#]+)"', page.decode())
+            assert status == 200 and len(links) >= 5 and not any(link.startswith("/") for link in links)
+            assert {get(f"{server.url}{prefix}/{link}", public)[0] for link in links} == {200}
+        changed = public | {"Host": f"127.0.0.1:{server.port}"}  # by the proxy
+        assert get(f"{server.url}/health?token=open+sesame,+open", changed)[0] == 200
+    for file in (file for name, file in page_files().items() if name.endswith((".js", ".css", ".html"))):
+        assert not re.search(rb"""["'`(]/(page|ws|watch|health|path|camera|broadcast)\b""", file.content)
+
+
+@pytest.mark.parametrize("url", ["rig.example.org", "ftp://rig.example.org", "https://", "https://a/?b=1"])
+def test_a_public_address_is_one(url):
+    with pytest.raises(ValueError, match="expected --public-url https://NAME/PATH, got"):
+        AccessControl("127.0.0.1", TOKEN, url)
+    with pytest.raises(ValueError, match="expected --token with --public-url"):
+        AccessControl("127.0.0.1", None, url)
 
 
 def test_an_origin_has_the_default_port_of_its_scheme():

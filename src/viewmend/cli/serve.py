@@ -47,6 +47,8 @@ class Options:
     variable VIEWMEND_TOKEN."""
     token_file: Path | None = None
     """File whose first line is the token."""
+    public_url: str | None = None
+    """Address at which a reverse proxy serves the page, such as https://example.org/rig; needs --token."""
     model: str | None = None
     """A shipped model's name or a model's folder; 'telea' and 'nearest' are classical fills. By default 'views'."""
     fps: float | None = None
@@ -118,7 +120,7 @@ def run(options: Options) -> int:
     server = Server(live, config)
     with server.bind() as address:
         freeze_loaded_objects()
-        query = token_query(config.token)
+        query, address = token_query(config.token), (config.public_url or address).rstrip("/")
         say(f"open {address}/{query}   (Ctrl-C stops it)")
         for extension in live.extensions:
             if extension.notice:
@@ -160,12 +162,13 @@ def server_config(options: Options) -> "ServerConfig":
     from viewmend.models.registry import default_method
 
     token = _token(options)
-    AccessControl(options.host, token)
+    AccessControl(options.host, token, options.public_url)
     values = {"broadcast": options.broadcast, "riftcast": options.riftcast_port}
     return ServerConfig(
         host=options.host,
         port=options.port,
         token=token,
+        public_url=options.public_url,
         budget_ms=options.budget_ms or None,
         model=options.model or default_method(),
         limits=Limits(viewers=options.viewers),
@@ -261,7 +264,7 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
     )
     # Ray has a signal handler of its own.
     with import_object(SERVE_ON_RAY)(settings, address) as url, exit_on_sigterm():
-        say(f"open {url}/{token_query(config.token)}   (Ctrl-C stops it)")
+        say(f"open {(config.public_url or url).rstrip('/')}/{token_query(config.token)}   (Ctrl-C stops it)")
         while True:  # returns to this thread now and then, which has to handle signals
             time.sleep(0.5)
 

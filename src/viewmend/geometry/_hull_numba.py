@@ -1,18 +1,14 @@
 """The hull on the CPU, fast: blocks of space are judged whole, single voxels only where masks have edges."""
 
-from typing import no_type_check
-
 import numpy as np
-from numba import njit
 
-# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+from viewmend.utils.compiled import kernel
 
 UNSEEN, EMPTY, FULL, MIXED = 0, 1, 2, 3
 NEAR_M = 1e-6
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def soften(mask, rows, columns, pool, out):
     """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
 
@@ -49,8 +45,7 @@ def soften(mask, rows, columns, pool, out):
     out[height] = out[height - 1]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def count_tiles(image, rows, columns, tile, sums):
     """Summed-area tables: how many tiles have any foreground (sums[..., 0]), how many are all of it (sums[..., 1])."""
     sums[:] = 0
@@ -72,8 +67,7 @@ def count_tiles(image, rows, columns, tile, sums):
             sums[ty + 1, tx + 1, 1] = sums[ty, tx + 1, 1] + sums[ty + 1, tx, 1] - sums[ty, tx, 1] + full
 
 
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-@no_type_check
+@kernel(inline="always")
 def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
     """Classify a ball in one camera: not in view, all background, all foreground, or mixed.
 
@@ -109,8 +103,7 @@ def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
     return FULL if full == (bottom - top) * (right - left) else MIXED
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, first, end, occupied):
     """Mark the blocks of slabs [first, end) along x that no camera calls empty and enough cameras may see."""
     radius = block_m * np.sqrt(3.0) / 2
@@ -131,8 +124,7 @@ def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, first, end,
                 occupied[i, j, k] = seen >= needed
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, block, first, values):
     """Fill values[first : first + block]: the smallest mask value over the cameras that see each voxel's middle."""
     end_x, end_y, end_z = min(first + block, values.shape[0]), values.shape[1], values.shape[2]
@@ -168,8 +160,7 @@ def carve_blocks(P, lens, size, soft, pool, tile, sums, low, voxel_m, needed, bl
                 carve_voxels(P, size, soft, pool, corner, voxel_m, needed, seen, mixed[:undecided], box, scratch)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, values, scratch):
     """Voxel by voxel: the smallest bilinear mask value over those of `views` that see it; 0 where too few do.
 
@@ -202,8 +193,7 @@ def carve_voxels(P, size, soft, pool, low, voxel_m, needed, seen_before, views, 
             values[at // plane, at % plane // line, at % line] = smallest[n] / np.float32(255)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
-@no_type_check
+@kernel(fastmath=True)
 def locate(P, origin, voxel_m, size, pool, count, scratch):
     """Where the first `count` voxels are in one camera's pooled mask: scratch[6:8]; -1 in scratch[6] if out of view."""
     base, step = np.empty(3, np.float32), np.empty((3, 3), np.float32)
@@ -229,8 +219,7 @@ def locate(P, origin, voxel_m, size, pool, count, scratch):
         vs[n] = v
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath=True)
-@no_type_check
+@kernel(fastmath=True)
 def sample(image, count, scratch):
     """Lower the first `count` voxels' values to the mask's at scratch[6:8]; move those still above 0 to the front."""
     x, y, z, smallest, seen, place = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4], scratch[5]

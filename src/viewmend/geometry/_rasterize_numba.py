@@ -1,15 +1,11 @@
 """The rasteriser's fast path on the CPU: scalar loops compiled by numba, image bands shared among threads."""
 
-from typing import no_type_check
-
 import numpy as np
-from numba import njit
 
-# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+from viewmend.utils.compiled import kernel
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def project_vertices(vertices, P, out):
     """Fill out[:, 0:3] with P [X; 1], in pixels times z, and out[:, 3:5] with the pixel coordinates, in float64."""
     for i in range(vertices.shape[0]):
@@ -21,8 +17,7 @@ def project_vertices(vertices, P, out):
         out[i, 4] = out[i, 1] / w
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, triangle):
     """Draw all faces into rows [first_row, end_row) of one view's `depth` (as z) and `triangle`.
 
@@ -67,8 +62,7 @@ def draw_band(projected, faces, near, cull, first_row, end_row, width, depth, tr
                 depth[row, column] = np.float32(1) / depth[row, column]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def interpolate_band(attributes, vertices, faces, P, triangle, first_row, end_row, image):
     """Fill rows [first_row, end_row) of one view's `image` from its `triangle` ids; P = K [R | t], float64.
 
@@ -92,8 +86,7 @@ def interpolate_band(attributes, vertices, faces, P, triangle, first_row, end_ro
                 image[row, column, channel] = value * scale
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def _beside(vertices, n, P, u, v):
     """Pixel offsets of a vertex from (u, v), times its depth."""
     x, y, z = vertices[n, 0], vertices[n, 1], vertices[n, 2]

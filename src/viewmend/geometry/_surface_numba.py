@@ -1,15 +1,11 @@
 """Marching cubes and vertex normals on the CPU: one thread, so that a busy machine does not stall them."""
 
-from typing import no_type_check
-
 import numpy as np
-from numba import njit
 
-# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+from viewmend.utils.compiled import kernel
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def count_crossings(values, iso):
     """How many grid edges the surface crosses."""
     count = 0
@@ -26,8 +22,7 @@ def count_crossings(values, iso):
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def place_crossings(values, iso, vertices, vertex_of_edge):
     """Where the surface crosses the grid's edges, in voxels: all edges along x first, then y, then z."""
     count = 0
@@ -46,8 +41,7 @@ def place_crossings(values, iso, vertices, vertex_of_edge):
                         count += 1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def connect(values, iso, table, edge_starts, vertex_of_edge, faces):
     """The triangles of all cells; returns how many. `edge_starts[e]` is where edge e starts, after its axis."""
     count = 0
@@ -70,8 +64,7 @@ def connect(values, iso, table, edge_starts, vertex_of_edge, faces):
     return count
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def sum_face_normals(vertices, faces, normals):
     """Add each face's normal, as long as twice its area, to its corners, and make the sums unit vectors."""
     for f in range(faces.shape[0]):

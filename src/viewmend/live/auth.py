@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable
 from ipaddress import ip_address
+from urllib.parse import urlsplit
 
 from starlette.requests import HTTPConnection
 
@@ -23,13 +24,14 @@ def is_loopback(host: str) -> bool:
 
 
 class AccessControl:
-    """Checks the token, the origin and, on a loopback address, the host name of a request."""
+    """Checks the token, the origin and, on a loopback address without a token, the host name of a request."""
 
-    def __init__(self, host: str, token: str | None) -> None:
-        """Set up the checks of one server.
+    def __init__(self, host: str, token: str | None, public_url: str | None = None) -> None:
+        """Set up the checks of one server, which a proxy may serve at a public address.
 
         Raises:
-            ValueError: the address is not a loopback address and there is no token, or the token is too short.
+            ValueError: other machines can reach the server and there is no token, the token is too short, or the public
+                address is not one.
         """
         if token is not None and len(token) < MIN_TOKEN_LENGTH:
             raise ValueError(
@@ -41,7 +43,14 @@ class AccessControl:
                 f"expected --token with --host {host}, which other machines can reach; create a long random token, "
                 "or leave out --host"
             )
-        self._local = is_loopback(host)
+        if public_url is not None and not token:
+            raise ValueError(
+                f"expected --token with --public-url {public_url}, which other machines can reach; create a "
+                "long random one"
+            )
+        self._public = None if public_url is None else public_origin(public_url)
+        # Without a token, a page whose name resolves to this machine could read what it shows.
+        self._any_host = bool(token) or not is_loopback(host)
         self._token = token
 
     def find_foreign_origin(self, connection: HTTPConnection) -> str | None:
@@ -52,10 +61,11 @@ class AccessControl:
         """
         host = connection.headers.get("host", "")
         address = _parse_host(host, 80)
-        if address is None or (self._local and not is_loopback(address[0])):
-            return f"expected a request to localhost, got one to '{host[:60]}'; open the address that was printed"
+        if address is None or not (self._any_host or is_loopback(address[0])):
+            next_step = "open the address that was printed, or add --token"
+            return f"expected a request to localhost, got one to '{host[:60]}'; {next_step}"
         origin = connection.headers.get("origin")
-        if origin is not None and not _is_same_origin(origin, host):
+        if origin is not None and not (_is_same_origin(origin, host) or origin.lower() == self._public):
             return f"expected a request from this server's own page, got the origin '{origin[:60]}'"
         site = connection.headers.get("sec-fetch-site", "none")
         is_link = connection.headers.get("sec-fetch-dest") == "document"
@@ -86,6 +96,18 @@ def _is_same_origin(origin: str, host: str) -> bool:
     scheme, _, address = origin.partition("://")
     port = {"http": 80, "https": 443}.get(scheme.lower())
     return port is not None and None is not _parse_host(host, port) == _parse_host(address, port)
+
+
+def public_origin(url: str) -> str:
+    """Scheme, name and port of the address that a proxy serves.
+
+    Raises:
+        ValueError: it is not the address of a page.
+    """
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not _parse_host(parts.netloc, 80) or parts.query or parts.fragment:
+        raise ValueError(f"expected --public-url https://NAME/PATH, got '{url[:80]}'; write the proxy's address")
+    return f"{parts.scheme}://{parts.netloc}".lower()
 
 
 class RateLimit:

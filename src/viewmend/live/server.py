@@ -7,11 +7,12 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
+from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
@@ -57,6 +58,8 @@ class ServerConfig:
     host: str = "127.0.0.1"
     port: int = 8008
     token: str | None = None
+    public_url: str | None = None
+    """The address at which a proxy serves this server; it may have a path."""
     budget_ms: float | None = 100.0
     model: str = "views"
     """The model's name in `welcome` and /health."""
@@ -82,7 +85,7 @@ class LiveServer:
 
     def __init__(self, service: RenderService, config: ServerConfig) -> None:
         self._service, self._config = service, config
-        self._access = AccessControl(config.host, config.token)
+        self._access = AccessControl(config.host, config.token, config.public_url)
         self._files = page_files()
         self._num_images = 0
         self._is_exporting = False
@@ -106,7 +109,7 @@ class LiveServer:
     def app(self) -> Starlette:
         """The ASGI application; its lifespan starts and stops the service."""
         page = self._guard(self._page, needs_token=False)  # the page's files are public
-        routes = [
+        routes: list[BaseRoute] = [
             Route("/", page),
             Route("/page/{name:path}", page),
             Route("/watch", self._guard(self._watch, needs_token=False)),
@@ -121,6 +124,9 @@ class LiveServer:
         ]
         for extension in self.extensions:
             routes += [Route(path, self._guard(handler)) for path, handler in extension.routes().items()]
+        prefix = urlsplit(self._config.public_url or "").path.rstrip("/")
+        if prefix:  # of a proxy that does not remove it
+            routes.append(Mount(prefix, routes=list(routes)))
         return Starlette(routes=routes, lifespan=self._run)
 
     @contextlib.asynccontextmanager

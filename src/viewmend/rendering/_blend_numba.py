@@ -1,16 +1,15 @@
 """Kernel of image-based blending on the CPU, in numba."""
 
 from math import floor, sqrt
-from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from viewmend.utils.compiled import kernel
 
 # No type checks: numba cannot compile functions that a type checker has wrapped.
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def blend_rows(
     first, end, depth, normals, world_from_pixel, viewer, images, masks, depths, P, centers, focal, sizes,
     tolerance, powers, rgb, weights, disagreement,
@@ -41,8 +40,7 @@ def blend_rows(
                 _average(colour, weights, total, row, column, rgb, disagreement)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def _average(colour, weights, total, row, column, rgb, disagreement):
     variance = 0.0
     for channel in range(3):
@@ -57,8 +55,7 @@ def _average(colour, weights, total, row, column, rgb, disagreement):
 
 
 # Inlined: passing these arrays costs as much as the computation.
-@njit(nogil=True, cache=True, error_model="numpy", inline="always")
-@no_type_check
+@kernel(inline="always")
 def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, focal, sizes, tolerance, powers, colour):
     """Weight of one camera at a surface point; its sample goes into `colour[view]`."""
     x, y, w = point
@@ -100,22 +97,19 @@ def _weigh(point, normal, to_viewer, view, images, masks, depths, P, centers, fo
     return usable * facing ** powers[0] * agreeing ** powers[1]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def _unit(x, y, z):
     length = sqrt(x * x + y * y + z * z)
     scale = 1 / length if length > 0 else 0.0
     return x * scale, y * scale, z * scale
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def _backproject(u, v, z, world_from_pixel, center):
     m = world_from_pixel
     return (

@@ -3,12 +3,11 @@
 Rows of arrays are never sliced in the loops: each slice counts references, which threads then fight over.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-# Without type checks: numba compiles the functions themselves, not what a checker wraps around them.
+from viewmend.utils.compiled import kernel
 
 
 class Scene(NamedTuple):
@@ -42,8 +41,7 @@ class View(NamedTuple):
     """(3, row, column): background, linear light."""
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def shade_band(scene, view, first_row, end_row, rgb, mask):
     """Fill rows [first_row, end_row) of one view's rgb (3, h, w) and mask (h, w); see `render.shade_torch`."""
     n = view.ids.shape[0] // mask.shape[0]
@@ -71,8 +69,7 @@ def shade_band(scene, view, first_row, end_row, rgb, mask):
                 rgb[c, row, column] = encode(linear, scene.steps, scene.guesses)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def interpolate(scene, projected, face, u, v, at):
     """Fill `at` with the vertex columns of a face at pixel (u, v), perspective-correct (see the rasteriser).
 
@@ -102,8 +99,7 @@ def interpolate(scene, projected, face, u, v, at):
     return min(max(level, 0.0), scene.first.shape[1] - 1.0)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def texture_color(scene, texture, u, v, level, out):
     """Fill `out` with the trilinear look-up in one texture's levels, clamped at its edges."""
     texels, low = scene.texels, int(level)
@@ -127,8 +123,7 @@ def texture_color(scene, texture, u, v, level, out):
             out[c] += share * (above + fy * (below - above))
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def add_highlights(scene, center, at, out):
     """Add the Blinn-Phong highlights of all lamps to a colour."""
     ex, ey, ez = center[0] - at[0], center[1] - at[1], center[2] - at[2]
@@ -155,8 +150,7 @@ def encoding(entries=4096):
     return steps, np.searchsorted(steps, np.arange(entries + 1) / entries)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def encode(linear, steps, guesses):
     """8-bit sRGB of linear light, by tables: a power for each pixel would cost more than its shading."""
     if not linear > 0:
@@ -168,8 +162,7 @@ def encode(linear, steps, guesses):
     return np.uint8(level)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-@no_type_check
+@kernel
 def unshadowed(pixels, z, depth, bias, seen):
     """One light of `shading.unshadowed_torch`."""
     last_row, last_column = depth.shape[0] - 1, depth.shape[1] - 1

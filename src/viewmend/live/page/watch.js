@@ -16,7 +16,7 @@ const REASONS = {
 
 const token = new URLSearchParams(location.search).get("token");
 const film = /** @type {HTMLVideoElement} */ (byId("film"));
-const playlist = address("/broadcast/live.m3u8", token).href;
+const playlist = address("broadcast/live.m3u8", token).href;
 /** @type {SegmentPlayer | null} */
 let player = null;
 let playing = false;

@@ -3,24 +3,14 @@
 Functions called in a kernel live in this file: numba does not recompile a kernel when another file changes.
 """
 
-from collections.abc import Callable
-from inspect import unwrap
 from math import exp, floor, sqrt, tanh
-from typing import Any
 
 import numpy as np
-from numba import njit
 
 from viewmend.models.views.config import CONTRAST, FAR, IN_VIEW, NEAR
+from viewmend.utils.compiled import kernel
 
-
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator that compiles a function, without the wrapper of a run-time type checker; it releases the GIL."""
-    return lambda function: njit(nogil=True, error_model="numpy", **options)(unwrap(function))
-
-
-kernel = compiled(cache=True)
-inlined = compiled(inline="always")  # passing many arrays takes as long as the work itself
+inlined = kernel(cache=False, inline="always")  # passing many arrays takes as long as the work itself
 
 
 @kernel
@@ -223,7 +213,7 @@ def compare_silhouette(first, end, z, per_metre, start, size, images, scales, sm
                 _keep_smallest(smallest, ray, sample, 2, _sample_mask(images[1], u, v, scales[1]))
 
 
-@compiled(cache=True, fastmath={"reassoc", "contract", "nsz"})  # so that sums over features are vectorised
+@kernel(fastmath={"reassoc", "contract", "nsz"})  # so that sums over features are vectorised
 def aggregate(first, end, bias, features, statistics, prior, hidden, shared, weight, out, trust):
     """Softmax over the cameras that have a sample in view, and weighted sums over them, of rays first to end - 1."""
     _, samples, views, width = hidden.shape

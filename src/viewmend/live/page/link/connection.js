@@ -9,9 +9,12 @@ const FINAL = {
 };
 const REASONS = { 4429: "Too many messages.", 4503: "The maximum number of viewers is reached.", 1012: "The server has stopped." };
 
-/** @param {string} path @param {string | null} token */
+/**
+ * The address of a path of the server, which a proxy may serve under a prefix: relative to this file's own address.
+ * @param {string} path @param {string | null} token
+ */
 export function address(path, token) {
-  const url = new URL(path, location.href);
+  const url = new URL(`../../${path}`, import.meta.url);
   url.search = token === null ? "" : new URLSearchParams({ token }).toString();
   return url;
 }
@@ -41,7 +44,7 @@ export class Connection extends EventTarget {
     clearTimeout(this.timer);
     if (this.socket !== "none") return;
     this.#status("connecting", "Connecting");
-    const url = address("/ws", this.token);
+    const url = address("ws", this.token);
     url.protocol = url.protocol.replace("http", "ws");
     this.socket = "opening";
     this.#order({ open: url.href });
@@ -83,7 +86,7 @@ export class Connection extends EventTarget {
   /** A refused handshake says nothing to a page: whether it is the token, /health says. @param {number} code @param {string} reason */
   async #ended(code, reason) {
     if (code !== 1006 || this.socket !== "opening") return this.#closed(code, reason);
-    const health = await fetch(address("/health", this.token)).catch(() => null);
+    const health = await fetch(address("health", this.token)).catch(() => null);
     return this.#closed(health?.status === 401 ? 4401 : code, reason);
   }
 

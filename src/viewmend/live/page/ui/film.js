@@ -23,7 +23,7 @@ export class Film {
     const { signal } = this.stopped;
     try {
       const headers = { "content-type": "application/json" };
-      const answer = await fetch(address("/path.mp4", this.token), { method: "POST", headers, body: JSON.stringify(request), signal });
+      const answer = await fetch(address("path.mp4", this.token), { method: "POST", headers, body: JSON.stringify(request), signal });
       if (!answer.ok) {
         const said = await answer.json().catch(() => ({}));
         throw new Error(said.error ?? `the server answered ${answer.status}`);
@@ -38,7 +38,7 @@ export class Film {
   }
 
   async #ask() {
-    const answer = await fetch(address("/path", this.token)).catch(() => null);
+    const answer = await fetch(address("path", this.token)).catch(() => null);
     if (!answer?.ok) return;
     const { done, of } = await answer.json();
     if (!of) return;

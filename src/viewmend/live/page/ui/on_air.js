@@ -22,7 +22,7 @@ export class OnAir {
   #want(on) {
     this.wanted = on;
     this.link.onAir(on);
-    const where = address("/watch", this.token).href;
+    const where = address("watch", this.token).href;
     this.notices.toast(on ? `Broadcasting your view: ${where}` : "Broadcast stopped; spectators keep the last view.");
   }
 

@@ -24,7 +24,7 @@ export class Original {
       byId("original").hidden = true;
       return;
     }
-    const url = address("/camera.jpg", this.token);
+    const url = address("camera.jpg", this.token);
     url.searchParams.set("name", camera.name);
     url.searchParams.set("time", String(time));
     const image = byId("original-image");
