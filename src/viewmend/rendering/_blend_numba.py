@@ -6,8 +6,6 @@ import numpy as np
 
 from viewmend.utils.compiled import kernel
 
-# No type checks: numba cannot compile functions that a type checker has wrapped.
-
 
 @kernel
 def blend_rows(
