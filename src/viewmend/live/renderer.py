@@ -1,5 +1,6 @@
 """Renders requested views from a frame source, without threads and sockets."""
 
+import secrets
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -9,9 +10,10 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.frame_cache import CachedFrame
+from viewmend.frame_cache import CachedFrame, cache_frame
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.proxy import GeometryProxy
+from viewmend.live.assets import FrameAssets, make_assets
 from viewmend.live.budget import ladder_for
 from viewmend.live.frame_source import FrameSource, RigInfo
 from viewmend.live.poses import HomeView, bounds_json, cameras_json, home_view, view_camera
@@ -76,19 +78,23 @@ class Renderer:
         config: StreamConfig | None = None,
         device: str = "cpu",
         error_model: Inpainter | None = None,
+        draws_in_page: bool = True,
     ) -> None:
-        """Set up; `error_model` as in `Stream`."""
+        """Set up; `error_model` as in `Stream`, and whether pages draw moving views by themselves."""
         self._source = source
         self._inpainter, self._error_model = inpainter, error_model
         self._config = config or StreamConfig()
         self.ladder = ladder_for(inpainter)
         self._device = device
+        self._draws_in_page = draws_in_page
         self._rig: RigInfo | None = None
         self._stream: Stream | None = None
         self.home: HomeView | None = None
         """The initial view; None before the first frame."""
         self.rig_json: dict[str, Any] | None = None
         """The message `rig`."""
+        self.assets_version: str | None = None
+        """Changes with the rig; None before the first frame."""
         self._coloured: tuple[GeometryProxy, Tensor] | None = None
         """The last proxy that was shown as points, and its vertex colours."""
         self.model_error: str | None = None
@@ -128,6 +134,8 @@ class Renderer:
         warm_up = view_camera(Camera(azimuth=home.azimuth), home, (WARM_UP_PX, WARM_UP_PX)).to(self._device)
         self._view(stream, warm_up, stream.viewer(), index, RenderQuality())
         rig_json = {"name": rig.name, "cameras": cameras_json(cameras), "bounds": bounds_json(bounds or proxy.bounds)}
+        self.assets_version = secrets.token_hex(4)
+        rig_json["assets"] = self.assets_version if self._draws_in_page else None
         self.rig_json = rig_json | home.as_json() | {"fps": self._source.span.fps or None}
         self._rig, self._stream, self.home = rig, stream, home
         return True
@@ -153,6 +161,34 @@ class Renderer:
         times = sum((v.times for v in views), StageTimes(rendering=1000 * (time.perf_counter() - start)))
         completed = tuple(view.completed for view in views)
         return RenderResult(request.time, completed, views[0].viewer, times, self.background, hulls)
+
+    def make_assets(self, frame: MultiViewFrame) -> FrameAssets:
+        """What a page needs to draw views of a frame; callable from any thread.
+
+        Raises:
+            ValueError: the frame has no geometry.
+        """
+        return make_assets(frame, self.geometry(frame), self._config.render)
+
+    def geometry(self, frame: MultiViewFrame) -> GeometryProxy:
+        """The proxy of a frame, on the CPU; callable from any thread.
+
+        Raises:
+            ValueError: the frame has no geometry, or no rig has been prepared yet.
+        """
+        shared = self._source.read_cached(frame.time)
+        if shared is not None and isinstance(shared.proxy, GeometryProxy):
+            return shared.proxy.to("cpu")
+        stream = self._stream
+        if stream is None:
+            raise ValueError("expected a rig, got none yet; see /health")
+        try:
+            cached = stream.cached_frame(frame.time)
+        except ValueError:  # not shown by the server so far: carved without keeping it
+            cached = cache_frame(frame.to(self._device), stream.bounds, stream.config.hull)
+        proxy = cached.proxy
+        assert isinstance(proxy, GeometryProxy), "streams carve hulls"
+        return proxy.to("cpu")
 
     def _render_proxy(self, cached: CachedFrame, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
         """Images of the proxy; the vertex colours are computed once per frame."""

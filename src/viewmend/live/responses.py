@@ -8,12 +8,15 @@ from pathlib import Path
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
+from viewmend.live.assets import Asset
 from viewmend.live.connection import SessionRegistry
 from viewmend.live.protocol import ProtocolError
 from viewmend.utils.heap import resident_bytes
 
 MAX_BODY_BYTES, BODY_S = 1_000_000, 10.0
 """The largest request body, and the time in which it has to arrive."""
+MAX_AGE_S = 31_536_000
+"""How long assets that never change may be cached."""
 POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; media-src 'self' blob:; style-src 'self' 'unsafe-inline'; "
     "worker-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -56,6 +59,17 @@ def page_files() -> dict[str, PageFile]:
 def error_response(status: int, message: str | None) -> Response:
     """An error message as JSON."""
     return JSONResponse({"error": message}, status, headers={"Cache-Control": "no-store"})
+
+
+def asset_response(request: Request, asset: Asset, is_final: bool) -> Response:
+    """An asset with its cache headers, or 304 if the client has it; final ones never change under their address."""
+    scope = "private" if "authorization" in request.headers else "public"  # the address is enough only with a token
+    cache = f"{scope}, max-age={MAX_AGE_S}, immutable" if is_final else f"{scope}, no-cache"
+    headers = {"ETag": asset.etag, "Cache-Control": cache, "X-Content-Type-Options": "nosniff"}
+    known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
+    if asset.etag in known or "*" in known:
+        return Response(status_code=304, headers=headers)
+    return Response(asset.content, media_type=asset.media_type, headers=headers)
 
 
 async def read_body(request: Request) -> bytearray | None:

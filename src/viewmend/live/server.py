@@ -17,6 +17,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
 from viewmend.data.videos import can_write_mp4
+from viewmend.live.assets import AssetQuery, AssetStore, BusyError
 from viewmend.live.auth import AccessControl
 from viewmend.live.connection import Extension, SessionRegistry, ViewerConnection
 from viewmend.live.connection_limits import authenticate
@@ -32,7 +33,15 @@ from viewmend.live.render_jobs import (
     parse_query,
     source_jpeg,
 )
-from viewmend.live.responses import HEADERS, MAX_BODY_BYTES, error_response, metrics_text, page_files, read_body
+from viewmend.live.responses import (
+    HEADERS,
+    MAX_BODY_BYTES,
+    asset_response,
+    error_response,
+    metrics_text,
+    page_files,
+    read_body,
+)
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 from viewmend.utils.plugins import import_object
@@ -87,6 +96,7 @@ class LiveServer:
         self._service, self._config = service, config
         self._access = AccessControl(config.host, config.token, config.public_url)
         self._files = page_files()
+        self.assets = AssetStore(service.source.read, service.renderer.make_assets)
         self._num_images = 0
         self._is_exporting = False
         self._path_job: PathJob | None = None
@@ -117,6 +127,8 @@ class LiveServer:
             Route("/metrics", self._guard(self._metrics)),
             Route("/frame.jpg", self._guard(self._image)),
             Route("/camera.jpg", self._guard(self._source_image)),
+            Route("/assets/{time}", self._guard(self._asset)),
+            Route("/assets/{time}/{camera}", self._guard(self._asset)),
             Route("/path", self._guard(self._progress)),
             Route("/path.mp4", self._guard(self._export), methods=["POST"]),
             WebSocketRoute("/ws", self._viewer),
@@ -225,6 +237,25 @@ class LiveServer:
             self._num_images -= 1
         headers = {"X-Viewmend-Time": str(index), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
+
+    async def _asset(self, request: Request) -> Response:
+        given = {**request.query_params, **request.path_params}
+        asked: AssetQuery = read_message(given, AssetQuery, strict=False)
+        span, version = self._service.source.span, self._service.renderer.assets_version
+        if version is None or not span.first <= asked.time < span.end:
+            return error_response(404, f"expected a frame from {span.first} to {span.end - 1}; see /health")
+        try:
+            made = await self.assets.get(asked.time, version)
+        except BusyError as error:
+            return error_response(429, str(error))
+        except TimeoutError as error:
+            return error_response(503, str(error))
+        except ValueError as error:
+            return error_response(404, f"this frame has no geometry: {error}"[:400])
+        if asked.camera is not None and asked.camera >= len(made.images):
+            return error_response(404, f"expected a camera from 0 to {len(made.images) - 1}, got {asked.camera}")
+        asset = made.shape if asked.camera is None else made.images[asked.camera]
+        return asset_response(request, asset, is_final=asked.v == version)
 
     async def _progress(self, request: Request) -> Response:
         done, of = (None, None) if self._path_job is None else self._path_job.progress

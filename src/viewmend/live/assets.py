@@ -1,0 +1,266 @@
+"""What a page needs to draw the views of a frame by itself, made once per frame for all viewers.
+
+The shape: vertices, faces and vertex colours of the geometry proxy, with the cameras and the blending rule. Positions
+are 16 bits a coordinate within the proxy's box: a thousandth of a pixel for a subject that fills a view of any size
+allowed, at half the bytes of floats. All arrays are stored as differences and deflated: browsers inflate by
+themselves, so the page needs no decoder, and a mesh codec would save less than a tenth of a frame's bytes, most of
+which are images.
+
+The images: the part of each camera's image that shows the subject, as JPEG with colour at full resolution, followed by
+its mask, deflated. WebP halves the colour's resolution, and takes 15 times as long, which rules out live rigs. On 20
+cameras of wd2, with masks: JPEG 0.72 MB, 36.6 dB and 30 ms; WebP of quality 90 0.49 MB, 35.4 dB and 385 ms.
+"""
+
+import asyncio
+import time
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from msgspec import Struct
+
+from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.geometry.proxy import GeometryProxy
+from viewmend.live import protocol
+from viewmend.live.poses import cameras_json
+from viewmend.live.protocol import pack
+from viewmend.rendering.blending import GRAZING
+from viewmend.rendering.error_mask import MIN_WEIGHT
+from viewmend.rendering.proxy_views import vertex_colours
+from viewmend.rendering.view import RenderConfig
+from viewmend.types import ContextViews, MultiViewFrame
+
+JPEG_QUALITY = 80
+MARGIN_PX = 1
+"""Pixels around the subject's part of an image: a bilinear sample outside touches no foreground."""
+KEPT_PX = 8
+"""Pixels further than this from the subject are black: JPEG blocks that reach the subject keep their colours."""
+MASK_STEP = 17
+"""Masks have 16 levels, for half the bytes of 256."""
+COLOUR_STRIDE = 4
+"""Vertices are coloured from images reduced by this factor: neighbouring vertices are several pixels apart."""
+READ_S, POLL_S = 10.0, 0.02
+"""Time limit for reading a frame, and time between attempts."""
+MAX_MAKING = 16
+"""Frames whose assets are being made at a time."""
+MEMORY_MB = 64.0
+COMPRESSION = 6
+
+
+class AssetQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Path and query of an asset."""
+
+    time: protocol.Count
+    camera: protocol.Count | None = None
+    """Number of the camera in the frame's list; None for the shape."""
+    v: protocol.ShortText = ""
+    """The version in the message `rig`, with which the response never changes."""
+    token: str = ""
+
+
+@dataclass(frozen=True)
+class Asset:
+    """The content of a response."""
+
+    content: bytes
+    media_type: str
+
+    @cached_property
+    def etag(self) -> str:
+        """Depends on the content only, so that it is the same in all processes of a server."""
+        return f'"{blake2b(self.content, digest_size=12).hexdigest()}"'
+
+
+@dataclass(frozen=True)
+class FrameAssets:
+    """The assets of one frame."""
+
+    shape: Asset
+    images: tuple[Asset, ...]
+    """In the order of the shape's cameras."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all assets."""
+        return len(self.shape.content) + sum(len(image.content) for image in self.images)
+
+
+class BusyError(Exception):
+    """Too many frames are being prepared."""
+
+
+class AssetStore:
+    """Makes assets on demand, one frame after the other, and keeps those used last. Its methods run on one loop."""
+
+    def __init__(
+        self,
+        read: Callable[[int], MultiViewFrame | None],
+        make: Callable[[MultiViewFrame], FrameAssets],
+        memory_mb: float = MEMORY_MB,
+    ) -> None:
+        """Begin empty; `read` returns None while a frame is not in memory, and `make` is called on a thread."""
+        self._read, self._make, self._max_bytes = read, make, 1e6 * memory_mb
+        self._kept: OrderedDict[int, FrameAssets] = OrderedDict()
+        self._making: dict[int, asyncio.Task[FrameAssets]] = {}
+        self._turn = asyncio.Lock()
+        self._version: str | None = None
+        self.size_bytes = 0
+        """Bytes of all assets that are kept."""
+
+    async def get(self, index: int, version: str) -> FrameAssets:
+        """The assets of a frame; whoever asks for the same frame meanwhile waits for the same result.
+
+        Those of another version, that is, of another rig, are dropped.
+
+        Raises:
+            BusyError: too many other frames are being prepared.
+            TimeoutError: the frame was not read in time.
+            ValueError: the frame has no geometry.
+        """
+        if version != self._version:
+            self._kept.clear()
+            self._making.clear()  # those of the rig before end without being kept
+            self._version, self.size_bytes = version, 0
+        if (kept := self._kept.get(index)) is not None:
+            self._kept.move_to_end(index)
+            return kept
+        if (task := self._making.get(index)) is None:
+            if len(self._making) >= MAX_MAKING:
+                raise BusyError("too many frames are being prepared; try again")
+            task = self._making[index] = asyncio.create_task(self._prepare(index, version))
+            task.add_done_callback(lambda done: done.cancelled() or done.exception())  # its waiters may have left
+        return await asyncio.shield(task)
+
+    async def _prepare(self, index: int, version: str) -> FrameAssets:
+        end = time.monotonic() + READ_S
+        try:
+            while (frame := self._read(index)) is None:
+                if time.monotonic() > end:
+                    raise TimeoutError("the frame was not available in time; see /health")
+                await asyncio.sleep(POLL_S)
+            async with self._turn:
+                made = await asyncio.to_thread(self._make, frame)
+            if version == self._version:
+                self._keep(index, made)
+            return made
+        finally:
+            if version == self._version:
+                self._making.pop(index, None)
+
+    def _keep(self, index: int, made: FrameAssets) -> None:
+        self._kept[index] = made
+        self.size_bytes += made.size_bytes
+        while self.size_bytes > self._max_bytes and len(self._kept) > 1:
+            self.size_bytes -= self._kept.popitem(last=False)[1].size_bytes
+
+
+def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfig) -> FrameAssets:
+    """The assets of a frame with masks."""
+    cameras, images, lengths = [], [], []
+    for n, (rgb, mask) in enumerate(zip(frame.per_camera("rgb"), frame.per_camera("mask"), strict=True)):
+        top, bottom, left, right = _subject_box(mask.cpu().numpy())
+        part = rgb[:, top:bottom, left:right].movedim(0, -1).contiguous().cpu().numpy()
+        jpeg, packed_mask = _encode_image(part, mask[top:bottom, left:right].cpu().numpy())
+        cameras.append(frame.cameras[n].cropped(left, top, right - left, bottom - top))
+        images.append(Asset(jpeg + packed_mask, "image/jpeg"))
+        lengths.append(len(jpeg))
+    arrays = _shape_arrays(frame, proxy)
+    vertices, blend = proxy.mesh.vertices, config.blend
+    packed = {name: pack_differences(values) for name, (values, _) in arrays.items()}
+    described = cameras_json(concatenate_cameras(cameras))
+    header: dict[str, Any] = {
+        "time": frame.time,
+        "center": (vertices.mean(0) if len(vertices) else proxy.bounds.center).tolist(),
+        "cameras": [camera | {"jpeg_bytes": size} for camera, size in zip(described, lengths, strict=True)],
+        "blend": {
+            "cameras": config.cameras,
+            "normal_power": blend.normal_power,
+            "view_power": blend.view_power,
+            "bias_m": blend.depth_bias * float(proxy.bounds.size_m.norm()),
+            "slope_px": blend.slope_px,
+            "grazing": GRAZING,
+            "min_weight": MIN_WEIGHT,
+        },
+        "parts": [
+            {"kind": name, "bytes": len(packed[name]), "rows": len(values), "columns": values.shape[1]} | more
+            for name, (values, more) in arrays.items()
+        ],
+    }
+    shape = Asset(pack(header, list(packed.values())), "application/octet-stream")
+    return FrameAssets(shape, tuple(images))
+
+
+def _shape_arrays(frame: MultiViewFrame, proxy: GeometryProxy) -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
+    """Integer arrays of the shape by name, each with more fields of its description."""
+    vertices = proxy.mesh.vertices.cpu().double().numpy()
+    low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else (np.zeros(3), np.zeros(3))
+    step = np.maximum((high - low) / 65535, 1e-9)
+    positions = np.rint((vertices - low) / step).astype(np.int64)
+    faces = proxy.mesh.faces.cpu().numpy().astype(np.int64).reshape(-1, 1)
+    colours = np.rint(255 * _colours(frame, proxy)).astype(np.int64)
+    box = {"low": low.tolist(), "step": step.tolist()}
+    return {"positions": (positions, box), "faces": (faces, {}), "colours": (colours, {})}
+
+
+def _colours(frame: MultiViewFrame, proxy: GeometryProxy) -> Float[np.ndarray, "vertex 3"]:
+    """RGB of the vertices in [0, 1], for what the closest cameras do not see."""
+    assert frame.mask is not None, "a frame with a hull has masks"
+    stride, rig = COLOUR_STRIDE, frame.cameras
+    if min(frame.mask.shape[1:]) < 64 * stride:
+        stride = 1
+    first = stride // 2
+    rgb, mask = (image[..., first::stride, first::stride] for image in (frame.rgb, frame.mask))
+    K = rig.K.clone()
+    K[:, :2] /= stride
+    K[:, :2, 2] += 0.5 - (first + 0.5) / stride  # the centre of pixel `first` becomes that of pixel 0
+    sizes = ((rig.size_px - first + stride - 1) // stride).clamp(min=1)
+    small = replace(frame, cameras=replace(rig, K=K, size_px=sizes), rgb=rgb, mask=mask)
+    return vertex_colours(proxy, ContextViews(small, proxy.depth(small.cameras))).cpu().numpy()
+
+
+def pack_differences(values: Int[np.ndarray, "row column"]) -> bytes:
+    """Integers of 31 bits as deflated differences to the row before.
+
+    They are folded to unsigned (0, -1, 1, -2, ... become 0, 1, 2, 3, ...) and stored column by column: first the
+    lowest byte of all, then the second, the third and the highest.
+    """
+    differences = np.diff(values, axis=0, prepend=np.zeros((1, values.shape[1]), values.dtype)).T
+    folded = ((differences << 1) ^ (differences >> 63)).astype("<u4")
+    planes = folded.reshape(-1, 1).view(np.uint8).T
+    return zlib.compress(planes.tobytes(), COMPRESSION)
+
+
+def _subject_box(mask: UInt8[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
+    """Top, bottom, left and right of the foreground with its margin; one pixel if there is none."""
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return 0, 1, 0, 1
+    height, width = mask.shape
+    return (
+        max(0, int(rows[0]) - MARGIN_PX),
+        min(height, int(rows[-1]) + 1 + MARGIN_PX),
+        max(0, int(columns[0]) - MARGIN_PX),
+        min(width, int(columns[-1]) + 1 + MARGIN_PX),
+    )
+
+
+def _encode_image(
+    rgb: UInt8[np.ndarray, "height width 3"], mask: UInt8[np.ndarray, "height width"]
+) -> tuple[bytes, bytes]:
+    """JPEG and deflated mask."""
+    import cv2
+
+    near = cv2.dilate(mask, np.ones((2 * KEPT_PX + 1, 2 * KEPT_PX + 1), np.uint8))
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, jpeg = cv2.imencode(".jpg", cv2.bitwise_and(bgr, bgr, mask=near), options)
+    assert done, "8-bit images can be encoded"
+    levels = (mask.astype(np.uint16) + MASK_STEP // 2) // MASK_STEP * MASK_STEP
+    return jpeg.tobytes(), zlib.compress(levels.astype(np.uint8).tobytes(), COMPRESSION)
