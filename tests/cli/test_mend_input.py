@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from viewmend.cli import main
+from viewmend.cli.checks import chosen_times
 
 
 @pytest.mark.parametrize(
@@ -19,8 +20,8 @@ from viewmend.cli import main
         (["--leave-out", "held", "--use-cameras", "c0"], "at least 2 input cameras, got 1"),
         ([], "either --leave-out CAMERA or --path"),
         (["--leave-out", "held", "--path", "orbit"], "either --leave-out CAMERA or --path"),
-        (["--leave-out", "held", "--frames", "5:9"], "--frames first:end within 0:2"),
-        (["--leave-out", "held", "--frames", "x"], "--frames first:end within 0:2"),
+        (["--leave-out", "held", "--frames", "5:9"], "--frames FIRST:END within 0:2"),
+        (["--leave-out", "held", "--frames", "x"], "--frames FIRST:END within 0:2"),
         (["--leave-out", "held", "--num-source-views", "0"], "--num-source-views of at least 1"),
         (["--leave-out", "held", "--device", "abacus"], "expected an available device"),
         (["--leave-out", "held", "--model", "nothing"], "nothing"),
@@ -60,6 +61,22 @@ def test_a_bad_path_is_named(folder, tmp_path, mend, content, message):
     assert [f.name for f in tmp_path.iterdir()] == ["path.json"]
 
 
+@pytest.mark.parametrize(
+    ("text", "times", "said"),
+    [
+        (None, range(10), ""),
+        ("8:", range(8, 10), ""),
+        (":-4", range(6), ""),
+        ("-2:", range(8, 10), ""),
+        ("8:100", range(8, 10), "--frames 8:100: there are 10 frames, so 8:10 is used\n"),
+        ("-12:3", range(3), "--frames -12:3: there are 10 frames, so 0:3 is used\n"),
+    ],
+)
+def test_fewer_frames_than_asked_for_are_said(capsys, text, times, said):
+    assert chosen_times(text, 10) == times
+    assert capsys.readouterr().err == said
+
+
 def test_a_capture_without_masks_is_refused(folder, tmp_path, mend):
     bare = tmp_path / "bare"
     shutil.copytree(folder, bare)
@@ -92,8 +109,9 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, mend):
         and notes.read_text() == "precious"
     )
     notes.unlink()
-    for _ in range(2):  # its own results are
-        assert mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")[0] == 0
+    for said in (False, True):  # its own results are
+        code, _, err = mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
+        assert code == 0 and (f"{tmp_path}: the results of an earlier run will be replaced" in err) == said
     assert {f.name for f in tmp_path.iterdir()} == {
         ".viewmend",
         "holes",

@@ -15,13 +15,8 @@ from viewmend.cli import main
 from viewmend.data.checks import diagnosis, leave_one_out
 from viewmend.data.checks.calibration import HULL_ONLY, MASK_ONLY, check_calibration, draw_check
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
-from viewmend.data.checks.leave_one_out import (
-    LeaveOneOut,
-    check_image_mask_sync,
-    describe_delay,
-    find_outlier_by_hull,
-    find_outlier_by_outlines,
-)
+from viewmend.data.checks.leave_one_out import LeaveOneOut, find_outlier_by_hull, find_outlier_by_outlines
+from viewmend.data.checks.synchronisation import check_image_mask_sync, describe_delay
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare

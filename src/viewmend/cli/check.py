@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,8 +22,8 @@ TRIAL_PX = 64
 class Options:
     """Check and describe a capture or a model.
 
-    For a capture: checks that all files exist, and that masks, calibration and images of one frame agree. For a model:
-    runs it once on a small view, and fails if the result is not finite.
+    For a capture: checks that all files exist, that masks, calibration and images of one frame agree, and that cameras
+    and films are in step. For a model: runs it once on a small view, and fails if the result is not finite.
     """
 
     target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|MODEL")]
@@ -104,16 +104,20 @@ def _try_model(model: str) -> None:
 def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck]":
     from viewmend.cli.console import busy, say
     from viewmend.data.checks.calibration import check_calibration, draw_check
+    from viewmend.data.checks.synchronisation import find_desynchronised_cameras
     from viewmend.data.images import write_image
-    from viewmend.data.native_capture import open_capture
+    from viewmend.data.native_capture import NativeCapture
     from viewmend.utils.atomic_writes import remove_partial_file
 
-    capture = open_capture(options.target, format=options.format)
+    capture = NativeCapture(Path(options.target), format=options.format)
     if not 0 <= options.time < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
         raise ValueError(f"{options.target}: expected --time of 0 to {last}, got {options.time}; choose again")
     with busy("computing the hull"):
         check = check_calibration(capture.read(options.time), capture.bounds)
+        good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
+        late = find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
+        check = replace(check, issues=(*capture.issues, *check.issues, *late))
     if options.out is not None:
         remove_partial_file(options.out)
         with busy("drawing the picture"):
@@ -164,6 +168,7 @@ def _describe_camera(capture: "NativeCapture", check: "CalibrationCheck", view: 
         "fov_x_deg": math.degrees(2 * math.atan(width / (2 * float(K[0, 0])))),
         "center_m": camera.centers[0].tolist(),
         "hull_iou": check.iou.get(name),
+        "films": [] if capture.clock is None else capture.clock.describe(name),
     }
 
 
@@ -207,9 +212,20 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         size = f"{camera['width']} x {camera['height']}"
         lens = f"{size:<12} focal {camera['focal_px'][0]:7.1f} px  {camera['fov_x_deg']:5.1f} deg wide"
         lines.append(f"  {camera['name']:<{width}}  {lens}{iou}")
+    for camera in capture["cameras"]:
+        lines += [f"  {camera['name']:<{width}}  {_film_as_text(film)}" for film in camera["films"]]
     if capture["findings"]:
         lines += ["", "  issues:", *(f"  - {text}" for text in capture["findings"])]
     return lines
+
+
+def _film_as_text(film: dict[str, Any]) -> str:
+    """Rate, length, gaps and offset of a camera's images or masks, by the times in the film."""
+    fps = "unknown fps" if film["fps"] is None else f"{film['fps']:.5g} fps"
+    gaps = [f"{count} missing at {start_s:.2f} s" for start_s, count in film["gaps"]]
+    more = f", and {len(gaps) - 3} more gaps" if len(gaps) > 3 else ""
+    text = f"{film['frames']} {film['kind']}, {fps}, {film['start_s']:.2f} to {film['end_s']:.2f} s"
+    return f"{text}, {', '.join(gaps[:3]) or 'no gaps'}{more}, offset {film['offset_ms']:g} ms"
 
 
 def _vector(values: Sequence[float], digits: int = 2) -> str:

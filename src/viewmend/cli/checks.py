@@ -43,11 +43,20 @@ def load_named(name: str | None, device: str) -> "Inpainter":
 
 
 def chosen_times(text: str | None, count: int) -> range:
-    """The frame indices that `--frames FIRST:END` selects out of `count`; all by default, ValueError for none."""
-    parts = re.fullmatch(r"(\d{0,9}):(\d{0,9})", text or ":")
-    times = range(count)[int(parts[1] or 0) : int(parts[2] or count)] if parts else range(0)
+    """The frame indices that `--frames FIRST:END` selects out of `count`; all by default.
+
+    Negative indices count from the end. Says so if there are fewer frames than asked for.
+
+    Raises:
+        ValueError: there is no such frame.
+    """
+    parts = re.fullmatch(r"(-?\d{1,9})?:(-?\d{1,9})?", text or ":")
+    first, end = (None if part is None else int(part) for part in parts.groups()) if parts else (0, 0)
+    times = range(count)[first:end]
     if not times:
-        raise ValueError(f"expected --frames as FIRST:END within 0:{count}, got '{text}'; choose again")
+        raise ValueError(f"expected --frames FIRST:END within 0:{count}, got '{text}'; for example 0:{count}")
+    if any(abs(index) > count for index in (first, end) if index is not None):
+        say(f"--frames {text}: there are {count} frames, so {times[0]}:{times[-1] + 1} is used")
     return times
 
 

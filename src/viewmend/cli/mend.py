@@ -33,7 +33,7 @@ class Options:
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
     """A capture with masks, in any supported format."""
     out: Path
-    """Folder for the results; created if missing."""
+    """Folder for the results; created if missing. Results of an earlier run in it are replaced, other files kept."""
     leave_out: str | None = None
     """Name of the camera to hold out, whose view is rendered. Give either this or --path."""
     path: str | None = None
@@ -83,13 +83,8 @@ FRAMES_PER_TURN = 150
 
 def run(options: Options) -> int:
     """Run the command; returns the exit code."""
-    if (options.leave_out is None) == (options.path is None):
-        raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
-    if options.num_source_views < 1:
-        raise ValueError(f"expected --num-source-views of at least 1, got {options.num_source_views}; the paper uses 3")
-    if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
-    from viewmend.cli.checks import load_named, log_preparation
+    _check(options)
+    from viewmend.cli.checks import chosen_times, load_named, log_preparation
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import MendOutput
     from viewmend.data.prepare import prepare
@@ -105,12 +100,12 @@ def run(options: Options) -> int:
     )
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
-    times = _times(options.frames, len(opened.frame_ids))
-    if options.top_k is not None and options.top_k < 1:
-        raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; omit it to keep all")
+    times = chosen_times(options.frames, len(opened.frame_ids))
     inpainter = load_named(options.model, options.device)
     inputs = [name for name in opened.cameras.names if name not in held]
-    capture = prepare(opened, inputs, align=options.align, match_colours=options.match_colours, first=times[0])
+    capture = prepare(
+        opened, inputs, align=options.align, match_colours=options.match_colours, first=times[0], last=times[-1]
+    )
     log_preparation(capture)
     error_model = error_model_for(inpainter, options.device) if render.error_rule == "predicted" else None
     config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
@@ -118,6 +113,8 @@ def run(options: Options) -> int:
     summary = MendSummary()
     plan, frames, frame = _plan(options, capture, times), prefetch(capture, times), None
     with MendOutput(options.out, capture.fps or 15.0, options.alpha, options.depth) as output:
+        if output.replaces:
+            say(f"{options.out}: the results of an earlier run will be replaced")
         for time, target in track(plan, "inpainting"):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
@@ -131,6 +128,18 @@ def run(options: Options) -> int:
     else:
         show(*_in_words(summary))
     return 0
+
+
+def _check(options: Options) -> None:
+    """Raise a ValueError for options that contradict each other or are out of range."""
+    if (options.leave_out is None) == (options.path is None):
+        raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
+    if options.num_source_views < 1:
+        raise ValueError(f"expected --num-source-views of at least 1, got {options.num_source_views}; the paper uses 3")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+    if options.top_k is not None and options.top_k < 1:
+        raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; omit it to keep all")
 
 
 def _in_words(summary: "MendSummary") -> list[str]:
@@ -172,19 +181,6 @@ def _open(options: Options, held: tuple[str, ...]) -> "CaptureSource":
         known, got = list(capture.cameras.names), options.leave_out
         raise CaptureError(f"{options.capture}: expected --leave-out among {known}, got '{got}'")
     return capture
-
-
-def _times(frames: str | None, count: int) -> range:
-    if frames is None:
-        return range(count)
-    first, colon, end = frames.partition(":")
-    try:
-        wanted = range(count)[slice(int(first) if first else None, int(end) if end else None)] if colon else range(0)
-    except ValueError:
-        wanted = range(0)
-    if not len(wanted):
-        raise ValueError(f"expected --frames first:end within 0:{count}, got '{frames}'; for example 0:{count}")
-    return wanted
 
 
 def _plan(options: Options, capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":

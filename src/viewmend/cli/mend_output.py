@@ -60,6 +60,11 @@ class MendOutput:
             raise
         return self
 
+    @property
+    def replaces(self) -> bool:
+        """Whether the folder has results of an earlier run, which this one will replace."""
+        return self._folder.listed
+
     def add(self, step: MendStep) -> None:
         """Write one view, and keep a few views, spread over the run, as rows of the contact sheet."""
         completed, number = step.completed, f"{self._count:06d}.png"

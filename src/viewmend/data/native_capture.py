@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from viewmend.data.containers import names_in
-from viewmend.data.errors import CaptureError
+from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.images import (
     RUN_LENGTH_SUFFIX,
@@ -27,8 +27,9 @@ from viewmend.data.images import (
     read_run_lengths,
     to_mask,
 )
-from viewmend.data.native_format import CALIBRATION, FileKind, NativeCamera, stays_inside
-from viewmend.data.videos import VideoFile, is_video
+from viewmend.data.native_format import CALIBRATION, FileKind, NativeCalibration, NativeCamera, stays_inside
+from viewmend.data.video_clock import ABSENT, Track, TrackKind, VideoClock, match_tracks, video_track
+from viewmend.data.videos import VideoFile, is_video, video_properties
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
@@ -64,17 +65,18 @@ def open_capture(
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 64, 64])
     """
-    path = Path(path)
-    folder = path.parent if path.name == CALIBRATION and path.is_file() else path
-    return NativeCapture(folder, cameras, format, alpha)
+    capture = NativeCapture(Path(path), cameras, format, alpha)
+    for issue in capture.issues:
+        logging.getLogger("viewmend").warning("%s: %s", capture.name, issue.text)
+    return capture
 
 
 class NativeCapture:
     """A capture folder as a `CaptureSource`. Opening checks the calibration and which files exist; reading is lazy.
 
-    A camera whose image or mask is missing is absent from that frame (a gap). Images and masks are undistorted to
-    pinhole images with the same K, and padded right and below to the largest of the frame. The arguments are those of
-    `open_capture`.
+    A camera whose image or mask is missing is absent from that frame (a gap). Films are matched by the times of their
+    frames. Images and masks are undistorted to pinhole images with the same K, and padded right and below to the
+    largest of the frame. The arguments are those of `open_capture`, which logs `issues`.
 
     Raises:
         CaptureError: `cameras.json` is invalid; a camera has no files in any frame, or a frame has no camera; only
@@ -84,6 +86,7 @@ class NativeCapture:
     def __init__(
         self, path: Path, cameras: Sequence[str] | None = None, format: str | None = None, alpha: bool = False
     ):
+        path = path.parent if path.name == CALIBRATION and path.is_file() else path
         calibration = read_any_calibration(path, format)
         self.folder = folder = calibration.folder
         self._name = path.stem if path.is_file() else folder.resolve().name
@@ -92,11 +95,14 @@ class NativeCapture:
         if alpha:
             self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
         self._calibration = calibration
+        self.clock = read_clock(calibration)
+        """When the films' frames were taken; None for a capture of images."""
+        self._frame_ids = calibration.frames[: None if self.clock is None else len(self.clock.times_s)]
         self.has_masks = self._all_or_none("mask")
         self.has_depth = self._all_or_none("depth")
+        self._readers = tuple(CameraReader(folder, camera, self._frame_ids, self.clock) for camera in self._entries)
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
-        self._readers = tuple(CameraReader(folder, camera) for camera in self._entries)
         self._cameras = pinhole_cameras(self._entries)
 
     @property
@@ -112,7 +118,7 @@ class NativeCapture:
     @property
     def frame_ids(self) -> tuple[str, ...]:
         """Frame ids in temporal order."""
-        return self._calibration.frames
+        return self._frame_ids
 
     @property
     def fps(self) -> float | None:
@@ -142,8 +148,20 @@ class NativeCapture:
         missing = np.argwhere(~self.present)
         return tuple((self._entries[camera].name, self.frame_ids[time]) for camera, time in missing)
 
+    @property
+    def issues(self) -> tuple[Issue, ...]:
+        """Films whose times differ from the others'."""
+        if self.clock is None:
+            return ()
+        listed, found = len(self._calibration.frames), len(self._frame_ids)
+        text = f"expected {listed} frames as listed, got films with {found} common times; the other frames are left out"
+        short = (Issue(text),) if found < listed else ()
+        return short + self.clock.issues(self.cameras.names)
+
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
+
+        A camera whose film is damaged at this time is absent.
 
         Raises:
             CaptureError: a file is unreadable or has the wrong size, or no mask has any foreground.
@@ -154,9 +172,12 @@ class NativeCapture:
         views = [int(view) for view in np.flatnonzero(self.present[:, time])]
         frame_id = self.frame_ids[time]
         with ThreadPoolExecutor(min(len(views), os.cpu_count() or 1)) as pool:
-            images = list(pool.map(lambda view: self._readers[view].read(frame_id, time), views))
+            images = list(pool.map(lambda view: self._readers[view].read(time), views))
         self._warn_of_rotation()
-        frame = stack_images(images, self._cameras[views], time)
+        views = [view for view, image in zip(views, images, strict=True) if image is not None]
+        if not views:
+            raise CaptureError(f"{self.folder}: frame '{frame_id}': expected a frame in one film or more, got none")
+        frame = stack_images([image for image in images if image is not None], self._cameras[views], time)
         if frame.mask is not None and (highest := int(frame.mask.max())) <= FOREGROUND:
             camera = self._entries[views[0]]
             raise CaptureError(
@@ -204,10 +225,8 @@ class NativeCapture:
             parent, name = os.path.split(path)
             return name in listing(parent)
 
-        def has_all(camera: NativeCamera, frame: str) -> bool:
-            return all(exists(camera.file(kind, frame)) for kind in camera.file_kinds)
-
-        present = np.array([[has_all(camera, frame) for frame in self.frame_ids] for camera in self._entries], bool)
+        times = range(len(self.frame_ids))
+        present = np.array([[reader.has(time, exists) for time in times] for reader in self._readers], bool)
         for camera, row in zip(self._entries, present, strict=True):
             if not row.any():
                 raise CaptureError(self._never_present(camera, exists))
@@ -272,6 +291,37 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
     )
 
 
+def read_clock(calibration: NativeCalibration) -> VideoClock | None:
+    """Match the films of a capture by time; None if it has no films and no offsets.
+
+    Numbered images count as films with the capture's frame rate, or else that of its first film.
+
+    Raises:
+        CaptureError: a film cannot be decoded, no two show the same time, or offsets lack a frame rate.
+    """
+    cameras, folder = calibration.cameras, calibration.folder
+    files = {(c.name, kind): path for c in cameras for kind, path in (("images", c.video), ("masks", c.mask)) if path}
+    films = {key: folder / path for key, path in files.items() if is_video(path) and (folder / path).is_file()}
+    if not films and not any(camera.offset_ms for camera in cameras):
+        return None
+    fps = calibration.fps or next((video_properties(path).fps for path in films.values()), None)
+    if fps is None:
+        raise CaptureError(f"{calibration.file}: expected fps, which offset_ms needs, got none; add it")
+    numbers_s = np.arange(len(calibration.frames)) / fps
+    tracks = []
+    for camera in cameras:
+        offset_s = camera.offset_ms / 1000
+        for kind in ("images", "masks"):
+            if (path := films.get((camera.name, kind))) is not None:
+                tracks.append(video_track(camera.name, kind, path, offset_s))
+            elif kind == "images":  # numbered masks follow their images
+                tracks.append(Track(camera.name, kind, numbers_s, fps, offset_s))
+    try:
+        return match_tracks(tracks)
+    except ValueError as error:
+        raise CaptureError(f"{calibration.file}: {error}") from None
+
+
 @dataclass(frozen=True)
 class CameraImages:
     """The images of one camera in one frame."""
@@ -283,39 +333,74 @@ class CameraImages:
 
 
 class CameraReader:
-    """Reads the files of one camera. Keeps its videos open and its undistortion map. Thread-safe."""
+    """Reads the files of one camera. Keeps its videos open and its undistortion map. Thread-safe.
 
-    def __init__(self, folder: Path, camera: NativeCamera):
+    Args:
+        folder: the folder that its paths are relative to.
+        camera: the camera.
+        frames: the ids of the capture's frames.
+        clock: which frames of its films belong to them; None without films.
+    """
+
+    def __init__(self, folder: Path, camera: NativeCamera, frames: Sequence[str], clock: VideoClock | None):
         self.camera = camera
         self.rotation: str | None = None
         """How EXIF asks to rotate the first image that was read; "" if it does not."""
         self.warned = False
         """Whether the user was warned of the rotation."""
         self._folder = folder
+        self._frames = frames
         self._undistortion = Undistortion(camera)
         paths = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
         self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in paths)
         self._curves = None if camera.colour is None else _colour_curves(camera.colour)
+        numbers = np.arange(len(frames))
+        own = {} if clock is None else clock.frames
+        images = own.get((camera.name, "images"), numbers)
+        masks = images if camera.video is None or self._has_mask_per_image() else numbers
+        self._index: dict[TrackKind, np.ndarray] = {
+            "images": images,
+            "masks": own.get((camera.name, "masks"), masks),
+        }
 
-    def read(self, frame: str, index: int) -> CameraImages:
-        """Read and undistort the images of frame id `frame`, which has this index in the capture.
+    def _has_mask_per_image(self) -> bool:
+        """Whether numbered masks are those of the film's own frames, of which some of the capture's are missing."""
+        if self._video is None or self.camera.mask is None or self._mask_video is not None:
+            return False
+        count = sum((self._folder / self.camera.file("mask", frame)).is_file() for frame in self._frames)
+        return count < len(self._frames) and count == video_properties(self._video.path).frames
+
+    def has(self, time: int, exists: Callable[[str], bool]) -> bool:
+        """Whether the camera has all of its files in the frame at index `time`; `exists` looks a path up."""
+        if any(index[time] == ABSENT for index in self._index.values()):
+            return False
+        return all(exists(self.camera.file(kind, self._file_id(kind, time))) for kind in self.camera.file_kinds)
+
+    def read(self, time: int) -> CameraImages | None:
+        """Read and undistort the images of the frame at index `time`, in which the camera is present.
+
+        Returns None if the camera's film is damaged there.
 
         Raises:
             CaptureError: a file is missing, unreadable, or does not have the camera's size.
         """
         camera = self.camera
-        path, where = self._locate("video" if camera.video else "image", frame)
-        rgb = self._video.read(index, where) if self._video else read_rgb(path, where)
+        path, where = self._locate("video" if camera.video else "image", time)
+        rgb = self._video.read(int(self._index["images"][time]), where) if self._video else read_rgb(path, where)
+        if rgb is None:
+            return None
         if self.rotation is None:
             self.rotation = "" if self._video else exif_rotation(path) or ""
         self._check_size(rgb, where, self.rotation)
         mask, depth = None, None
         if camera.mask:
-            path, where = self._locate("mask", frame)
-            mask = self._read_mask(path, where, index)
+            path, where = self._locate("mask", time)
+            mask = self._read_mask(path, where, time)
+            if mask is None:
+                return None
             self._check_size(mask, where)
         if camera.depth:
-            path, where = self._locate("depth", frame)
+            path, where = self._locate("depth", time)
             depth = read_depth(path, where)
             self._check_size(depth, where)
         return self._undistortion.apply(CameraImages(self._correct_colours(rgb), mask, depth))
@@ -329,18 +414,26 @@ class CameraReader:
 
         return rgb if self._curves is None else cv2.LUT(rgb, self._curves)
 
-    def _read_mask(self, path: Path, where: str, index: int) -> UInt8[np.ndarray, "height width"]:
+    def _read_mask(self, path: Path, where: str, time: int) -> UInt8[np.ndarray, "height width"] | None:
         if self._mask_video:
-            mask = to_mask(self._mask_video.read(index, where))
+            image = self._mask_video.read(int(self._index["masks"][time]), where)
+            if image is None:
+                return None
+            mask = to_mask(image)
         elif path.suffix == RUN_LENGTH_SUFFIX:
             mask = read_run_lengths(path, where, (self.camera.height, self.camera.width))
         else:
             mask = read_mask(path, where)
         return 255 * (mask > 0).astype(np.uint8) if self.camera.mask_labels else mask
 
-    def _locate(self, kind: FileKind, frame: str) -> tuple[Path, str]:
-        path = self._folder / self.camera.file(kind, frame)
-        return path, f"{path}: camera '{self.camera.name}', frame '{frame}'"
+    def _file_id(self, kind: FileKind, time: int) -> str:
+        """The frame id in the path of a file that belongs to the frame at index `time`."""
+        own = self._index["masks" if kind == "mask" else "images"]
+        return self._frames[int(own[time])]
+
+    def _locate(self, kind: FileKind, time: int) -> tuple[Path, str]:
+        path = self._folder / self.camera.file(kind, self._file_id(kind, time))
+        return path, f"{path}: camera '{self.camera.name}', frame '{self._frames[time]}'"
 
     def _check_size(self, image: np.ndarray, where: str, rotation: str = "") -> None:
         height, width = image.shape[:2]

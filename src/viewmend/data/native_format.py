@@ -45,6 +45,7 @@ class NativeCameraEntry(Struct, frozen=True, kw_only=True):
     depth: Text | None = None
     colour: Matrix | None = None
     mask_labels: bool = False
+    offset_ms: Annotated[float, Meta(ge=-1e9, le=1e9)] = 0.0
 
     def __post_init__(self) -> None:
         if not bool(is_intrinsics(torch.tensor(self.K, dtype=torch.float64))):
@@ -113,6 +114,8 @@ class NativeCamera:
     """Coefficients a, b, c of red, green and blue: a value x in 0..255 becomes a x^2 + b x + c."""
     mask_labels: bool = False
     """Whether mask values are labels, of which only 0 is background."""
+    offset_ms: float = 0.0
+    """Subtracted from the times of the camera's frames."""
 
     @property
     def file_kinds(self) -> tuple[FileKind, ...]:
@@ -190,7 +193,7 @@ def _camera(entry: NativeCameraEntry, shift_px: Float64[np.ndarray, "2"], scale:
     K[:2, 2] += shift_px
     u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations are often rounded
     return NativeCamera(
-        **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", *FILE_KINDS)},
+        **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", "offset_ms", *FILE_KINDS)},
         K=K,
         R=u @ vt,
         t_m=np.array(entry.t) * scale,
@@ -220,6 +223,8 @@ def _entry(camera: NativeCamera) -> dict[str, Any]:
     entry |= {kind: getattr(camera, kind) for kind in camera.file_kinds}
     if camera.colour is not None:
         entry["colour"] = camera.colour.tolist()
+    if camera.offset_ms:
+        entry["offset_ms"] = camera.offset_ms
     return entry | ({"mask_labels": True} if camera.mask_labels else {})
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
-from viewmend.data.checks.leave_one_out import MAX_DELAY, find_desynchronised_camera
+from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
 from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.native_capture import NativeCapture, open_capture
@@ -68,7 +68,7 @@ class PreparedCapture(CaptureWrapper):
         frame = self.source.read(time).without(self.left_out)
         inputs = self.cameras.names if self.inputs is None else self.inputs
         absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
-        text = "camera '{}' has no image or no mask and is absent; check its files"
+        text = "camera '{}' has no image or no mask in this frame and is absent; check its files"
         issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
         _raise_or_warn(f"{self.name}: frame '{self.frame_ids[time]}'", issues, self._reported)
         bad = [issue.camera for issue in issues if issue.camera]
@@ -89,6 +89,7 @@ def prepare(
     align: bool = True,
     match_colours: bool = True,
     first: int = 0,
+    last: int | None = None,
 ) -> PreparedCapture:
     """Check and align a capture, match its colours, and limit its image size.
 
@@ -97,11 +98,11 @@ def prepare(
         inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras have no effect.
         longest_px: images are reduced to at most this length of their longer side.
         align: find a shift that all images share, in the masks of one frame at full size, and look for a camera that
-            is out of sync, in the frames around it. That frame is the first from `first` on in which two input cameras
-            have any foreground.
+            is out of sync, around it. It is the first frame from `first` on in which two input cameras see anything.
         match_colours: match the input cameras' colours in the same frame, if that improves their agreement on parts
             of the surface that the correction was not fitted to.
         first: index of the first frame that will be used.
+        last: index of the last frame that will be used, at which synchronisation is checked again.
 
     Raises:
         CaptureError: a frame cannot be read, or its masks or calibration are unusable.
@@ -125,8 +126,7 @@ def prepare(
     frame = frame.without([issue.camera for issue in issues if issue.camera])
     alignment = None
     if align:
-        issues = find_desynchronised_camera(*_frames_around(source, frame), source.bounds)
-        _raise_or_warn(source.name, issues, reported)
+        _raise_or_warn(source.name, find_desynchronised_cameras(source, frame, last), reported)
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
     prepared = PreparedCapture(source, alignment, longest_px, names, left_out, None, reported)
@@ -168,14 +168,6 @@ def open_masked(
     if count < 2:
         raise CaptureError(f"{path}: expected at least 2 input cameras, got {count}; use more cameras")
     return capture
-
-
-def _frames_around(source: CaptureSource, frame: MultiViewFrame) -> tuple[list[MultiViewFrame], int]:
-    """This frame with those before and after it, of the cameras that all of them have, and its position in the list."""
-    times = range(max(0, frame.time - MAX_DELAY), min(len(source.frame_ids), frame.time + MAX_DELAY + 1))
-    frames = [frame if time == frame.time else source.read(time) for time in times]
-    names = [name for name in frame.cameras.names if all(name in other.cameras.names for other in frames)]
-    return [other.select(names) for other in frames], frame.time - times[0]
 
 
 def _first_masked(source: CaptureSource, inputs: Sequence[str] | None, first: int) -> MultiViewFrame | None:

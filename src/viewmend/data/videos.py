@@ -1,27 +1,47 @@
-"""Video files: exact frames by index, and writing of MP4 and WebM."""
+"""Video files: exact frames with their presentation times, and writing of MP4 and WebM.
 
+Captures and live rigs decode films here, so they see the same frames: upright, in the colours that the file declares,
+at the times that it gives. What a container claims of length and rate is not trusted.
+"""
+
+import functools
 import threading
-from collections.abc import Iterable
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
 from io import BytesIO
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from viewmend.data.errors import CaptureError
 
 if TYPE_CHECKING:
+    from av import VideoFrame
+    from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv")
-MAX_MISSING_FRAMES = 30
-"""How many more frames a container may claim than it has."""
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".ts", ".mts", ".m2ts")
 SMPTE170M, BT709, VIDEO_RANGE = 6, 1, 1
 """ITU-T H.273 codes: the matrix of BT.601, primaries and transfer of BT.709, and luma from 16 to 235."""
+ABSOLUTE_TIMES = {"mp4", "matroska"}
+"""Containers in which time 0 is the start of the recording; in the others the first frame is."""
+MAX_ENCODER_DELAY = 2.5
+"""A fragmented MP4 with B-frames starts up to this many frames late, which is not a part of the recording."""
+HIDDEN_FRAMES = ("vp8",)
+"""Codecs of which some packets show no frame, so that packets cannot be counted instead of frames."""
+CHECKED_FRAMES = 8
+"""The times of this many frames at the start are compared with those of their packets."""
+SEEK_FRAMES = 8
+"""Fewer frames than this are decoded rather than skipped by seeking."""
+RATE_TOLERANCE = 0.01
+NO_CHROMA_FILTER = "POINT"
+"""Interpolation of chroma, as ffmpeg has it for 8 bit whatever is asked for; other bit depths follow this choice."""
 
 Image = UInt8[np.ndarray, "height width 3"]
 ImageWithAlpha = UInt8[np.ndarray, "height width 4"]
@@ -35,92 +55,241 @@ def is_video(path: str) -> bool:
 
 @dataclass(frozen=True)
 class VideoProperties:
-    """Properties of a video file."""
+    """What a video file contains: measured, whatever its header claims."""
 
+    path: Path
     width: int
     height: int
+    """Size of the upright image."""
     fps: float | None
-    frames: int
-    """How many frames can be decoded; containers often claim a few more."""
+    """Frames per second, gaps aside; None for a single frame without a declared rate."""
+    times_s: tuple[float, ...]
+    """Presentation time of each frame, increasing; 0 is the start of the recording."""
+    timestamps: tuple[int, ...] | None
+    """The decoder's own times of the frames; None if they do not increase, so that frames are counted instead."""
+    keys: tuple[int, ...]
+    """The timestamps at which decoding can start."""
+
+    @property
+    def frames(self) -> int:
+        """How many frames can be decoded."""
+        return len(self.times_s)
 
 
 def video_properties(path: Path) -> VideoProperties:
-    """Size, rate and length of a video. Only its end is decoded.
+    """Size, rate and frame times of a video. Reads its packets and decodes its start and its end.
 
     Raises:
         CaptureError: no decoder opens it, or it has no frames.
     """
-    import cv2
+    stat = path.stat() if path.is_file() else None
+    return _measured(path, None if stat is None else (stat.st_mtime_ns, stat.st_size))
 
-    decoder = cv2.VideoCapture(str(path))
-    width, height = (int(decoder.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-    frames, fps = int(decoder.get(cv2.CAP_PROP_FRAME_COUNT)), float(decoder.get(cv2.CAP_PROP_FPS))
-    for last in range(frames - 1, max(-1, frames - 1 - MAX_MISSING_FRAMES), -1):
-        decoder.set(cv2.CAP_PROP_POS_FRAMES, last)
-        if decoder.grab():
-            break
-        frames = last
-    decoder.release()
-    if min(width, height, frames) < 1:
+
+@functools.lru_cache(maxsize=512)
+def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
+    """As `video_properties`; `_version` changes with the file."""
+    with _open_video(path) as container:
+        stream = container.streams.video[0]
+        codec, base, frames = stream.codec_context, stream.time_base or Fraction(1, 25), stream.frames
+        rate = stream.average_rate or stream.guessed_rate
+        packets = [(packet.pts, packet.is_keyframe) for packet in container.demux(stream) if _shows(packet)]
+        reordered, names = codec.has_b_frames, set(container.format.name.split(","))
+    head = list(islice(_decoded(path), CHECKED_FRAMES))
+    if not head:
         raise CaptureError(f"{path}: expected a video, got a file without decodable frames; export it again")
-    return VideoProperties(width, height, fps if fps > 0 else None, frames)
+    timestamps = None if codec.name in HIDDEN_FRAMES else _timestamps(path, packets, [f.pts for f in head])
+    if timestamps is None:
+        decoded = [frame.pts for frame in _decoded(path)]
+        known = [time for time in decoded if time is not None]
+        timestamps = tuple(known) if known == sorted(set(known)) and len(known) == len(decoded) else None
+        times, base = (timestamps, base) if timestamps else (range(len(decoded)), 1 / (rate or Fraction(25)))
+    else:
+        times = timestamps
+    seconds = np.array([float(time * base) for time in times])
+    fps = _measured_rate(seconds, None if rate is None else float(rate), float(base))
+    delayed = frames == 0 and reordered and fps is not None and seconds[0] <= MAX_ENCODER_DELAY / fps
+    if not names & ABSOLUTE_TIMES or ("mp4" in names and delayed):
+        seconds -= seconds[0]
+    height, width = _upright(np.empty((head[0].height, head[0].width), np.uint8), head[0]).shape
+    keys = tuple(sorted(time for time, key in packets if key and time is not None)) if timestamps else ()
+    return VideoProperties(path, width, height, fps, tuple(seconds.tolist()), timestamps, keys)
+
+
+def _shows(packet: Any) -> bool:
+    """Whether a packet holds a frame that the edit list does not hide."""
+    return packet.size > 0 and not packet.is_discard
+
+
+def _timestamps(path: Path, packets: list[tuple[int | None, bool]], head: list[int | None]) -> tuple[int, ...] | None:
+    """The times of all frames by their packets; None if packets and the frames at the start and the end differ."""
+    times = sorted(time for time, _ in packets if time is not None)
+    if len(set(times)) != len(packets) or head[0] is None:
+        return None
+    times = times[bisect_left(times, head[0]) :]  # earlier ones lack the frames that they are predicted from
+    if times[: len(head)] != head:
+        return None
+    last_key = max((time for time, key in packets if key and time is not None and time >= times[0]), default=times[0])
+    tail = [frame.pts for frame in _decoded(path, last_key) if frame.pts is not None]
+    if last_key not in tail:
+        return None
+    return tuple(times[: bisect_left(times, last_key)] + tail[tail.index(last_key) :])
+
+
+def _measured_rate(seconds: Float64[np.ndarray, "frame"], declared: float | None, resolution_s: float) -> float | None:
+    """Frames per second between gaps; the declared rate if that is as close as the resolution of the times allows."""
+    if len(seconds) < 2:
+        return declared
+    steps = np.diff(seconds)
+    steps = steps[steps < 1.5 * np.median(steps)]
+    tolerance = RATE_TOLERANCE + resolution_s / float(steps.sum())
+    measured = 1 / float(steps.mean())
+    return declared if declared and abs(measured / declared - 1) < tolerance else measured
+
+
+def _open_video(path: Path) -> "InputContainer":
+    import av
+
+    try:
+        container = av.open(str(path), metadata_errors="ignore")
+    except (av.FFmpegError, OSError, ValueError) as error:
+        missing = isinstance(error, FileNotFoundError)
+        got = (
+            ": No such file or directory; check the path"
+            if missing
+            else " a file that no decoder opens; export it again"
+        )
+        raise CaptureError(f"{path}: expected a video, got{got}") from None
+    if not container.streams.video:
+        container.close()
+        raise CaptureError(f"{path}: expected a video, got a file without one; export it again")
+    return container
+
+
+def _decoded(path: Path, seek: int | None = None, threads: int = 0) -> "Iterator[VideoFrame]":
+    """The undamaged frames of a file in order, from the key frame at or before the timestamp `seek` on."""
+    import av
+
+    with _open_video(path) as container:
+        stream = container.streams.video[0]
+        stream.thread_type, stream.codec_context.thread_count = "AUTO", threads
+        if seek is not None:
+            container.seek(seek, stream=stream, backward=True)
+        packets = container.demux(stream)
+        while True:
+            try:
+                packet = next(packets, None)
+                if packet is None:
+                    return
+                yield from packet.decode()  # the last packet is empty and returns the frames that the decoder holds
+            except av.InvalidDataError:
+                continue
+            except av.FFmpegError:
+                return
+
+
+def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterator[tuple[int, VideoFrame]]":
+    """The frames of a file from index `start` on, each with its index. Frames that cannot be decoded are left out."""
+    times = video.timestamps
+    if start >= video.frames:
+        return
+    if times is None:
+        yield from islice(enumerate(_decoded(video.path, None, threads)), start, None)
+        return
+    key = bisect_right(video.keys, times[start]) - 1
+    frames = _decoded(video.path, video.keys[key] if key > 0 else None, threads)
+    first = next(frames, None)
+    if key > 0 and (first is None or first.pts is None or first.pts > video.keys[key]):  # the seek has missed
+        frames = _decoded(video.path, None, threads)
+        first = next(frames, None)
+    for frame in chain([] if first is None else [first], frames):
+        index = bisect_left(times, frame.pts) if frame.pts is not None else len(times)
+        if start <= index < len(times) and times[index] == frame.pts:
+            yield index, frame
+
+
+def to_rgb(frame: "VideoFrame", size_px: tuple[int, int] | None = None) -> Image:
+    """A decoded frame as an upright RGB image, by the matrix and the range that it declares, BT.601 by default.
+
+    Args:
+        frame: the frame.
+        size_px: width and height of the upright image; the frame's by default.
+    """
+    if size_px is None or size_px == ((frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)):
+        return np.ascontiguousarray(_upright(frame.to_ndarray(format="rgb24", interpolation=NO_CHROMA_FILTER), frame))
+    width, height = size_px[::-1] if is_turned(frame) else size_px
+    rgb = frame.to_ndarray(format="rgb24", width=width, height=height, interpolation="AREA")
+    return np.ascontiguousarray(_upright(rgb, frame))
+
+
+def is_turned(frame: "VideoFrame") -> bool:
+    """Whether the upright image is as wide as the stored one is high."""
+    return _display_matrix(frame)[0] == 0
+
+
+def _display_matrix(frame: "VideoFrame") -> tuple[int, int, int, int]:
+    """a, b, c, d of the display matrix, as signs: a stored (x, y) is shown at (a x + c y, b x + d y)."""
+    from av.sidedata.sidedata import Type
+
+    side_data: Any = frame.side_data  # its stub names other keys
+    matrix = side_data.get(Type.DISPLAYMATRIX)
+    if matrix is not None:
+        numbers = np.frombuffer(bytes(matrix), np.int32)
+        a, b, c, d = np.sign(np.rint(numbers[[0, 1, 3, 4]] / 2**16).astype(int)).tolist()
+        if (b == c == 0 and a * d != 0) or (a == d == 0 and b * c != 0):
+            return a, b, c, d
+    return 1, 0, 0, 1
+
+
+def _upright(image: np.ndarray, frame: "VideoFrame") -> np.ndarray:
+    """An image as stored, turned and mirrored as the frame's display matrix says; a view."""
+    a, b, c, d = _display_matrix(frame)
+    if a == 0:
+        image, a, d = image.swapaxes(0, 1), c, b
+    return image[:: -1 if d < 0 else 1, :: -1 if a < 0 else 1]
 
 
 class VideoFile:
-    """A video, read by frame index. Thread-safe.
-
-    Seeking in compressed video is inexact, so the file is decoded sequentially, and going back starts again at the
-    beginning. Read frames in order of time.
-    """
+    """A video, read by frame index. Thread-safe. Frames are cheapest in order of time."""
 
     def __init__(self, path: Path):
         self.path = path
         self._lock = threading.Lock()
-        self._decoder = None
-        self._decoded = 0  # frames decoded so far; `_last` is the last one
-        self._last: Image | None = None
+        self._frames: Iterator[tuple[int, VideoFrame]] | None = None
+        self._before, self._at = -1, -1  # indices of the last two frames that were decoded
+        self._last: VideoFrame | None = None
+        self._image: Image | None = None
 
-    def read(self, index: int, where: str) -> Image:
-        """The frame at `index` as RGB, read-only. `where` starts the error messages: file, camera, frame.
+    def read(self, index: int, where: str) -> Image | None:
+        """The frame at `index` as RGB, read-only; None if it is damaged. `where` starts the error messages.
 
         Raises:
             CaptureError: the video cannot be opened, or ends before this frame.
         """
         with self._lock:
-            if self._decoder is None or index < self._decoded - 1:
-                self._open(where)
-            while self._decoded <= index:
-                self._advance(index, where)
-            assert self._last is not None
-            return self._last
+            video = video_properties(self.path)
+            if index >= video.frames:
+                raise CaptureError(
+                    f"{where}: expected at least {index + 1} frames in the video, got {video.frames}; "
+                    "shorten 'frames' in cameras.json, or export the video again"
+                )
+            if self._frames is None or index <= self._before or self._skips(video, index):
+                self._frames = decode(video, index)
+                self._before, self._at, self._last = index - 1, index - 1, None
+            while self._at < index and (found := next(self._frames, None)) is not None:
+                self._before, (self._at, self._last), self._image = self._at, found, None
+            if self._at != index or self._last is None:
+                return None
+            if self._image is None:
+                self._image = to_rgb(self._last)
+            return self._image
 
-    def _open(self, where: str) -> None:
-        import cv2
-
-        self._decoder = cv2.VideoCapture(str(self.path))
-        self._decoded, self._last = 0, None
-        if not self._decoder.isOpened():
-            self._decoder = None
-            raise CaptureError(f"{where}: expected a video, got a file that no decoder opens; export it again")
-
-    def _advance(self, index: int, where: str) -> None:
-        import cv2
-
-        assert self._decoder is not None
-        bgr = None
-        if self._decoder.grab():
-            if self._decoded < index:  # skipped frames are not converted
-                self._decoded += 1
-                return
-            bgr = self._decoder.retrieve()[1]
-        if bgr is None:
-            end, self._decoder = self._decoded, None
-            raise CaptureError(
-                f"{where}: expected at least {index + 1} frames in the video, got {end}; "
-                "shorten 'frames' in cameras.json, or export the video again"
-            )
-        self._last = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-        self._decoded += 1
+    def _skips(self, video: VideoProperties, index: int) -> bool:
+        """Whether seeking is faster than decoding on to a frame."""
+        if video.timestamps is None or index < self._at + SEEK_FRAMES:
+            return False
+        key = bisect_right(video.keys, video.timestamps[index]) - 1
+        return key >= 0 and video.keys[key] > video.timestamps[max(self._at, 0)]
 
 
 class VideoWriter:

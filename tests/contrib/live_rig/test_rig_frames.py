@@ -16,6 +16,7 @@ from viewmend.cli import main
 from viewmend.contrib.live_rig import frames as rig_frames
 from viewmend.contrib.live_rig.frames import RigSource
 from viewmend.data.errors import CaptureError
+from viewmend.data.video_clock import Track
 from viewmend.live.client import Publisher
 
 
@@ -110,9 +111,13 @@ def test_what_is_wrong_is_said_once_until_something_else_is(rig, caplog):
 
 
 def test_recordings_are_played_as_long_as_the_shortest_is(rig, monkeypatch):
-    lengths = dict(zip(CAMERAS.names, (9.0, 7.5, 8.0, 9.0, 7.0, 7.2), strict=True))
-    monkeypatch.setattr(rig_frames, "_length_s", lambda camera: lengths[camera.name])
-    assert RigSource(rig, align=False)._playback.length_s == 7.0
+    frames = dict(zip(CAMERAS.names, (90, 75, 80, 90, 70, 72), strict=True))
+
+    def track(name, kind, path):
+        return Track(name, kind, np.arange(frames[name]) / 10, 10.0)
+
+    monkeypatch.setattr(rig_frames, "video_track", track)
+    assert RigSource(rig, align=False)._playback.length_s == pytest.approx(7.0)
 
 
 def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):

@@ -11,10 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from reference.ball_rig import CAMERAS
+from reference.films import picture, set_matrix, write_film
 
 from viewmend.contrib.live_rig import frame_readers as pictures
 from viewmend.contrib.live_rig.frame_readers import Playback, _KernelStamps, _SenderStamps, _Stamps, _Whole, pictures_of
 from viewmend.contrib.live_rig.rig_file import read_rig
+from viewmend.data.video_clock import Track
+from viewmend.data.videos import to_rgb
 
 FPS = 10
 
@@ -68,6 +71,29 @@ def test_a_recording_is_joined_where_the_others_are_and_what_is_past_is_left_out
         assert next(played).taken_s == pytest.approx(1000 + 1.2)
         clock.now += 0.25  # somebody was slow
         assert next(played).taken_s == pytest.approx(1000 + 1.4)
+
+
+def test_recordings_keep_the_times_at_which_they_started():
+    def track(name, start_s, frames):
+        return Track(name, "images", start_s + np.arange(frames) / 10, 10.0)
+
+    playback = Playback()
+    playback.follow([track("a", 5.0, 10), track("b", 5.3, 7)])
+    assert playback.length_s == pytest.approx(1.0)
+    assert playback.shifts_s == {"a": pytest.approx(-5.0), "b": pytest.approx(-5.0)}
+    playback.follow([track("a", 5.0, 10), track("b", 5.0, 9), track("c", 100.0, 10)])  # no common time
+    assert playback.length_s == pytest.approx(0.9) and playback.shifts_s["c"] == pytest.approx(-100.0)
+
+
+def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):
+    frames = [picture(number) for number in range(3)]
+    upright = write_film(tmp_path / "a.mp4", frames)
+    turned = set_matrix(write_film(tmp_path / "b.mp4", frames), "turned by 90 degrees")
+    shown = []
+    for path in (upright, turned):
+        with closing(pictures_of(replace(camera, url=str(path)), Counter(), Playback(), clock.wait)) as played:
+            shown.append(to_rgb(next(played).frame))
+    assert (np.rot90(shown[0], -1) == shown[1]).all()
 
 
 def test_an_offset_is_taken_off(camera, clock):

@@ -2,8 +2,8 @@
 
 import itertools
 import threading
-from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 from live.live_servers import WAIT_S, wait_until
@@ -19,7 +19,7 @@ SIZE = CAMERAS.max_size_px
 
 def frame(size=SIZE):
     rgb = np.full((size[1], size[0], 3), 200, np.uint8)
-    return SimpleNamespace(width=size[0], height=size[1], to_ndarray=lambda **_: rgb)
+    return av.VideoFrame.from_ndarray(rgb, format="rgb24")
 
 
 @pytest.fixture

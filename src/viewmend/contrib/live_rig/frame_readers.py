@@ -1,13 +1,18 @@
 """What a camera's address gives: pictures, by PyAV, and when they were taken."""
 
 import time
+from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from viewmend.contrib.live_rig.rig_file import LiveCamera
+from viewmend.data.errors import CaptureError
+from viewmend.data.video_clock import Track, match_tracks
+from viewmend.data.videos import decode, video_properties
 
 WINDOW_S = 10.0
 """The least delayed packet of so long says where the sender's clock is; clocks drift apart by less than 1 ms then."""
@@ -82,27 +87,29 @@ class Playback:
         self.start_s = time.monotonic()
         self.length_s = length_s
         """Where all of them start over: at the end of the shortest."""
+        self.shifts_s: dict[str, float] = {}
+        """What is added to the times in each recording, so that the first of all starts at 0; else each does."""
+
+    def follow(self, tracks: Sequence[Track]) -> None:
+        """Play these recordings by their own times.
+
+        Raises:
+            ValueError: no two of them show the same time.
+        """
+        matched = match_tracks(tracks).tracks
+        first_s = min(float(track.times_s[0]) for track in matched)
+        ends_s = [float(track.times_s[-1]) + 1 / (track.fps or 1.0) for track in matched]
+        self.length_s = min(ends_s) - first_s
+        self.shifts_s = {
+            track.camera: float(moved.times_s[0] - track.times_s[0]) - first_s
+            for track, moved in zip(tracks, matched, strict=True)
+        }
 
     def lap(self, now_s: float) -> tuple[float, float]:
         """When the current lap began, and the position in it."""
         passed_s = now_s - self.start_s
         position_s = passed_s % self.length_s
         return self.start_s + passed_s - position_s, position_s
-
-
-def file_length_s(camera: LiveCamera) -> float:
-    """How long a recording is.
-
-    Raises:
-        OSError: it cannot be opened, or has no pictures.
-    """
-    with closing(_opened(camera)) as container:
-        stream = container.streams.video[0]
-        if stream.duration is not None and stream.time_base is not None:
-            return float(stream.duration * stream.time_base)
-        if container.duration is not None:
-            return container.duration / 1e6
-    raise OSError("expected a video that says how long it is, got one that does not; write it as MP4 or MKV")
 
 
 def pictures_of(camera: LiveCamera, counts: "Counter[str]", playback: Playback, wait: Callable[[float], bool]) -> Any:
@@ -147,27 +154,26 @@ def _received(camera: LiveCamera, counts: "Counter[str]") -> Iterator[Picture]:
 
 def _played(camera: LiveCamera, playback: Playback, wait: Callable[[float], bool]) -> Iterator[Picture]:
     """A recording's pictures when their time comes; those whose time has passed are left out."""
-    with closing(_opened(camera)) as container:
-        stream = container.streams.video[0]
-        stream.codec_context.thread_count = 1
-        assert stream.time_base is not None, "FFmpeg gives every stream a unit of time"
-        first_s = float((stream.start_time or 0) * stream.time_base)
-        lap_s, position_s = playback.lap(time.monotonic())
-        while True:
-            container.seek(int((first_s + position_s) / stream.time_base), stream=stream, backward=True)
-            for frame in container.decode(stream):
-                at_s = (frame.time or 0.0) - first_s
-                due_s = lap_s + at_s
-                if at_s >= playback.length_s - 1e-6:
-                    break
-                if at_s < position_s - 1e-6 or due_s < time.monotonic() - SILENT_S / 10:
-                    continue
-                if wait(due_s - time.monotonic()):
-                    return
-                yield Picture(frame, due_s - camera.offset_s)
-            lap_s, position_s = max(lap_s + playback.length_s, playback.lap(time.monotonic())[0]), 0.0
-            if wait(lap_s - time.monotonic()):
+    try:
+        video = video_properties(Path(camera.url))
+    except CaptureError as error:
+        raise OSError(str(error)) from None
+    shift_s = playback.shifts_s.get(camera.name, -video.times_s[0])
+    times_s = [time_s + shift_s for time_s in video.times_s]
+    lap_s, position_s = playback.lap(time.monotonic())
+    while True:
+        for index, frame in decode(video, bisect_left(times_s, position_s - 1e-6), threads=1):
+            due_s = lap_s + times_s[index]
+            if times_s[index] >= playback.length_s - 1e-6:
+                break
+            if due_s < time.monotonic() - SILENT_S / 10:
+                continue
+            if wait(due_s - time.monotonic()):
                 return
+            yield Picture(frame, due_s - camera.offset_s)
+        lap_s, position_s = max(lap_s + playback.length_s, playback.lap(time.monotonic())[0]), 0.0
+        if wait(lap_s - time.monotonic()):
+            return
 
 
 def _opened(camera: LiveCamera) -> "InputContainer":

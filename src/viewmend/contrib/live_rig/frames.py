@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.contrib.live_rig.frame_readers import Playback, file_length_s, pictures_of
+from viewmend.contrib.live_rig.frame_readers import Playback, pictures_of
 from viewmend.contrib.live_rig.rig_file import LiveCamera, LiveRig, read_rig
 from viewmend.contrib.live_rig.worker import CameraWorker
-from viewmend.data.errors import CaptureError
 from viewmend.data.native_capture import CameraImages, pinhole_cameras, stack_images
 from viewmend.data.prepare import PreparedCapture, prepare
+from viewmend.data.video_clock import video_track
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
@@ -264,7 +264,9 @@ class RigSource(LiveSource):
         unchanged = {camera.key for camera in rig.cameras}
         kept = {name: worker for name, worker in self._workers.items() if worker.camera.key in unchanged}
         new = {camera.name: self._worker_of(camera) for camera in rig.cameras if camera.name not in kept}
-        length_s = min([_length_s(camera) for camera in rig.cameras if camera.is_file], default=1.0)
+        tracks = [video_track(c.name, "images", Path(c.url)) for c in rig.cameras if c.is_file]
+        if tracks:
+            self._playback.follow(tracks)
         names = tuple(camera.name for camera in rig.cameras)
         gone = [worker for name, worker in self._workers.items() if name not in kept]
         aligner = Aligner(names, 1 / (self._fps or rig.fps), rig.tolerance_s, rig.wait_s)
@@ -272,7 +274,6 @@ class RigSource(LiveSource):
             aligner.counts.update({name: self._aligner.counts[name] for name in kept})
             self._rig_file, self._prepared, self._aligner = rig, None, aligner
             self._workers = {name: (kept | new)[name] for name in names}
-        self._playback.length_s = length_s
         self._cameras = pinhole_cameras([camera.calibration for camera in rig.cameras])
         self._gather_until = None
         self._new = list(new.values())
@@ -403,10 +404,3 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size
-
-
-def _length_s(camera: LiveCamera) -> float:
-    try:
-        return file_length_s(camera)
-    except OSError as error:
-        raise CaptureError(f"{camera.url}: camera '{camera.name}': expected a video, got: {error}") from None

@@ -14,6 +14,7 @@ from viewmend.contrib.live_rig.frame_readers import Picture
 from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.errors import CaptureError
 from viewmend.data.native_capture import CameraImages, Undistortion
+from viewmend.data.videos import is_turned, to_rgb
 from viewmend.preprocess.masks.maker import Mask, MaskMaker, Rgb
 from viewmend.preprocess.masks.person import PersonMasks
 from viewmend.preprocess.masks.plate import PlateMasks, read_plate
@@ -125,13 +126,14 @@ class CameraInput:
             ValueError: it has another size than the calibration.
         """
         frame, camera = picture.frame, self._camera.calibration
-        if (frame.width, frame.height) != self._camera.taken_px:
+        size = (frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)
+        if size != self._camera.taken_px:
             expected = "{} x {}".format(*self._camera.taken_px)
             raise ValueError(
-                f"expected pictures of {expected} as the calibration says, got {frame.width} x {frame.height}; "
+                f"expected pictures of {expected} as the calibration says, got {size[0]} x {size[1]}; "
                 "set the camera's mode in 'options'"
             )
-        rgb = frame.to_ndarray(format="rgb24", width=camera.width, height=camera.height, interpolation="AREA")
+        rgb = to_rgb(frame, (camera.width, camera.height))
         return self._undistortion.apply(CameraImages(rgb, self._masks.mask(rgb), None))
 
 

@@ -1,10 +1,9 @@
-"""Finds a camera that is inconsistent with the others: in its masks, its pose, or its timing.
+"""Finds a camera whose masks or pose are inconsistent with the others'.
 
 Each test leaves cameras out in turn and looks at how well the others agree.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -33,19 +32,6 @@ MAX_REMOVED, LEAVE_OUT_REMOVED = 0.004, 0.06
 larger share on it is left out: a smaller error costs less than a missing camera."""
 MAX_OUTSIDE, LEAVE_OUT_OUTSIDE = 0.15, 0.3
 """It is also one if this share of its mask is outside the others' hull, beyond 3 times the median."""
-
-MAX_DELAY = 4
-"""Largest delay that is searched, in frames."""
-MIN_DELAY_GAIN = 0.008
-"""A camera may be delayed if the share of its mask outside the others' hull is this much lower in another frame."""
-MAX_DELAY_CANDIDATES = 3
-"""The camera opposite a delayed one looks delayed too, so several are tried."""
-MIN_EXPLAINED = 0.002
-"""A camera is delayed if its mask of another frame lets the hull explain this much more of all masks."""
-SHARPER = 1.015
-"""Images are delayed if those of another frame have this much stronger edges along the outlines of the masks."""
-MIN_OUTLINE_FRAMES = 3
-"""Edges are compared by the median of this many frames or more, since one frame may be damaged."""
 
 OUTLINE_LONGEST_PX = 384
 """Size of the images whose outlines are compared."""
@@ -92,31 +78,32 @@ def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None) -> LeaveOneOut |
         return None
     inside, step = mask > FOREGROUND, max(1, -(-len(names) // MAX_PEERS))
     try:
-        missed = _missed(inside, reconstruct(mask, frame.cameras, bounds, HULL).depth(frame.cameras) > 0)
+        missed = missed_share(inside, reconstruct(mask, frame.cameras, bounds, HULL).depth(frame.cameras) > 0)
         silhouettes, removed = [], []
         for view, name in enumerate(names):
             others, peers = frame.without([name]), [v for v in range(0, len(names), step) if v != view]
             assert others.mask is not None
             proxy = reconstruct(others.mask, others.cameras, bounds, HULL)
-            covered = _pad_like(proxy.depth(frame.cameras[[view, *peers]]) > 0, mask)
-            removed.append((missed[peers] - _missed(inside[peers], covered[1:])).nanmean())
+            covered = pad_like(proxy.depth(frame.cameras[[view, *peers]]) > 0, mask)
+            removed.append((missed[peers] - missed_share(inside[peers], covered[1:])).nanmean())
             silhouettes.append(covered[0])
     except ValueError:  # without this camera, nothing is in front of all others
         return None
     covered = torch.stack(silhouettes)
-    return LeaveOneOut(covered, torch.stack(removed).nan_to_num(0.0), _missed(inside, covered).nan_to_num(0.0))
+    return LeaveOneOut(covered, torch.stack(removed).nan_to_num(0.0), missed_share(inside, covered).nan_to_num(0.0))
 
 
-def _missed(
+def missed_share(
     inside: Bool[Tensor, "view height width"], covered: Bool[Tensor, "view height width"]
 ) -> Float[Tensor, "view"]:
     """The share of each mask that a silhouette does not cover; NaN for an empty mask."""
     return (inside & ~covered).sum((1, 2)) / inside.sum((1, 2))
 
 
-def _pad_like(
+def pad_like(
     covered: Bool[Tensor, "view _height _width"], mask: UInt8[Tensor, "_view height width"]
 ) -> Bool[Tensor, "view height width"]:
+    """A silhouette padded right and below with False to the size of the masks."""
     return F.pad(covered, (0, mask.shape[2] - covered.shape[2], 0, mask.shape[1] - covered.shape[1]))
 
 
@@ -146,113 +133,6 @@ def _outlier(text: str, camera: str, leave_out: bool) -> Issue:
     if leave_out:
         return Issue(f"{text}, so it is left out; {advice}", camera=camera, always=True)
     return Issue(f"{text}; {advice}")
-
-
-def find_desynchronised_camera(
-    frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | None
-) -> tuple[Issue, ...]:
-    """Find the camera whose mask of another frame fits the others' masks of `frames[middle]` best.
-
-    If the masks are in sync, looks for images that are out of sync with their own masks.
-
-    Args:
-        frames: consecutive frames.
-        middle: index of the frame to check.
-        bounds: the bounds of the capture.
-    """
-    small = [limit_size(frame, LONGEST_PX) for frame in frames]
-    names = [name for name in small[middle].cameras.names if all(name in frame.cameras.names for frame in small)]
-    small = [frame.select(names) for frame in small]
-    found = leave_one_out(small[middle], bounds)
-    if found is None or len(frames) < 2:
-        return ()
-    outside = torch.stack(
-        [_missed(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None]
-    ).nan_to_num(1.0)
-    gain, best = outside[middle] - outside.amin(0), outside.argmin(0).tolist()
-    views = gain.argsort(descending=True)[:MAX_DELAY_CANDIDATES].tolist()
-    unexplained = {
-        view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds)
-        for view in views
-        if float(gain[view]) > MIN_DELAY_GAIN
-    }
-    if unexplained:
-        view = min(unexplained, key=lambda view: unexplained[view])
-        if unexplained[view] < _unexplained(small[middle], bounds) - MIN_EXPLAINED:
-            delay = describe_delay(best[view] - middle)
-            return (
-                Issue(f"camera '{names[view]}': {delay}, compared with the others' masks; shift its files in time"),
-            )
-    return check_image_mask_sync(small)
-
-
-def _with_mask_of(frames: Sequence[MultiViewFrame], middle: int, view: int, time: int) -> MultiViewFrame:
-    """The frame in the middle, with one camera's mask from another frame."""
-    frame, other = frames[middle], frames[time]
-    assert frame.mask is not None and other.mask is not None
-    mask = frame.mask.clone()
-    mask[view] = other.mask[view]
-    return replace(frame, mask=mask)
-
-
-def _unexplained(frame: MultiViewFrame, bounds: Bounds | None) -> float:
-    """The share of the masks that the hull does not cover, mean of all cameras."""
-    assert frame.mask is not None
-    try:
-        covered = reconstruct(frame.mask, frame.cameras, bounds, HULL).depth(frame.cameras) > 0
-    except ValueError:
-        return 1.0
-    return float(_missed(frame.mask > FOREGROUND, _pad_like(covered, frame.mask)).nanmean().nan_to_num(1.0))
-
-
-def describe_delay(frames: int) -> str:
-    """A delay of a camera by this number of frames, in words."""
-    return f"{'late' if frames > 0 else 'early'} by about {abs(frames)} frame{'s' if abs(frames) > 1 else ''}"
-
-
-def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]:
-    """Find cameras whose images have stronger edges along the outlines of their own masks in another frame.
-
-    `frames` are consecutive, of the same cameras, and should be small.
-    """
-    if any(frame.mask is None for frame in frames):
-        return ()
-    masks = [frame.mask for frame in frames if frame.mask is not None]
-    edges = torch.stack([_gradient(frame.rgb.float()) for frame in frames])
-    outlines = torch.stack([_gradient((mask > FOREGROUND).float()[:, None]) for mask in masks])
-    outlines = F.normalize(outlines, dim=3)  # unit normals of the outline; 0 elsewhere
-    reach = min(len(frames) // 2, len(frames) - MIN_OUTLINE_FRAMES)
-    delays = [delay for delay in range(-reach, reach + 1) if delay]
-    if not delays:
-        return ()
-    ratios = torch.stack([_edge_ratio(edges, outlines, delay) for delay in delays])
-    text = "the images of camera '{}': {} compared with its masks; shift its images or its masks in time"
-    return tuple(
-        Issue(text.format(name, describe_delay(delays[int(own.argmax())])))
-        for name, own in zip(frames[0].cameras.names, ratios.unbind(1), strict=True)
-        if float(own.max()) > SHARPER
-    )
-
-
-def _gradient(image: Float[Tensor, "view channel height width"]) -> Float[Tensor, "view channel 2 height width"]:
-    """Central differences in x and y."""
-    padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
-    return torch.stack(
-        [padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]], 2
-    )
-
-
-def _edge_ratio(
-    edges: Float[Tensor, "time view channel 2 height width"],
-    outlines: Float[Tensor, "time view 1 2 height width"],
-    delay: int,
-) -> Float[Tensor, "view"]:
-    """Strength of the edges across an outline in the image `delay` frames later, relative to its own; the median."""
-    first, count = max(0, -delay), len(edges) - abs(delay)
-    own, shifted = (edges[start : start + count] for start in (first, first + delay))
-    normals = outlines[first : first + count]
-    later, now = ((image * normals).sum(3).abs().sum((2, 3, 4)) for image in (shifted, own))
-    return (later / now.clamp(min=1.0)).median(0).values
 
 
 def find_outlier_by_outlines(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[tuple[str, ...], float] | None:

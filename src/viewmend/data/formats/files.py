@@ -14,6 +14,7 @@ import numpy as np
 from viewmend.data.containers import read_bytes
 from viewmend.data.images import size_from_header
 from viewmend.data.native_format import stays_inside
+from viewmend.data.video_clock import match_tracks, video_track
 from viewmend.data.videos import is_video, video_properties
 
 HEADER_BYTES = 2**20
@@ -174,14 +175,13 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
-    entries, frames, rates = {}, set(), []
+    entries, frames, fps = {}, set(), None
     paths = {name: _only_video(folder, path) or path for name, path in paths.items()}
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
         if name in videos:
             video = videos[name]
             entries[name] = {"width": video.width, "height": video.height, "video": path}
-            rates.append(video.fps)
             continue
         images = list_images(folder, path)
         if images is None:
@@ -189,11 +189,15 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         width, height = image_size_px(folder, images.first())
         entries[name] = {"width": width, "height": height, "image": images.pattern}
         frames |= images.frames
-    if videos:
-        frames = {f"{time:06d}" for time in range(min(video.frames for video in videos.values()))}
     for name, mask in _find_masks(folder, tuple(paths)).items():
         entries[name] |= mask
-    return Footage(tuple(sorted(frames, key=frame_order)), rates[0] if rates else None, entries)
+    if videos:
+        tracks = [video_track(name, "images", folder / paths[name]) for name in videos]
+        masks = {name: str(entry.get("mask", "")) for name, entry in entries.items()}
+        tracks += [video_track(name, "masks", folder / masks[name]) for name in videos if is_video(masks[name])]
+        clock = match_tracks(tracks)
+        frames, fps = {f"{time:06d}" for time in range(clock.end)}, clock.fps
+    return Footage(tuple(sorted(frames, key=frame_order)), fps, entries)
 
 
 def list_images(folder: Path, place: str) -> ImageList | None:

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int, UInt8
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats.files import collect_footage, list_images
-from viewmend.data.native_capture import CameraReader
+from viewmend.data.native_capture import CameraReader, read_clock
 from viewmend.data.native_format import FILE_KINDS, NativeCalibration, NativeCamera
 from viewmend.data.videos import is_video
 
@@ -261,14 +261,15 @@ def look_for(
     """
     import cv2
 
-    seen = {}
+    seen, clock = {}, read_clock(footage)
     for view, camera in enumerate(track(footage.cameras)):
-        reader = CameraReader(footage.folder, camera)
+        reader = CameraReader(footage.folder, camera, footage.frames, clock)
         for time in times:
-            frame = footage.frames[time]
-            if camera.image and not (footage.folder / camera.file("image", frame)).is_file():
+            if not reader.has(time, lambda path: (footage.folder / path).is_file()):
                 continue
-            grey = cv2.cvtColor(reader.read(frame, time).rgb, cv2.COLOR_RGB2GRAY)
+            if (images := reader.read(time)) is None:
+                continue
+            grey = cv2.cvtColor(images.rgb, cv2.COLOR_RGB2GRAY)
             if (corners := board.find(grey)) is not None:
                 seen[view, time] = corners
     return seen

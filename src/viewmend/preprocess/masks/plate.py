@@ -177,4 +177,5 @@ def _paths(names: Sequence[str], place: str) -> list[Path]:
 
 def _video_frames(path: Path, where: str) -> list[Rgb]:
     video = VideoFile(path)
-    return [video.read(index, where) for index in spread(range(video_properties(path).frames))]
+    images = [video.read(index, where) for index in spread(range(video_properties(path).frames))]
+    return [image for image in images if image is not None]

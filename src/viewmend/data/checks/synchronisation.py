@@ -1,0 +1,171 @@
+"""Finds cameras whose images or masks are late or early, by comparing outlines in neighbouring frames."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from viewmend.data.checks.leave_one_out import HULL, LONGEST_PX, leave_one_out, missed_share, pad_like
+from viewmend.data.errors import Issue
+from viewmend.data.resize import limit_size
+from viewmend.data.source import CaptureSource
+from viewmend.geometry.bounds import Bounds
+from viewmend.geometry.hull import FOREGROUND
+from viewmend.geometry.proxy import reconstruct
+from viewmend.types import MultiViewFrame
+
+MAX_DELAY = 4
+"""Largest delay that is searched, in frames."""
+MIN_DELAY_GAIN = 0.008
+"""A camera may be delayed if the share of its mask outside the others' hull is this much lower in another frame."""
+MAX_DELAY_CANDIDATES = 3
+"""The camera opposite a delayed one looks delayed too, so several are tried."""
+MIN_EXPLAINED = 0.002
+"""A camera is delayed if its mask of another frame lets the hull explain this much more of all masks."""
+SHARPER = 1.015
+"""Images are delayed if those of another frame have this much stronger edges along the outlines of the masks."""
+MIN_OUTLINE_FRAMES = 3
+"""Edges are compared by the median of this many frames or more, since one frame may be damaged."""
+
+
+def find_desynchronised_cameras(
+    source: CaptureSource, frame: MultiViewFrame, last: int | None = None
+) -> tuple[Issue, ...]:
+    """Find cameras that are late or early around a frame, or else around a later one.
+
+    A camera that is in step in the first place only has lost frames on the way.
+
+    Args:
+        source: the capture.
+        frame: one of its frames, with the cameras to check.
+        last: index of a later frame to check too.
+    """
+    issues = find_desynchronised_camera(*_frames_around(source, frame, frame.time), source.bounds, source.fps)
+    if issues or last is None or last <= frame.time + MAX_DELAY:
+        return issues
+    later = find_desynchronised_camera(*_frames_around(source, frame, last), source.bounds, source.fps)
+    text = "{} (at frame '{}', but not at frame '{}': frames were lost in between)"
+    first_id, last_id = source.frame_ids[frame.time], source.frame_ids[last]
+    return tuple(replace(issue, text=text.format(issue.text, last_id, first_id)) for issue in later)
+
+
+def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> tuple[list[MultiViewFrame], int]:
+    """The frames around a time, of the cameras of `frame` that all of them have, and the time's position among them."""
+    times = range(max(0, time - MAX_DELAY), min(len(source.frame_ids), time + MAX_DELAY + 1))
+    frames = [frame if other == frame.time else source.read(other) for other in times]
+    names = [name for name in frame.cameras.names if all(name in other.cameras.names for other in frames)]
+    return [other.select(names) for other in frames], time - times[0]
+
+
+def find_desynchronised_camera(
+    frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | None, fps: float | None = None
+) -> tuple[Issue, ...]:
+    """Find the camera whose mask of another frame fits the others' masks of `frames[middle]` best.
+
+    If the masks are in sync, looks for images that are out of sync with their own masks.
+
+    Args:
+        frames: consecutive frames.
+        middle: index of the frame to check.
+        bounds: the bounds of the capture.
+        fps: frames per second, to state delays in milliseconds.
+    """
+    small = [limit_size(frame, LONGEST_PX) for frame in frames]
+    names = [name for name in small[middle].cameras.names if all(name in frame.cameras.names for frame in small)]
+    small = [frame.select(names) for frame in small]
+    found = leave_one_out(small[middle], bounds)
+    if found is None or len(frames) < 2:
+        return ()
+    outside = torch.stack(
+        [missed_share(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None]
+    ).nan_to_num(1.0)
+    gain, best = outside[middle] - outside.amin(0), outside.argmin(0).tolist()
+    views = gain.argsort(descending=True)[:MAX_DELAY_CANDIDATES].tolist()
+    unexplained = {
+        view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds)
+        for view in views
+        if float(gain[view]) > MIN_DELAY_GAIN
+    }
+    if unexplained:
+        view = min(unexplained, key=lambda view: unexplained[view])
+        if unexplained[view] < _unexplained(small[middle], bounds) - MIN_EXPLAINED:
+            frames_late = best[view] - middle
+            shift = "shift its files in time"
+            if fps is not None:
+                change, by_ms = "raise" if frames_late > 0 else "lower", abs(1000 * frames_late / fps)
+                shift += f", or {change} its offset_ms in cameras.json by {by_ms:.0f}"
+            delay = describe_delay(frames_late)
+            return (Issue(f"camera '{names[view]}': {delay}, compared with the others' masks; {shift}"),)
+    return check_image_mask_sync(small)
+
+
+def _with_mask_of(frames: Sequence[MultiViewFrame], middle: int, view: int, time: int) -> MultiViewFrame:
+    """The frame in the middle, with one camera's mask from another frame."""
+    frame, other = frames[middle], frames[time]
+    assert frame.mask is not None and other.mask is not None
+    mask = frame.mask.clone()
+    mask[view] = other.mask[view]
+    return replace(frame, mask=mask)
+
+
+def _unexplained(frame: MultiViewFrame, bounds: Bounds | None) -> float:
+    """The share of the masks that the hull does not cover, mean of all cameras."""
+    assert frame.mask is not None
+    try:
+        covered = reconstruct(frame.mask, frame.cameras, bounds, HULL).depth(frame.cameras) > 0
+    except ValueError:
+        return 1.0
+    return float(missed_share(frame.mask > FOREGROUND, pad_like(covered, frame.mask)).nanmean().nan_to_num(1.0))
+
+
+def describe_delay(frames: int) -> str:
+    """A delay of a camera by this number of frames, in words."""
+    return f"{'late' if frames > 0 else 'early'} by about {abs(frames)} frame{'s' if abs(frames) > 1 else ''}"
+
+
+def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]:
+    """Find cameras whose images have stronger edges along the outlines of their own masks in another frame.
+
+    `frames` are consecutive, of the same cameras, and should be small.
+    """
+    if any(frame.mask is None for frame in frames):
+        return ()
+    masks = [frame.mask for frame in frames if frame.mask is not None]
+    edges = torch.stack([_gradient(frame.rgb.float()) for frame in frames])
+    outlines = torch.stack([_gradient((mask > FOREGROUND).float()[:, None]) for mask in masks])
+    outlines = F.normalize(outlines, dim=3)  # unit normals of the outline; 0 elsewhere
+    reach = min(len(frames) // 2, len(frames) - MIN_OUTLINE_FRAMES)
+    delays = [delay for delay in range(-reach, reach + 1) if delay]
+    if not delays:
+        return ()
+    ratios = torch.stack([_edge_ratio(edges, outlines, delay) for delay in delays])
+    text = "the images of camera '{}': {} compared with its masks; shift its images or its masks in time"
+    return tuple(
+        Issue(text.format(name, describe_delay(delays[int(own.argmax())])))
+        for name, own in zip(frames[0].cameras.names, ratios.unbind(1), strict=True)
+        if float(own.max()) > SHARPER
+    )
+
+
+def _gradient(image: Float[Tensor, "view channel height width"]) -> Float[Tensor, "view channel 2 height width"]:
+    """Central differences in x and y."""
+    padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
+    return torch.stack(
+        [padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]], 2
+    )
+
+
+def _edge_ratio(
+    edges: Float[Tensor, "time view channel 2 height width"],
+    outlines: Float[Tensor, "time view 1 2 height width"],
+    delay: int,
+) -> Float[Tensor, "view"]:
+    """Strength of the edges across an outline in the image `delay` frames later, relative to its own; the median."""
+    first, count = max(0, -delay), len(edges) - abs(delay)
+    own, shifted = (edges[start : start + count] for start in (first, first + delay))
+    normals = outlines[first : first + count]
+    later, now = ((image * normals).sum(3).abs().sum((2, 3, 4)) for image in (shifted, own))
+    return (later / now.clamp(min=1.0)).median(0).values

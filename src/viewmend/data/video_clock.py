@@ -1,0 +1,234 @@
+"""One clock for all films of a capture: which frame of each film shows what the others show at the same time."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from viewmend.data.errors import CaptureError, Issue
+from viewmend.data.videos import video_properties
+
+ABSENT = -1
+"""Stands for the frame of a film that has none at a time."""
+TOLERANCE, NEW_TIME = 0.5, 0.75
+"""In frame periods: a frame belongs to a time if it is at most the first from it, and adds a time of its own if it is
+farther than the second from all others."""
+GAP = 1.5
+"""Frames are missing where the interval is this many periods."""
+SAME_PHASE = 0.5
+"""Frames keep a constant distance to the times if the mean of their unit phasors is this long."""
+RATE_TOLERANCE = 0.02
+NOTEWORTHY = 0.05
+"""Films that differ in length by a smaller share are not mentioned."""
+MAX_NAMED = 3
+
+TrackKind = Literal["images", "masks"]
+
+
+@dataclass(frozen=True)
+class Track:
+    """When the frames of a film were taken, or those of a camera's numbered images."""
+
+    camera: str
+    kind: TrackKind
+    times_s: Float64[np.ndarray, "frame"]
+    """Increasing, by the film's own clock."""
+    fps: float | None
+    """Frames per second, gaps aside; None for a single frame."""
+    offset_s: float = 0.0
+    """How far the camera's clock is ahead of the others'."""
+
+    @property
+    def gaps(self) -> list[tuple[float, int]]:
+        """Where frames are missing: the time at which the first should be, in seconds, and their number."""
+        if self.fps is None:
+            return []
+        steps = np.diff(self.times_s) * self.fps
+        return [
+            (float(self.times_s[at]) + 1 / self.fps, round(float(steps[at])) - 1)
+            for at in np.flatnonzero(steps > GAP).tolist()
+        ]
+
+
+def video_track(camera: str, kind: TrackKind, path: Path, offset_s: float = 0.0) -> Track:
+    """The track of a film.
+
+    Raises:
+        CaptureError: it cannot be decoded.
+    """
+    try:
+        video = video_properties(path)
+    except CaptureError as error:
+        raise CaptureError(f"{path}: camera '{camera}': {str(error).removeprefix(f'{path}: ')}") from None
+    return Track(camera, kind, np.array(video.times_s), video.fps, offset_s)
+
+
+@dataclass(frozen=True)
+class VideoClock:
+    """The times of a capture, and the frame of each film at each of them."""
+
+    tracks: tuple[Track, ...]
+    """With offsets subtracted from their times."""
+    reference_fps: float | None
+    """Frames per second of the film that sets the times; at least half of the cameras are as fast."""
+    times_s: Float64[np.ndarray, "time"]
+    """When two cameras or more have all of their frames."""
+    end: int
+    """How many of the times lie before the end of the shortest film."""
+    frames: Mapping[tuple[str, TrackKind], Int[np.ndarray, "time"]]
+    """Index of each film's frame at each time; `ABSENT` without one."""
+    moved: frozenset[tuple[str, TrackKind]]
+    """Films that had no time in common with the others, and were moved to start together with them."""
+    by_index: frozenset[str]
+    """Cameras whose masks have other times, but as many frames as their images, and were matched one to one."""
+
+    @property
+    def fps(self) -> float | None:
+        """Mean number of times per second; None for a single time."""
+        times = self.times_s[: self.end]
+        if len(times) < 2:
+            return None
+        mean = (len(times) - 1) / float(times[-1] - times[0])
+        rate = self.reference_fps
+        return rate if rate is not None and abs(mean / rate - 1) < RATE_TOLERANCE else round(mean, 3)
+
+    def describe(self, camera: str) -> list[dict[str, Any]]:
+        """Rate, length, gaps and offset of a camera's films, for `viewmend check`."""
+        return [
+            {
+                "kind": track.kind,
+                "frames": len(track.times_s),
+                "fps": track.fps,
+                "start_s": _extent([track])[0],
+                "end_s": _extent([track])[1],
+                "gaps": track.gaps,
+                "offset_ms": 1000 * track.offset_s,
+            }
+            for track in self.tracks
+            if track.camera == camera
+        ]
+
+    def issues(self, cameras: Sequence[str]) -> tuple[Issue, ...]:
+        """What is wrong with the times of these cameras' films; one issue for all cameras with the same fault."""
+        faults: dict[str, list[str]] = {}
+        for track in self.tracks:
+            if track.camera in cameras:
+                for fault in self._faults(track):
+                    faults.setdefault(fault, []).append(track.camera)
+        return tuple(Issue(fault.format(_named(names))) for fault, names in faults.items())
+
+    def _faults(self, track: Track) -> list[str]:
+        """The faults of a film, with {} for the camera."""
+        images = [other for other in self.tracks if other.kind == "images"]
+        rate, what, than, faults = self.reference_fps or 1.0, f"the {track.kind} of {{}}", "the others'", []
+        if track.kind == "masks":
+            images, than = [other for other in images if other.camera == track.camera], "the images'"
+            if track.camera in self.by_index:
+                return [f"{what} have other times than the images, but as many frames; they are matched one to one"]
+            if np.array_equal(track.times_s, images[0].times_s):
+                return []
+        if (track.camera, track.kind) in self.moved:
+            faults.append(f"{what} have no time in common with {than}; they are taken to start together")
+        if track.fps and track.fps < rate * (1 - RATE_TOLERANCE):
+            text = f"{what} have {track.fps:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+            faults.append(f"{text}, and the camera is absent in between")
+        if track.gaps:
+            lost, from_s = sum(count for _, count in track.gaps), track.gaps[0][0]
+            text = f"{what} lack {lost} frame{'s' if lost > 1 else ''} from {from_s:.2f} s on"
+            faults.append(f"{text}, by the film's own times; the camera is absent there")
+        start_s, end_s = _extent(images)
+        late_s, early_s = float(track.times_s[0]) - start_s, end_s - _extent([track])[1]
+        least_s = max(NOTEWORTHY * (end_s - start_s), NEW_TIME / rate)
+        if late_s > least_s:
+            faults.append(f"{what} start {late_s:.2f} s after {than}; the camera is absent before")
+        if early_s > least_s:
+            faults.append(f"{what} end {early_s:.2f} s before {than}; the capture ends, or the camera is absent, there")
+        return faults
+
+
+def _extent(tracks: Sequence[Track]) -> tuple[float, float]:
+    """When the first of some films starts, and the last one ends."""
+    ends = [float(track.times_s[-1]) + (1 / track.fps if track.fps else 0.0) for track in tracks]
+    return min(float(track.times_s[0]) for track in tracks), max(ends)
+
+
+def _named(cameras: list[str]) -> str:
+    names = ", ".join(f"'{name}'" for name in cameras[:MAX_NAMED])
+    more = f" and {len(cameras) - MAX_NAMED} more" if len(cameras) > MAX_NAMED else ""
+    return f"camera{'s' if len(cameras) > 1 else ''} {names}{more}"
+
+
+def match_tracks(tracks: Sequence[Track]) -> VideoClock:
+    """Match films by time. A film of the rate that at least half of the cameras have sets the times.
+
+    Other films fill its gaps. Films of its rate that run with a constant distance of less than a frame are matched one
+    to one, and so are masks with as many frames as their images.
+
+    Raises:
+        ValueError: no two cameras have a frame at the same time.
+    """
+    tracks = [_moved(track, -track.offset_s) for track in tracks]
+    images = {track.camera: track for track in tracks if track.kind == "images"}
+    order = sorted(images.values(), key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True)
+    rate = round(order[len(order) // 2].fps or 0.0, 1)
+    reference = next(track for track in order if round(track.fps or 0.0, 1) == rate)
+    period_s = 1 / (reference.fps or 1.0)
+    moved, by_index = set(), set()
+    for number, track in enumerate(tracks):
+        peer = reference if track.kind == "images" else images[track.camera]
+        early_s, late_s = peer.times_s[0] - track.times_s[-1], track.times_s[0] - peer.times_s[-1]
+        if track.kind == "masks" and len(track.times_s) == len(peer.times_s):
+            if np.abs(np.diff(track.times_s - peer.times_s)).max(initial=0.0) > TOLERANCE * period_s:
+                by_index.add(track.camera)
+            tracks[number] = replace(track, times_s=peer.times_s)
+        elif max(early_s, late_s) > period_s:
+            moved.add((track.camera, track.kind))
+            tracks[number] = _moved(track, float(peer.times_s[0] - track.times_s[0]))
+        if track.kind == "images":
+            images[track.camera] = tracks[number]
+    centred = [track.times_s - _phase_s(track.times_s, reference.times_s, period_s) for track in tracks]
+    times = reference.times_s
+    for track, own in zip(tracks, centred, strict=True):
+        if track.kind == "images":
+            far = np.abs(own - times[_nearest(times, own)]) > NEW_TIME * period_s
+            times = np.sort(np.concatenate([times, own[far]]))
+    found: dict[tuple[str, TrackKind], np.ndarray] = {}
+    for track, own in zip(tracks, centred, strict=True):
+        found[track.camera, track.kind] = _frames_at(times, own, period_s)
+    complete = [np.min([found[key] for key in found if key[0] == camera], axis=0) != ABSENT for camera in images]
+    kept = np.sum(complete, axis=0) >= min(2, len(images))
+    if not kept.any():
+        raise ValueError("expected films of which two show the same time, got none; check their times and offset_ms")
+    times, frames = times[kept], {key: index[kept] for key, index in found.items()}
+    ends = [own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)]
+    end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))
+    return VideoClock(tuple(tracks), reference.fps, times, end, frames, frozenset(moved), frozenset(by_index))
+
+
+def _moved(track: Track, by_s: float) -> Track:
+    return replace(track, times_s=track.times_s + by_s)
+
+
+def _nearest(times: Float64[np.ndarray, "time"], wanted: Float64[np.ndarray, "frame"]) -> Int[np.ndarray, "frame"]:
+    """Index of the time nearest to each wanted one."""
+    return np.searchsorted((times[1:] + times[:-1]) / 2, wanted)
+
+
+def _phase_s(own: Float64[np.ndarray, "frame"], times: Float64[np.ndarray, "time"], period_s: float) -> float:
+    """The constant distance of a film's frames from the times, less than half a period; 0 if it is not constant."""
+    distances = own - times[_nearest(times, own)]
+    mean = np.exp(2j * np.pi * distances[np.abs(distances) < period_s] / period_s)
+    if not len(mean) or abs(mean.mean()) < SAME_PHASE:
+        return 0.0
+    return float(np.angle(mean.mean())) / (2 * np.pi) * period_s
+
+
+def _frames_at(
+    times: Float64[np.ndarray, "time"], own: Float64[np.ndarray, "frame"], period_s: float
+) -> Int[np.ndarray, "time"]:
+    """Index of the film's frame at each time; `ABSENT` without one."""
+    index = _nearest(own, times)
+    return np.where(np.abs(own[index] - times) <= TOLERANCE * period_s + 1e-6, index, ABSENT)
