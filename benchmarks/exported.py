@@ -21,7 +21,7 @@ from reference.random_views import holed, images, mended, random_view
 from viewmend import Stream, StreamConfig, load_inpainter
 from viewmend.data.synthetic.rigs import orbit
 from viewmend.data.synthetic.stage import Studio, StudioConfig
-from viewmend.export.model_inputs import ViewInputs, ViewOutputs
+from viewmend.export.traceable import ViewInputs, ViewOutputs
 from viewmend.models.base import ContextProvider
 from viewmend.models.views.model import ViewSynthNet
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from viewmend import Stream, StreamConfig, load_inpainter
 from viewmend.data.synthetic.rigs import orbit
 from viewmend.data.synthetic.stage import Studio, StudioConfig
-from viewmend.export.model_inputs import ViewInputs
+from viewmend.export.traceable import ViewInputs
 from viewmend.models.base import ContextProvider
 from viewmend.utils.atomic_writes import write_tensors
 

@@ -10,7 +10,7 @@ from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pix
 from viewmend.geometry.rigid import look_at
 from viewmend.preprocess.masks.chroma import ChromaMasks, without_spill
 from viewmend.preprocess.masks.maker import MaskMaker, lasting
-from viewmend.preprocess.masks.multi_view_cleanup import agreed
+from viewmend.preprocess.masks.masked import agreed
 from viewmend.preprocess.masks.plate import PlateMasks, median_plate
 
 HEIGHT, WIDTH = 120, 160

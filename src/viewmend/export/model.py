@@ -12,8 +12,7 @@ import torch
 from torch.export import Dim, ExportedProgram
 
 from viewmend import __version__
-from viewmend.export.model_inputs import ViewInputs, ViewOutputs
-from viewmend.export.traceable import LARGEST_PX, ExportedModel
+from viewmend.export.traceable import LARGEST_PX, ExportedModel, ViewInputs, ViewOutputs
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.utils.atomic_writes import write_atomically
 

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.data.images import write_image
-from viewmend.export.camera_files import blender_script, engine_from_world, usd_scene
-from viewmend.export.mesh_files import write_glb, write_ply
+from viewmend.export.scene_files import blender_script, engine_from_world, usd_scene, write_glb, write_ply
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.geometry.hull import FOREGROUND

@@ -6,7 +6,14 @@ import torch
 from data.synthetic.tiny_performer import write_motion
 
 from viewmend.data.synthetic.gltf_performer import GltfPerformer
-from viewmend.data.synthetic.performer import TexturedMesh
+from viewmend.data.synthetic.performer import (
+    TexturedMesh,
+    face_levels,
+    linear_from_srgb,
+    sample_texture,
+    srgb_from_linear,
+    texture_pyramid,
+)
 from viewmend.data.synthetic.render import (
     SHADOW_BIAS_M,
     Lights,
@@ -19,13 +26,6 @@ from viewmend.data.synthetic.render import (
     visibility,
 )
 from viewmend.data.synthetic.rigs import orbit, ring_rig
-from viewmend.data.synthetic.textures import (
-    face_levels,
-    linear_from_srgb,
-    sample_texture,
-    srgb_from_linear,
-    texture_pyramid,
-)
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize

@@ -14,7 +14,7 @@ import torch
 from reference.random_views import holed, images, mended, random_view
 from safetensors.torch import load_file
 
-from viewmend.export.model_inputs import ViewInputs, ViewOutputs
+from viewmend.export.traceable import ViewInputs, ViewOutputs
 from viewmend.models.checkpoint import load_inpainter, save_inpainter
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet

@@ -6,8 +6,7 @@ import pytest
 import torch
 from reference.random_views import holed, images, mended, random_view
 
-from viewmend.export.model_inputs import ViewInputs, ViewOutputs
-from viewmend.export.traceable import ExportedModel, fill_any_size, pull_push_any_size
+from viewmend.export.traceable import ExportedModel, ViewInputs, ViewOutputs, fill_any_size, pull_push_any_size
 from viewmend.models.smooth_fill import fill, pull_push
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet

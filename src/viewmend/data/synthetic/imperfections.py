@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from viewmend.data.synthetic.textures import linear_from_srgb, srgb_from_linear
+from viewmend.data.synthetic.performer import linear_from_srgb, srgb_from_linear
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.rigid import rotation_from_axis_angle
 from viewmend.types import MultiViewFrame

@@ -1,12 +1,14 @@
-"""Who stands on the studio's stage: anything that is a textured mesh at each moment."""
+"""Who stands on the studio's stage: a textured mesh at each moment; and its textures, ready for drawing."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
 
 
@@ -90,3 +92,104 @@ def skin_with_normals(
     transforms = blend_transforms(joints, weights, world_from_bind)
     skinned = _turned(transforms, vertices) + transforms[:, :, 3]
     return skinned, torch.nn.functional.normalize(_turned(transforms, normals), dim=-1)
+
+
+@dataclass(frozen=True)
+class TexturePyramid:
+    """Several textures, each in halving sizes: level l of texture t is `size[t, l]` texels from `first[t, l]` on."""
+
+    texels: Float[Tensor, "texel 3"]
+    """Linear light."""
+    first: Int[Tensor, "texture level"]
+    size: Int[Tensor, "texture level 2"]
+    """Width and height. A texture with fewer levels repeats its last."""
+
+    def to(self, device: torch.device | str) -> "TexturePyramid":
+        """The same pyramid on `device`."""
+        return replace(self, texels=self.texels.to(device), first=self.first.to(device), size=self.size.to(device))
+
+
+def linear_from_srgb(srgb: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Linear light of sRGB values in [0, 1]."""
+    return torch.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+    """Encode as sRGB: values of linear light, clamped to [0, 1]."""
+    linear = linear.clamp(0, 1)
+    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp(min=1e-8) ** (1 / 2.4) - 0.055)
+
+
+def texture_pyramid(textures: Sequence[Float[Tensor, "3 _ _"]]) -> TexturePyramid:
+    """Prepare sRGB textures of any sizes; costs about 50 ms for 1024 x 1024, so keep the result."""
+    texels: list[Tensor] = []
+    first: list[list[int]] = []
+    size: list[list[tuple[int, int]]] = []
+    total = 0
+    for texture in textures:
+        level = linear_from_srgb(texture)
+        first.append([])
+        size.append([])
+        while True:
+            first[-1].append(total)
+            size[-1].append((level.shape[2], level.shape[1]))
+            texels.append(level.flatten(1).T)
+            total += level.shape[1] * level.shape[2]
+            if max(level.shape[1:]) == 1:
+                break
+            level = torch.nn.functional.adaptive_avg_pool2d(
+                level, (max(1, level.shape[1] // 2), max(1, level.shape[2] // 2))
+            )
+    depth = max(len(f) for f in first)
+    device = textures[0].device
+    return TexturePyramid(
+        torch.cat(texels).contiguous(),
+        torch.tensor([f + f[-1:] * (depth - len(f)) for f in first], device=device),
+        torch.tensor([s + s[-1:] * (depth - len(s)) for s in size], device=device),
+    )
+
+
+def face_levels(scene: TexturedMesh, cameras: Cameras, pyramid: TexturePyramid) -> Float[Tensor, "view face"]:
+    """The pyramid level, with fraction, at which a texel of each face is about as large as a pixel of each view."""
+    faces = scene.mesh.faces.long()
+    corners = scene.uv[faces] * pyramid.size[scene.texture_of_face.long(), 0][:, None]
+    pixels, z = project(scene.mesh.vertices, cameras)
+    shown = pixels[:, faces]
+    # A face across the camera plane has no meaningful area: it is too near to need a smaller texture.
+    behind = (z[:, faces] <= 0).any(-1)
+    ratio = _area(corners)[None] / _area(shown).clamp(min=1e-6)
+    level = 0.5 * torch.log2(ratio.clamp(min=1e-6))
+    return torch.where(behind, torch.zeros_like(level), level).clamp(0, pyramid.first.shape[1] - 1)
+
+
+def _area(triangles: Float[Tensor, "*batch 3 2"]) -> Float[Tensor, "*batch"]:
+    a, b = triangles[..., 1, :] - triangles[..., 0, :], triangles[..., 2, :] - triangles[..., 0, :]
+    return (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]).abs() / 2
+
+
+def sample_texture(
+    pyramid: TexturePyramid,
+    texture: Int[Tensor, "sample"],
+    uv: Float[Tensor, "sample 2"],
+    level: Float[Tensor, "sample"],
+) -> Float[Tensor, "sample 3"]:
+    """Trilinear look-up, clamped at the textures' edges; linear light."""
+    low = level.floor().long()
+    high = (low + 1).clamp(max=pyramid.first.shape[1] - 1)
+    below, above = (_bilinear(pyramid, texture, uv, at) for at in (low, high))
+    return torch.lerp(below, above, (level - low)[:, None])
+
+
+def _bilinear(
+    pyramid: TexturePyramid, texture: Int[Tensor, "sample"], uv: Float[Tensor, "sample 2"], level: Int[Tensor, "sample"]
+) -> Float[Tensor, "sample 3"]:
+    size, first = pyramid.size[texture, level], pyramid.first[texture, level]
+    place = (uv * size - 0.5).clamp(min=0).minimum(size - 1)
+    corner = place.floor().long()
+    fraction = place - corner
+    beyond = (corner + 1).minimum(size - 1)
+    blended = torch.zeros(len(uv), 3, device=uv.device)
+    for x, wx in ((corner[:, 0], 1 - fraction[:, 0]), (beyond[:, 0], fraction[:, 0])):
+        for y, wy in ((corner[:, 1], 1 - fraction[:, 1]), (beyond[:, 1], fraction[:, 1])):
+            blended += (wx * wy)[:, None] * pyramid.texels[first + y * size[:, 0] + x]
+    return blended

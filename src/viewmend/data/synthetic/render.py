@@ -9,8 +9,13 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from viewmend.data.synthetic import _shade_numba as kernels
-from viewmend.data.synthetic.performer import TexturedMesh
-from viewmend.data.synthetic.textures import TexturePyramid, face_levels, sample_texture, srgb_from_linear
+from viewmend.data.synthetic.performer import (
+    TexturedMesh,
+    TexturePyramid,
+    face_levels,
+    sample_texture,
+    srgb_from_linear,
+)
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers, project
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import Raster, barycentric, rasterize

@@ -11,10 +11,16 @@ from torch import Tensor
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.imperfections import Imperfections, imperfect_cameras, imperfect_frame
-from viewmend.data.synthetic.performer import Performer, TexturedMesh
+from viewmend.data.synthetic.performer import (
+    Performer,
+    TexturedMesh,
+    TexturePyramid,
+    linear_from_srgb,
+    srgb_from_linear,
+    texture_pyramid,
+)
 from viewmend.data.synthetic.render import Surface, light, render, stage_backdrop, stage_lights
 from viewmend.data.synthetic.rigs import dome_rig, ring_rig
-from viewmend.data.synthetic.textures import TexturePyramid, linear_from_srgb, srgb_from_linear, texture_pyramid
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.types import MultiViewFrame

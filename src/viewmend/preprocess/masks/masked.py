@@ -1,4 +1,4 @@
-"""A capture whose masks are made as it is read."""
+"""A capture whose masks are made as it is read, and their clean-up across cameras."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -6,16 +6,132 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from viewmend.data.source import CaptureSource, CaptureWrapper
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
+from viewmend.geometry.proxy import reconstruct
 from viewmend.preprocess.masks.chroma import without_spill
 from viewmend.preprocess.masks.maker import MaskMaker, Rgb, lasting
-from viewmend.preprocess.masks.multi_view_cleanup import agreed, supported
 from viewmend.types import MultiViewFrame
+
+CARVED_PX = 480
+"""Silhouettes are compared in images of this longer side."""
+MARGIN_PX = 4
+"""Dilation of silhouettes and hulls, for inexact calibration and voxels."""
+GAP = 1 / 24
+"""Gaps of a mask up to this share of the image's longer side are filled where the other cameras support it."""
+GROUP = 3
+"""Cameras per group; a pixel is kept if any group supports it, so that one bad mask has no effect."""
+
+
+def agreed(
+    mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds | None
+) -> UInt8[Tensor, "view height width"]:
+    """Clean the masks of one frame, each with the hull of the others.
+
+    A pixel is dropped where the hull of no group of the others is seen; it is filled where those of all groups are, and
+    the camera's own mask lies around it. Masks of fewer than three cameras, and those that agree on nothing, come back
+    as they are.
+    """
+    if len(cameras) < 3:
+        return mask
+    small, small_cameras = _reduced(mask, cameras)
+    cleaned = mask.clone()
+    for view in range(len(cameras)):
+        width, height = (int(side) for side in cameras.size_px[view])
+        votes = _votes(small, small_cameras, view, bounds)
+        if votes is not None:
+            some, all_ = (_enlarged(vote, width, height) for vote in votes)
+            cleaned[view, :height, :width] = torch.from_numpy(_judged(mask[view, :height, :width].numpy(), some, all_))
+    return cleaned
+
+
+def supported(
+    mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds | None
+) -> list[Bool[np.ndarray, "height width"] | None]:
+    """Silhouette of the hull of the other cameras in each camera, dilated; None without a hull."""
+    small, small_cameras = _reduced(mask, cameras)
+    found: list[Bool[np.ndarray, "height width"] | None] = []
+    for view in range(len(cameras)):
+        votes = _votes(small, small_cameras, view, bounds)
+        width, height = (int(side) for side in cameras.size_px[view])
+        found.append(None if votes is None else _enlarged(votes[0], width, height))
+    return found
+
+
+def _votes(
+    mask: UInt8[Tensor, "view height width"], cameras: Cameras, view: int, bounds: Bounds | None
+) -> tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]] | None:
+    """Silhouettes of the hulls of any group of the others (dilated) and of all groups; None without a hull."""
+    others = [v for v in range(len(cameras)) if v != view and bool((mask[v] > FOREGROUND).any())]
+    groups = max(1, len(others) // GROUP)
+    width, height = (int(side) for side in cameras.size_px[view])
+    seen = []
+    for first in range(groups):
+        group = others[first::groups]
+        if len(group) < 2:
+            return None
+        proxy = reconstruct(mask[group], cameras[group], bounds)
+        seen.append(proxy.depth(cameras[view])[0, :height, :width].numpy() > 0)
+    if not any(s.any() for s in seen):
+        return None
+    return _widened(np.any(seen, 0), MARGIN_PX), np.all(seen, 0)
+
+
+def _judged(
+    own: UInt8[np.ndarray, "height width"],
+    some: Bool[np.ndarray, "height width"],
+    all_: Bool[np.ndarray, "height width"],
+) -> UInt8[np.ndarray, "height width"]:
+    import cv2
+
+    radius = max(1, round(GAP * max(own.shape) / 2))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    kept = np.where(some, own, 0).astype(np.uint8)
+    around = np.asarray(cv2.morphologyEx(kept, cv2.MORPH_CLOSE, disc))
+    return np.where(all_, np.maximum(kept, around), kept).astype(np.uint8)
+
+
+def _reduced(
+    mask: UInt8[Tensor, "view height width"], cameras: Cameras
+) -> tuple[UInt8[Tensor, "view small_height small_width"], Cameras]:
+    """Masks and cameras at the size that they are compared in, silhouettes widened."""
+    import cv2
+
+    scale = min(1.0, CARVED_PX / int(cameras.size_px.max()))
+    sizes = [[max(1, round(side * scale)) for side in size] for size in cameras.size_px.tolist()]
+    parts = [cameras[view].resized(*size) for view, size in enumerate(sizes)]
+    small = Cameras(
+        cameras.names,
+        torch.cat([part.K for part in parts]),
+        cameras.camera_from_world,
+        torch.cat([part.size_px for part in parts]),
+    )
+    width, height = small.max_size_px
+    masks = torch.zeros(len(mask), height, width, dtype=torch.uint8)
+    for view, (w, h) in enumerate(sizes):
+        full_w, full_h = cameras.size_px[view].tolist()
+        own = cv2.resize(mask[view, :full_h, :full_w].numpy(), (w, h), interpolation=cv2.INTER_AREA)
+        masks[view, :h, :w] = torch.from_numpy(_widened(np.asarray(own) > FOREGROUND, MARGIN_PX).astype(np.uint8)) * 255
+    return masks, small
+
+
+def _enlarged(inside: Bool[np.ndarray, "height width"], width: int, height: int) -> Bool[np.ndarray, "h w"]:
+    import cv2
+
+    return np.asarray(cv2.resize(inside.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)) > 0.5
+
+
+def _widened(inside: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
+    import cv2
+
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
+    return np.asarray(cv2.dilate(inside.astype(np.uint8), disc)) > 0
+
 
 CleanUp = Literal["none", "parts", "pixels"]
 MIN_SUPPORT = 0.2

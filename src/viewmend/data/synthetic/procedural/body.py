@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from viewmend.data.synthetic.procedural.fabric import Image
-from viewmend.data.synthetic.procedural.patches import Patch
+from viewmend.data.synthetic.procedural.fabric import Image, Patch
 from viewmend.data.synthetic.procedural.skeleton import (
     INDEX,
     JOINTS,

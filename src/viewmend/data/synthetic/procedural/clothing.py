@@ -15,13 +15,15 @@ from viewmend.data.synthetic.procedural.fabric import (
     Canvas,
     Fabric,
     Image,
+    Patch,
     blend,
     edge,
     hsv,
+    outward_of,
     sample_fabric,
+    two_sided,
     write,
 )
-from viewmend.data.synthetic.procedural.patches import Patch, outward_of, two_sided
 from viewmend.data.synthetic.procedural.skeleton import INDEX, SKIRT_COLUMNS, Points, Skeleton, Values, Weights
 
 Painter = Callable[[Canvas], Image]

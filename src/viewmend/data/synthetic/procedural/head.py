@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.data.synthetic.procedural.body import Torso, mix, one_joint, smooth_table, smoothstep
-from viewmend.data.synthetic.procedural.fabric import Canvas, Image, blend, hsv
-from viewmend.data.synthetic.procedural.patches import Patch, outward_of, two_sided
+from viewmend.data.synthetic.procedural.fabric import Canvas, Image, Patch, blend, hsv, outward_of, two_sided
 from viewmend.data.synthetic.procedural.skeleton import TABLES, Physique, Points, Skeleton, Values, Vector
 
 RINGS = np.array(TABLES["head"])

@@ -18,11 +18,10 @@ from viewmend.data.synthetic.procedural.clothing import (
     sample_outfit,
     torso_sheet,
 )
-from viewmend.data.synthetic.procedural.fabric import Canvas, Image
+from viewmend.data.synthetic.procedural.fabric import BoundMesh, Canvas, Image, Patch, assemble
 from viewmend.data.synthetic.procedural.grounds import Tempo, seat_height, solve
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
 from viewmend.data.synthetic.procedural.motion import MOTIONS, Motion, sample_motion
-from viewmend.data.synthetic.procedural.patches import BoundMesh, Patch, assemble
 from viewmend.data.synthetic.procedural.props import HELD, STANDING, held_prop, standing_prop, stool
 from viewmend.data.synthetic.procedural.skeleton import SIDES, Physique, Skeleton, build_skeleton, sample_physique
 from viewmend.geometry.mesh import Mesh

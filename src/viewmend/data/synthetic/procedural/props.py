@@ -6,8 +6,17 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.data.synthetic.procedural.body import Body, one_joint, unit_grid
-from viewmend.data.synthetic.procedural.fabric import Canvas, Fabric, Image, blend, edge, hsv, sample_fabric, wave
-from viewmend.data.synthetic.procedural.patches import Patch
+from viewmend.data.synthetic.procedural.fabric import (
+    Canvas,
+    Fabric,
+    Image,
+    Patch,
+    blend,
+    edge,
+    hsv,
+    sample_fabric,
+    wave,
+)
 from viewmend.data.synthetic.procedural.skeleton import SIGN, Rotation, Skeleton, Vector, rotation
 
 HELD = ("ball", "cup", "book", "bag", "staff", "bottle", "tablet")
