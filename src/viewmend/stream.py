@@ -7,7 +7,7 @@ a frame is computed once and shared by all viewers; what depends on a viewer is 
 """
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from viewmend.frame_cache import CachedFrame, DepthProvider, cache_frame, evict
@@ -16,18 +16,13 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.threads import heavy_operations, light_operations
-from viewmend.models.base import ContextProvider, HeldOutView, Inpainter, Memory, RenderQuality, State
+from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State
 from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.error_mask import Evidence, decide_error_mask
 from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame
 from viewmend.utils.timing import StageTimes, ms_since, now_s
-
-CALIBRATION_VIEWS = 3
-"""Cameras that are held out in turn to calibrate an inpainter, spread evenly over the rig's order."""
-MIN_CALIBRATION_CAMERAS = 4
-"""Smaller rigs are not calibrated: views from two cameras say little about views from three."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,15 +146,6 @@ class Stream:
         self._frames.move_to_end(frame.time)
         evict(self._frames, frame.time, self.config.memory_mb)
         return self._frames[frame.time]
-
-    def calibrate(self, frame: MultiViewFrame) -> None:
-        """Adapt the inpainter to the rig, from views of a few of its own cameras; usually with the first frame.
-
-        Each of `CALIBRATION_VIEWS` cameras is held out and rendered from the others. Does nothing for frames without
-        masks, rigs of fewer than `MIN_CALIBRATION_CAMERAS`, and inpainters that cannot be calibrated.
-        """
-        if frame.mask is not None and len(frame.cameras) >= MIN_CALIBRATION_CAMERAS:
-            self.inpainter = self.inpainter.calibrate_to_rig(self._held_out_views(frame))
 
     def cached_frame(self, time: int | None = None) -> CachedFrame:
         """The frame of this index, by default the latest.
@@ -302,25 +288,6 @@ class Stream:
         evict(self._frames, part.time, self.config.memory_mb)
         times = StageTimes(geometry=cached.pop_geometry_ms(), context=context.encoding_ms, inpainting=inpainting_ms)
         return StreamView(completed, viewer, times)
-
-    def _held_out_views(self, frame: MultiViewFrame) -> Iterator[HeldOutView]:
-        """Views of a few of the frame's cameras, each rendered without that camera, and what it saw."""
-        names, inpainter = frame.cameras.names, self.inpainter
-        for name in (names[len(names) * number // CALIBRATION_VIEWS] for number in range(CALIBRATION_VIEWS)):
-            own = frame.select([name])
-            assert own.mask is not None, "`calibrate` is for frames with masks"
-            try:
-                cached = cache_frame(frame.without([name]), self.bounds, self.config.hull)
-            except ValueError:  # the other cameras see no foreground
-                continue
-            assert isinstance(cached.proxy, GeometryProxy), "a visual hull"
-            context = ContextProvider(lambda _, names, cached=cached: cached.context(names))
-            made = render_view(cached.frame, cached.proxy, own.cameras, self.config.render, (), cached.depth)
-            view = decide_error_mask(*made, inpainter.error_rule, None, inpainter, context)
-            truth = own.rgb[0].float() / 255 * (own.mask[0].float() / 255)
-            margin_px = inpainter.crop_margin_px(RenderQuality())
-            crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
-            yield HeldOutView(crop.of_view(view), context, crop.of_image(truth))
 
     def _context(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
         return self._frames[time].context(names) if time in self._frames else None

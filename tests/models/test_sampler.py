@@ -11,10 +11,26 @@ from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras
 from viewmend.models.views import pyramids
 from viewmend.models.views.config import AROUND, FAR, NEAR, OFFSETS
-from viewmend.models.views.pyramids import SceneScale, SourceCameras, choose_levels, downsample2x, silhouette_pyramids
+from viewmend.models.views.pyramids import (
+    MipLevels,
+    SceneScale,
+    SourceCameras,
+    choose_levels,
+    downsample2x,
+    silhouette_pyramids,
+)
 from viewmend.models.views.ray_fill import OFFSETS as FILL_OFFSETS
 from viewmend.models.views.ray_fill import sample_behind_proxy
-from viewmend.models.views.sampler import PATCH, CameraFeatures, Rays, sample_rays, sample_rays_torch
+from viewmend.models.views.sampler import (
+    PATCH,
+    CameraFeatures,
+    Projections,
+    Rays,
+    sample_level,
+    sample_level_cubic,
+    sample_rays,
+    sample_rays_torch,
+)
 from viewmend.types import Silhouettes
 
 
@@ -55,13 +71,13 @@ def test_fill_samples_equal_the_reference(rng, kernels, monkeypatch):
     assert torch.allclose(one[:, 0], samples.features[:, FILL_OFFSETS.index(0.09)], atol=1e-6)
 
 
-@pytest.mark.parametrize("step_px", [1.0, 5.0])
-def test_both_implementations_take_the_same_samples(scene, step_px):
+@pytest.mark.parametrize(("step_px", "cubic"), [(1.0, False), (1.0, True), (5.0, False)])
+def test_both_implementations_take_the_same_samples(scene, step_px, cubic):
     _, view, sources = scene
     _, rays = rays_of(view)
     rays = rays._replace(z_m=torch.where(torch.rand(rays.z_m.shape) < 0.1, 0.0, rays.z_m))
     given = rays, sources, view.source_views, step_px, SceneScale.of(view)
-    fast, slow = sample_rays(*given), sample_rays_torch(*given)
+    fast, slow = sample_rays(*given, cubic=cubic), sample_rays_torch(*given, cubic=cubic)
     levels = sources.levels(view.camera, step_px, SceneScale.of(view))
     assert min(level for part in levels for pair in part for level in pair) == {1.0: 0, 5.0: 2}[step_px]
     for name, one, other in zip(fast._fields, fast, slow, strict=True):
@@ -69,6 +85,18 @@ def test_both_implementations_take_the_same_samples(scene, step_px):
         flips = (off > 1e-3).float().mean()  # of the proxy's nearest pixel, where a position is between two
         assert float(flips) < 2e-3 and float(off.median()) < 1e-6, name
     assert float(fast.prior.sum(2).max()) <= 1 + 1e-5 and float(fast.statistics[..., 3:6].max()) > 0.1
+
+
+def test_cubic_samples_keep_straight_lines_and_overshoot_none(rng):
+    ramp = (10 * torch.arange(12.0))[None, None, None].expand(1, 1, 9, 12).contiguous()
+    at = Projections(*(5 + 2 * torch.rand(40, 1, 1, dtype=torch.double, generator=rng) for _ in range(3)), None)
+    levels = MipLevels.full(ramp)
+    found = sample_level_cubic(levels, at, 1)
+    assert torch.allclose(found, sample_level(levels, at, 1), atol=1e-5)
+    step = torch.where(torch.arange(12) < 6, 0.0, 255.0)[None, None, None].expand(1, 1, 9, 12).contiguous()
+    wide, narrow = sample_level(MipLevels.full(step), at, 1), sample_level_cubic(MipLevels.full(step), at, 1)
+    assert float(narrow.min()) >= 0 and float(narrow.max()) <= 1
+    assert float((narrow - 0.5).abs().mean()) > float((wide - 0.5).abs().mean()), "edges are sharper"
 
 
 def test_at_the_finest_level_both_networks_see_the_same(scene, monkeypatch):

@@ -5,13 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from viewmend.models.base import ContextProvider, HeldOutView, RenderQuality, State
+from viewmend.models.base import ContextProvider, RenderQuality, State
 from viewmend.models.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
 from viewmend.models.views import pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import rim_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.models.views.prediction import SLOPES, fit_alpha_slope, repremultiply, scale_logits
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.rendering.crop import Crop
 from viewmend.stream import Stream
@@ -168,56 +167,3 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
     own = image_of(net(holed, sources, guess=guess, where=where), view)
     found = net.step(holed, context_of(stream, RenderQuality(refine_fraction=0.5)), State())[0].rgb
     torch.testing.assert_close(found[:, where], own[:, where], atol=1e-4, rtol=0)
-
-
-def test_a_slope_softens_alpha_and_keeps_straight_colours(scene, monkeypatch):
-    stream, view, _ = scene
-    plain, _ = stream.inpainter.step(view, context_of(stream), State())
-    monkeypatch.setattr(stream.inpainter, "alpha_slope", 0.5)
-    soft, _ = stream.inpainter.step(view, context_of(stream), State())
-    at = (view.error > 0) & (plain.alpha > 0.001) & (plain.alpha < 0.999)
-    assert int(at.sum()) > 50
-    torch.testing.assert_close(soft.alpha[at], (0.5 * plain.alpha[at].logit()).sigmoid(), atol=1e-5, rtol=0)
-    straight = (own.rgb[:, at] / own.alpha[at] for own in (soft, plain))
-    torch.testing.assert_close(*straight, atol=1e-3, rtol=0)
-    assert torch.equal(soft.rgb[:, view.error == 0], view.rgb[:, view.error == 0])
-
-
-def test_calibration_to_a_rig_finds_the_slope_of_its_cameras(scene, monkeypatch):
-    stream, view, _ = scene
-    net, context = stream.inpainter, context_of(stream)
-    with monkeypatch.context() as patch:
-        patch.setattr(net, "alpha_slope", 0.6)
-        truth = net.step(view, context, State())[0].rgb
-    fitted = net.calibrate_to_rig([HeldOutView(view, context, truth)])
-    assert fitted.alpha_slope == pytest.approx(0.6) and net.alpha_slope == 1.0
-    assert fitted.calibrate_to_rig([HeldOutView(view, context, truth)]).alpha_slope == pytest.approx(0.6)
-    assert next(fitted.parameters()) is next(net.parameters())
-
-
-def test_scaled_logits():
-    alpha = torch.linspace(0, 1, 101)
-    assert (scale_logits(alpha, 1.0) - alpha).abs().max() < 2e-4
-    softer = scale_logits(alpha, 0.5)
-    assert softer[0] == 0 and softer[50] == pytest.approx(0.5, abs=1e-6)
-    assert (softer[1:50] > alpha[1:50]).all() and (softer[51:100] < alpha[51:100]).all()
-    assert softer[20] == pytest.approx(1 / 3, abs=1e-5)  # the logit of 0.2 is log(1 / 4); half of it is log(1 / 2)
-    straight, alpha = torch.rand(3, 50), torch.linspace(0.05, 1, 50)
-    torch.testing.assert_close(repremultiply(alpha * straight, alpha, softer[:50]), softer[:50] * straight)
-
-
-@pytest.mark.parametrize("slope", [0.55, 1.0, 1.15])
-def test_a_known_slope_is_found_with_equal_weight_of_views(slope, rng):
-    true = torch.rand(4000, generator=rng).clamp(0.02, 0.98)
-    alpha, straight = (true.logit() / slope).sigmoid(), torch.rand(3, 4000, generator=rng)
-    truth = true * straight + 0.05 * torch.randn(3, 4000, generator=rng)
-    whole = alpha * straight, alpha, truth
-    assert fit_alpha_slope([whole]) == pytest.approx(slope, abs=1e-9) and fit_alpha_slope([whole]) in SLOPES
-    even, sure = torch.full((1000,), 0.8), scale_logits(torch.full((1000,), 0.8), 1.2)
-    soft = scale_logits(even, slope)
-    views = [
-        tuple(part[..., :count] for part in (even.expand(3, -1), even, alpha.expand(3, -1)))
-        for count, alpha in ((1000, sure), (10, soft), (1000, soft))
-    ]
-    assert fit_alpha_slope([views[0], views[1]]) == fit_alpha_slope([views[0], views[2]])
-    assert fit_alpha_slope([]) == 1.0 == fit_alpha_slope([(torch.zeros(3, 0), torch.zeros(0), torch.zeros(3, 0))])

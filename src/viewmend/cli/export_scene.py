@@ -74,7 +74,6 @@ def run(options: Options) -> int:
         folder.check_own_files(*RESULTS)
         capture = _prepared(options, opened, times[0])
         frame = capture.read(times[0]).to(options.device)
-        stream.calibrate(frame)
         first = stream.add_frame(frame)
         views = _views(options, first, capture.cameras, capture.up)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))

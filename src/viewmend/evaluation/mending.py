@@ -29,8 +29,7 @@ SLOW_MS = 10_000.0
 class Mender:
     """Completes the views of one viewer, frame by frame.
 
-    The inpainter is calibrated to the rig with the first frame. The first view is computed twice, and the second is
-    timed, so that nothing is compiled in it.
+    The first view is computed twice, and the second is timed, so that nothing is compiled in it.
     """
 
     def __init__(
@@ -65,7 +64,6 @@ class Mender:
         """Add a frame, with its proxy and depths if another stream computed them already."""
         given = frame.frame if isinstance(frame, CachedFrame) else frame
         if not self.stream.times:
-            self.stream.calibrate(given)
             self._warm_up = Stream(
                 self.stream.inpainter, self.stream.config, self.stream.bounds, self.stream.error_model
             )

@@ -68,20 +68,15 @@ class ViewInputs(NamedTuple):
     """The cameras' poses."""
     image_sizes_px: Int[Tensor, "camera 2"]
     """Width and height of each camera's image; smaller ones are padded right and below."""
-    alpha_slope: Float[Tensor, ""]
-    """Factor on the logits of alpha: 1, or that of an inpainter calibrated to the rig."""
 
     @classmethod
-    def of(
-        cls, view: IncompleteView, context: ContextProvider, num_views: int, alpha_slope: float = 1.0
-    ) -> "ViewInputs":
+    def of(cls, view: IncompleteView, context: ContextProvider, num_views: int) -> "ViewInputs":
         """The inputs for a view as `ViewSynthNet.step` would complete it.
 
         Args:
             view: the rendered view.
             context: the cameras' images.
             num_views: number of source cameras.
-            alpha_slope: of the inpainter calibrated to the rig.
 
         Raises:
             ValueError: fewer than two of the cameras that the view names have a frame.
@@ -110,7 +105,6 @@ class ViewInputs(NamedTuple):
             rig_K=frame.cameras.K,
             rig_camera_from_world=frame.cameras.camera_from_world,
             image_sizes_px=frame.cameras.size_px.long(),
-            alpha_slope=torch.tensor(alpha_slope),
         )
 
     @property
@@ -161,7 +155,7 @@ class ExportedModel(nn.Module):
         guess = self._guess(view, sources)
         prediction = self.net(view, sources, where=where, guess=guess)
         fill = None if self.net.coarse is None else guess
-        completed = prediction.composite_into(view, where, torch.zeros_like(where), inputs.alpha_slope, fill)
+        completed = prediction.composite_into(view, where, torch.zeros_like(where), fill)
         assert completed.confidence is not None, "the model predicts it"
         return tuple(ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth))
 
@@ -218,7 +212,9 @@ class PackedPyramids(NamedTuple):
     first: Int[Tensor, "level"]
     """Index of each level's first pixel."""
     columns: Int[Tensor, "level"]
-    """Pixels per row of each level, with the border."""
+    """Pixels from one row to the next of each level."""
+    size: Int[Tensor, "level 2"]
+    """Rows and columns of each level, with the border."""
     last: Int[Tensor, "camera"]
     """The coarsest level of each camera."""
     subject_px: Float[Tensor, "camera"]
@@ -239,11 +235,11 @@ class PackedPyramids(NamedTuple):
     def at(self, level: Int[Tensor, "camera"]) -> MipLevels:
         """One level of each camera."""
         first = self.first[level] + torch.arange(level.shape[0]) * self.pixels.shape[1]
-        return MipLevels(self.pixels.flatten(0, 1), first, self.columns[level], 0.5 ** level.double())
+        return MipLevels(self.pixels.flatten(0, 1), first, self.columns[level], self.size[level], 0.5 ** level.double())
 
 
-def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """All levels as one row of pixels, channels last; the index of each level's first pixel, and its row length.
+def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """All levels as one row of pixels, channels last; the index of each level's first pixel, its row length and size.
 
     The finest level and, below each other to its right, those before `CONSTANT` make one sheet; the others follow.
     """
@@ -260,7 +256,8 @@ def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     sizes = torch.tensor([0, *(level.shape[2] * level.shape[3] for level in rows)]).cumsum(0)[:-1]
     first = torch.zeros(1, dtype=torch.long), tops * columns + width, sizes + sheet.shape[2] * columns
     all_columns = torch.full((CONSTANT,), columns, dtype=torch.long), torch.tensor([r.shape[3] for r in rows])
-    return pixels, torch.cat(first), torch.cat(all_columns)
+    sides = [torch.cat([torch.full((1,), level.shape[axis] + 1) for level in levels]) for axis in (2, 3)]
+    return pixels, torch.cat(first), torch.cat(all_columns), torch.stack(sides, 1)
 
 
 def halvings(

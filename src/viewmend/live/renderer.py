@@ -124,7 +124,6 @@ class Renderer:
             return False
         bounds = rig.bounds
         stream = Stream(self._inpainter, self._config, bounds, self._error_model)
-        stream.calibrate(self._read(index))
         cached = self._add_frame(stream, index)
         proxy = cached.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"

@@ -5,7 +5,7 @@ calls. What one viewer's view leaves for the next is the state; what is computed
 viewers is kept by the `ContextProvider`.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -169,17 +169,6 @@ class ErrorMap(NamedTuple):
     """The gain that is left once the rendered colour is attenuated by `alpha`."""
 
 
-@dataclass(frozen=True)
-class HeldOutView:
-    """The view of one of the rig's own cameras, rendered without it, and the image of that camera."""
-
-    view: IncompleteView
-    context: ContextProvider
-    """The other cameras."""
-    truth: Float[Tensor, "3 height width"]
-    """The camera's image times its mask, in [0, 1]."""
-
-
 class Inpainter:
     """Base class of everything that completes views. Override `step`; everything else has a default.
 
@@ -262,10 +251,3 @@ class Inpainter:
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
         """Predict which pixels of a rendered view are wrong; None if no camera is available."""
         return None
-
-    def calibrate_to_rig(self, held_out: Iterable[HeldOutView]) -> "Inpainter":
-        """An inpainter adapted to a rig by views of its own cameras; this one is not changed.
-
-        The views are rendered as they are iterated over.
-        """
-        return self

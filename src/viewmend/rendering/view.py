@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, pixel_centers, unproject
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.rasterize import interpolate, rasterize
 from viewmend.geometry.threads import light_operations
@@ -68,19 +68,60 @@ def render_view(
     Raises:
         ValueError: no camera is left to colour the view.
     """
-    usable = _without(frame.cameras, exclude)
     source_depth = source_depth or (lambda names: proxy.depth(frame.cameras.select(names)))
     raster = rasterize(proxy.mesh, target)
-    depth = raster.depth[0]
-    mask = (depth > 0).to(depth)
-
+    normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
     center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
+    size_m = float(proxy.bounds.size_m.norm())
+    return _colour(frame, target, raster.depth[0], normals, center, size_m, config, exclude, source_depth)
+
+
+def render_depth(
+    frame: MultiViewFrame,
+    target: Cameras,
+    depth: Float[Tensor, "height width"],
+    source_depth: SourceDepth,
+    config: RenderConfig,
+) -> tuple[IncompleteView, Evidence]:
+    """`render_view` for geometry that is known as depth maps: z-depth in metres, 0 where there is no surface.
+
+    Args:
+        frame: the cameras' images.
+        target: the novel view's camera (one view), on the same device.
+        depth: of the surface in the novel view.
+        source_depth: returns the surface's depth in the frame's cameras of given names.
+        config: number of source cameras and weights.
+
+    Raises:
+        ValueError: there is no camera to colour the view.
+    """
+    uv_px = pixel_centers(depth.shape[1], depth.shape[0], depth.device)
+    points = unproject(uv_px.flatten(0, 1)[None], depth.flatten()[None], target)[0].view(*depth.shape, 3)
+    across, down = (torch.gradient(points, dim=axis)[0] for axis in (1, 0))
+    normals = normalize(torch.linalg.cross(down, across), dim=-1)
+    there = points[depth > 0] if bool((depth > 0).any()) else points.new_zeros(1, 3)
+    size_m = float((there.amax(0) - there.amin(0)).norm())
+    return _colour(frame, target, depth, normals, there.mean(0), size_m, config, (), source_depth)
+
+
+def _colour(
+    frame: MultiViewFrame,
+    target: Cameras,
+    depth: Float[Tensor, "height width"],
+    normals: Float[Tensor, "height width 3"],
+    center: Float[Tensor, "3"],
+    size_m: float,
+    config: RenderConfig,
+    exclude: Sequence[str],
+    source_depth: SourceDepth,
+) -> tuple[IncompleteView, Evidence]:
+    """The view of a surface of this size around `center`, in the colours of the closest cameras."""
+    usable = _without(frame.cameras, exclude)
+    mask = (depth > 0).to(depth)
     candidate_views = select_closest(target, usable, center, len(usable))
     source_views = candidate_views[: config.cameras]
-    normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
     sources = ContextViews(frame.select(source_views), source_depth(source_views))
-    bias_m = config.blend.depth_bias * float(proxy.bounds.size_m.norm())
-    blended = blend(target, depth, normals, sources, bias_m, config.blend)
+    blended = blend(target, depth, normals, sources, config.blend.depth_bias * size_m, config.blend)
 
     evidence = Evidence(mask, depth, blended)
     coloured = mask * (blended.weights.sum(0) >= MIN_WEIGHT)

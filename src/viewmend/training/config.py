@@ -82,6 +82,8 @@ class SamplingConfig:
     """Cameras in the context at least, however many coloured the view."""
     num_ray_views: int = 0
     """Cameras that models which sample along rays receive: the source views, then the closest others."""
+    depth_fraction: float = 0.0
+    """Fraction of the views that are rendered from depth maps with errors instead of the hull, for `views`."""
     min_hole_px: int = 50
     """Views with fewer pixels to inpaint are skipped."""
 

@@ -11,15 +11,17 @@ import torch
 from jaxtyping import Float, Int32, UInt16
 from torch import Tensor
 
+from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.models.classical import Unfilled
-from viewmend.rendering.view import RenderConfig
+from viewmend.rendering.view import RenderConfig, render_depth
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import SamplingConfig, SceneConfig, SceneSource
+from viewmend.training.depth_geometry import DepthErrors, DepthMaps
 from viewmend.training.samples import HeldOutCamera, Sample, draw_source_views
 from viewmend.training.scenes import RigSource, Scene
 from viewmend.training.shards import storable
@@ -81,8 +83,12 @@ class StoredScene:
     """True depth of every second pixel of all cameras; None if unavailable."""
     held: tuple[StoredView, ...]
 
-    def sample(self, number: int, render: RenderConfig, num_ray_views: int) -> Sample:
+    def sample(
+        self, number: int, render: RenderConfig, num_ray_views: int, errors: DepthErrors | None = None
+    ) -> Sample:
         """The sample of held-out view `number`, with this number of cameras near it.
+
+        With `errors`, and true depth, it is rendered from depth maps with such errors instead of the hull.
 
         Raises:
             ValueError: the stored scene is damaged.
@@ -94,9 +100,16 @@ class StoredScene:
         _check(view.truth, view.truth.cameras)
         depth = None if self.depth is None else _upsampled(self.depth.metres(), self.frame)
         frame = replace(self.frame, cameras=view.cameras, depth=depth)
-        stream = Stream(Unfilled(), StreamConfig(render=render, memory_mb=None))
-        cached = stream.add_frame(replace(frame, depth=None).without([view.name]), _proxy(view))
-        rendered = stream.render(view.cameras.select([view.name]))
+        others, target = replace(frame, depth=None).without([view.name]), view.cameras.select([view.name])
+        true_depth = None if view.depth is None else view.depth.metres()[0]
+        if errors is None or depth is None or true_depth is None:
+            stream = Stream(Unfilled(), StreamConfig(render=render, memory_mb=None))
+            cached = stream.add_frame(others, _proxy(view))
+            rendered = stream.render(target)
+        else:
+            maps = DepthMaps(frame.cameras.names, torch.stack([errors.apply(own) for own in depth]))
+            cached = CachedFrame(others, maps)
+            rendered, _ = render_depth(others, target, errors.apply(true_depth), cached.depth, render)
         names = rendered.closest_views(num_ray_views)
         context = cached.context(names)
         assert context is not None, "a rig has cameras besides the held-out one"
@@ -105,7 +118,6 @@ class StoredScene:
         assert view.truth.mask is not None, "it was checked"
         alpha = view.truth.mask[0]
         black = (view.truth.rgb[0] * (alpha / 255)).round().to(torch.uint8)
-        true_depth = None if view.depth is None else view.depth.metres()[0]
         return Sample(rendered, (), context, black, alpha=alpha, depth=true_depth)
 
 
@@ -193,5 +205,6 @@ class StoredSamples:
         for stored in self.scenes.scene(number):
             for view in range(len(stored.held)):
                 render = RenderConfig(cameras=draw_source_views(self.sampling, random), error_rule="all")
-                samples.append(stored.sample(view, render, self.sampling.num_ray_views))
+                errors = DepthErrors.draw(random) if random.random() < self.sampling.depth_fraction else None
+                samples.append(stored.sample(view, render, self.sampling.num_ray_views, errors))
         return samples

@@ -20,6 +20,7 @@ from torch.nn import functional as F
 from viewmend.geometry.cameras import project, unproject
 from viewmend.geometry.sampling import in_view
 from viewmend.metrics.image_quality import psnr
+from viewmend.metrics.lpips import MIN_PX, load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.network import set_compute_dtype
 from viewmend.models.views.config import OFFSETS, ViewsConfig
@@ -71,11 +72,13 @@ class ViewsLossWeights:
 
     colour: Annotated[float, HIDDEN] = 1.0
     """L1 of colours on black."""
-    holes: float = 2.0
+    perceptual: float = 0.7
+    """Weight of LPIPS (AlexNet) of a crop, which keeps views as sharp as photographs."""
+    holes: float = 4.0
     """Additional weight of pixels that no source view colours."""
-    log_error: float = 0.15
+    log_error: Annotated[float, HIDDEN] = 0.4
     """Weight of log10 of the squared error of a crop."""
-    gradient: float = 0.5
+    gradient: float = 0.3
     """Weight of L1 of differences between neighbouring pixels, which keeps textures sharp."""
     cell_colour: Annotated[float, HIDDEN] = 0.5
     """L1 of the mean colour over the samples of a ray."""
@@ -222,12 +225,16 @@ def _crop_side(center: int, size: int) -> tuple[int, int]:
 class ViewsObjective(Objective[ViewSynthNet]):
     """The loss of `ViewSynthNet` on a random crop of each view of a batch."""
 
-    loss_summary = "L1 of colours with terms of gradients, alpha, depth, visibility, confidence and predicted errors"
+    loss_summary = (
+        "L1 of colours with terms of LPIPS, gradients, alpha, depth, visibility, confidence and predicted errors"
+    )
 
     def __init__(self, config: TrainConfig, options: "ViewsObjectiveConfig", start: nn.Module | None) -> None:
         super().__init__(config, initial_model(options, config.precision))
         load_start(self.model, start, kept="coarse.", optional="errors.")
         self.options, self.weights = options, options.loss
+        # In a tuple: it is neither trained nor part of checkpoints.
+        self._perceptual = (load_lpips("alex"),) if options.loss.perceptual else ()
         self.validation = ViewsValidation(config, options)
         if options.train_params == "errors":
             if self.model.errors is None or start is None:
@@ -262,9 +269,19 @@ class ViewsObjective(Objective[ViewSynthNet]):
         total = total + weights.alpha * ((made.alpha - alpha).abs().mean() + 0.3 * _cross_entropy(made.alpha, alpha))
         total = total + weights.confidence * _cross_entropy(made.confidence, correct)
         total = total + self._cell_terms(crop, made)
+        total = total + weights.perceptual * self._perceptual_term(crop, made)
         total = total + weights.errors * self._error_terms(crop, made, off)
         inside = (hole * off.detach().abs().mean(1)).sum() / hole.sum().clamp_min(1)
         return total, inside, colour.detach(), log_error.detach()
+
+    def _perceptual_term(self, crop: TrainingView, made: ViewPrediction) -> Float[Tensor, ""]:
+        """LPIPS of the crop with the predicted pixels against the truth, in float32; 0 for crops that are too small."""
+        truth = crop.truth / 255
+        if not self._perceptual or min(truth.shape[1:]) < MIN_PX["alex"]:
+            return truth.new_zeros(())
+        at, image = tuple(made.pixels.T), truth.clone()
+        image[:, at[0], at[1]] = made.rgb.T.float()
+        return self._perceptual[0].to(truth.device)(image[None], truth[None])[0]
 
     def _error_terms(
         self, crop: TrainingView, made: ViewPrediction, off: Float[Tensor, "pixel 3"]
@@ -315,7 +332,9 @@ class ViewsObjectiveConfig(ObjectiveConfig):
     model: Annotated[ViewsConfig, HIDDEN] = field(
         default_factory=lambda: ViewsConfig(coarse_fill="rays", error_features=24)
     )
-    sampling: Annotated[SamplingConfig, HIDDEN] = field(default_factory=lambda: SamplingConfig(num_ray_views=8))
+    sampling: Annotated[SamplingConfig, HIDDEN] = field(
+        default_factory=lambda: SamplingConfig(num_ray_views=8, depth_fraction=0.3)
+    )
     train_params: Literal["all", "errors"] = "all"
     """Parameters to train: all but those of the ray fill, or only the error predictor of the model given by --from."""
     coarse_from: str = "rays"

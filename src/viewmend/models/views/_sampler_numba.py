@@ -100,6 +100,30 @@ def _sample(image, u, v, scale, out, ray, sample, view, first, count):
 
 
 @inlined
+def _catmull_rom(t):
+    """Weights of the four values around a position `t` of the way from the second to the third."""
+    a, d = t * (t * (1 - 0.5 * t) - 0.5), 0.5 * t * t * (t - 1)
+    b = t * t * (1.5 * t - 2.5) + 1
+    return a, b, 1 - a - b - d, d
+
+
+@inlined
+def _sample_cubic(image, u, v, scale, out, ray, sample, view, first, count):
+    """`_sample` by Catmull-Rom splines, clamped to [0, 1]."""
+    x, y = u * scale + 0.5, v * scale + 0.5
+    left, top = floor(x), floor(y)
+    across, down = _catmull_rom(x - left), _catmull_rom(y - top)
+    last_row, last_column = image.shape[0] - 1, image.shape[1] - 1
+    for c in range(count):
+        total = 0.0
+        for i in range(4):
+            row = min(max(top + i - 1, 0), last_row)
+            for j in range(4):
+                total += down[i] * across[j] * image[row, min(max(left + j - 1, 0), last_column), c]
+        out[ray, sample, view, first + c] = min(max((1 / 255) * total, 0.0), 1.0)
+
+
+@inlined
 def _covered_depth(depth, u, v):
     """Bilinear share of the pixels that have a depth, and the mean of their depths times it."""
     left, top = floor(u - 0.5), floor(v - 0.5)
@@ -117,11 +141,12 @@ def _covered_depth(depth, u, v):
 @kernel
 def sample_camera(
     first, end, view, z, directions, per_metre, start, offset, size, images, scales, depth, size_m, is_source,
-    least_share, out, prior,
+    least_share, cubic, out, prior,
 ):  # fmt: skip
     """`CameraFeatures` of the samples on rays first to end - 1 in one camera, and prior weights, not normalised.
 
-    With a `least_share` above 0, distances behind the proxy are those of `RayFill`, and there are no prior weights.
+    `cubic` applies to colour and mask. With a `least_share` above 0, distances behind the proxy are those of `RayFill`,
+    and there are no prior weights.
     """
     fine, wide, shapes = images
     per_near, per_far = 1 / (NEAR * size_m), 1 / (FAR * size_m)
@@ -135,7 +160,10 @@ def sample_camera(
                     out[ray, sample, view, c] = 0.0
                 prior[ray, sample, view] = 0.0
                 continue
-            _sample(fine, u, v, scales[0], out, ray, sample, view, 0, 4)
+            if cubic:
+                _sample_cubic(fine, u, v, scales[0], out, ray, sample, view, 0, 4)
+            else:
+                _sample(fine, u, v, scales[0], out, ray, sample, view, 0, 4)
             _sample(wide, u, v, scales[1], out, ray, sample, view, 9, wide.shape[2])
             cosine = _cosine(offset, directions[ray], t)
             if least_share > 0:

@@ -19,6 +19,8 @@ TILE_PX = 32
 """Side of the tiles of `run_tiled`; a multiple of a cell's."""
 AT_ONCE = (8, 4, 2, 1)
 """Numbers of tiles that pass the layers together: few, since convolutions are compiled for each."""
+BAND_PX = (3, 7)
+"""Sides of the squares whose means separate the bands of detail."""
 WIDER = 16
 """Channels that the U-Net adds at each coarser scale."""
 
@@ -97,6 +99,39 @@ def scatter_to_image(
     """An image of this shape with the values at rows and columns, zeros elsewhere."""
     image = values.new_zeros(shape[0] * shape[1], values.shape[1])
     return image.index_copy_(0, at[:, 0] * shape[1] + at[:, 1], values).view(*shape, -1).permute(2, 0, 1)
+
+
+def detail_bands(
+    colours: Float[Tensor, "pixel image 3"],
+    weight: Float[Tensor, "pixel"],
+    pixels: Int[Tensor, "pixel 2"],
+    shape: torch.Size,
+) -> Float[Tensor, "pixel band image 3"]:
+    """What some images have around their own local means: a band for each of `BAND_PX`, the finest first.
+
+    Args:
+        colours: of each image at the pixels.
+        weight: of each pixel in the means, above 0.
+        pixels: row and column.
+        shape: height and width of the images.
+    """
+    count = colours.shape[1]
+    values = torch.cat([(weight[:, None, None] * colours).flatten(1), weight[:, None]], 1)
+    image = scatter_to_image(values, pixels, shape)
+    bands, finer = [], colours
+    for side in BAND_PX:
+        if image.device.type == "cpu" and not torch.is_grad_enabled() and not torch.compiler.is_exporting():
+            import cv2
+
+            channels_last = image.permute(1, 2, 0).contiguous().numpy()  # faster than PyTorch by an order of magnitude
+            sums = torch.from_numpy(cv2.blur(channels_last, (side, side), borderType=cv2.BORDER_CONSTANT))
+            sums = sums[pixels[:, 0], pixels[:, 1]]
+        else:
+            sums = F.avg_pool2d(image[None], side, 1, side // 2)[0, :, pixels[:, 0], pixels[:, 1]].T
+        mean = (sums[:, :-1] / sums[:, -1:].clamp_min(1e-6)).unflatten(1, (count, 3))
+        bands.append(finer - mean)
+        finer = mean
+    return torch.stack(bands, 1)
 
 
 def index_image(at: Int[Tensor, "point 2"], shape: torch.Size) -> Int[Tensor, "rows columns"]:

@@ -4,12 +4,11 @@
 
 At half the resolution, samples at fixed offsets behind the proxy are taken from the source cameras along every ray and
 aggregated over cameras. A U-Net over the view turns them into a distribution over depths, as networks on cost volumes
-do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the depth found, and blended: textures stay
-sharp, and neighbours agree.
+do (MVSNet, ENeRF). At full resolution, the cameras are sampled again at the depth found, and blended. What blending
+softens comes back as two bands of detail, each from the blended colours, one camera or the rendered view, with a
+learned gain for every pixel.
 """
 
-import copy
-from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.geometry.threads import heavy_operations, light_operations
-from viewmend.models.base import ContextProvider, ErrorMap, HeldOutView, RenderQuality, State
+from viewmend.models.base import ContextProvider, ErrorMap, RenderQuality, State
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.aggregation import AggregatedSamples, SampleAggregator
@@ -30,13 +29,14 @@ from viewmend.models.views.grid import (
     cell_means,
     concatenate_channels,
     crop_to,
+    detail_bands,
     index_image,
     nearest_depth,
     rim_depth,
     run_tiled,
     scatter_to_image,
 )
-from viewmend.models.views.prediction import DepthDistribution, ViewPrediction, fit_alpha_slope, unpremultiply
+from viewmend.models.views.prediction import DepthDistribution, ViewPrediction, unpremultiply
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
 from viewmend.models.views.sampler import Rays, sample_rays
@@ -46,11 +46,17 @@ IMAGE_CHANNELS = 7
 """RGB of the first guess, M, whether a pixel is coloured, its largest source weight, and whether it is predicted."""
 CHOICES = 4
 """Colours that a pixel blends: trusted cameras at its depth, the most trusted one, the mean over depths, the guess."""
+DETAILS = 6
+"""Gains of detail: in two bands, of the blended colours, the most trusted camera's, and the guess."""
+INITIAL_GAIN = 0.3
+"""Of the finest details of the blended colours, before training."""
 PIXEL_CHANNELS = 27
 """Inputs of a pixel at full resolution: the colours of the choices, two differences and two masks of them, statistics
 of its ray sample, and the certainty of its depth."""
 JOINT = 0.03
 """A pixel belongs to the surface of its cell if their depths differ by less than this, in subject sizes."""
+LEAST_WEIGHT = 0.01
+"""Of pixels outside the subject in the local means around which there is detail."""
 MARGIN_PX = 16
 
 
@@ -66,7 +72,6 @@ class ViewSynthNet(Network):
         super().__init__()
         config = config or ViewsConfig()
         self.config = config  # pyright: ignore[reportIncompatibleVariableOverride]
-        self.alpha_slope = 1.0
         self.coarse = None
         if config.coarse_fill == "rays":
             self.coarse = RayFill(RaysConfig(num_views=config.num_views)).requires_grad_(False)
@@ -77,9 +82,11 @@ class ViewSynthNet(Network):
         self.depth_logits = nn.Conv2d(config.features, len(OFFSETS), 1)
         self.pixel_aggregator = SampleAggregator(config.width, config.sample_channels)
         inputs, fine = config.features + PIXEL_CHANNELS + config.sample_channels, config.fine_features
+        last = nn.Conv2d(fine, CHOICES + 2 + DETAILS, 3, padding=1)
+        with torch.no_grad():
+            last.weight[-DETAILS:], last.bias[-DETAILS:] = 0, torch.eye(DETAILS)[0] * INITIAL_GAIN  # pyright: ignore
         self.blending = nn.Sequential(
-            *(nn.Conv2d(inputs, fine, 3, padding=1), nn.ReLU(), nn.Conv2d(fine, fine, 3, padding=1), nn.ReLU()),
-            nn.Conv2d(fine, CHOICES + 2, 3, padding=1),
+            *(nn.Conv2d(inputs, fine, 3, padding=1), nn.ReLU(), nn.Conv2d(fine, fine, 3, padding=1), nn.ReLU()), last
         )
 
     def forward(
@@ -132,19 +139,6 @@ class ViewSynthNet(Network):
         """Computes the image pyramids of these cameras."""
         SourceCameras.of(views, None, context)
 
-    @torch.no_grad()
-    def calibrate_to_rig(self, held_out: Iterable[HeldOutView]) -> "ViewSynthNet":
-        """A model with the same layers, whose alpha is as soft as fits held-out cameras of the rig best."""
-        plain, views = copy.copy(self), []
-        plain.alpha_slope = 1.0
-        for own in held_out:
-            completed, _ = plain.step(own.view, own.context, plain.initial_state())
-            at = completed.opacity > 0
-            views.append((completed.rgb[:, at], completed.opacity[at], own.truth[:, at]))
-        fitted = copy.copy(self)
-        fitted.alpha_slope = fit_alpha_slope(views)
-        return fitted
-
     def crop_margin_px(self, quality: RenderQuality) -> int:
         """The surroundings of the subject show where its outline is."""
         return MARGIN_PX
@@ -167,7 +161,7 @@ class ViewSynthNet(Network):
         guess = self.coarse_guess(view, sources, quick)
         prediction = self(view, sources, where=where, guess=guess)
         ray_fill = guess if not quick and self.coarse is not None else None
-        return prediction.composite_into(view, where, fades, self.alpha_slope, ray_fill), state
+        return prediction.composite_into(view, where, fades, ray_fill), state
 
     def _depth_distribution(
         self,
@@ -214,7 +208,7 @@ class ViewSynthNet(Network):
         front = torch.where((own - front).abs() < JOINT * scale.size_m, own, front)
         depth = front + scale.size_m * offset
         rays = Rays(view.camera, pixels.flip(1).double() + 0.5, depth.detach()[:, None])
-        samples = sample_rays(rays, sources, view.source_views, 1.0, scale)
+        samples = sample_rays(rays, sources, view.source_views, 1.0, scale, cubic=True)
         with self.autocast():
             blended = self.pixel_aggregator(samples, distribution.samples.trust[cell, hypothesis][:, None])
         sharp = unpremultiply(blended.colour[:, 0], blended.mask[:, 0])
@@ -236,7 +230,11 @@ class ViewSynthNet(Network):
         straight = (choice[..., None] * torch.stack([sharp, single, soft, guess], 1)).sum(1)
         alpha = (out[:, CHOICES] + 4 * (blended.mask[:, 0, 0] - 0.5)).sigmoid()
         confidence = out[:, CHOICES + 1].sigmoid()
-        rgb, trust = alpha[:, None] * straight, blended.trust[:, 0]
+        weight = blended.mask[:, 0, 0].clamp_min(LEAST_WEIGHT)
+        bands = detail_bands(torch.stack([straight, single, guess], 1), weight, pixels, view.mask.shape)
+        gains = out[:, CHOICES + 2 :].unflatten(1, bands.shape[1:3])
+        sharp = (straight + (gains[..., None] * bands).sum((1, 2))).clamp(0, 1)
+        rgb, trust = alpha[:, None] * sharp, blended.trust[:, 0]
         return ViewPrediction(pixels, rgb, alpha, confidence, depth, trust, distribution)
 
     def _depth_offset(

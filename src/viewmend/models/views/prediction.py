@@ -1,6 +1,5 @@
-"""The depth distribution and the prediction of `ViewSynthNet`, and the calibration of its alpha."""
+"""The depth distribution and the prediction of `ViewSynthNet`."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,10 +16,6 @@ LEAST_MASK = 0.1
 """Lower bound of the mask by which colours on black are divided."""
 HOLE_GUESS = 0.7
 """Weight of `RayFill` in holes; `ViewSynthNet`, which saw few holes in training, has the rest."""
-SLOPES = tuple(0.5 + 0.05 * step for step in range(15))
-"""Candidate factors on the logits of alpha: 1 keeps alpha, less makes it softer."""
-FAINTEST = 1e-4
-"""Alpha is clamped to this distance from 0 and 1 before its logit is taken."""
 
 
 class DepthDistribution(NamedTuple):
@@ -73,7 +68,6 @@ class ViewPrediction(NamedTuple):
         view: IncompleteView,
         predicted: Bool[Tensor, "height width"],
         fades: Bool[Tensor, "height width"],
-        alpha_slope: float | Float[Tensor, ""],
         fill: Float[Tensor, "3 height width"] | None = None,
     ) -> CompletedView:
         """The view with this prediction: Fhat = E Ftilde + (1 - E) F.
@@ -82,7 +76,6 @@ class ViewPrediction(NamedTuple):
             view: the rendered view.
             predicted: pixels of this prediction.
             fades: pixels that are background in part; they are attenuated by E.
-            alpha_slope: factor on the logits of alpha.
             fill: the output of `RayFill`, to blend into holes; None without.
         """
         E = view.error
@@ -90,8 +83,6 @@ class ViewPrediction(NamedTuple):
             scatter_to_image(values, self.pixels, view.mask.shape)
             for values in (self.rgb, self.alpha[:, None], self.confidence[:, None], self.depth[:, None])
         )
-        soft = scale_logits(alpha, alpha_slope)
-        rgb, alpha = repremultiply(rgb, alpha[0], soft[0]), soft
         if fill is not None:
             rgb = torch.where(predicted & view.holes, HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb, rgb)
         return CompletedView(
@@ -106,35 +97,3 @@ class ViewPrediction(NamedTuple):
 def unpremultiply(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
     """Colours on black, divided by their mask."""
     return (colour / mask.clamp_min(LEAST_MASK)).clamp(0, 1)
-
-
-def scale_logits(alpha: Float[Tensor, "*pixel"], slope: float | Float[Tensor, ""]) -> Float[Tensor, "*pixel"]:
-    """Alpha with its logits multiplied by `slope`; 0 stays 0."""
-    scaled = (slope * alpha.clamp(FAINTEST, 1 - FAINTEST).logit()).sigmoid()
-    return torch.where(alpha > 0, scaled, 0.0)
-
-
-def repremultiply(
-    rgb: Float[Tensor, "channel *pixel"], alpha: Float[Tensor, "*pixel"], new_alpha: Float[Tensor, "*pixel"]
-) -> Float[Tensor, "channel *pixel"]:
-    """Colours on black, for another alpha."""
-    return new_alpha * (rgb / alpha.clamp_min(FAINTEST)).clamp(0, 1)
-
-
-def fit_alpha_slope(
-    views: Sequence[tuple[Float[Tensor, "3 _pixel"], Float[Tensor, "_pixel"], Float[Tensor, "3 _pixel"]]],
-) -> float:
-    """The slope for which the squared error of colours on black is smallest.
-
-    A network is as sure of outlines as the calibration and the masks of its training data allow; those of a real rig
-    are worse. As temperature scaling (Guo et al., ICML 2017), one factor corrects that.
-
-    Args:
-        views: predicted colours on black, their alpha, and the true colours on black, of the pixels of held-out views.
-            Each view has the same weight, however many pixels it has.
-    """
-    errors = torch.zeros(len(SLOPES), dtype=torch.double)
-    for rgb, alpha, truth in views:
-        images = (repremultiply(rgb, alpha, scale_logits(alpha, slope)) for slope in SLOPES)
-        errors += torch.stack([(image - truth).square().double().mean().cpu() for image in images]).nan_to_num()
-    return SLOPES[int(errors.argmin())] if bool((errors > 0).any()) else 1.0

@@ -60,7 +60,9 @@ class MipLevels(NamedTuple):
     first: Int[Tensor, "view"]
     """Index of each image's first pixel."""
     columns: Int[Tensor, "view"]
-    """Pixels per row, with the border."""
+    """Pixels from one row to the next."""
+    size: Int[Tensor, "view 2"]
+    """Rows and columns of each image, with the border."""
     scale: Float[Tensor, "view"]
     """Factor from positions in the camera's image to positions in this one."""
 
@@ -69,10 +71,10 @@ class MipLevels(NamedTuple):
         """One level of each pyramid."""
         images = [pyramid.levels[level] for pyramid, level in zip(pyramids, levels, strict=True)]
         sizes, device = [image.shape[0] * image.shape[1] for image in images], images[0].device
-        first, columns = torch.tensor([0, *sizes[:-1]]).cumsum(0), torch.tensor([image.shape[1] for image in images])
+        first, size = torch.tensor([0, *sizes[:-1]]).cumsum(0), torch.tensor([image.shape[:2] for image in images])
         scale = torch.tensor([0.5**level for level in levels], dtype=torch.double)
         pixels = torch.cat([image.flatten(0, 1) for image in images])
-        return cls(pixels, first.to(device), columns.to(device), scale.to(device))
+        return cls(pixels, *(values.to(device) for values in (first, size[:, 1], size, scale)))
 
     @classmethod
     def full(cls, images: Shaped[Tensor, "view channel height width"]) -> "MipLevels":
@@ -81,7 +83,9 @@ class MipLevels(NamedTuple):
         rows, columns = bordered.shape[2:]
         view = torch.arange(images.shape[0], device=device)
         pixels = bordered.movedim(1, 3).flatten(0, 2)
-        return cls(pixels, view * (rows * columns), 0 * view + columns, torch.ones_like(view, dtype=torch.double))
+        scale = torch.ones_like(view, dtype=torch.double)
+        size = torch.tensor([[rows, columns]], device=device).expand(len(images), 2)
+        return cls(pixels, view * (rows * columns), 0 * view + columns, size, scale)
 
 
 def choose_levels(

@@ -108,7 +108,12 @@ class CameraFeatures(NamedTuple):
 
 
 def sample_rays(
-    rays: Rays, sources: SourceCameras, source_views: Sequence[str], step_px: float, scale: SceneScale
+    rays: Rays,
+    sources: SourceCameras,
+    source_views: Sequence[str],
+    step_px: float,
+    scale: SceneScale,
+    cubic: bool = False,
 ) -> RaySamples:
     """Samples the pyramid levels of the source cameras that match the rays.
 
@@ -118,19 +123,25 @@ def sample_rays(
         source_views: names of the cameras that coloured the view.
         step_px: distance between neighbouring rays, pixels.
         scale: of the view.
+        cubic: interpolate colours and masks by Catmull-Rom splines, which are sharper than bilinear interpolation.
     """
     if torch.compiler.is_exporting():
-        return sample_rays_torch(rays, sources, source_views, step_px, scale)
+        return sample_rays_torch(rays, sources, source_views, step_px, scale, cubic)
     with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
         if not sources.use_kernels:
-            return sample_rays_torch(rays, sources, source_views, step_px, scale)
+            return sample_rays_torch(rays, sources, source_views, step_px, scale, cubic)
         levels = sources.levels(rays.camera, step_px, scale)
         images, outlines = map(_at_levels, (sources.pyramids, sources.silhouette_pyramids), levels)
-        return _sample_numba(rays, sources, source_views, scale, images, outlines, FEATURES, 0.0)
+        return _sample_numba(rays, sources, source_views, scale, images, outlines, FEATURES, 0.0, cubic)
 
 
 def sample_rays_torch(
-    rays: Rays, sources: SourceCameras, source_views: Sequence[str], step_px: float, scale: SceneScale
+    rays: Rays,
+    sources: SourceCameras,
+    source_views: Sequence[str],
+    step_px: float,
+    scale: SceneScale,
+    cubic: bool = False,
 ) -> RaySamples:
     """The reference of `sample_rays`."""
     fine, wide, outline, mean_outline = sources.mips(rays.camera, step_px, scale)
@@ -139,7 +150,7 @@ def sample_rays_torch(
     first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
     surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
     behind = torch.where(surface > 0, at.z_m - surface, 0.0) / scale.size_m
-    values = sample_level(fine, at, 4), sample_level(wide, at, 5)
+    values = (sample_level_cubic if cubic else sample_level)(fine, at, 4), sample_level(wide, at, 5)
     features = _camera_features(rays, sources, source_views, at, *values, behind, _softsign)
     named = CameraFeatures.unstack(features)
     prior = named.in_view * (4 * named.viewing_cosine).exp() / (1 + (6 * named.depth_difference).exp())
@@ -259,6 +270,30 @@ def sample_level(levels: MipLevels, at: Projections, channels: int) -> Float[Ten
     return ((1 - below) * upper + below * lower) / 255
 
 
+def sample_level_cubic(levels: MipLevels, at: Projections, channels: int) -> Float[Tensor, "ray sample view channel"]:
+    """`sample_level` by Catmull-Rom splines (Catmull & Rom, 1974), clamped to [0, 1]."""
+    x, y = at.u_px * levels.scale + 0.5, at.v_px * levels.scale + 0.5
+    left, top = x.floor(), y.floor()
+    across, down = _catmull_rom((x - left).float()), _catmull_rom((y - top).float())
+    pixels = levels.pixels[:, :channels]
+    last_row, last_column = (levels.size - 1).unbind(1)
+    total = torch.zeros(1, device=x.device)
+    for i in range(4):
+        row = levels.first + torch.minimum((top.long() + i - 1).clamp_min(0), last_row) * levels.columns
+        for j in range(4):
+            column = torch.minimum((left.long() + j - 1).clamp_min(0), last_column)
+            total = total + (down[i] * across[j])[..., None] * pixels[row + column]
+    return (total / 255).clamp(0, 1)
+
+
+def _catmull_rom(t: Float[Tensor, "*any"]) -> tuple[Float[Tensor, "*any"], ...]:
+    """Weights of the four values around a position `t` of the way from the second to the third."""
+    a = t * (t * (1 - 0.5 * t) - 0.5)
+    d = 0.5 * t * t * (t - 1)
+    b = t * t * (1.5 * t - 2.5) + 1
+    return a, b, 1 - a - b - d, d
+
+
 class BoxSums(NamedTuple):
     """Sums over all pixels above and left of each pixel corner (summed-area tables, Crow, SIGGRAPH 1984)."""
 
@@ -328,6 +363,7 @@ def _sample_numba(
     outlines: Sequence[tuple],
     channels: int,
     least_share: float,
+    cubic: bool = False,
 ) -> RaySamples:
     """Samples with compiled kernels; `images` and `outlines` are the images of each camera, and their scales."""
     from viewmend.models.views import _sampler_numba
@@ -347,7 +383,7 @@ def _sample_numba(
         first, end = band * BAND, min(count, (band + 1) * BAND)
         for n, (per_metre, start, size) in enumerate(views):
             camera = directions, per_metre, start, offsets[n], size, *images[n], *more[n]
-            kernels.sample_camera(first, end, n, z, *camera, least_share, features, prior)
+            kernels.sample_camera(first, end, n, z, *camera, least_share, cubic, features, prior)
         if channels == FEATURES:
             kernels.compare_cameras(first, end, features, prior, statistics)
         for line, own in zip(silhouettes, outlines, strict=True):
