@@ -10,10 +10,12 @@ from torch.nn import functional as F
 from viewmend.geometry.cameras import project
 from viewmend.models.views.grid import (
     AT_ONCE,
+    BAND_PX,
     CELL_PX,
     TILE_PX,
     UNet,
     concatenate_channels,
+    detail_bands,
     downsample2x,
     index_image,
     nearest_depth,
@@ -43,6 +45,24 @@ def test_the_rim_has_the_smallest_depth_within_two_pixels(shape, dtype):
 def test_cells_have_the_nearest_depth():
     depth = torch.tensor([[0.0, 3.0, 0.0], [2.0, 5.0, 0.0], [0.0, 0.0, 4.0]])
     assert nearest_depth(depth).tolist() == [[2.0, 0.0], [0.0, 4.0]]
+
+
+@pytest.mark.parametrize("grad", [False, True])
+def test_detail_is_what_pixels_have_around_weighted_local_means(grad, rng):
+    shape, (finest, coarser) = torch.Size((9, 14)), (side // 2 for side in BAND_PX)
+    pixels = torch.nonzero(torch.rand(shape, generator=rng) < 0.6)
+    colours, weight = torch.rand(len(pixels), 2, 3, generator=rng), 0.01 + torch.rand(len(pixels), generator=rng)
+    with torch.set_grad_enabled(grad):  # both implementations
+        bands = detail_bands(colours, weight, pixels, shape)
+    for n, (row, column) in enumerate(pixels.tolist()):
+        means = []
+        for radius in (finest, coarser):
+            near = ((pixels - pixels[n]).abs() <= radius).all(1)
+            means.append((weight[near, None, None] * colours[near]).sum(0) / weight[near].sum())
+        assert torch.allclose(bands[n], torch.stack([colours[n] - means[0], means[0] - means[1]]), atol=1e-5), (
+            row,
+            column,
+        )
 
 
 def test_a_downsampled_view_has_the_means_of_covered_pixels(scene):

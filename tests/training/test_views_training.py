@@ -20,6 +20,7 @@ from viewmend.models.views.grid import nearest_depth, rim_depth
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.config import TrainConfig
+from viewmend.training.depth_geometry import DepthErrors
 from viewmend.training.loop import train
 from viewmend.training.scenes import Scene, StudioRigs, rig_source
 from viewmend.training.shards import ShardError, ShardScenes, sample_from_bytes, sample_to_bytes, write_shards
@@ -112,6 +113,35 @@ def test_a_stored_scene_is_the_rig_without_a_camera(studio, stored):
         assert torch.equal(near.rgb.movedim(1, -1)[inside], own.rgb.movedim(1, -1)[inside])
         both = (near.depth > 0) & (own.depth > 0)
         assert float((near.depth - own.depth)[both].abs().median()) < 0.01, "of every second pixel"
+
+
+def test_views_behind_depth_maps_have_the_true_surface_and_its_errors(stored, view):
+    exact = stored.sample(0, VIEWS_RENDER, 4, DepthErrors())
+    assert torch.equal(exact.view.depth, exact.depth)
+    shown = (exact.view.mask > 0) & ~exact.view.holes & (exact.alpha == 255)
+    off = (exact.view.rgb - exact.truth / 255).abs().amax(0)[shown]
+    hull = stored.sample(0, VIEWS_RENDER, 4)
+    behind_hull = (hull.view.rgb - hull.truth / 255).abs().amax(0)[shown & ~hull.view.holes]
+    assert float((off > 0.1).float().mean()) < 0.8 * float((behind_hull > 0.1).float().mean())
+    assert exact.ray_views.frame.cameras.names == exact.view.closest_views(4)
+    wrong = stored.sample(0, VIEWS_RENDER, 4, DepthErrors(bias_m=0.02, step_m=0.01, grow_px=2, holes=0.05))
+    both = (wrong.view.depth > 0) & (exact.view.depth > 0)
+    assert float((wrong.view.depth - exact.view.depth)[both].median()) == pytest.approx(0.02, abs=0.006)
+    assert int((wrong.view.depth > 0).sum()) > int((exact.view.depth > 0).sum()), "it grew"
+    assert int(((wrong.view.depth == 0) & (exact.view.depth > 0)).sum()) > 20, "it has holes"
+
+
+def test_drawn_errors_are_of_all_kinds_and_some_have_none():
+    drawn = [DepthErrors.draw(Random(n)) for n in range(200)]
+    assert 40 < drawn.count(DepthErrors()) < 100
+    for name in ("bias_m", "noise_m", "waves_m", "step_m", "smooth_px", "grow_px", "holes"):
+        assert sum(getattr(errors, name) != 0 for errors in drawn) > 20, name
+    depth = torch.zeros(40, 30)
+    depth[5:35, 5:25] = 2.0
+    for errors in drawn:
+        found = errors.apply(depth)
+        assert found.shape == depth.shape and bool(torch.isfinite(found).all()) and float(found.min()) >= 0
+        assert float((found[found > 0] - 2).abs().median()) < 0.1
 
 
 def test_stored_hulls_have_the_configured_resolution(studio):

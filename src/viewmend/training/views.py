@@ -76,7 +76,7 @@ class ViewsLossWeights:
     """Weight of LPIPS (AlexNet) of a crop, which keeps views as sharp as photographs."""
     holes: float = 4.0
     """Additional weight of pixels that no source view colours."""
-    log_error: Annotated[float, HIDDEN] = 0.4
+    log_error: Annotated[float, HIDDEN] = 0.5
     """Weight of log10 of the squared error of a crop."""
     gradient: float = 0.3
     """Weight of L1 of differences between neighbouring pixels, which keeps textures sharp."""
