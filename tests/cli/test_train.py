@@ -42,7 +42,7 @@ def models(tmp_path_factory):
 
 
 def finetune(capture, model, out, *more):
-    command = ["train", "finetune", "--captures", str(capture), "--from", str(model), "--out", str(out)]
+    command = ["train", "finetune", str(capture), "--from", str(model), "--out", str(out)]
     return main([*command, "--captures-fraction", "1", *BRIEF, *more])
 
 
@@ -78,7 +78,7 @@ def test_fine_tuning_refuses_captures_reserved_for_tests(capture, models, tmp_pa
     ("arguments", "message"),
     [
         (["smal"], "expected a recipe among"),
-        (["finetune"], "expected --captures DIR"),
+        (["finetune"], "expected viewmend train finetune CAPTURE"),
         (["finetune", "--captures", "here", "--from=nothing"], "one of the shipped models"),
         (["views", "--performers", "people"], "both --performers and --motions"),
         (["views", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),

@@ -20,7 +20,7 @@ class Options:
     """Train a model: viewmend train RECIPE --out DIR [options].
 
     RECIPE is one of: views (the default model), rays (its ray fill), paper and paper_small (the paper's model),
-    finetune (adapts a trained model to your own --captures), or a published baseline: dstt, fuseformer, e2fgvi,
+    finetune CAPTURE (adapts a trained model to your own capture), or a published baseline: dstt, fuseformer, e2fgvi,
     e2fgvi-hq. Defaults are the recipe's. DIR gets the averaged weights, a log, validation images and checkpoints; the
     same command resumes a run that was stopped at any moment. torchrun distributes the same command over processes
     and machines.
@@ -42,6 +42,8 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
     from viewmend.training.recipes import make_recipe
 
     name, rest = split_recipe(arguments)
+    if name == "finetune" and rest and not rest[0].startswith("-"):
+        rest = ["--captures", *rest]
     words = [part for word in rest for part in (word.split("=", 1) if word.startswith("--from=") else [word])]
     start = next((after for word, after in pairwise(words) if word == "--from"), None)
     flags = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
@@ -49,7 +51,7 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
     options = tyro.cli(Options, args=list(rest), default=default, prog=f"{prog} {name}", config=flags)
     config = options.config
     if name == "finetune" and not (config.scenes.captures or config.shards):
-        raise ValueError("expected --captures DIR for finetune, got none; name the folder of your capture")
+        raise ValueError("expected viewmend train finetune CAPTURE, got no capture; name the folder of yours")
     check_scenes(config.scenes)
     return options
 
@@ -92,7 +94,23 @@ def run(options: Options) -> int:
         return 128 + number
     if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
         say(f"wrote {options.out}" if reporter.last else f"{options.out}: this run is complete; nothing to do")
+        _show_gain(options)
     return 0
+
+
+def _show_gain(options: Options) -> None:
+    """After fine-tuning: the scores before and after by camera, and a contact sheet."""
+    scenes, start = options.config.scenes, options.config.start
+    if scenes.hold_out is None or start is None or not scenes.captures:
+        return
+    from viewmend.cli.console import say
+    from viewmend.models.checkpoint import load_inpainter
+    from viewmend.training.held_back import compare
+
+    sheet = options.out / "comparison.png"
+    say("comparing both models by camera")
+    print(compare(scenes.captures[0], scenes.hold_out, load_inpainter(start), load_inpainter(options.out), sheet))
+    print(f"views before and after: {sheet}")
 
 
 class _Reporter:

@@ -52,6 +52,9 @@ class SceneConfig:
     """Fraction of the studio scenes with characters from these folders."""
     captures: tuple[Path, ...] = ()
     """Folders of your own captures, or files written by `viewmend splits`, of which only the training part is used."""
+    hold_out: str | None = None
+    """Camera of the captures that training never sees, nor their last tenth of frames: the run is validated on both,
+    and keeps the best weights. 'auto' chooses a camera, in rigs of five or more."""
     captures_fraction: float = 0.75
     """Fraction of the scenes that come from the captures, if any are given; the rest comes from the studio."""
     data_device: str = "cpu"

@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -13,6 +13,7 @@ from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel
 
 from viewmend.training.config import TrainConfig
+from viewmend.training.held_back import PATIENCE, HeldBackValidation
 from viewmend.training.objective import StepOutput
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import (
@@ -33,7 +34,7 @@ from viewmend.utils.output_folder import OutputFolder
 
 WRITTEN = (
     *("model.safetensors", "config.json", "README.md", "log.jsonl"),
-    *("validation-*.png", "not-finite-*", "tensorboard"),
+    *("comparison.png", "validation-*.png", "not-finite-*", "tensorboard"),
 )
 """Files and folders that a run writes, apart from its checkpoints."""
 
@@ -227,15 +228,20 @@ class Run:
         self.shared = own.wrap_ddp(self.objective)
         self.streams = self._make_streams()
         self.validation = self.objective.validation if config.validate_every and own.first else None
+        self.keeps_best = config.scenes.hold_out is not None and bool(config.validate_every)
+        if self.keeps_best and own.first:
+            self.validation = HeldBackValidation(config.scenes.captures, str(config.scenes.hold_out))
 
     def steps(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[Progress]:
         """Make the remaining steps, or those until `stopped` returns True; yields after each."""
         config, clock = self.config, Clock(self.config, self.state.step, self.state.elapsed_s)
         with Log(self.out, self.state.step, self.own.first) as log:
             step = first = self.state.step
+            if self.keeps_best and step == 0:
+                self._validate(log, step)  # the weights that the run starts from are kept if none are better
             while True:
-                progress = 1.0 if stopped() else clock.progress(step)
-                progress, due = self.own.maximum(progress, float(step > self.state.step and clock.checkpoint_due()))
+                progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
+                progress, due = self.own.maximum(progress, float(self._checkpoint_due(step, clock)))
                 if due:
                     self._save(step, clock)
                 if progress >= 1:
@@ -252,19 +258,38 @@ class Run:
                 entry = Progress(step, progress, rate, losses, clock.elapsed_s(), *pace)
                 log.add(entry)
                 if self.validation is not None and step % config.validate_every == 0:
-                    log.add_validation(step, self.validation(self.averaged, self._image(step)))
+                    self._validate(log, step)
                 yield entry
             if step > self.state.step:
                 self._save(step, clock)
-            elif self.own.first:
+            elif self.own.first and not self.keeps_best:
                 self._write_model()  # it may be lost or damaged, and a finished run does nothing else
             if self.validation is not None and step > first and step % config.validate_every:
-                log.add_validation(step, self.validation(self.averaged, self._image(step)))
+                self._validate(log, step)
 
     @property
     def averaged(self) -> nn.Module:
         """The model with averaged weights, which is the result."""
         return self.average.module
+
+    def _validate(self, log: Log, step: int) -> None:
+        """Log the scores of the averaged weights; in runs that keep the best weights, write them if they are."""
+        assert self.validation is not None, "the caller checked"
+        scores = self.validation(self.averaged, self._image(step))
+        log.add_validation(step, scores)
+        score = scores.get("score")
+        if self.keeps_best and score is not None and (self.state.best_score is None or score > self.state.best_score):
+            self.state = replace(self.state, best_score=score, best_step=step)
+            self._write_model(step)
+
+    def _is_done(self, step: int) -> bool:
+        """Whether a run that keeps the best weights has not found better ones for `PATIENCE` validations."""
+        waited = step - self.state.best_step
+        return self.own.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
+
+    def _checkpoint_due(self, step: int, clock: Clock) -> bool:
+        """Whether to write a checkpoint: one that is older than the best weights would let worse ones replace them."""
+        return step > self.state.step and (clock.checkpoint_due() or self.state.best_step > self.state.step)
 
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """One step of all weights, by the mean gradient of the streams."""
@@ -333,17 +358,19 @@ class Run:
 
     def _save(self, step: int, clock: Clock) -> None:
         positions = self.own.gather([stream.position for stream in self.streams])
-        self.state = RunState(step, clock.elapsed_s(), positions)
+        self.state = replace(self.state, step=step, elapsed_s=clock.elapsed_s(), positions=positions)
         if self.own.first:
             save_run(self.out, self.config, self.state, self._modules, self._optimizers)
-            self._write_model()
+            if not self.keeps_best:
+                self._write_model()
         clock.saved()
 
     def _image(self, step: int) -> Path:
         return self.out / f"validation-{step:06d}.png"
 
-    def _write_model(self) -> None:
-        card = model_card(self.config, self.state, self.objective.loss_summary)
+    def _write_model(self, step: int | None = None) -> None:
+        state = self.state if step is None else replace(self.state, step=step)
+        card = model_card(self.config, state, self.objective.loss_summary)
         self.objective.save(self.averaged, self.out, card)
 
 

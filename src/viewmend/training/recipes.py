@@ -17,6 +17,10 @@ SUBJECT_SIZES_PX = (224, 320, 416, 576)
 """Image sizes of `views` and `rays`; each is at most 1.5 times the one before, so subjects of all sizes occur."""
 
 
+CAPTURE_SIZES_PX = (320, 576, 832)
+"""Image sizes of fine-tuning, up to those of real cameras."""
+
+
 def views() -> TrainConfig:
     """The default model: every pixel of the subject, with alpha, confidence, depth and predicted errors."""
     return TrainConfig(
@@ -106,14 +110,16 @@ def finetune(start: str = "views") -> TrainConfig:
         config,
         name="finetune",
         objective=objective,
+        scenes=replace(config.scenes, hold_out="auto", sizes_px=CAPTURE_SIZES_PX),
         start=start,
-        steps=400,
+        steps=4000,
         minutes=20.0,
+        new_per_batch=1,
         learning_rate=1e-4,
         warmup=60,
         ema=0.995,
         checkpoint_minutes=2.0,
-        validate_every=100,
+        validate_every=60,
     )
 
 

@@ -35,6 +35,9 @@ class RunState:
     elapsed_s: float
     positions: tuple[ReplayPosition, ...]
     """Positions of all streams, in their order."""
+    best_score: float | None = None
+    """Of the weights that are kept, in runs that keep the best."""
+    best_step: int = 0
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,8 @@ def load_run(
         for name, optimizer in optimizers.items():
             _load_optimizer(optimizer, _with_prefix(name, tensors))
         positions = tuple(ReplayPosition(**position) for position in values["positions"])
-        return RunState(values["step"], values["elapsed_s"], positions)
+        best = values.get("best_score"), values.get("best_step", 0)
+        return RunState(values["step"], values["elapsed_s"], positions, *best)
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise RunError(

@@ -16,6 +16,7 @@ from viewmend.data.synthetic.imperfections import Imperfections
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras
 from viewmend.training.config import SamplingConfig, SceneConfig
+from viewmend.training.held_back import HeldBack
 from viewmend.training.samples import Sample, rig_samples
 from viewmend.types import MultiViewFrame
 
@@ -120,6 +121,8 @@ class CaptureRigs:
     config: SceneConfig
     frames: Sequence[int]
     seed: str
+    held_back: Sequence[HeldBack | None] = ()
+    """What is never used of each capture."""
     _prepared: dict[tuple[int, str], PreparedCapture] = field(default_factory=dict)
 
     def rig(self, number: int) -> Scene:
@@ -127,18 +130,21 @@ class CaptureRigs:
         random = Random(f"{self.seed}/{number}")
         which = random.randrange(len(self.captures))
         capture, held_out = self.captures[which]
-        last = len(capture.frame_ids) - 1
+        own = self.held_back[which] if self.held_back else None
+        last = (len(capture.frame_ids) if own is None else own.first_frame) - 1
         first = random.randint(0, max(0, last - max(self.frames)))
         size_px, device = random.choice(self.config.sizes_px), self.config.data_device
         times = sorted({min(first + offset, last) for offset in self.frames})
         frames = {time: limit_size(capture.read(time), size_px).to(device) for time in times}
+        if own is not None and own.camera is not None:
+            frames = {time: frame.without([own.camera]) for time, frame in frames.items()}
         # A camera without an image at some of these frames cannot be held out there.
         complete = [n for n in frames[times[-1]].cameras.names if all(n in f.cameras.names for f in frames.values())]
         frames = {time: frame.select(complete) for time, frame in frames.items()}
 
         def cameras(held: str) -> Cameras:
             if (which, held) not in self._prepared:  # aligned when this camera is first held out
-                others = [n for n in capture.cameras.names if n != held]
+                others = [n for n in capture.cameras.names if n != held and (own is None or n != own.camera)]
                 self._prepared[which, held] = prepare(capture, others, match_colours=False)
             return replace(self._prepared[which, held], longest_px=size_px).cameras.to(device)
 
@@ -173,7 +179,11 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
     opened = [own for folder in folders for own in _open_captures(folder)]
     # Only for its checks: each held-out camera has its own alignment.
     captures = [(prepare(capture, align=False, match_colours=False), held) for capture, held in opened]
-    return MixedRigs(CaptureRigs(captures, config, frames, seed), studio, config.captures_fraction, seed)
+    back = [
+        None if held is not None or config.hold_out is None else HeldBack.of(capture, config.hold_out)
+        for capture, held in opened
+    ]
+    return MixedRigs(CaptureRigs(captures, config, frames, seed, back), studio, config.captures_fraction, seed)
 
 
 def _open_captures(place: Path) -> Sequence[tuple[NativeCapture, str | None]]:

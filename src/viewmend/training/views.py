@@ -74,7 +74,7 @@ class ViewsLossWeights:
     """L1 of colours on black."""
     perceptual: float = 0.7
     """Weight of LPIPS (AlexNet) of a crop, which keeps views as sharp as photographs."""
-    holes: float = 4.0
+    holes: Annotated[float, HIDDEN] = 4.0
     """Additional weight of pixels that no source view colours."""
     log_error: Annotated[float, HIDDEN] = 0.5
     """Weight of log10 of the squared error of a crop."""

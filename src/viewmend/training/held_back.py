@@ -1,0 +1,222 @@
+"""What fine-tuning never trains on: one camera of a capture and its last frames, for validation and the final table."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.holdout.scenes import LeaveOneOut
+from viewmend.data.images import write_image
+from viewmend.data.prepare import open_masked, prepare
+from viewmend.data.source import CaptureSource
+from viewmend.frame_cache import CachedFrame
+from viewmend.metrics.image_quality import psnr
+from viewmend.metrics.lpips import MIN_PX, Lpips, load_lpips
+from viewmend.models.base import Inpainter
+from viewmend.models.compositing import Background, composite
+from viewmend.stream import Stream, StreamConfig
+from viewmend.types import CompletedView, MultiViewFrame
+from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
+
+AUTO = "auto"
+"""Value of `SceneConfig.hold_out` that leaves the choice to `HeldBack.of`."""
+TAIL = 0.1
+"""Fraction of a capture's frames that is held back, at its end."""
+MIN_CAMERAS = 5
+"""Smaller rigs keep all their cameras for training: views from two cameras say little about views from three."""
+MAX_VIEWS = 6
+"""Views that a run is validated on."""
+MAX_TABLE = 8
+"""Cameras of the final table."""
+LPIPS_DB = 40.0
+"""Decibels that one unit of LPIPS is worth when weights are compared: 0.01 counts as much as 0.4 dB."""
+PATIENCE = 6
+"""Validations without a new best score after which a run ends."""
+PADDING_PX = 8
+
+
+@dataclass(frozen=True)
+class HeldBack:
+    """The camera and the frames of a capture that training never uses."""
+
+    camera: str | None
+    """None for rigs of fewer than `MIN_CAMERAS`."""
+    first_frame: int
+    """Frames from this one on; the number of frames if the capture has only one."""
+
+    @classmethod
+    def of(cls, capture: CaptureSource, camera: str) -> "HeldBack":
+        """This camera, or with `AUTO` the middle one of the rig, and the last tenth of the frames.
+
+        Raises:
+            CaptureError: there is no such camera, or too few others.
+        """
+        names, count = capture.cameras.names, len(capture.frame_ids)
+        if camera != AUTO and camera not in names:
+            raise CaptureError(f"{capture.name}: expected --hold-out among {', '.join(names)}, got '{camera}'")
+        if camera != AUTO and len(names) < MIN_CAMERAS:
+            raise CaptureError(
+                f"{capture.name}: expected at least {MIN_CAMERAS} cameras to hold one back, got {len(names)}; leave "
+                "--hold-out away: only the last frames are held back then"
+            )
+        chosen = names[len(names) // 2] if camera == AUTO else camera
+        return cls(chosen if len(names) >= MIN_CAMERAS else None, count - math.ceil(TAIL * count) if count > 1 else 1)
+
+
+@dataclass(frozen=True)
+class HeldBackView:
+    """A view of one camera of a capture, from the others, with the truth."""
+
+    camera: str
+    trained_on: bool
+    """Whether training saw this camera's image at this frame."""
+    inputs: CachedFrame
+    truth: MultiViewFrame
+
+    def score(self, model: Inpainter, metric: Lpips) -> tuple["ViewScore", CompletedView]:
+        """The view by this model, and its scores on the background that the model paints."""
+        background = model.background or "black"
+        stream = Stream(model, StreamConfig(memory_mb=None, background=background))
+        stream.add_frame(self.inputs.frame, self.inputs.proxy)
+        completed = stream.view(self.truth.cameras).completed
+        rgb, truth = composite(background, completed.rgb, completed.opacity), self.true_image(background)
+        everywhere = torch.ones_like(truth[0], dtype=torch.bool)
+        found = psnr(rgb, truth, everywhere)
+        assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
+        (top, bottom), (left, right) = (_span(own, length) for own, length in _box(self.truth.mask[0]))
+        box = slice(top, bottom), slice(left, right)
+        distance = float(metric(rgb[None, :, *box], truth[None, :, *box]))
+        return ViewScore(self.camera, self.trained_on, found, distance), completed
+
+    def true_image(self, background: Background) -> Float[Tensor, "3 height width"]:
+        """What the camera saw, on a background."""
+        assert self.truth.mask is not None, "fine-tuning needs masks"
+        alpha = self.truth.mask[0].float() / 255
+        return composite(background, self.truth.rgb[0].float() / 255 * alpha, alpha)
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Scores of one view."""
+
+    camera: str
+    trained_on: bool
+    psnr_db: float
+    """Of the whole view."""
+    lpips: float
+    """LPIPS (AlexNet) in the subject's box."""
+
+
+def _box(mask: Tensor) -> list[tuple[Tensor, int]]:
+    """Rows and columns with foreground, and the number of all."""
+    return [((mask > 127).any(1).nonzero()[:, 0], mask.shape[0]), ((mask > 127).any(0).nonzero()[:, 0], mask.shape[1])]
+
+
+def _span(own: Tensor, length: int) -> tuple[int, int]:
+    """First and last (exclusive) index with a margin, at least as long as LPIPS needs where the image allows it."""
+    first, last = (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
+    short = max(0, MIN_PX["alex"] - (last - first))
+    first, last = first - (short + 1) // 2, last + (short + 1) // 2
+    first, last = (0, last - first) if first < 0 else (first, last)
+    return (max(0, first - (last - length)), length) if last > length else (first, last)
+
+
+def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator[HeldBackView]:
+    """The views on which a run is validated, or with `table` those of its final table, the held-back camera first.
+
+    A camera is rendered from all others, as `viewmend mend --leave-out` does. Without a held-back camera, all cameras
+    are rendered at frames that are held back.
+
+    Raises:
+        CaptureError: the capture cannot be used.
+    """
+    capture = open_masked(place, held=1)
+    own, names, count = HeldBack.of(capture, hold_out), capture.cameras.names, len(capture.frame_ids)
+    late = range(own.first_frame, count) if count > 1 else range(1)
+    if table:
+        others = [name for name in names if name != own.camera]
+        chosen = [own.camera] if own.camera else []
+        shown = min(MAX_TABLE, len(others))
+        chosen += [others[len(others) * n // shown] for n in range(shown)]
+        wanted = [(name, late[len(late) // 2]) for name in dict.fromkeys(chosen)]
+    elif own.camera is None:
+        wanted = [(names[n % len(names)], late[len(late) * n // MAX_VIEWS]) for n in range(MAX_VIEWS)]
+    else:
+        frames = (
+            dict.fromkeys(count * n // MAX_VIEWS for n in range(1, MAX_VIEWS)) if count > MAX_VIEWS else range(count)
+        )
+        wanted = [(own.camera, time) for time in dict.fromkeys((*frames, late[-1]))]
+    for camera, time in dict.fromkeys(wanted):
+        others = tuple(name for name in names if name != camera)
+        prepared = prepare(capture, others)
+        frame = prepared.read(time)
+        if camera not in frame.cameras.names or len(frame.cameras) < 3:
+            continue
+        seen = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
+        stream = Stream(Inpainter(), bounds=prepared.bounds)
+        yield HeldBackView(camera, camera != own.camera and count == 1, stream.add_frame(seen.inputs), seen.truth)
+
+
+@dataclass
+class HeldBackValidation:
+    """Validation of a fine-tuning run on what it holds back; the run keeps the weights with the best "score"."""
+
+    captures: Sequence[Path]
+    hold_out: str
+    _views: list[HeldBackView] = field(default_factory=list)
+    _metric: Lpips | None = None
+
+    @torch.no_grad()
+    def __call__(self, model: nn.Module, image: Path) -> dict[str, float | None]:
+        """Mean PSNR of whole views in dB, LPIPS in the subject's box, and "score", which weighs both."""
+        assert isinstance(model, Inpainter), "a network that completes views"
+        if not self._views:
+            self._views = [view for place in self.captures for view in held_back_views(place, self.hold_out)]
+        self._metric = self._metric or load_lpips("alex")
+        training = model.training  # pyright: ignore
+        model.eval()  # pyright: ignore
+        made = [view.score(model, self._metric) for view in self._views]
+        model.train(training)  # pyright: ignore
+        background = model.background or "black"
+        rows = [
+            _row(view, [("tuned", completed)], background)
+            for view, (_, completed) in zip(self._views, made, strict=True)
+        ]
+        write_image(image, contact_sheet(rows[:4]))
+        psnr_db, lpips = (
+            sum(values) / len(made) for values in zip(*((s.psnr_db, s.lpips) for s, _ in made), strict=True)
+        )
+        return {"psnr_whole": psnr_db, "lpips_subject": lpips, "score": psnr_db - LPIPS_DB * lpips}
+
+
+def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, sheet: Path) -> str:
+    """A table of the scores before and after fine-tuning by camera, and the views as a contact sheet.
+
+    Returns:
+        Lines of Markdown.
+    """
+    metric, lines, rows = load_lpips("alex"), [], []
+    for view in held_back_views(place, hold_out, table=True):
+        (old, old_view), (new, new_view) = view.score(before, metric), view.score(after, metric)
+        note = " (its image was trained on)" if view.trained_on else ""
+        lines.append(
+            f"| {view.camera}{note} | {old.psnr_db:.2f} | {new.psnr_db:.2f} | {old.lpips:.4f} | {new.lpips:.4f} |"
+        )
+        rows.append(_row(view, [("before", old_view), ("after", new_view)], after.background or "black"))
+    write_image(sheet, contact_sheet(rows))
+    return "\n".join(
+        ["| camera | PSNR before, dB | after | LPIPS before | after |", "| --- | --- | --- | --- | --- |", *lines]
+    )
+
+
+def _row(view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], background: Background) -> list[Tile]:
+    """The view as rendered, as completed, and the truth, cut to the subject."""
+    (top, bottom), (left, right) = (_span(own, length) for own, length in _box(view.truth.mask[0]))  # pyright: ignore
+    images = [("rendered", completed[0][1].view.rgb), *((name, own.rgb) for name, own in completed)]
+    images.append(("truth", view.true_image(background)))
+    return [Tile(f"{view.camera}: {name}", picture(image[:, top:bottom, left:right])) for name, image in images]

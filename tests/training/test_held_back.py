@@ -1,0 +1,101 @@
+"""Fine-tuning holds back a camera and the last frames, and keeps the best weights."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.native_writer import write_capture
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.models.checkpoint import load_network
+from viewmend.models.views.model import ViewSynthNet
+from viewmend.training import held_back
+from viewmend.training.config import TrainConfig
+from viewmend.training.held_back import AUTO, HeldBack, HeldBackValidation, compare, held_back_views
+from viewmend.training.loop import train
+from viewmend.training.scenes import rig_source
+from viewmend.training.views import ViewsObjectiveConfig
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("captures") / "mine"
+    write_capture(Studio(StudioConfig(seed=5, cameras=5, frames=4, size_px=96)), folder)
+    return folder
+
+
+def test_the_middle_camera_and_the_last_tenth_are_held_back():
+    studio = Studio(StudioConfig(seed=5, cameras=5, frames=31, size_px=32))
+    assert HeldBack.of(studio, AUTO) == HeldBack("cam02", 27)
+    assert HeldBack.of(studio, "cam04") == HeldBack("cam04", 27)
+    one_frame = Studio(StudioConfig(seed=5, cameras=5, frames=1, size_px=32))
+    assert HeldBack.of(one_frame, AUTO) == HeldBack("cam02", 1)
+    small = Studio(StudioConfig(seed=5, cameras=4, frames=31, size_px=32))
+    assert HeldBack.of(small, AUTO) == HeldBack(None, 27)
+    with pytest.raises(CaptureError, match=r"--hold-out among cam00, .*got 'front'"):
+        HeldBack.of(studio, "front")
+    with pytest.raises(CaptureError, match="at least 5 cameras to hold one back, got 4"):
+        HeldBack.of(small, "cam00")
+
+
+def test_training_never_sees_what_is_held_back(place):
+    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out="cam03")
+    source = rig_source(scenes, (0, 1), "tests")
+    rigs = [source.rig(number).rig for number in range(12)]
+    assert {time for rig in rigs for time in rig.frames} == {0, 1, 2}
+    names = {name for rig in rigs for frame in rig.frames.values() for name in frame.cameras.names}
+    assert names == {"cam00", "cam01", "cam02", "cam04"}
+
+
+def test_what_is_held_back_is_scored(place):
+    views = list(held_back_views(place, AUTO))
+    assert {view.camera for view in views} == {"cam02"} and not any(view.trained_on for view in views)
+    assert 3 in {view.truth.time for view in views}
+    assert all("cam02" not in view.inputs.frame.cameras.names for view in views)
+    table = list(held_back_views(place, AUTO, table=True))
+    assert [view.camera for view in table] == ["cam02", "cam00", "cam01", "cam03", "cam04"]
+    assert {view.truth.time for view in table} == {3}
+
+
+def test_the_table_tells_better_weights_from_worse_ones(place, tmp_path):
+    good, bad = ViewSynthNet(VIEWS_MODEL).eval(), ViewSynthNet(VIEWS_MODEL).eval()
+    with torch.no_grad():
+        bad.blending[-1].weight.zero_()
+        bad.blending[-1].bias.fill_(-9.0)  # everything is transparent
+    lines = compare(place, AUTO, bad, good, tmp_path / "sheet.png").splitlines()
+    assert len(lines) == 7 and (tmp_path / "sheet.png").stat().st_size > 1000
+    for line in lines[2:]:
+        _, psnr_before, psnr_after, lpips_before, lpips_after = (part.strip() for part in line.strip("|").split("|"))
+        assert float(psnr_after) > float(psnr_before) and float(lpips_after) < float(lpips_before)
+
+
+def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
+    scores = iter([1.0, 2.0, 1.5, 1.0, 1.2, 0.9, 0.8, 0.7, 0.6])
+    monkeypatch.setattr(HeldBackValidation, "__call__", lambda *_: {"score": next(scores)})
+    monkeypatch.setattr("viewmend.training.loop.PATIENCE", 3)
+    scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out=AUTO)
+    options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
+    config = TrainConfig(
+        name="finetune", objective=options, scenes=scenes, **RUN | {"steps": 40, "validate_every": 1, "ema": 0.0}
+    )
+    kept = []
+    out = train(config, tmp_path / "run", report=lambda _: kept.append(first_weight(tmp_path / "run")))
+    log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert max(entry["step"] for entry in log) == 4, "three validations after the best one"
+    assert all(float(value) == float(kept[0]) for value in kept), "step 1 was the best"
+    assert "1 steps of" in (out / "README.md").read_text()
+    train(config, out)
+    assert float(first_weight(out)) == float(kept[0]), "a finished run stays as it is"
+
+
+def first_weight(folder):
+    return load_network(str(folder)).depth_logits.weight.detach().flatten()[0]
+
+
+def test_psnr_and_lpips_are_both_weighed(place):
+    found = HeldBackValidation([place], AUTO)(ViewSynthNet(VIEWS_MODEL), place.parent / "shown.png")
+    assert found["score"] == pytest.approx(found["psnr_whole"] - held_back.LPIPS_DB * found["lpips_subject"])
+    assert (place.parent / "shown.png").exists()
