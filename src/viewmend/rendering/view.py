@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -72,8 +73,8 @@ def render_view(
     raster = rasterize(proxy.mesh, target)
     normals = interpolate(proxy.normals, proxy.mesh, target, raster)[0]
     center = proxy.mesh.vertices.mean(0) if len(proxy.mesh.vertices) else proxy.bounds.center
-    size_m = float(proxy.bounds.size_m.norm())
-    return _colour(frame, target, raster.depth[0], normals, center, size_m, config, exclude, source_depth)
+    surface = _Surface(raster.depth[0], normals, center, float(proxy.bounds.size_m.norm()))
+    return _colour(frame, target, surface, config, exclude, source_depth)
 
 
 def render_depth(
@@ -100,23 +101,31 @@ def render_depth(
     across, down = (torch.gradient(points, dim=axis)[0] for axis in (1, 0))
     normals = normalize(torch.linalg.cross(down, across), dim=-1)
     there = points[depth > 0] if bool((depth > 0).any()) else points.new_zeros(1, 3)
-    size_m = float((there.amax(0) - there.amin(0)).norm())
-    return _colour(frame, target, depth, normals, there.mean(0), size_m, config, (), source_depth)
+    surface = _Surface(depth, normals, there.mean(0), float((there.amax(0) - there.amin(0)).norm()))
+    return _colour(frame, target, surface, config, (), source_depth)
+
+
+class _Surface(NamedTuple):
+    """What a novel view shows of the proxy."""
+
+    depth: Float[Tensor, "height width"]
+    normals: Float[Tensor, "height width 3"]
+    center: Float[Tensor, "3"]
+    """Of the whole subject."""
+    size_m: float
+    """Diagonal of the subject's box."""
 
 
 def _colour(
     frame: MultiViewFrame,
     target: Cameras,
-    depth: Float[Tensor, "height width"],
-    normals: Float[Tensor, "height width 3"],
-    center: Float[Tensor, "3"],
-    size_m: float,
+    surface: _Surface,
     config: RenderConfig,
     exclude: Sequence[str],
     source_depth: SourceDepth,
 ) -> tuple[IncompleteView, Evidence]:
-    """The view of a surface of this size around `center`, in the colours of the closest cameras."""
-    usable = _without(frame.cameras, exclude)
+    """The view of a surface in the colours of the closest cameras."""
+    usable, (depth, normals, center, size_m) = _without(frame.cameras, exclude), surface
     mask = (depth > 0).to(depth)
     candidate_views = select_closest(target, usable, center, len(usable))
     source_views = candidate_views[: config.cameras]

@@ -132,7 +132,7 @@ def sample_rays(
             return sample_rays_torch(rays, sources, source_views, step_px, scale, cubic)
         levels = sources.levels(rays.camera, step_px, scale)
         images, outlines = map(_at_levels, (sources.pyramids, sources.silhouette_pyramids), levels)
-        return _sample_numba(rays, sources, source_views, scale, images, outlines, FEATURES, 0.0, cubic)
+        return _sample_numba(rays, sources, source_views, scale, images, outlines, 0.0, cubic)
 
 
 def sample_rays_torch(
@@ -177,7 +177,7 @@ def sample_fill_rays(rays: Rays, sources: SourceCameras, source_views: Sequence[
     count, scales, outline_scales = len(images), (1.0, 0.5 / half, 1 / side), (1.0, 1 / outline_side)
     views = [((image.numpy(), means[n], means[count + n]), scales) for n, image in enumerate(images)]
     outlines = [((mask.numpy(), means[2 * count + n]), outline_scales) for n, mask in enumerate(masks)]
-    return _sample_numba(rays, sources, source_views, scale, views, outlines, sum(CAMERA_CHANNELS), LEAST_SHARE)
+    return _sample_numba(rays, sources, source_views, scale, views, outlines, LEAST_SHARE)
 
 
 def sample_fill_rays_torch(
@@ -361,15 +361,18 @@ def _sample_numba(
     scale: SceneScale,
     images: Sequence[tuple],
     outlines: Sequence[tuple],
-    channels: int,
     least_share: float,
     cubic: bool = False,
 ) -> RaySamples:
-    """Samples with compiled kernels; `images` and `outlines` are the images of each camera, and their scales."""
+    """Samples with compiled kernels; `images` and `outlines` are the images of each camera, and their scales.
+
+    Those of `RayFill` have a `least_share` above 0.
+    """
     from viewmend.models.views import _sampler_numba
 
     kernels: Any = _sampler_numba
     count, samples = rays.z_m.shape
+    channels = sum(CAMERA_CHANNELS) if least_share > 0 else FEATURES
     names, size_m = sources.cameras.names, float(scale.size_m)
     features = np.empty((count, samples, len(names), channels), np.float32)
     prior, statistics = np.zeros(features.shape[:3], np.float32), np.ones((count, samples, STATISTICS), np.float32)
