@@ -12,11 +12,15 @@ import torch
 from reference.ball import BallCapture, photograph, ring
 
 from viewmend.cli import main
-from viewmend.data.checks import diagnosis, leave_one_out
+from viewmend.data.checks import diagnosis, leave_one_out, synchronisation
 from viewmend.data.checks.calibration import HULL_ONLY, MASK_ONLY, check_calibration, draw_check
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.leave_one_out import LeaveOneOut, find_outlier_by_hull, find_outlier_by_outlines
-from viewmend.data.checks.synchronisation import check_image_mask_sync, describe_delay
+from viewmend.data.checks.synchronisation import (
+    check_image_mask_sync,
+    describe_delay,
+    find_desynchronised_cameras,
+)
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
@@ -275,6 +279,30 @@ def test_a_faulty_camera_is_named(moving, tmp_path, fault):
     found = warnings_of(moving, tmp_path, change)
     name = names_of(moving)[3]
     assert any(words.format(name) in text and f"'{name}'" in text for text in found), found
+
+
+def test_check_names_a_late_camera_as_mend_does(moving, tmp_path, capsys):
+    found = warnings_of(moving, tmp_path, delay("image", "mask"))
+    assert main(["check", str(tmp_path / "changed"), "--time", "3"]) == 0
+    issue = capsys.readouterr().out.splitlines()[-1].removeprefix("  - ")
+    assert "late by about 2 frames" in issue and any(text.endswith(issue) for text in found)
+    assert "or raise its offset_ms in cameras.json by 200" in issue
+
+
+def test_frames_that_were_lost_on_the_way_are_found(moving, tmp_path, monkeypatch):
+    monkeypatch.setattr(synchronisation, "MAX_DELAY", 2)
+    folder = shutil.copytree(moving, tmp_path / "changed")
+    name = names_of(folder)[3]
+    for kind in ("image", "mask"):
+        files = sorted((folder / kind / name).glob("*.png"))
+        for time in (3, 4, 5):
+            shutil.copy(files[time + 1], files[time])
+    capture = open_capture(folder)
+    assert find_desynchronised_cameras(capture, capture.read(0)) == ()
+    (issue,) = find_desynchronised_cameras(capture, capture.read(0), last=4)
+    assert f"camera '{name}': early by about 1 frame" in issue.text
+    first, last = capture.frame_ids[0], capture.frame_ids[4]
+    assert f"(at frame '{last}', but not at frame '{first}': frames were lost or repeated in between)" in issue.text
 
 
 # EXIF orientation.

@@ -116,7 +116,8 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck]"
     with busy("computing the hull"):
         check = check_calibration(capture.read(options.time), capture.bounds)
         good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
-        late = find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
+        fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
+        late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
         check = replace(check, issues=(*capture.issues, *check.issues, *late))
     if options.out is not None:
         remove_partial_file(options.out)

@@ -47,7 +47,7 @@ def find_desynchronised_cameras(
     if issues or last is None or last <= frame.time + MAX_DELAY:
         return issues
     later = find_desynchronised_camera(*_frames_around(source, frame, last), source.bounds, source.fps)
-    text = "{} (at frame '{}', but not at frame '{}': frames were lost in between)"
+    text = "{} (at frame '{}', but not at frame '{}': frames were lost or repeated in between)"
     first_id, last_id = source.frame_ids[frame.time], source.frame_ids[last]
     return tuple(replace(issue, text=text.format(issue.text, last_id, first_id)) for issue in later)
 
