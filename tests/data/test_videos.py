@@ -66,10 +66,19 @@ def test_an_edit_list_hides_frames(tmp_path):
     assert len(shown) == 12 and np.abs(shown[0].astype(int) - FRAMES[0]).mean() < 12
 
 
-def test_lost_frames_leave_gaps_in_time(tmp_path):
-    times = [3, 4, 5, 9, 10, 11]
-    video = video_properties(write_film(tmp_path / "a.mp4", FRAMES[:6], times=times))
-    assert video.times_s == pytest.approx(np.array(times) / 30, abs=1e-3) and video.fps == pytest.approx(30, abs=0.1)
+@pytest.mark.parametrize(("name", "how"), [("a.mp4", {}), ("a.mkv", {}), ("a.avi", {"codec": "mpeg4"})])
+def test_lost_frames_leave_gaps_in_time(tmp_path, name, how):
+    times = [0, 1, 2, 6, 7, 8] if name == "a.avi" else [3, 4, 5, 9, 10, 11]  # AVI starts with its first frame
+    video = video_properties(write_film(tmp_path / name, FRAMES[:6], times=times, **how))
+    assert video.times_s == pytest.approx(np.array(times) / 30, abs=1e-3)
+    assert video.fps == pytest.approx(30, abs=0.1)
+
+
+def test_lost_frames_of_an_avi_with_b_frames_leave_a_gap(tmp_path):
+    video = video_properties(write_film(tmp_path / "a.avi", FRAMES, times=[*range(6), *range(9, 15)]))
+    steps = np.diff(video.times_s) * 30
+    assert (video.timestamps, video.frames) == (None, 12)
+    assert sorted(np.rint(steps).tolist()) == [1] * 10 + [4]
 
 
 def test_a_film_that_was_cut_off_ends_with_its_last_whole_frame(tmp_path):

@@ -99,14 +99,15 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
     if not head:
         raise CaptureError(f"{path}: expected a video, got a file without decodable frames; export it again")
     timestamps = None if codec.name in HIDDEN_FRAMES else _timestamps(path, packets, [f.pts for f in head])
+    times = timestamps
     if timestamps is None:
         decoded = [frame.pts for frame in _decoded(path)]
-        known = [time for time in decoded if time is not None]
-        timestamps = tuple(known) if known == sorted(set(known)) and len(known) == len(decoded) else None
-        times, base = (timestamps, base) if timestamps else (range(len(decoded)), 1 / (rate or Fraction(25)))
-    else:
-        times = timestamps
-    seconds = np.array([float(time * base) for time in times])
+        times = sorted({time for time in decoded if time is not None})
+        if times == decoded:
+            timestamps = tuple(times)
+        elif not len(times) == len(decoded) == len(packets):  # AVI mixes the order up, but keeps the gaps
+            times, base = range(len(decoded)), 1 / (rate or Fraction(25))
+    seconds = np.array([float(time * base) for time in times or ()])
     fps = _measured_rate(seconds, None if rate is None else float(rate), float(base))
     delayed = frames == 0 and reordered and fps is not None and seconds[0] <= MAX_ENCODER_DELAY / fps
     if not names & ABSOLUTE_TIMES or ("mp4" in names and delayed):
