@@ -61,6 +61,17 @@ def test_a_bad_path_is_named(folder, tmp_path, mend, content, message):
     assert [f.name for f in tmp_path.iterdir()] == ["path.json"]
 
 
+def test_frames_with_too_few_cameras_are_left_out(folder, tmp_path, mend):
+    few = shutil.copytree(folder, tmp_path / "few")
+    for name in ("c1", "c2", "c3", "c4", "c5"):
+        (few / "image" / name / "001.png").unlink()
+    code, scores, err = mend(few, tmp_path / "out", "--leave-out", "held")
+    assert code == 0 and scores["frames"] == 1
+    assert "1 of 2 frames have fewer than two input cameras and are left out; the first is '001'" in err
+    code, _, err = mend(few, tmp_path / "out", "--leave-out", "held", "--frames", "1:2")
+    assert code == 2 and "expected two input cameras in one frame or more, got none" in err
+
+
 @pytest.mark.parametrize(
     ("text", "times", "said"),
     [

@@ -93,7 +93,10 @@ def test_a_camera_without_a_file_is_said_once_and_is_absent_there(caplog):
     prepared = prepare(Absent(ring(6)), align=False)
     assert [len(prepared.read(time).cameras) for time in (0, 1, 1)] == [6, 5, 5]
     said = [record.getMessage() for record in caplog.records if "'c1'" in record.getMessage()]
-    assert len(said) == 1 and "has no image or no mask in this frame and is absent; check its files" in said[0]
+    assert (
+        len(said) == 1
+        and "has no image or no mask in this frame and is absent; viewmend check lists all gaps" in said[0]
+    )
 
 
 def test_a_camera_that_is_no_input_may_be_absent(caplog):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
+    from viewmend.data.native_capture import NativeCapture
     from viewmend.data.source import CaptureSource
     from viewmend.evaluation.mending import MendSummary
     from viewmend.geometry.cameras import Cameras
@@ -101,17 +102,19 @@ def run(options: Options) -> int:
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
+    usable = _usable(opened, times, held)
     inpainter = load_named(options.model, options.device)
     inputs = [name for name in opened.cameras.names if name not in held]
     capture = prepare(
-        opened, inputs, align=options.align, match_colours=options.match_colours, first=times[0], last=times[-1]
+        opened, inputs, align=options.align, match_colours=options.match_colours, first=usable[0], last=usable[-1]
     )
     log_preparation(capture)
     error_model = error_model_for(inpainter, options.device) if render.error_rule == "predicted" else None
     config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
     mender = Mender(inpainter, config, capture.bounds, held, quality, error_model)
     summary = MendSummary()
-    plan, frames, frame = _plan(options, capture, times), prefetch(capture, times), None
+    plan = [(time, target) for time, target in _plan(options, capture, times, usable[0]) if time in usable]
+    frames, frame = prefetch(capture, usable), None
     with MendOutput(options.out, capture.fps or 15.0, options.alpha, options.depth) as output:
         if output.replaces:
             say(f"{options.out}: the results of an earlier run will be replaced")
@@ -168,7 +171,7 @@ def _in_words(summary: "MendSummary") -> list[str]:
     return lines
 
 
-def _open(options: Options, held: tuple[str, ...]) -> "CaptureSource":
+def _open(options: Options, held: tuple[str, ...]) -> "NativeCapture":
     from viewmend.data.errors import CaptureError
     from viewmend.data.prepare import open_masked
 
@@ -183,22 +186,41 @@ def _open(options: Options, held: tuple[str, ...]) -> "CaptureSource":
     return capture
 
 
-def _plan(options: Options, capture: "CaptureSource", times: range) -> "list[tuple[int, Cameras]]":
-    """Frame indices and the camera of each view, in order."""
+def _usable(capture: "NativeCapture", times: range, held: tuple[str, ...]) -> list[int]:
+    """The times at which two input cameras or more are present; says which are not.
+
+    Raises:
+        ValueError: there is none.
+    """
+    from viewmend.cli.console import say
+
+    inputs = [view for view, name in enumerate(capture.cameras.names) if name not in held]
+    usable = [time for time in times if capture.present[inputs, time].sum() >= 2]
+    left_out = [capture.frame_ids[time] for time in times if time not in usable]
+    if not usable:
+        raise ValueError(f"{capture.name}: expected two input cameras in one frame or more, got none; add cameras")
+    if left_out:
+        count = f"{len(left_out)} of {len(times)} frames"
+        say(f"{count} have fewer than two input cameras and are left out; the first is '{left_out[0]}'")
+    return usable
+
+
+def _plan(options: Options, capture: "CaptureSource", times: range, first: int) -> "list[tuple[int, Cameras]]":
+    """Frame indices and the camera of each view, in order; an orbit's centre is the subject in the `first` frame."""
     from viewmend.data.camera_path import pair_with_frames, read_camera_path
 
     if options.leave_out is not None:
         return [(time, capture.cameras.select([options.leave_out])) for time in times]
     if options.path == "orbit":
-        return pair_with_frames(_orbit(capture, times), times)
+        return pair_with_frames(_orbit(capture, times, first), times)
     return pair_with_frames(read_camera_path(Path(str(options.path)), capture.cameras), times)
 
 
-def _orbit(capture: "CaptureSource", times: range) -> "Cameras":
+def _orbit(capture: "CaptureSource", times: range, first_time: int) -> "Cameras":
     from viewmend.geometry.orbit import orbit_around
     from viewmend.geometry.proxy import reconstruct
 
-    first = capture.read(times[0])
+    first = capture.read(first_time)
     assert first.mask is not None, "captures without masks are refused"
     center = reconstruct(first.mask, first.cameras, capture.bounds).mesh.vertices.mean(0)
     views, turn = (STATIC_VIEWS, STATIC_VIEWS) if len(times) == 1 else (len(times), FRAMES_PER_TURN)

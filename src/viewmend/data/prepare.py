@@ -68,7 +68,7 @@ class PreparedCapture(CaptureWrapper):
         frame = self.source.read(time).without(self.left_out)
         inputs = self.cameras.names if self.inputs is None else self.inputs
         absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
-        text = "camera '{}' has no image or no mask in this frame and is absent; check its files"
+        text = "camera '{}' has no image or no mask in this frame and is absent; viewmend check lists all gaps"
         issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
         _raise_or_warn(f"{self.name}: frame '{self.frame_ids[time]}'", issues, self._reported)
         bad = [issue.camera for issue in issues if issue.camera]
