@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.data.checks.leave_one_out import HULL, LONGEST_PX, leave_one_out, missed_share, pad_like
+from viewmend.data.checks.leave_one_out import HULL, LONGEST_PX, MIN_CAMERAS, leave_one_out, missed_share, pad_like
 from viewmend.data.errors import Issue
 from viewmend.data.resize import limit_size
 from viewmend.data.source import CaptureSource
@@ -43,6 +43,8 @@ def find_desynchronised_cameras(
         frame: one of its frames, with the cameras to check.
         last: index of a later frame to check too.
     """
+    if frame.mask is None or len(frame.cameras) < MIN_CAMERAS:
+        return ()
     issues = find_desynchronised_camera(*_frames_around(source, frame, frame.time), source.bounds, source.fps)
     if issues or last is None or last <= frame.time + MAX_DELAY:
         return issues
