@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from viewmend.live.protocol import (
     Ack,
     Camera,
+    Cancel,
     ClockChange,
     FrameTimes,
     Hello,
@@ -32,6 +33,7 @@ def said(**message):
 def test_every_message_is_parsed():
     assert said(type="hello", version=1, codecs=["h264", "theora", "jpeg"]) == Hello(1, ("h264", "theora", "jpeg"))
     assert said(type="ack", frame=3) == Ack(3)
+    assert said(type="cancel") == Cancel()
     assert said(type="ping", sent_ms=1.5) == Ping(1.5)
     assert said(type="clock", seek=4, speed=2) == ClockChange(None, 2.0, 4, False)
     assert said(type="clock", playing=False, live=True) == ClockChange(False, None, None, True)
@@ -47,7 +49,7 @@ def test_every_message_is_parsed():
 @pytest.mark.parametrize(
     ("message", "words"),
     [
-        ({"type": "shout"}, 'type: expected hello or look or ack or clock or on_air or ping, got "shout"'),
+        ({"type": "shout"}, 'type: expected hello or look or cancel or ack or clock or on_air or ping, got "shout"'),
         ({"type": "look", "width": 5000}, "from 16 to 2048 pixels, got 5000 x 320"),
         ({"type": "look", "width": 2048, "height": 2048}, "at most 2100000 pixels, got 2048 x 2048"),
         ({"type": "look", "width": 1024, "height": 1100, "eyes": [{}, {}]}, "at most 2100000 pixels"),

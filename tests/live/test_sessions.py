@@ -105,6 +105,29 @@ def test_a_moving_view_is_small_and_a_still_one_full():
     assert desk.size(desk.due()) == (200, 100)
 
 
+def test_a_client_that_draws_by_itself_gets_the_full_view_only():
+    desk = Desk(budget_ms=5.0)
+    desk.pause()
+    desk.look(id=1, full=True, width=200, height=100)
+    request = desk.due()
+    assert desk.size(request) == (200, 100) and request.quality.context_times == FULL.context_times
+    assert desk.due(FULL_S + 1) is None, "there is no better view"
+
+
+def test_a_cancelled_look_is_neither_rendered_nor_sent(ball_view):
+    desk = Desk()
+    desk.pause()
+    result = RenderResult(0, (ball_view,), State(), StageTimes())
+    desk.look(id=1)
+    request = desk.due()
+    desk.session.cancel()
+    desk.session.deliver(request, result)
+    assert not desk.sent and desk.session.in_flight is None and desk.due(1.0) is None
+    desk.look(id=2)
+    desk.session.deliver(desk.due(), result)
+    assert [unpack(message)[0]["look"] for message in desk.sent] == [2]
+
+
 def test_a_still_view_is_refined_in_two_steps():
     desk = Desk(budget_ms=50.0)
     desk.pause()

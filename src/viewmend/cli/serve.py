@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
 
 import tyro
 
@@ -51,6 +51,9 @@ class Options:
     """Address at which a reverse proxy serves the page, such as https://example.org/rig; needs --token."""
     model: str | None = None
     """A shipped model's name or a model's folder; 'telea' and 'nearest' are classical fills. By default 'views'."""
+    render: Literal["page", "server"] = "page"
+    """Where moving views are drawn: in the page, from the frame's mesh and images, or on the server. Views at rest are
+    completed on the server either way."""
     fps: float | None = None
     """Frames per second; by default those of the capture."""
     budget_ms: float = 100.0
@@ -115,7 +118,8 @@ def run(options: Options) -> int:
     config = server_config(options)
     source = open_source(options)
     inpainter, device = load_inpainter(options), options.device
-    renderer = Renderer(source, inpainter, stream_config(options), device, error_model_for(inpainter, device))
+    errors, in_page = error_model_for(inpainter, device), config.draws_in_page
+    renderer = Renderer(source, inpainter, stream_config(options), device, errors, draws_in_page=in_page)
     live = LiveServer(RenderService(renderer, source), config)
     server = Server(live, config)
     with server.bind() as address:
@@ -171,6 +175,7 @@ def server_config(options: Options) -> "ServerConfig":
         public_url=options.public_url,
         budget_ms=options.budget_ms or None,
         model=options.model or default_method(),
+        draws_in_page=options.render == "page",
         limits=Limits(viewers=options.viewers),
         extensions=tuple(load_extension(name, values[name]) for name in EXTENSIONS if values[name] is not None),
     )

@@ -17,6 +17,7 @@ from viewmend.live.protocol import (
     MODES,
     VERSION,
     Ack,
+    Cancel,
     ClockChange,
     Hello,
     Limits,
@@ -231,12 +232,14 @@ class ViewerConnection:
         with self._service.lock:
             if isinstance(message, Look):
                 self._session.look(message)
+            elif isinstance(message, Cancel):
+                self._session.cancel()
             elif isinstance(message, Ack):
                 self._session.ack(message.frame)
             elif isinstance(message, ClockChange):
                 self._session.change_clock(message, self._service.source.span)
             used = [extension.handle(self._session, message) for extension in self._registry.extensions]
-            if not any(used) and not isinstance(message, Look | Ack | ClockChange):
+            if not any(used) and not isinstance(message, Look | Cancel | Ack | ClockChange):
                 raise ProtocolError(
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
@@ -264,7 +267,10 @@ class ViewerConnection:
             own = self._session.state_json(self._service.source.span, self._service.source.edge)
             for extension in self._registry.extensions:
                 own |= extension.state_json(self._session)
-            state = (shared, {key: own[key] for key in own if key not in ("time", "behind")})
+            steady = (
+                ("behind",) if self._service.source.span.live else ("time", "behind")
+            )  # a rig's frames are announced
+            state = (shared, {key: own[key] for key in own if key not in steady})
             if state != last or now - state_at >= 0.5:
                 last, state_at = state, now
                 self._send_soon({"type": "state"} | shared | own)

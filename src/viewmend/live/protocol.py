@@ -117,6 +117,8 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     """Which pixels are inpainted; None for the server's default."""
     scale: Annotated[float, Meta(ge=0.1, le=1)] = 1.0
     moving: bool = False
+    full: bool = False
+    """Only the view at full quality is of use: the client draws a draft by itself."""
     adaptive: bool = True
     depth: bool = False
     codec: Annotated[str, one_of(*CODECS)] = "jpeg"
@@ -147,6 +149,10 @@ class Hello(Struct, frozen=True, tag="hello"):
     codecs: Annotated[tuple[ShortText, ...], Meta(max_length=8)] = ("jpeg",)
 
 
+class Cancel(Struct, frozen=True, tag="cancel"):
+    """The last look is not needed any more; nothing is rendered until the next one."""
+
+
 class Ack(Struct, frozen=True, tag="ack"):
     """A frame has arrived."""
 
@@ -174,7 +180,7 @@ class Ping(Struct, frozen=True, tag="ping"):
     sent_ms: ClientMs = 0.0
 
 
-Message = Hello | Look | Ack | ClockChange | OnAir | Ping
+Message = Hello | Look | Cancel | Ack | ClockChange | OnAir | Ping
 
 
 def parse(text: str, limits: Limits) -> Message:

@@ -72,6 +72,8 @@ class ServerConfig:
     budget_ms: float | None = 100.0
     model: str = "views"
     """The model's name in `welcome` and /health."""
+    draws_in_page: bool = True
+    """Whether pages draw moving views by themselves."""
     limits: Limits = field(default_factory=Limits)
     extensions: tuple["ExtensionFactory", ...] = ()
 

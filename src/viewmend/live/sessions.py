@@ -104,7 +104,7 @@ class ViewerSession:
         self._advanced_at = now()
         self._requested: tuple[Look | None, int] = (None, -1)
         """Look and frame of the last request."""
-        self._is_full = False
+        self._is_full = self._is_cancelled = False
         self._awaited = (-1, 0.0)
         """The frame that is being read, and since when; -1 for none."""
         self._level, self._wait_ms = FULL, 0.0
@@ -118,6 +118,10 @@ class ViewerSession:
             self.dropped += 1
         self._look, self._look_at = look, self._now()
         self._encoders.key_frame |= look.key  # kept until a frame is encoded, even if this look is dropped
+
+    def cancel(self) -> None:
+        """Drop the look; a view that is being rendered is not sent."""
+        self._look, self._is_cancelled = None, True
 
     @property
     def newest_look(self) -> Look | None:
@@ -161,7 +165,7 @@ class ViewerSession:
             return None
         if is_new and not is_new_look and self.clock.playing:
             self.dropped += max(0, index - self._requested[1] - 1)
-        self._level, self._is_full = level, level == FULL
+        self._level, self._is_full, self._is_cancelled = level, level == FULL, False
         self.rendered_level = playback.resolution_limit.apply(
             level, look.pixels, playback.active_viewers, playback.has_company
         )
@@ -191,6 +195,8 @@ class ViewerSession:
         return better[-1] if better else None
 
     def _choose_level(self, look: Look, active_viewers: int) -> QualityLevel:
+        if look.full:
+            return FULL
         if self.budget is not None and self._budget_ms is not None:
             self.budget.target_ms = self._budget_ms / max(1, active_viewers)
             level = self.budget.level
@@ -220,6 +226,8 @@ class ViewerSession:
         look = self._requested[0]
         assert look is not None, "a view is rendered for a look"
         self.viewer = result.viewer
+        if self._is_cancelled:
+            return FrameTimes(**vars(result.times))
         fields = {"frame": next(self._frame_numbers), "full": self._is_full, "dropped": self.dropped}
         message, times = encode_frame(look, request, result, self._encoders, self._wait_ms, **fields)
         self._encoders.key_frame = False

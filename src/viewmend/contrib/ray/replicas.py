@@ -207,7 +207,8 @@ def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
     stream = replace(served.stream, memory_mb=min(served.stream.memory_mb or math.inf, served.replica_mb / 2))
     inpainter = served.load_inpainter()
     error_model = error_model_for(inpainter, served.device)
-    renderer = Renderer(source, inpainter, stream, served.device, error_model)
+    in_page = served.server.draws_in_page
+    renderer = Renderer(source, inpainter, stream, served.device, error_model, draws_in_page=in_page)
     service = RenderService(renderer, source)
 
     async def ready() -> None:

@@ -1,8 +1,10 @@
 // The page: puts the parts together and repaints when something changed.
 
+import { DRAWN_MODES } from "./draw/scene.js";
 import { Stage } from "./draw/stage.js";
 import { rigLines } from "./draw/rig.js";
 import { Headset, headsetThere } from "./headset.js";
+import { Assets, rankedCameras } from "./link/assets.js";
 import { Connection } from "./link/connection.js";
 import { decodable } from "./link/pictures.js";
 import { ViewerLink } from "./link/viewer.js";
@@ -25,7 +27,7 @@ import { contained, lensOf, resize, sharpSide, sizeFor } from "./view/lens.js";
 import { degrees } from "./view/matrix.js";
 import { Motion } from "./view/motion.js";
 import { Place, poseOf, poseText, timeOf } from "./view/url_state.js";
-import { extrinsicsOf } from "./view/pose.js";
+import { extrinsicsOf, eyeOf } from "./view/pose.js";
 import { Pace, Resolution } from "./draw/resolution.js";
 
 const query = new URLSearchParams(location.search);
@@ -45,6 +47,9 @@ class Page {
     this.scheduled = false;
     this.connection = new Connection(token, ["jpeg"]);
     this.link = new ViewerLink(this.connection);
+    this.assets = new Assets(token);
+    /** The frame that the page draws; null if the server draws. @type {import("./link/assets.js").Frame | null} */
+    this.drawn = null;
     this.notices = new Notices(() => this.connection.open());
     this.onAir = new OnAir(this.link, this.notices, token);
     this.statistics = new Statistics();
@@ -128,12 +133,18 @@ class Page {
       document.title = `${rig.name} · viewmend live`;
       this.motion.place(rig);
       this.cameras.set(rig);
+      this.assets.open(rig);
       this.showSources([], undefined);
       this.wake();
     });
     on(this.link, "state", (state) => {
       this.notices.source(state);
       this.wake();
+    });
+    on(this.assets, "change", () => this.wake());
+    on(this.assets, "dropped", (frame) => {
+      if (this.drawn === frame) this.drawn = null;
+      this.stage.scene.drop(frame);
     });
     on(this.link, "stats", (stats) => (this.statistics.server = stats));
     on(this.link, "error", ({ message }) => this.notices.toast(message, "error"));
@@ -142,6 +153,7 @@ class Page {
     this.canvas.addEventListener("webglcontextlost", (/** @type {Event} */ event) => event.preventDefault());
     this.canvas.addEventListener("webglcontextrestored", () => {
       this.stage.prepare();
+      this.drawn = null;
       this.link.lastLook = "";
       this.showSources([], undefined);
       this.wake();
@@ -163,8 +175,8 @@ class Page {
   take(shown) {
     const { header } = shown;
     this.stage.take(shown);
-    this.showSources(header.source_views, this.settings.modes.includes("coverage") ? header.colours : undefined);
-    this.transport.picture(header.time);
+    if (!this.drawing) this.showSources(header.source_views, this.settings.modes.includes("coverage") ? header.colours : undefined);
+    if (!this.drawing) this.transport.picture(header.time);
     this.controls.size(header);
     this.notices.arrived(this.settings.modes.includes("confidence") && header.confidence === null);
     this.paint();
@@ -210,18 +222,56 @@ class Page {
     };
   }
 
+  /** Whether the page draws moving views by itself. */
+  get drawing() {
+    const drawn = this.settings.modes.every((mode) => DRAWN_MODES.includes(mode));
+    return drawn && this.assets.usable && this.settings.get("render") === "page" && !this.headset.session && this.motion.pose !== null;
+  }
+
+  /** Choose the frame to draw, and ask for the next ones. @param {number} now ms */
+  choose(now) {
+    const { transport, motion, assets } = this;
+    transport.drawing = this.drawing;
+    const fps = motion.rig?.fps ?? 0;
+    const time = transport.drawing ? transport.timeAt(now, fps) : -1;
+    if (time < 0 || !motion.pose) {
+      this.drawn = null;
+      return;
+    }
+    const [eye, { range, playing }] = [eyeOf(motion.rig, motion.pose), transport];
+    const [framesPerMs, live] = [(fps * transport.state.speed) / 1000, transport.state.kind === "live"];
+    assets.want(time, eye, range, { playing, framesPerMs, live });
+    const late = playing ? Math.ceil(2 * fps) : 0;
+    const kept = this.drawn && assets.frames.get(this.drawn.time) === this.drawn && assets.drawable(this.drawn, eye) ? this.drawn : null;
+    const chosen = assets.choose(time, eye, range, late) ?? kept;
+    if (!chosen) return;
+    this.drawn = assets.shown = chosen;
+    const shape = /** @type {import("./link/assets.js").Shape} */ (chosen.shape);
+    const sources = rankedCameras(shape, eye).slice(0, shape.header.blend.cameras);
+    this.showSources(sources.map((/** @type {number} */ n) => shape.header.cameras[n].name), undefined);
+    transport.picture(chosen.time);
+    this.notices.arrived(false);
+    this.canvas.dataset.drawn = String(chosen.time);
+  }
+
   /** Ask for the view at the newest pose. */
   ask() {
     if (!this.motion.pose || this.headset.session) return;
+    const { drawing } = this;
+    if (drawing && (this.motion.moving || this.transport.playing || !this.drawn)) {
+      this.link.rest();
+      this.canvas.dataset.full = "false";
+      return;
+    }
     const { R, T, lens, box } = this.viewer();
     const [fixedWidth, fixedHeight] = this.settings.get("size").split("x").map(Number);
     const { moving } = this.motion;
-    const atRest = this.settings.get("sharp") && !moving && !this.transport.playing;
+    const atRest = (drawing || this.settings.get("sharp")) && !moving && !this.transport.playing;
     const side = atRest ? sharpSide(box, Math.min(2, window.devicePixelRatio)) : this.settings.get("side");
     const size = fixedWidth > 0 ? { width: fixedWidth, height: fixedHeight } : sizeFor(box, side, this.limits);
     const { fx, fy, cx, cy } = resize(lens, size.width, size.height);
-    const look = { camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving };
-    if (this.link.look(look)) this.notices.asked();
+    const look = { camera: { R, T, fx, fy, cx, cy }, ...size, ...this.wanted(), moving, ...(drawing ? { full: true, depth: false } : {}) };
+    if (this.link.look(look) && !drawing) this.notices.asked();
     if (!moving) this.tell();
   }
 
@@ -245,7 +295,7 @@ class Page {
     const parts = split
       ? [{ mode: settings.get("left"), until: divider }, { mode: settings.get("right"), until: 1 }]
       : [{ mode: settings.get("mode"), until: 1 }];
-    return { parts, reproject: settings.get("reproject"), rig: settings.get("rig") };
+    return { parts, reproject: settings.get("reproject"), rig: settings.get("rig"), frame: this.drawing ? this.drawn : null };
   }
 
   paint() {
@@ -264,7 +314,7 @@ class Page {
     this.cameras.place(this.settings.get("rig"), viewer, box);
     const there = this.settings.get("originals") && this.motion.goal === this.snapped?.goal;
     this.original.show(there ? this.snapped.camera : null, this.transport.shown);
-    this.statistics.repaints.mark();
+    this.statistics.painted(this.drawing && this.drawn ? this.stage.scene.cost : null);
     this.controls.fov(this.motion.pose?.fov ?? 50);
   }
 
@@ -288,10 +338,12 @@ class Page {
     const busy = this.paths.step(now);
     const stepped = this.motion.step(elapsed);
     const moving = this.motion.moving;
+    this.choose(now);
+    const drawsOn = this.drawing && (this.transport.playing || this.stage.fading);
     this.resolution.refreshed(elapsed, stepped || busy);
     this.ask();
     this.paint();
-    if (held || busy || stepped || moving || this.link.late) this.wake();
+    if (held || busy || stepped || moving || drawsOn || this.link.late || (this.drawn && this.stage.fading)) this.wake();
   }
 
   async start() {

@@ -18,6 +18,7 @@
  * @property {"dark" | "light"} theme
  * @property {string} background of the images, hexadecimal RGB; "" for the theme's or the model's
  * @property {string} modelGround background colour of the model, hexadecimal RGB; not stored
+ * @property {"page" | "server"} render who draws moving views
  * @property {boolean} rig
  * @property {boolean} panel
  */
@@ -39,6 +40,7 @@ const DEFAULTS = {
   theme: "dark",
   background: "",
   modelGround: "000000",
+  render: "page",
   rig: false,
   panel: window.innerHeight > 460,
 };
@@ -51,6 +53,7 @@ const SENSIBLE = {
   right: (value) => PICTURES.includes(value),
   theme: (value) => value === "dark" || value === "light",
   modelGround: () => false,
+  render: (value) => value === "page" || value === "server",
   background: (value) => /^([0-9a-f]{6})?$/.test(value),
   size: (value) => /^[1-9]\d*x[1-9]\d*$/.test(value),
 };

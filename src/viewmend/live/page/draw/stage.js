@@ -3,7 +3,9 @@
 import { buildProgram } from "./program.js";
 import { LinePainter } from "./lines.js";
 import { clipFromPicture, clipFromPixels, clipFromWorld, samePlace } from "./projection.js";
+import { Scene } from "./scene.js";
 import { planeOf } from "./surface.js";
+import { eyeOfCamera } from "../view/pose.js";
 
 /** @typedef {import("./projection.js").Viewpoint} Viewpoint */
 /** @typedef {import("./surface.js").Surface} Surface */
@@ -20,6 +22,7 @@ import { planeOf } from "./surface.js";
  * @property {{mode: string, until: number}[]} parts modes from left to right, each until a share of the viewport's width
  * @property {boolean} reproject
  * @property {boolean} rig
+ * @property {import("../link/assets.js").Frame | null} [frame] drawn here, under the server's picture of the same view
  */
 
 const VERTEX = `#version 300 es
@@ -37,6 +40,7 @@ uniform sampler2D picture;
 uniform vec2 size;
 uniform float tone;
 uniform vec3 ground;
+uniform float opacity;
 in vec3 pixel;
 out vec4 colour;
 void main() {
@@ -44,20 +48,24 @@ void main() {
   // The background is of one colour, but compression leaves traces in it.
   vec3 off = abs(seen - ground);
   float something = smoothstep(0.015, 0.055, max(off.r, max(off.g, off.b)));
-  colour = vec4(mix(ground, seen * tone, something), 1.0);
+  colour = vec4(mix(ground, seen * tone, something), opacity);
 }`;
 /** Brightness of disoccluded areas, which show the colours next to them. */
 const STRETCHED_TONE = 0.6;
+/** Time in which the server's picture appears over the drawn one. */
+const FADE_MS = 250;
 
 export class Stage {
   /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
     this.canvas = canvas;
-    const options = { alpha: false, antialias: false, powerPreference: "high-performance" };
+    this.software = software();
+    // Smooth outlines of drawn views, where that is cheap and pixels are large enough to see.
+    const antialias = !this.software && window.devicePixelRatio < 2;
+    const options = { alpha: false, antialias, stencil: true, powerPreference: "high-performance" };
     const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
     if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
     this.gl = gl;
-    this.software = drawnBySoftware(gl);
     /** @type {Header | null} */
     this.header = null;
     /** @type {any[]} */
@@ -70,7 +78,10 @@ export class Stage {
   prepare() {
     this.header = null;
     this.eyes = [];
-    this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground"]);
+    this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground", "opacity"]);
+    this.scene = new Scene(this.gl);
+    /** When the last picture came, and the share of it that was drawn last. */
+    this.taken = { at: -Infinity, shown: 0 };
     this.lines = new LinePainter(this.gl);
   }
 
@@ -92,6 +103,12 @@ export class Stage {
     });
     this.eyes.length = shown.eyes.length;
     this.header = shown.header;
+    this.taken = { at: performance.now(), shown: 0 };
+  }
+
+  /** Whether the server's picture is still appearing over the drawn one. */
+  get fading() {
+    return this.taken.shown > 0 && this.taken.shown < 1;
   }
 
   /** Empty the whole canvas. @param {string} ground background colour, hexadecimal RGB */
@@ -107,6 +124,10 @@ export class Stage {
   draw(viewer, viewport, wish, eye = 0) {
     const { gl } = this;
     const [x, y, width, height] = viewport;
+    if (wish.frame) {
+      this.#scene(viewer, viewport, wish, wish.frame, eye);
+      return;
+    }
     gl.viewport(x, y, width, height);
     gl.scissor(x, y, width, height);
     gl.enable(gl.SCISSOR_TEST);
@@ -127,6 +148,56 @@ export class Stage {
     if (wish.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
   }
 
+  /** The frame as drawn here, and over it the server's picture of the same view. @param {Viewpoint} viewer @param {number[]} viewport @param {Wish} wish @param {import("../link/assets.js").Frame} frame @param {number} eye */
+  #scene(viewer, [x, y, width, height], wish, frame, eye) {
+    const { gl, header } = this;
+    const place = eyeOfCamera(viewer);
+    const sources = this.scene.prepare(frame, place);
+    const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
+    const source = header?.cameras[Math.min(eye, header.cameras.length - 1)];
+    const same = header && kept && header.time === frame.time && samePlace(source, header.width, header.height, viewer);
+    const opacity = same ? Math.min(1, Math.max(0.01, (performance.now() - this.taken.at) / FADE_MS)) : 0;
+    this.taken.shown = opacity;
+    gl.viewport(x, y, width, height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.enable(gl.DEPTH_TEST);
+    gl.depthFunc(gl.LEQUAL);
+    gl.scissor(x, y, width, height);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
+    let start = 0;
+    for (const { mode, until } of wish.parts) {
+      const [from, to] = [Math.round(start * width), Math.round(until * width)];
+      gl.scissor(x + from, y, Math.max(0, to - from), height);
+      const over = kept?.modes.includes(mode) ? opacity : 0;
+      if (over < 1 || wish.rig) this.scene.draw(frame, sources, viewer, place, mode);
+      if (over > 0) this.#overlay(kept, kept.textures[mode], over);
+      start = until;
+    }
+    gl.scissor(x, y, width, height);
+    if (wish.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
+  }
+
+  /** @param {any} kept @param {WebGLTexture} picture @param {number} opacity */
+  #overlay(kept, picture, opacity) {
+    const { gl } = this;
+    const header = /** @type {Header} */ (this.header);
+    const { program, at } = /** @type {any} */ (this.painter);
+    gl.disable(gl.DEPTH_TEST);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.useProgram(program);
+    gl.bindTexture(gl.TEXTURE_2D, picture);
+    gl.uniform2f(at.size, header.width, header.height);
+    gl.uniform1f(at.tone, 1);
+    gl.uniform1f(at.opacity, opacity);
+    gl.uniform3fv(at.ground, this.ground);
+    gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
+    gl.bindVertexArray(kept.quad.array);
+    gl.drawElements(gl.TRIANGLES, kept.quad.solid, gl.UNSIGNED_INT, 0);
+    gl.disable(gl.BLEND);
+    gl.enable(gl.DEPTH_TEST);
+  }
+
   /** @param {Viewpoint} viewer @param {any} kept @param {WebGLTexture} picture @param {Wish} wish @param {number} eye */
   #picture(viewer, kept, picture, wish, eye) {
     const { gl } = this;
@@ -138,6 +209,7 @@ export class Stage {
     gl.bindTexture(gl.TEXTURE_2D, picture);
     gl.uniform2f(at.size, header.width, header.height);
     gl.uniform1f(at.tone, 1);
+    gl.uniform1f(at.opacity, 1);
     gl.uniform3fv(at.ground, this.ground);
     if (still) {
       gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
@@ -166,10 +238,14 @@ export class Stage {
   }
 }
 
-/** Whether the processor does what a GPU should. @param {WebGL2RenderingContext} gl */
-function drawnBySoftware(gl) {
+/** Whether the processor does what a GPU should. */
+function software() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return false;
   const info = gl.getExtension("WEBGL_debug_renderer_info");
-  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "");
+  const name = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
 /** @param {WebGL2RenderingContext} gl */

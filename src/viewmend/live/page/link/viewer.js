@@ -49,6 +49,12 @@ export class ViewerLink extends EventTarget {
     return true;
   }
 
+  /** Give up what was asked for, and do not ask for a view. */
+  rest() {
+    this.late = false;
+    if (this.lastLook && this.connection.send({ type: "cancel" })) this.lastLook = "";
+  }
+
   /** Show all who watch what is looked at here. @param {boolean} on */
   onAir(on) {
     this.connection.send({ type: "on_air", on });

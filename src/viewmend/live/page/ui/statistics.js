@@ -41,6 +41,9 @@ export class Statistics {
   constructor() {
     this.pictures = new Rate();
     this.repaints = new Rate();
+    this.drawn = new Rate();
+    /** What the last view drawn by the page needed; null if the server draws. @type {{draws: number, triangles: number, textureBytes: number} | null} */
+    this.cost = null;
     /** @type {number[]} */
     this.latencies = [];
     /** @type {Record<string, number>[]} */
@@ -64,6 +67,7 @@ export class Statistics {
       ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "latency"],
       ["holes", "holes"], ["size", "picture"], ["kb", "per frame"],
       ["dropped", "dropped"], ["viewers", "viewers"], ["budget", "budget"],
+      ["triangles", "triangles"], ["textures", "textures"],
     ]) {
       const value = element("dd", { id: `figure-${name}`, textContent: "–" });
       this.figures[name] = value;
@@ -93,17 +97,29 @@ export class Statistics {
     return latency;
   }
 
+  /** The page has drawn a view, or shown one of the server's. @param {{draws: number, triangles: number, textureBytes: number} | null} cost */
+  painted(cost) {
+    this.repaints.mark();
+    this.cost = cost;
+    if (cost) this.drawn.mark();
+  }
+
   #show() {
-    if (!this.header) return;
+    const { cost } = this;
     const median = quantile(this.latencies, 0.5);
-    const fps = Math.round(this.pictures.perSecond);
-    byId("readout").textContent = [...(fps ? [`${fps} fps`] : []), ...(median > 0 ? [`${median.toFixed(0)} ms`] : [])].join(" · ");
+    const fps = Math.round((cost ? this.drawn : this.pictures).perSecond);
+    const late = !cost && median > 0 ? [`${median.toFixed(0)} ms`] : [];
+    byId("readout").textContent = [...(fps ? [`${fps} fps`] : []), ...late].join(" · ");
+    if (!this.header) return;
     if (!byId("section-stats").offsetParent) return;
     const { figures, header, server } = this;
+    const count = (/** @type {number} */ value) => value.toLocaleString("en");
     const put = (/** @type {string} */ name, /** @type {string} */ value, unit = "") => {
       figures[name].replaceChildren(value, element("small", { textContent: unit }));
     };
-    put("fps", this.pictures.perSecond.toFixed(1));
+    put("fps", (cost ? this.drawn : this.pictures).perSecond.toFixed(1));
+    put("triangles", cost ? count(cost.triangles) : "–");
+    put("textures", cost ? (cost.textureBytes / 1e6).toFixed(1) : "–", cost ? " MB" : "");
     put("repaints", this.repaints.perSecond.toFixed(0));
     put("latency", Number.isNaN(median) ? "–" : median.toFixed(0), " ms");
     put("holes", (100 * header.holes).toFixed(1), " %");

@@ -19,6 +19,12 @@ export class Transport {
     this.shown = -1;
     /** The requested frame while it is not shown yet; -1 if none. */
     this.sought = -1;
+    /** Whether the page draws frames by itself: it pauses at the shown one, which may not be the server's. */
+    this.drawing = false;
+    /** The server's clock at a moment, and the position that follows it smoothly. */
+    this.heard = { time: 0, at: 0 };
+    this.position = 0;
+    this.positionAt = 0;
     const seek = byId("seek");
     seek.addEventListener("input", () => {
       this.seeking = true;
@@ -34,7 +40,11 @@ export class Transport {
     byId("play").addEventListener("click", () => this.toggle());
     byId("live").addEventListener("click", () => this.live());
     byId("speed").addEventListener("change", () => this.speed(Number(byId("speed").value)));
-    link.addEventListener("state", (event) => this.#state(/** @type {CustomEvent} */ (event).detail));
+    link.addEventListener("state", (event) => {
+      const state = /** @type {CustomEvent} */ (event).detail;
+      this.heard = { time: state.time, at: performance.now() };
+      this.#state(state);
+    });
     link.addEventListener("welcome", () => this.#again());
   }
 
@@ -50,7 +60,37 @@ export class Transport {
 
   toggle() {
     this.sought = -1;
-    this.#tell({ playing: !this.#current("playing", true) });
+    const playing = !this.#current("playing", true);
+    this.#tell(playing || !this.drawing || this.shown < 0 ? { playing } : { playing, seek: this.shown });
+  }
+
+  /** The frames that there are. */
+  get range() {
+    return { first: this.state?.first ?? 0, end: this.state?.end ?? 0 };
+  }
+
+  /**
+   * The frame to draw now: the server's clock, continued between its messages.
+   * @param {number} now ms @param {number} fps of the source @returns {number} -1 if there is none
+   */
+  timeAt(now, fps) {
+    const { state, heard } = this;
+    if (!state || state.end <= state.first) return -1;
+    if (!this.playing) return this.#within(this.sought >= 0 ? this.sought : this.#current("seek", state.time));
+    if (state.kind === "live") return this.#within(state.time);
+    const [count, perMs] = [state.end - state.first, (fps * state.speed) / 1000];
+    const wrap = (/** @type {number} */ frames) => (state.end === state.total ? frames - count * Math.round(frames / count) : frames);
+    this.position += (now - this.positionAt) * perMs;
+    this.positionAt = now;
+    const off = wrap(heard.time + 0.5 + (now - heard.at) * perMs - this.position);
+    this.position += Math.abs(off) > Math.max(2, fps / 3) ? off : 0.03 * off;
+    if (state.end === state.total) this.position = state.first + ((((this.position - state.first) % count) + count) % count);
+    return this.#within(Math.floor(this.position));
+  }
+
+  /** @param {number} time */
+  #within(time) {
+    return Math.min(this.state.end - 1, Math.max(this.state.first, time));
   }
 
   /** @param {number} time */

@@ -50,6 +50,9 @@ export function extrinsicsOf(basis, pose) {
   return { R, T: scale(apply(R, eyeOf(basis, pose)), -1) };
 }
 
+/** Where a camera stands. @param {Extrinsics} camera @returns {number[]} */
+export const eyeOfCamera = ({ R, T }) => scale(apply(transpose(R), T), -1);
+
 /** How azimuth grows, seen from the camera: 1 to the right, -1 to the left. @param {Basis} basis */
 export const handedness = (basis) => Math.sign(dot(basis.side, cross(basis.up, basis.front))) || 1;
 
@@ -59,8 +62,7 @@ export const handedness = (basis) => Math.sign(dot(basis.side, cross(basis.up, b
  * @returns {Pose}
  */
 export function poseOfCamera(basis, camera, center, fov) {
-  const world = transpose(camera.R);
-  const eye = scale(apply(world, camera.T), -1);
+  const eye = eyeOfCamera(camera);
   const forward = camera.R.slice(6, 9);
   const distance = Math.max(dot(sub(center, eye), forward), 0.25 * length(sub(center, eye)), 0.1);
   const back = scale(forward, -1);

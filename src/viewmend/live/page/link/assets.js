@@ -1,0 +1,209 @@
+// Which frames the page can draw by itself: asks for their assets ahead of time, and keeps those used last.
+
+import { address } from "./connection.js";
+import { dot, sub, unit } from "../view/matrix.js";
+
+/** @typedef {import("./asset_worker.js").Shape} Shape */
+/** @typedef {import("./asset_worker.js").CameraImage} CameraImage */
+
+/**
+ * @typedef {object} Frame
+ * @property {number} time its index
+ * @property {Shape | null} shape
+ * @property {Map<number, CameraImage>} images by the camera's number
+ * @property {number} since when it was asked for, ms
+ * @property {boolean} failed
+ */
+
+/** Cameras beyond the blending rule's that fill its holes. */
+export const FILLING = 3;
+/** Frames that are kept, frames that are asked for at a time, and requests at a time. */
+const [KEPT, LOADING, REQUESTS] = [16, 3, 8];
+/** Frames beyond the next that would be in time that are asked for while playing, and the longest time that one may take. */
+const [AHEAD, MOST_MS] = [3, 2000];
+/** Failed frames in a row after which the server draws. */
+const MOST_FAILURES = 3;
+
+/** The cameras' numbers by their angle to the eye, seen from the subject's centre. @param {Shape} shape @param {number[]} eye */
+export function rankedCameras({ header: { cameras, center } }, eye) {
+  const toEye = unit(sub(eye, center));
+  const near = cameras.map((/** @type {any} */ camera) => dot(unit(sub(camera.center, center)), toEye));
+  return cameras.map((/** @type {any} */ _, /** @type {number} */ n) => n)
+    .sort((/** @type {number} */ a, /** @type {number} */ b) => near[b] - near[a] || a - b);
+}
+
+/** Whether as many images are there as the blending rule needs. @param {Frame} frame */
+const complete = ({ shape, images }) => shape !== null && images.size >= Math.min(shape.header.blend.cameras, shape.header.cameras.length);
+
+/** Dispatches "change" when something has arrived, and "dropped" (detail: the frame) when a frame is let go. */
+export class Assets extends EventTarget {
+  /** @param {string | null} token */
+  constructor(token) {
+    super();
+    this.token = token;
+    /** The version that the server's message `rig` names; null if the server draws. @type {string | null} */
+    this.version = null;
+    /** @type {Map<number, Frame>} the one used last at the end */
+    this.frames = new Map();
+    /** The frame that is shown: it is kept. @type {Frame | null} */
+    this.shown = null;
+    /** @type {Set<string>} */
+    this.waiting = new Set();
+    this.failures = 0;
+    this.bytes = 0;
+    /** Time from asking for a frame until it can be drawn, ms. */
+    this.latency = 150;
+    /** @type {Worker | null} */
+    this.worker = null;
+  }
+
+  /** Whether the server's frames can be drawn here. */
+  get usable() {
+    return this.version !== null && this.failures < MOST_FAILURES;
+  }
+
+  /** @param {any} rig the message */
+  open(rig) {
+    if (rig.assets === this.version) return;
+    this.shown = null;
+    for (const frame of this.frames.values()) this.#forget(frame);
+    this.waiting.clear();
+    this.version = rig.assets ?? null;
+    this.failures = 0;
+    if (this.version === null || this.worker) return;
+    this.worker = new Worker(new URL("./asset_worker.js", import.meta.url), { type: "module" });
+    this.worker.onmessage = ({ data }) => this.#take(data);
+  }
+
+  /**
+   * The frame to draw: the one at `time`, or the last before it that is there.
+   * @param {number} time @param {number[]} eye @param {{first: number, end: number}} range @param {number} late frames that it may be behind
+   * @returns {Frame | null}
+   */
+  choose(time, eye, { first, end }, late) {
+    const count = Math.max(1, end - first);
+    for (let back = 0; back <= Math.min(late, count - 1); back++) {
+      const frame = this.frames.get(first + ((((time - back - first) % count) + count) % count));
+      if (frame && this.drawable(frame, eye)) return this.#touch(frame);
+    }
+    return null;
+  }
+
+  /** Whether all that the blending rule needs is there. @param {Frame} frame @param {number[]} eye */
+  drawable({ shape, images }, eye) {
+    if (!shape) return false;
+    const { header } = shape;
+    return rankedCameras(shape, eye).slice(0, header.blend.cameras).every((/** @type {number} */ n) => images.has(n));
+  }
+
+  /**
+   * Ask for what is missing: first for the rest of frames that were begun and are still of use, then for the next ones.
+   * @param {number} time @param {number[]} eye @param {{first: number, end: number}} range
+   * @param {{playing: boolean, framesPerMs: number, live: boolean}} clock a live rig's next frames cannot be asked for
+   */
+  want(time, eye, { first, end }, { playing, framesPerMs, live }) {
+    const count = Math.max(1, end - first);
+    const late = playing ? Math.ceil(framesPerMs * this.#expected()) : 0;
+    const ahead = playing && !live ? Math.min(count - 1, AHEAD + late) : 0;
+    const steps = (/** @type {Frame} */ frame) => (((frame.time - time) % count) + count) % count;
+    let loading = 0;
+    for (const frame of this.frames.values()) {
+      const useful = steps(frame) <= ahead || (playing && count - steps(frame) <= AHEAD + 2 * late);
+      if (useful && !frame.failed && !this.#load(frame, eye, playing)) loading += 1;
+      else if (!useful && !complete(frame)) this.#forget(frame);
+    }
+    for (let step = 0; step <= ahead && loading < (playing ? LOADING : 1); step++) {
+      const index = first + ((time - first + step) % count);
+      if (this.frames.has(index) || (ahead && step < late && loading > 0)) continue; // known, or it would come too late
+      this.#load(this.#add(index), eye, playing);
+      loading += 1;
+    }
+  }
+
+  /** How long the next frame will probably take, ms. */
+  #expected() {
+    const now = performance.now();
+    let longest = this.latency;
+    for (const frame of this.frames.values()) if (!complete(frame)) longest = Math.max(longest, now - frame.since);
+    return Math.min(MOST_MS, longest);
+  }
+
+  /** Ask for a frame's missing parts. @param {Frame} frame @param {number[]} eye @param {boolean} playing @returns {boolean} whether all is there */
+  #load(frame, eye, playing) {
+    const { shape, images, time } = frame;
+    if (!shape) {
+      this.#ask(`${time}`, null);
+      return false;
+    }
+    const ranked = rankedCameras(shape, eye);
+    const wanted = playing ? ranked.slice(0, shape.header.blend.cameras + FILLING) : ranked;
+    const missing = wanted.filter((/** @type {number} */ n) => !images.has(n));
+    for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
+    return missing.length === 0;
+  }
+
+  /** @param {string} path @param {any} camera */
+  #ask(path, camera) {
+    const key = `${this.version} ${path}`;
+    if (this.waiting.has(key) || this.waiting.size >= REQUESTS) return;
+    this.waiting.add(key);
+    const url = address(`assets/${path}`, this.token);
+    url.searchParams.set("v", this.version ?? "");
+    this.worker?.postMessage({ key, url: url.href, camera });
+  }
+
+  /** @param {number} time @returns {Frame} */
+  #add(time) {
+    /** @type {Frame} */
+    const frame = { time, shape: null, images: new Map(), since: performance.now(), failed: false };
+    this.frames.set(time, frame);
+    for (const old of this.frames.values()) if (this.frames.size > KEPT) this.#forget(old);
+    return frame;
+  }
+
+  /** @param {Frame} frame */
+  #forget(frame) {
+    if (frame === this.shown) return;
+    this.frames.delete(frame.time);
+    this.dispatchEvent(new CustomEvent("dropped", { detail: frame }));
+    for (const { picture } of frame.images.values()) picture.close();
+    frame.images.clear();
+  }
+
+  /** @param {Frame} frame */
+  #touch(frame) {
+    this.frames.delete(frame.time);
+    this.frames.set(frame.time, frame);
+    return frame;
+  }
+
+  /** @param {import("./asset_worker.js").News} news */
+  #take({ key, shape, image, bytes, failed }) {
+    this.waiting.delete(key);
+    const [version, path] = key.split(" ");
+    const [time, camera] = path.split("/").map(Number);
+    const frame = version === this.version ? this.frames.get(time) : undefined;
+    if (!frame) image?.picture.close();
+    else if (shape) frame.shape = shape;
+    else if (image) frame.images.set(camera, image);
+    else if (failed !== undefined) this.#fail(frame);
+    if (frame && !frame.failed) {
+      this.failures = shape ? 0 : this.failures;
+      this.bytes += bytes ?? 0;
+      if (image && frame.images.size === frame.shape?.header.blend.cameras) {
+        this.latency += 0.2 * (performance.now() - frame.since - this.latency);
+      }
+    }
+    this.dispatchEvent(new CustomEvent("change"));
+  }
+
+  /** It is tried again when it is wanted the next time round. @param {Frame} frame */
+  #fail(frame) {
+    frame.failed = true;
+    this.failures += 1;
+    setTimeout(() => {
+      if (this.frames.get(frame.time) === frame && !frame.shape) this.frames.delete(frame.time);
+      frame.failed = false;
+    }, 1000);
+  }
+}

@@ -1,0 +1,191 @@
+"""The page draws moving views by itself; the server's picture of a view at rest appears over it."""
+
+import contextlib
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from live.browser.conftest import SIZES, View
+from live.live_servers import Running, running, wait_until
+
+from viewmend.cli import serve
+from viewmend.live.encoding import draw_mode
+from viewmend.live.poses import view_camera
+from viewmend.live.renderer import RenderRequest
+from viewmend.models.base import RenderQuality
+
+MIN_DB, MIN_BALL_DB = 35.0, 32.0
+"""Of a real scene; and of the ball, whose texture is as fine as its images of 48 pixels, which JPEG costs more."""
+SCREENSHOT_S = 60.0
+STUDIO = {"source": "studio", "size": 256, "frames": 2, "cameras": 8}
+
+
+@contextlib.contextmanager
+def opened(browser, server: Running, query: str = "", size: str = "desktop", route=None) -> Iterator[View]:
+    width, height = SIZES[size]
+    page = browser.new_page(viewport={"width": width, "height": height})
+    errors: list[str] = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda m: errors.append(m.text) if m.type == "error" and route is None else None)
+    if route is not None:
+        page.route("**/assets/**", route)
+    page.goto(f"{server.url}/?{query}")
+    try:
+        yield View(page, server, errors)
+    finally:
+        page.close()
+    assert not errors, errors
+
+
+@contextlib.contextmanager
+def silent(server: Running) -> Iterator[None]:
+    """The server renders no views, and its renderer may be used here."""
+    server.service.serve_next = lambda: False
+    try:
+        yield
+    finally:
+        del server.service.serve_next
+
+
+def drawn(view: View, time: int = 0) -> np.ndarray:
+    """The canvas, once all cameras' images are there and the view rests."""
+    session = view.server.live.registry.sessions
+    view.until(lambda: view.data("drawn") == str(time) and session and session[0].newest_look is not None, SCREENSHOT_S)
+    view.page.wait_for_timeout(300)
+    return view.picture()
+
+
+def rendered(server: Running, time: int, mode: str = "rendered") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the server renders for the page's last look: the picture, its holes and its mask."""
+    look = server.live.registry.sessions[0].newest_look
+    renderer = server.service.renderer
+    camera = view_camera(look.camera, renderer.home, (look.width, look.height))
+    result = renderer.render(RenderRequest(time, (camera,), RenderQuality(mend=mode == "mended")), None)
+    view = result.completed[0].view
+    picture = draw_mode(result.completed[0], mode, look.background or "000000")
+    return picture.astype(int), view.holes.numpy(), view.mask.numpy() > 0
+
+
+def psnr_in_box(page: np.ndarray, server: np.ndarray, mask: np.ndarray, ignored: np.ndarray) -> float:
+    rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    error = ((page - server)[box] ** 2)[~ignored[box]].mean()
+    return float(10 * np.log10(255**2 / max(error, 1e-9)))
+
+
+def pose_text(home, center, azimuth: float, elevation: float = 10.0, nearer: float = 1.0) -> str:
+    fov, distance = home["fov_y"], home["distance"] / nearer
+    return ",".join(str(round(value, 3)) for value in (azimuth, elevation, 0.0, distance, fov, *center))
+
+
+def compare(browser, server: Running, azimuths, time: int = 0) -> list[float]:
+    """PSNR of the drawn against the server's rendered picture at these poses."""
+    rig = server.service.renderer.rig_json
+    found = []
+    for azimuth in azimuths:
+        pose = pose_text(rig["home"], rig["center"], azimuth)
+        with silent(server), opened(browser, server, f"mode=rendered&time={time}&pose={pose}") as view:
+            page = drawn(view, time)
+            picture, _, mask = rendered(server, time)
+            found.append(psnr_in_box(page, picture, mask, np.zeros_like(mask)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def balls() -> Iterator[Running]:
+    with running() as server:
+        yield server
+
+
+def test_the_page_draws_what_the_server_renders(browser, balls):
+    assert min(compare(browser, balls, (20, 75, 200))) > MIN_BALL_DB
+
+
+def test_holes_are_filled_marked_or_black(browser, balls):
+    rig = balls.service.renderer.rig_json
+    pose = pose_text(rig["home"], rig["center"], 300, 60)
+    shown = {}
+    for mode in ("mended", "holes", "rendered"):
+        with silent(balls), opened(browser, balls, f"mode={mode}&time=0&pose={pose}") as view:
+            shown[mode] = drawn(view)
+            _, holes, mask = rendered(balls, 0)
+    inner = holes & mask
+    assert inner.sum() > 100
+    assert shown["rendered"][inner].mean() < 8
+    assert np.abs(shown["holes"][inner] - np.array([255, 38, 140])).mean() < 8
+    assert (shown["mended"][inner].max(-1) < 20).mean() < 0.01, "no black holes"
+    assert np.abs(shown["mended"] - shown["rendered"])[~holes].mean() < 0.5
+
+
+def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, balls):
+    with opened(browser, balls, "time=0") as view:
+        view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
+        view.page.wait_for_timeout(500)
+        shown = view.picture()
+        with silent(balls):
+            picture, _, mask = rendered(balls, 0, "mended")
+            assert psnr_in_box(shown, picture, mask, np.zeros_like(mask)) > 30, "as JPEG"
+        (session,) = balls.live.registry.sessions
+        x, y = view.middle()
+        view.page.mouse.move(x, y)
+        view.page.mouse.down()
+        view.page.mouse.move(x + 40, y)
+        view.until(lambda: session.newest_look is None)
+        before = len(session.recent)
+        for step in range(10):
+            view.page.mouse.move(x + 40 + 8 * step, y)
+            view.page.wait_for_timeout(30)
+        assert session.newest_look is None and len(session.recent) == before, "the page draws alone"
+        assert np.abs(view.picture() - shown).mean() > 0.2
+        view.page.mouse.up()
+        view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
+        assert len(session.recent) > before
+
+
+def test_playing_costs_the_server_no_views(browser, balls):
+    with opened(browser, balls) as view:
+        times = set()
+
+        def seen() -> bool:
+            times.add(view.data("drawn"))
+            return times >= {"0", "1", "2"}
+
+        view.until(seen, SCREENSHOT_S)
+        wait_until(lambda: balls.live.registry.sessions[0].newest_look is None)
+        before = balls.service.counts["frames"]
+        times.clear()
+        view.until(seen, SCREENSHOT_S)
+        assert balls.service.counts["frames"] == before
+        view.page.keyboard.press("Space")
+        view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
+        assert view.data("time") == view.data("drawn"), "it pauses at the frame that is shown"
+
+
+def test_the_server_draws_where_asked_to_and_where_assets_are_missing(browser, balls):
+    requested = []
+
+    def refuse(route):
+        requested.append(route.request.url)
+        route.fulfill(status=503, body="{}")
+
+    with opened(browser, balls, "render=server", route=refuse) as view:
+        view.until(lambda: view.data("frame") is not None, SCREENSHOT_S)
+        assert not requested and view.data("drawn") is None
+    with opened(browser, balls, route=refuse) as view:
+        view.until(lambda: view.data("frame") is not None, SCREENSHOT_S)
+        assert requested and view.data("drawn") is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["wd2", "utrecht", "studio"])
+def test_drawn_pictures_of_real_scenes_are_the_servers(browser, request, scene, record_property):
+    if scene == "studio":
+        options = serve.Options(**STUDIO)
+    else:
+        options = serve.Options(source=str(request.getfixturevalue("shared") / "captures" / scene))
+    with running(serve.open_source(options)) as server:
+        home = server.service.renderer.rig_json["home"]["azimuth"]
+        found = compare(browser, server, [home + 45 * step for step in range(8)])
+    record_property("psnr_db", found)
+    print(scene, [round(db, 1) for db in found])
+    assert min(found) > MIN_DB
