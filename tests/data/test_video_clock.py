@@ -143,6 +143,7 @@ def shown(capture):
 def test_a_capture_is_read_by_the_times_of_its_films(ball, caplog):
     rewrite(ball, "c1", [0, 1, 2, 5, 6, 7], times=[0, 1, 2, 5, 6, 7])
     rewrite(ball, "c2", [0, 2, 4, 6], fps=5)
+    rewrite(ball, "c3", [number // 2 for number in range(16)], fps=20)
     capture = open_capture(ball[0])
     for time, seen in enumerate(shown(capture)):
         assert set(seen.values()) == {time}

@@ -428,8 +428,9 @@ class CameraReader:
 
     def _file_id(self, kind: FileKind, time: int) -> str:
         """The frame id in the path of a file that belongs to the frame at index `time`."""
-        own = self._index["masks" if kind == "mask" else "images"]
-        return self._frames[int(own[time])]
+        if (self._mask_video if kind == "mask" else self._video) is not None:  # one file for all frames
+            return self._frames[time]
+        return self._frames[int(self._index["masks" if kind == "mask" else "images"][time])]
 
     def _locate(self, kind: FileKind, time: int) -> tuple[Path, str]:
         path = self._folder / self.camera.file(kind, self._file_id(kind, time))
