@@ -47,7 +47,7 @@ class Page {
     this.scheduled = false;
     this.connection = new Connection(token, ["jpeg"]);
     this.link = new ViewerLink(this.connection);
-    this.assets = new Assets(token);
+    this.assets = new Assets(token, this.stage.scene.fillers);
     /** The frame that the page draws; null if the server draws. @type {import("./link/assets.js").Frame | null} */
     this.drawn = null;
     this.notices = new Notices(() => this.connection.open());

@@ -2,7 +2,7 @@
 
 import { buildProgram } from "./program.js";
 import { clipFromWorld } from "./projection.js";
-import { FILLING, rankedCameras } from "../link/assets.js";
+import { rankedCameras } from "../link/assets.js";
 import { add, apply, multiply } from "../view/matrix.js";
 
 /** @typedef {import("../link/assets.js").Frame} Frame */
@@ -14,6 +14,8 @@ const MOST_SOURCES = 8;
 const DONE = 1;
 /** Frames whose textures are kept. */
 const KEPT = 2;
+/** Cameras beyond the blending rule's that fill its holes; none where the processor draws, which would take twice as long. */
+export const filling = (/** @type {boolean} */ software) => (software ? 0 : 3);
 
 const VERTEX = `#version 300 es
 layout(location = 0) in vec3 place;
@@ -117,9 +119,10 @@ const HOLES = { rendered: [0, 0, 0, 1], holes: [1, 0.15, 0.55, 1], mended: [0, 0
 export const DRAWN_MODES = Object.keys(HOLES);
 
 export class Scene {
-  /** @param {WebGL2RenderingContext} gl */
-  constructor(gl) {
+  /** @param {WebGL2RenderingContext} gl @param {number} fillers cameras that fill holes */
+  constructor(gl, fillers) {
     this.gl = gl;
+    this.fillers = fillers;
     this.depthOnly = buildProgram(gl, VERTEX, NOTHING, ["clip"]);
     this.cutOut = buildProgram(gl, QUAD, CUT_OUT, ["picture", "mask"]);
     /** @type {Map<number, ReturnType<typeof buildProgram>>} by number of sources */
@@ -155,7 +158,7 @@ export class Scene {
     this.kept.set(frame, own);
     for (const old of this.kept.keys()) if (this.kept.size > KEPT) this.drop(old);
     const shape = /** @type {import("../link/assets.js").Shape} */ (frame.shape);
-    const count = shape.header.blend.cameras + FILLING;
+    const count = shape.header.blend.cameras + this.fillers;
     const there = rankedCameras(shape, eye).filter((/** @type {number} */ n) => frame.images.has(n)).slice(0, count);
     for (const n of there) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
     return there.map((/** @type {number} */ n) => own.sources.get(n));
@@ -168,6 +171,7 @@ export class Scene {
     const { blend } = /** @type {any} */ (frame.shape).header;
     const matrix = clipFromWorld(viewer);
     gl.bindVertexArray(own.array);
+    gl.enable(gl.CULL_FACE); // the mesh is closed
     gl.useProgram(this.depthOnly.program);
     gl.uniformMatrix4fv(this.depthOnly.at.clip, false, matrix);
     gl.colorMask(false, false, false, false);
@@ -183,6 +187,7 @@ export class Scene {
     }
     passes.forEach((pass, n) => this.#pass(own, pass, { matrix, eye, blend, hole, leaves: n + 1 < passes.length }));
     gl.disable(gl.STENCIL_TEST);
+    gl.disable(gl.CULL_FACE);
     gl.depthFunc(gl.LEQUAL);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindVertexArray(null);

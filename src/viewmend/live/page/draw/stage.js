@@ -3,7 +3,7 @@
 import { buildProgram } from "./program.js";
 import { LinePainter } from "./lines.js";
 import { clipFromPicture, clipFromPixels, clipFromWorld, samePlace } from "./projection.js";
-import { Scene } from "./scene.js";
+import { Scene, filling } from "./scene.js";
 import { planeOf } from "./surface.js";
 import { eyeOfCamera } from "../view/pose.js";
 
@@ -79,7 +79,7 @@ export class Stage {
     this.header = null;
     this.eyes = [];
     this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground", "opacity"]);
-    this.scene = new Scene(this.gl);
+    this.scene = new Scene(this.gl, filling(this.software));
     /** When the last picture came, and the share of it that was drawn last. */
     this.taken = { at: -Infinity, shown: 0 };
     this.lines = new LinePainter(this.gl);

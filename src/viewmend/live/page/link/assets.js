@@ -15,8 +15,6 @@ import { dot, sub, unit } from "../view/matrix.js";
  * @property {boolean} failed
  */
 
-/** Cameras beyond the blending rule's that fill its holes. */
-export const FILLING = 3;
 /** Frames that are kept, frames that are asked for at a time, and requests at a time. */
 const [KEPT, LOADING, REQUESTS] = [16, 3, 8];
 /** Frames beyond the next that would be in time that are asked for while playing, and the longest time that one may take. */
@@ -37,10 +35,11 @@ const complete = ({ shape, images }) => shape !== null && images.size >= Math.mi
 
 /** Dispatches "change" when something has arrived, and "dropped" (detail: the frame) when a frame is let go. */
 export class Assets extends EventTarget {
-  /** @param {string | null} token */
-  constructor(token) {
+  /** @param {string | null} token @param {number} fillers cameras of a playing frame beyond the blending rule's */
+  constructor(token, fillers) {
     super();
     this.token = token;
+    this.fillers = fillers;
     /** The version that the server's message `rig` names; null if the server draws. @type {string | null} */
     this.version = null;
     /** @type {Map<number, Frame>} the one used last at the end */
@@ -136,7 +135,7 @@ export class Assets extends EventTarget {
       return false;
     }
     const ranked = rankedCameras(shape, eye);
-    const wanted = playing ? ranked.slice(0, shape.header.blend.cameras + FILLING) : ranked;
+    const wanted = playing ? ranked.slice(0, shape.header.blend.cameras + this.fillers) : ranked;
     const missing = wanted.filter((/** @type {number} */ n) => !images.has(n));
     for (const n of missing) this.#ask(`${time}/${n}`, shape.header.cameras[n]);
     return missing.length === 0;
