@@ -375,3 +375,11 @@ def test_some_holes_are_guessed_from_their_surroundings_only(view_shards):
             assert not torch.equal(a.guess, b.guess)
             kinds.add(torch.equal(own.guess, b.guess))
     assert kinds == {True, False}
+
+
+def test_crops_always_have_pixels_to_predict(view):
+    rim = (rim_depth(view.view.depth) > 0) & (view.view.mask == 0)
+    truth = torch.where(rim, 255, (255 * view.view.rgb).round().byte())  # only the rim is wrong
+    torch.manual_seed(0)
+    for _ in range(200):
+        assert bool((random_crop(replace(view, truth=truth)).view.mask > 0).any())

@@ -189,7 +189,7 @@ def recolour(sample: Sample, random: Random) -> Sample:
 
 def random_crop(whole: TrainingView) -> TrainingView:
     """A crop of the view, half of the time around an erroneous pixel; mostly with fewer cameras."""
-    wrong = torch.nonzero(whole.wrong)
+    wrong = torch.nonzero(whole.wrong & (whole.view.mask > 0))  # the rim may have no depth within the crop
     pixels = wrong if len(wrong) and bool(torch.rand(()) < 0.5) else torch.nonzero(whole.view.mask > 0)
     height, width = whole.view.mask.shape
     row, column = pixels[int(torch.randint(len(pixels), ()))].tolist()
@@ -217,7 +217,7 @@ def _crop_side(center: int, size: int) -> tuple[int, int]:
     """First and last (exclusive) pixel of a crop that contains a pixel; even, and within the image."""
     if size <= CROP_PX:
         return 0, size
-    first = center - int(torch.randint(CROP_PX, ()))
+    first = center - int(torch.randint(CROP_PX - 1, ()))  # one less, as it is rounded down
     first = min(max(0, first), size - CROP_PX) // 2 * 2
     return first, first + CROP_PX
 
