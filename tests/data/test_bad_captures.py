@@ -131,11 +131,14 @@ BAD = {
     "image size": (picture("images/b_000.png", of_pixels(16, 20)), ["b_000.png", B, "'000'", "40 x 32", "got 20 x 16"]),
     "mask size": (picture("masks/b_000.png", of_pixels(16, 20)), ["masks/b_000.png", B, "'000'", "got 20 x 16"]),
     "mask of 16 bit": (
-        picture("masks/b_000.png", of_pixels(32, 40).astype(np.uint16)),
+        picture("masks/b_000.png", np.arange(32 * 40, dtype=np.uint16).reshape(32, 40)),
         ["masks/b_000.png", B, "frame '000'", "8-bit mask", "uint16"],
     ),
     "empty masks": (every_mask(of_pixels(32, 40) * 0), ["masks/a_000.png", "frame '000'", "no value above 0"]),
-    "masks of ones": (every_mask(of_pixels(32, 40) // 255), ["masks/a_000.png", "no value above 1", "by 255"]),
+    "faint masks": (
+        every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))),
+        ["masks/a_000.png", "above 39"],
+    ),
     "no video": (lambda p: (video(2)(p), (p.path / "b.avi").unlink()), ["b.avi", B, "the camera's video"]),
     "video is text": (lambda p: (video(2)(p), write("b.avi", b"hello" * 99)(p)), ["b.avi", B, "a video"]),
 }

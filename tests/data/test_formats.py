@@ -397,7 +397,7 @@ INVALID_STORAGE = {
     "no keys": (b"- 1\n- 2\n", "got no keys"),
     "list as key": (b"? [1]\n: 2\n", "expected OpenCV's YAML or XML in a.yml, got"),
     "control characters": (b"a: \1\n", "expected OpenCV's YAML or XML in a.yml, got"),
-    "binary": (b"\xff\xfe\xfd", "can't decode"),
+    "binary": (b"\xff\xfe\xfd", "expected a.yml in UTF-8"),
     "entities": (b'<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "without a document type"),
     "too large": (b" " * (MAX_BYTES + 1), "expected a.yml to have at most"),
     "too few numbers": (MATRIX.format(3, 3, "d", "1, 2").encode(), "K: expected rows x cols numbers, got 2"),

@@ -65,7 +65,7 @@ def test_calibrations_of_other_tools(name, tmp_path):
         for image in (f"images/{camera}.png", f"images/{camera}/0.png"):
             cv2.imwrite(str(tmp_path / image), np.zeros((20, 30, 3), np.uint8))
         entry = {"name": camera, "width": 30, "height": 20, "K": np.diag([40.0, 40.0, 1.0]), "dist": np.zeros(5)}
-        entry |= {"R": np.eye(3), "t": np.zeros(3), "image": f"images/{camera}.png", "mask": None}
+        entry |= {"R": np.eye(3), "t": np.full(3, float(camera[3:])), "image": f"images/{camera}.png", "mask": None}
         cameras.append(entry)
     WRITERS[name](tmp_path, cameras)
     places = (tmp_path / "sparse" / "0", tmp_path / "cam1", tmp_path)

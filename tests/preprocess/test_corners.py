@@ -13,12 +13,12 @@ SIZE_PX = (512, 612)
 STRAIGHT, BENT = np.zeros(5), np.array([-0.06, 0.02, 0, 0, 0])
 
 
-def pictured(tilt_deg, lens=STRAIGHT, noise=2.0, blur_px=0.0):
+def pictured(tilt_deg, lens=STRAIGHT, noise=2.0, blur_px=0.0, board=BOARD):
     """A picture of the board, and where all its corners are in it."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.deg2rad([0.3 * tilt_deg, tilt_deg, 8.0]))[0]
     pose[:3, 3] = np.array([0, 0, 2.6]) - pose[:3, :3] @ [0.48, 0.36, 0]
-    image = photograph(BOARD, K, lens, pose, SIZE_PX).astype(np.float64)
+    image = photograph(board, K, lens, pose, SIZE_PX).astype(np.float64)
     image += np.random.default_rng(0).normal(0, noise, image.shape)
     image = cv2.GaussianBlur(image, (0, 0), blur_px) if blur_px else image
     true = cv2.projectPoints(BOARD.corners_m, pose[:3, :3], pose[:3, 3], K, lens)[0][:, 0]
@@ -45,6 +45,16 @@ def test_a_board_is_found_better_than_opencv_does():
     theirs = np.linalg.norm(plain[0].reshape(-1, 2) + 0.5 - true[plain[1].ravel()], axis=1)
     ours = np.linalg.norm(found.pixels - true[found.ids], axis=1)
     assert len(ours) > 20 and np.sqrt((ours**2).mean()) < 0.25 * np.sqrt((theirs**2).mean())
+
+
+def test_boards_of_both_patterns_are_found():
+    """Before OpenCV 4.6, and from calib.io, boards with an even number of rows start with a marker."""
+    board = parse_board("8x6:0.12:0.09", "DICT_5X5_1000")
+    board.opencv.setLegacyPattern(True)  # only what is printed
+    image, true = pictured(30, board=board)
+    found = BOARD.find(image)
+    assert len(found.ids) > 20 and np.abs(found.pixels - true[found.ids]).max() < 0.2
+    assert cv2.aruco.CharucoDetector(BOARD.opencv).detectBoard(pictured(30)[0])[1] is not None
 
 
 def test_where_nothing_is_seen_corners_stay():

@@ -85,7 +85,7 @@ def test_the_frames_of_a_capture_can_be_its_plate(unmasked, tmp_path):
 def test_the_images_own_alpha_is_a_mask(unmasked, tmp_path, capsys):
     command = ["masks", str(unmasked.path), str(tmp_path / "out"), "--method", "alpha"]
     assert main(command) == 2
-    assert "a_000.png: camera 'a': expected 8-bit RGB and alpha" in capsys.readouterr().err
+    assert "a_000.png: camera 'a': expected RGB and alpha, got 3 channels" in capsys.readouterr().err
     for name in "abcd":
         for frame in ("000", "001"):
             file = f"images/{name}_{frame}.png"

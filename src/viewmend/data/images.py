@@ -6,7 +6,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, UInt8, UInt16
 
 from viewmend.data.containers import read_bytes
 from viewmend.data.errors import CaptureError
@@ -19,6 +19,10 @@ MAX_PIXELS = 2**27
 """The largest image that is decoded. Its header is checked first."""
 PNG_START, PNG_CHUNK_OVERHEAD = b"\x89PNG\r\n\x1a\n", 12
 """The signature of a PNG, and the bytes of each chunk besides its data: length, type and checksum."""
+PNG_PALETTE, PNG_WITHOUT_ALPHA = 3, (b"\0", b"\2")
+"""The types of colour, in byte 25 of a PNG: a palette; grey and RGB."""
+MAX_LABELS = 32
+"""Masks with more values hold opacities, not labels."""
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits; the upper 8 of 16 bits would be black."""
 RUN_LENGTH_SUFFIX = ".bin"
@@ -59,7 +63,7 @@ def exif_rotation(path: Path) -> str | None:
 
 
 def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
-    """Read an 8-bit image file with alpha, as stored.
+    """Read an image file with alpha, of 8 bit or of 16 bit in full range, as stored.
 
     Raises:
         CaptureError: the file cannot be read or decoded, or has other channels.
@@ -67,23 +71,83 @@ def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
     import cv2
 
     bgra = _read(path, where, cv2.IMREAD_UNCHANGED)
-    if bgra.dtype != np.uint8 or bgra.ndim != 3 or bgra.shape[2] != 4:
-        raise CaptureError(f"{where}: expected 8-bit RGB and alpha, got {bgra.dtype} of shape {bgra.shape}")
+    channels = 1 if bgra.ndim == 2 else bgra.shape[2]
+    if bgra.dtype == np.uint16 and channels == 4 and bgra.max() >= FULL_16_BIT:
+        bgra = (bgra >> 8).astype(np.uint8)
+    if channels != 4 or bgra.dtype != np.uint8:
+        got = f"{channels} channels" + ("" if bgra.dtype == np.uint8 else f" of {bgra.dtype}")
+        raise CaptureError(f"{where}: expected RGB and alpha, got {got}; export it with alpha, or leave the camera out")
     return cv2.cvtColor(bgra, cv2.COLOR_BGRA2RGBA)
 
 
-def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
-    """Read an 8-bit mask file; see `to_mask`.
+def read_alpha(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
+    """Read the alpha of an image as a mask.
 
     Raises:
-        CaptureError: the file cannot be read or decoded, or is not 8 bit.
+        CaptureError: the file cannot be read or decoded, or its alpha cuts nothing out.
+    """
+    alpha = read_rgba(path, where)[..., 3]
+    if (alpha == 255).all():
+        next_step = "export it with alpha, or leave the camera out"
+        raise CaptureError(f"{where}: expected alpha that cuts out the subject, got an opaque image; {next_step}")
+    return alpha
+
+
+def uses_alpha(path: Path) -> bool:
+    """Whether this is an image with alpha that is not opaque everywhere."""
+    try:
+        head = read_bytes(path, 26)
+        if head.startswith(b"\xff\xd8") or (head.startswith(PNG_START) and head[25:] in PNG_WITHOUT_ALPHA):
+            return False  # JPEG, or PNG without alpha: not decoded
+        read_alpha(path, str(path))
+    except (ValueError, OSError):
+        return False
+    return True
+
+
+def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
+    """Read a mask file: grey or alpha (see `to_mask`), labels of several colours or a palette, or 16 bit.
+
+    Background are index 0 of a coloured palette, black among other colours, and 0 among few values of 16 bit.
+
+    Raises:
+        CaptureError: the file cannot be read or decoded, or its values have no known meaning.
     """
     import cv2
 
-    mask = _read(path, where, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    data = _read_file(path, where)
+    mask = _decode(data, where, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if mask.dtype == np.uint16 and mask.ndim == 2:
+        mask = _from_16_bit(mask)
     if mask.dtype != np.uint8:
         raise CaptureError(f"{where}: expected an 8-bit mask, got {mask.dtype}; write it as 8-bit PNG")
+    if mask.ndim == 3 and (mask.shape[2] == 3 or (mask.shape[2] == 4 and (mask[..., 3] == 255).all())):
+        background = _background(mask[..., :3], data)
+        if background is not None:
+            return 255 * (mask[..., :3] != background).any(-1).astype(np.uint8)
     return to_mask(mask)
+
+
+def _from_16_bit(mask: UInt16[np.ndarray, "height width"]) -> np.ndarray:
+    """The mask in 8 bit, if its meaning is clear: 8 bits stored as 16, labels, or the full range."""
+    if mask.max() <= 255:
+        return mask.astype(np.uint8)
+    if len(np.unique(mask)) <= MAX_LABELS:
+        return 255 * (mask > 0).astype(np.uint8)
+    return (mask >> 8).astype(np.uint8) if mask.max() >= FULL_16_BIT else mask
+
+
+def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes) -> tuple[int, ...] | None:
+    """The colour of the background if colours are labels; None if they are shades of one."""
+    blue, green, red = (bgr[..., channel] for channel in range(3))
+    if (blue == green).all() and (green == red).all():
+        return None
+    if data.startswith(PNG_START) and data[25] == PNG_PALETTE and (at := data.find(b"PLTE")) > 0:
+        return tuple(data[at + 6 : at + 3 : -1])
+    packed = bgr.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
+    colours = np.unique(packed)
+    several = len(colours) <= MAX_LABELS and np.linalg.matrix_rank(colours[:, None] >> [16, 8, 0] & 255) > 1
+    return (0, 0, 0) if several else None
 
 
 def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "height width"]:
@@ -163,7 +227,10 @@ def _read_file(path: Path, where: str) -> bytes:
 
 
 def _read(path: Path, where: str, flags: int) -> np.ndarray:
-    data = _read_file(path, where)
+    return _decode(_read_file(path, where), where, flags)
+
+
+def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
     if (size := size_from_header(data)) is not None and size[0] * size[1] > MAX_PIXELS:
         raise CaptureError(
             f"{where}: expected an image of at most {MAX_PIXELS / 1e6:.0f} million pixels, got {size[0]} x {size[1]}; "

@@ -18,14 +18,16 @@ from viewmend.data.containers import names_in
 from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.formats import read_any_calibration
 from viewmend.data.images import (
+    MAX_LABELS,
     RUN_LENGTH_SUFFIX,
     exif_rotation,
+    read_alpha,
     read_depth,
     read_mask,
     read_rgb,
-    read_rgba,
     read_run_lengths,
     to_mask,
+    uses_alpha,
 )
 from viewmend.data.native_format import CALIBRATION, FileKind, NativeCalibration, NativeCamera, stays_inside
 from viewmend.data.video_clock import ABSENT, Track, TrackKind, VideoClock, match_tracks, video_track
@@ -35,6 +37,9 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.rigid import rigid
 from viewmend.types import MultiViewFrame
+
+OPAQUE = 250
+"""Masks of which none reaches this value hold labels if their values are few."""
 
 
 def open_capture(
@@ -103,6 +108,7 @@ class NativeCapture:
         self._readers = tuple(CameraReader(folder, camera, self._frame_ids, self.clock) for camera in self._entries)
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
+        self._masks_are_opaque = self._warned_of_labels = False
         self._cameras = pinhole_cameras(self._entries)
 
     @property
@@ -178,12 +184,14 @@ class NativeCapture:
         if not views:
             raise CaptureError(f"{self.folder}: frame '{frame_id}': expected a frame in one film or more, got none")
         frame = stack_images([image for image in images if image is not None], self._cameras[views], time)
+        if frame.mask is not None and not self._masks_are_opaque:
+            frame = self._from_labels(frame)
         if frame.mask is not None and (highest := int(frame.mask.max())) <= FOREGROUND:
             camera = self._entries[views[0]]
             raise CaptureError(
                 f"{self.folder / camera.file('mask', frame_id)}: camera '{camera.name}', frame '{frame_id}': expected "
                 f"foreground (255) in this or another camera's mask, got no value above {highest} in any; segment the "
-                f"images, multiply masks of 0 and 1 by 255, or remove the frame from {self._file.name}"
+                f"images, or remove the frame from {self._file.name}"
             )
         return frame
 
@@ -195,6 +203,20 @@ class NativeCapture:
         """
         self.cameras.select([camera])
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
+
+    def _from_labels(self, frame: MultiViewFrame) -> MultiViewFrame:
+        """The frame with labels in its masks as 255, if no mask so far had an opaque pixel and values are few."""
+        assert frame.mask is not None
+        values = torch.bincount(frame.mask.flatten(), minlength=256).nonzero().flatten().tolist()
+        self._masks_are_opaque = values[-1] >= OPAQUE
+        if self._masks_are_opaque or values == [0] or len(values) > MAX_LABELS:
+            return frame
+        if not self._warned_of_labels:
+            self._warned_of_labels = True
+            logging.getLogger("viewmend").warning(
+                f"{self.name}: masks have no values above {values[-1]}: they are read as labels, with 0 as background"
+            )
+        return replace(frame, mask=255 * (frame.mask > 0).to(torch.uint8))
 
     def _warn_of_rotation(self) -> None:
         rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
@@ -267,15 +289,14 @@ def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file
 
 
 def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> NativeCamera:
-    """The camera with its images as masks; raises a CaptureError if its first image has no alpha."""
+    """The camera with its images as masks; raises a CaptureError if none of its images has alpha."""
     if camera.image is None:
         raise CaptureError(
             f"{folder}: camera '{camera.name}': expected images with alpha, got a video; use another --method"
         )
-    for file in (folder / camera.file("image", frame) for frame in frames):
-        if file.is_file():
-            read_rgba(file, f"{file}: camera '{camera.name}'")
-            break
+    files = [folder / camera.file("image", frame) for frame in frames]
+    if not any(uses_alpha(file) for file in files) and (file := next(filter(Path.is_file, files), None)):
+        read_alpha(file, f"{file}: camera '{camera.name}'")
     return replace(camera, mask=camera.image)
 
 
@@ -420,6 +441,8 @@ class CameraReader:
             if image is None:
                 return None
             mask = to_mask(image)
+        elif self.camera.mask == self.camera.image:
+            mask = read_alpha(path, where)
         elif path.suffix == RUN_LENGTH_SUFFIX:
             mask = read_run_lengths(path, where, (self.camera.height, self.camera.width))
         else:

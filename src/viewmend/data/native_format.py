@@ -193,7 +193,8 @@ def _camera(entry: NativeCameraEntry, shift_px: Float64[np.ndarray, "2"], scale:
     K[:2, 2] += shift_px
     u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations are often rounded
     return NativeCamera(
-        **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", "offset_ms", *FILE_KINDS)},
+        **{key: getattr(entry, key) for key in ("name", "width", "height", "mask_labels", "offset_ms")},
+        **{kind: path and path.replace("\\", "/") for kind in FILE_KINDS for path in [getattr(entry, kind)]},
         K=K,
         R=u @ vt,
         t_m=np.array(entry.t) * scale,

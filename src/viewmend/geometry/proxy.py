@@ -16,6 +16,7 @@ from viewmend.geometry.hull import (
     occupied_bounds,
     visual_hull,
 )
+from viewmend.geometry.hull_parts import without_floating_parts
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface, occupied_box
@@ -58,7 +59,7 @@ def reconstruct(
     bounds: Bounds | None = None,
     config: HullConfig | None = None,
 ) -> GeometryProxy:
-    """The visual hull's surface from the masks of all cameras.
+    """The visual hull's surface from the masks of all cameras, without floating parts that no mask needs.
 
     A search over `bounds` (estimated from the masks where None) finds the box that the subject fills; all voxels are
     spent there. So bounds much larger than the subject cost no detail. Where the masks agree on no
@@ -74,13 +75,13 @@ def reconstruct(
     if box is None:
         nothing = torch.zeros(0, 3, device=mask.device)
         return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds)
-    grid = visual_hull(mask, cameras, box, config)
+    grid = without_floating_parts(visual_hull(mask, cameras, box, config), cameras)
     # Where images end, the search cannot tell empty from unknown until its blocks are as small as voxels.
     for _ in range(RECARVINGS):
         tight = _filled_bounds(grid, box)
         if tight is None or float(tight.size_m.max()) > WORTH_RECARVING * float(box.size_m.max()):
             break
-        box, grid = tight, visual_hull(mask, cameras, tight, config)
+        box, grid = tight, without_floating_parts(visual_hull(mask, cameras, tight, config), cameras)
     mesh = extract_surface(grid)
     return GeometryProxy(mesh, vertex_normals(mesh), box)
 

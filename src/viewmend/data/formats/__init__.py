@@ -4,7 +4,7 @@ Each format is one module with two functions. `find(folder)` returns the file th
 `content(folder, file)` returns the equivalent content of a `cameras.json` and raises a ValueError for invalid input.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from viewmend.data.formats import (
     transforms,
     zju_mocap,
 )
+from viewmend.data.formats.files import folders_containing
 from viewmend.data.native_format import CALIBRATION, NativeCalibration, calibration_from_content, read_calibration
 
 
@@ -52,6 +53,24 @@ FORMATS = {
 FORMAT_NAMES = ("plain", *FORMATS)
 
 
+SESSIONS = ("pose2sim", "qualisys")
+"""Formats whose calibration may lie in a folder next to that of the recording, or one level higher."""
+
+
+def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
+    """The format, and the file that identifies it; of `names`, the first one that matches."""
+    for name in names:
+        if (file := FORMATS[name].find(path)) is not None:
+            return name, file
+    if path.is_dir():
+        parents = path.resolve().parents[:2]
+        for place in (place for parent in parents for place in folders_containing(parent, "calib")[1:]):
+            for name in (name for name in SESSIONS if name in names):
+                if (file := FORMATS[name].find(place)) is not None:
+                    return name, file
+    return "", None
+
+
 def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
     """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
 
@@ -66,14 +85,14 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
         raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")
     if format == "plain" or (format is None and (path / CALIBRATION).is_file()):
         return read_calibration(path)
-    for name in FORMATS if format is None else (format,):
-        if (file := FORMATS[name].find(path)) is not None:
-            try:
-                with np.errstate(all="ignore"):  # overflow becomes infinity, which is rejected
-                    calibration = calibration_from_content(FORMATS[name].content(path, file), file)
-                    return replace(calibration, folder=FORMATS[name].root(path, file))
-            except (ValueError, OSError) as error:
-                raise CaptureError(f"{file}: {error}") from None
+    name, file = _find(path, FORMATS if format is None else (format,))
+    if file is not None:
+        try:
+            with np.errstate(all="ignore"):  # overflow becomes infinity, which is rejected
+                calibration = calibration_from_content(FORMATS[name].content(path, file), file)
+                return replace(calibration, folder=FORMATS[name].root(path, file))
+        except (ValueError, OSError) as error:
+            raise CaptureError(f"{file}: {error}") from None
     if format is None:
         return read_calibration(path)  # its error message lists what a capture folder contains
     raise CaptureError(f"{path}: expected a capture of format '{format}', got none of its files; see docs/formats.md")

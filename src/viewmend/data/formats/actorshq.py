@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from viewmend.data.formats.files import collect_footage, invert_pose, to_rotation
+from viewmend.data.formats.files import collect_footage, decode_text, invert_pose, to_rotation
 from viewmend.utils.untrusted_input import bounded_bytes
 
 COLUMNS = ("name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py")
@@ -52,7 +52,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
 def _read_table(file: Path, columns: tuple[str, ...]) -> list[dict[str, Any]]:
     """The rows of a table; all columns but `name` are numbers."""
     try:
-        rows = list(csv.DictReader(bounded_bytes(file, MAX_BYTES).decode().splitlines()))
+        rows = list(csv.DictReader(decode_text(bounded_bytes(file, MAX_BYTES), file.name).splitlines()))
         found = [{key: row[key] if key == "name" else float(row[key]) for key in columns} for row in rows]
     except (csv.Error, KeyError, TypeError) as error:
         got = str(error)[:60]

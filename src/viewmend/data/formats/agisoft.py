@@ -6,7 +6,15 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from viewmend.data.formats.files import find_mask, names_from_paths, read_xml, xml_attributes, xml_number
+from viewmend.data.formats.files import (
+    files_like,
+    find_mask,
+    forward_slashes,
+    names_from_paths,
+    read_xml,
+    xml_attributes,
+    xml_number,
+)
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**24
@@ -17,8 +25,8 @@ UNSUPPORTED = ("k4", "p3", "p4")
 
 def find(folder: Path) -> Path | None:
     """The first XML file with a chunk of cameras."""
-    for path in sorted(folder.glob("*.xml")):
-        if path.is_file() and path.stat().st_size <= MAX_BYTES:
+    for path in files_like(folder, "*.xml"):
+        if path.stat().st_size <= MAX_BYTES:
             data = path.read_bytes()
             if b"<document" in data[:4096] and b"<chunk" in data:
                 return path
@@ -26,16 +34,15 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The enabled and aligned images of the first chunk, in the folder or in `images`.
+    """The enabled and aligned images of the chunk that has most, in the folder or in `images`.
 
     The unit is that of the chunk: metres if it was scaled.
 
     Raises:
         ValueError: the file is not XML or lacks a number, or a lens is not supported.
     """
-    chunk = read_xml(bounded_bytes(file, MAX_BYTES)).find("chunk")
-    cameras = [] if chunk is None else chunk.findall("./cameras//camera")
-    used = [c for c in cameras if c.find("transform") is not None and c.get("enabled", "1").lower() in ("1", "true")]
+    chunks = [(chunk, _used_cameras(chunk)) for chunk in read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")]
+    chunk, used = max(chunks, key=lambda pair: len(pair[1]), default=(None, []))
     if chunk is None or not used:
         raise ValueError("expected a chunk with aligned cameras, got none; align the photos and export them again")
     sensors = {sensor.get("id"): sensor for sensor in chunk.findall("./sensors/sensor")}
@@ -47,11 +54,16 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     return {"first_pixel_center": [0.5, 0.5], "frames": ["0"], "cameras": entries}
 
 
+def _used_cameras(chunk: Element) -> list[Element]:
+    cameras = chunk.findall("./cameras//camera")
+    return [c for c in cameras if c.find("transform") is not None and c.get("enabled", "1").lower() in ("1", "true")]
+
+
 def _find_image(folder: Path, label: str) -> str:
     """The path of the image with this label, which often lacks the suffix."""
+    label = forward_slashes(label)
     for place in ("", "images/"):
-        within = (folder / place).iterdir() if (folder / place).is_dir() else ()
-        for path in sorted(path for path in within if path.is_file()):
+        for path in files_like(folder / place, "*") if (folder / place).is_dir() else ():
             if path.name == label or (path.stem == label and path.suffix.lower() not in (".xml", ".txt")):
                 return place + path.name
     return f"images/{label}"

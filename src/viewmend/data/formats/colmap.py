@@ -6,9 +6,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from viewmend.data.formats.files import find_mask, names_from_paths
+from viewmend.data.formats.files import (
+    IMAGE_SUFFIXES,
+    decode_text,
+    existing,
+    find_mask,
+    folders_containing,
+    forward_slashes,
+    names_from_paths,
+    warn,
+)
 from viewmend.utils.untrusted_input import bounded_bytes
 
+IMAGES = "images.txt"
 MAX_BYTES = 2**29
 """A model of a thousand images needs about 100 MB."""
 MODELS = {
@@ -33,12 +43,43 @@ class ColmapImage(NamedTuple):
 
 
 def find(folder: Path) -> Path | None:
-    """The file cameras.bin or cameras.txt, next to that of the images."""
-    for place in ("sparse/0", "sparse", "."):
-        for suffix in (".bin", ".txt"):
-            if all((folder / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
-                return folder / place / f"cameras{suffix}"
+    """The file cameras.bin or cameras.txt of the model with most images: COLMAP's first is often not the largest."""
+    for place in ("sparse", "colmap/sparse", "."):
+        inner = [] if place == "." else folders_containing(folder / place, "")[1:]
+        models = [model for path in (*inner, folder / place) if (model := _model_in(path))]
+        if len(models) > 1:
+            return max(models, key=_count_images)
+        if models:
+            return models[0]
     return None
+
+
+def _model_in(place: Path) -> Path | None:
+    for suffix in (".bin", ".txt"):
+        if all((place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
+            return place / f"cameras{suffix}"
+    return None
+
+
+def _read(file: Path) -> tuple[dict[int, dict[str, Any]], list[ColmapImage]]:
+    """Lenses and images of a model, sorted by name."""
+    cameras, images = (bounded_bytes(path, MAX_BYTES) for path in (file, file.with_name(f"images{file.suffix}")))
+    try:
+        if file.suffix == ".bin":
+            lenses, views = _binary_lenses(cameras), _binary_images(images)
+        else:
+            lenses, views = _text_lenses(decode_text(cameras, "cameras.txt")), _text_images(decode_text(images, IMAGES))
+    except (struct.error, IndexError):
+        raise ValueError("expected complete files of cameras and images, got less; export the model again") from None
+    return lenses, sorted((view._replace(name=forward_slashes(view.name)) for view in views), key=lambda v: v.name)
+
+
+def _count_images(file: Path) -> int:
+    """The number of images of a model; 0 if it is invalid."""
+    try:
+        return len(_read(file)[1])
+    except (ValueError, OSError):
+        return 0
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
@@ -47,16 +88,13 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     Raises:
         ValueError: a file is truncated or invalid, or a camera model is not in `MODELS`.
     """
-    cameras, images = (bounded_bytes(path, MAX_BYTES) for path in (file, file.with_name(f"images{file.suffix}")))
-    try:
-        if file.suffix == ".bin":
-            lenses, views = _binary_lenses(cameras), _binary_images(images)
-        else:
-            lenses, views = _text_lenses(cameras.decode()), _text_images(images.decode())
-    except (struct.error, IndexError):
-        raise ValueError("expected complete files of cameras and images, got less; export the model again") from None
-    views.sort(key=lambda view: view.name)
+    lenses, views = _read(file)
     prefix = "images/" if (folder / "images").is_dir() else ""
+    known = {view.name for view in views}
+    views = existing(folder, views, lambda view: prefix + view.name)
+    unused = sorted(set(_images_in(folder / "images")) - known) if prefix else []
+    if unused:
+        warn(f"{file.parent}: the model has {len(views)} images, and not {', '.join(unused)[:200]}, which is ignored")
     entries = []
     for view, name in zip(views, names_from_paths([view.name for view in views]), strict=True):
         if view.camera not in lenses:
@@ -94,18 +132,59 @@ def _binary_images(data: bytes) -> list[ColmapImage]:
 
 
 def _text_lenses(text: str) -> dict[int, dict[str, Any]]:
-    lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    return {int(w[0]): _lens(w[1], int(w[2]), int(w[3]), [float(n) for n in w[4:]]) for w in lines}
+    lenses = {}
+    for number, line in enumerate(text.split("\n"), 1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            try:
+                camera, width, height = int(words[0]), int(words[2]), int(words[3])
+                values = [float(word) for word in words[4:]]
+            except (ValueError, IndexError):
+                raise _bad_line("cameras.txt", number, "an id, a model, a size and its parameters", line) from None
+            lenses[camera] = _lens(words[1], width, height, values)
+    return lenses
 
 
 def _text_images(text: str) -> list[ColmapImage]:
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    images = []
-    for line in lines[::2]:  # every other line has the image's points, and may be empty
-        if words := line.split(maxsplit=9):
-            pose = [float(number) for number in words[1:8]]
-            images.append(ColmapImage(pose[:4], pose[4:], int(words[8]), words[9].strip()))
+    """The images: lines of a pose and a name, each followed by a line of points, which may be empty."""
+    images, follows = [], False
+    for number, line in enumerate(text.split("\n"), 1):
+        words = line.split(maxsplit=9)
+        if words and words[0].startswith("#"):
+            continue
+        if follows:
+            points = line.split()
+            if len(points) % 3 or not _is_number(points[-1] if points else "0"):
+                expected = "the points of the image in the line before, 3 numbers each or an empty line"
+                raise _bad_line(IMAGES, number, expected, line)
+            follows = False
+        elif words:
+            try:
+                pose = [float(word) for word in words[1:8]]
+                images.append(ColmapImage(pose[:4], pose[4:], int(words[8]), words[9].strip()))
+            except (ValueError, IndexError):
+                raise _bad_line(IMAGES, number, "an id, a pose, a camera and a name", line) from None
+            follows = True
     return images
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _bad_line(file: str, number: int, expected: str, line: str) -> ValueError:
+    got = f"'{line.strip()[:60]}'"
+    return ValueError(f"{file}: expected {expected} in line {number}, got {got}; export the model again")
+
+
+def _images_in(folder: Path) -> list[str]:
+    """Paths of the images in a folder and its subfolders, relative to it."""
+    found = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return [path.as_posix() for path in found if not any(part.startswith(".") for part in path.parts)]
 
 
 def _parameters(model: str) -> list[str]:

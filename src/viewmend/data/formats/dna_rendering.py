@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from viewmend.data.containers import member, names_in, open_container
-from viewmend.data.formats.files import image_size_px, invert_pose, to_distortion
+from viewmend.data.formats.files import files_like, folders_containing, image_size_px, invert_pose, to_distortion
 
 SUFFIX, ANNOTATIONS = ".smc", "_annots.smc"
 GROUPS = ("Camera_5mp", "Camera_12mp")
@@ -64,8 +64,8 @@ def content(path: Path, file: Path) -> dict[str, Any]:
 
 def _image_files(folder: Path) -> list[Path]:
     """The files with images in the folder, or else in its subfolders `*main*`."""
-    for places in ([folder], sorted(place for place in folder.glob("*main*") if place.is_dir())):
-        files = sorted(file for place in places for file in place.glob(f"*{SUFFIX}"))
+    for places in ([folder], folders_containing(folder, "main")[1:]):
+        files = [file for place in places for file in files_like(place, f"*{SUFFIX}")]
         if found := [file for file in files if not file.name.endswith(ANNOTATIONS)]:
             return found
     return []

@@ -1,12 +1,14 @@
 """Helpers of the format readers: image sizes, poses, footage found by camera names, and safe XML."""
 
+import logging
 import math
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import numpy as np
@@ -17,9 +19,10 @@ from viewmend.data.native_format import stays_inside
 from viewmend.data.video_clock import match_tracks, video_track
 from viewmend.data.videos import is_video, video_properties
 
+Item = TypeVar("Item")
 HEADER_BYTES = 2**20
 """How much of an image is read to find its size."""
-PLACES = ("videos", "videos-raw", "recordings", "images", "")
+PLACES = ("videos", "synchronized_videos", "videos-raw", "recordings", "images", "")
 """Folders that are searched for footage; in `recordings` also its only subfolder."""
 MASK_PLACES = ("masks", "mask", "mask_cihp", "schp", "fmask", "rvm", "bgmtv2")
 """Folders that are searched for masks; the later names are those of segmentation networks and of MVHumanNet."""
@@ -27,14 +30,50 @@ LABELS = ("mask_cihp", "schp")
 """Folders whose masks are body part labels, of which only 0 is background."""
 NO_SUBJECT = re.compile("background|plate|empty|board|calib|intrinsic")
 """Videos with such names do not show the subject."""
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jp2", ".bmp", ".dib", ".tif", ".tiff", ".webp", ".avif", ".gif", ".exr"),
+    *(".hdr", ".pbm", ".pgm", ".ppm", ".pnm", ".ras", ".sr"),
+)
+HIDDEN = ("__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN")
+"""Folders of file managers; other files and folders of theirs start with a dot."""
+COMPARABLE = 3
+"""Cameras with fewer images are not compared by their frame ids."""
 MAX_CROP_PX = 16
 """Encoders round sizes down to whole blocks; the calibration of a slightly larger image stays valid."""
 
 
 def folders_containing(folder: Path, part: str) -> list[Path]:
     """A folder and its subfolders whose names contain `part`; empty if the folder does not exist."""
-    within = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [folder, *(path for path in within if path.is_dir() and part in path.name.lower())] if within else []
+    if not folder.is_dir():
+        return []
+    return [folder, *(folder / name for name in _subfolders(folder) if part in name.lower())]
+
+
+def files_like(folder: Path, pattern: str) -> list[Path]:
+    """The files in a folder that match a glob pattern, sorted, without those of file managers (`._cameras.xml`)."""
+    return sorted(path for path in folder.glob(pattern) if path.is_file() and not _is_hidden(path.name))
+
+
+def forward_slashes(path: str) -> str:
+    """A path that may have been written on Windows."""
+    return path.replace("\\", "/")
+
+
+def decode_text(data: bytes, name: str) -> str:
+    """The text of a file, without a byte order mark.
+
+    Raises:
+        ValueError: it is not UTF-8.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError(f"expected {name} in UTF-8, got another encoding; save it as UTF-8") from None
+
+
+def warn(text: str) -> None:
+    """Log a warning about a capture's files."""
+    logging.getLogger("viewmend").warning(text)
 
 
 def image_size_px(folder: Path, name: str) -> tuple[int, int]:
@@ -60,6 +99,39 @@ def names_from_paths(paths: Sequence[str]) -> list[str]:
     if len(set(stems)) == len(stems):
         return stems
     return [str(PurePosixPath(path).with_suffix("")).replace("/", "_") if path else path for path in paths]
+
+
+def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:
+    """The items whose image is in the folder, with a warning of the others; all of them if fewer than two exist."""
+    missing = [n for n, item in enumerate(items) if stays_inside(path(item)) and not _is_file(folder / path(item))]
+    if not missing or len(items) - len(missing) < 2:
+        return list(items)
+    names = ", ".join(path(items[number]) for number in missing)
+    warn(f"{folder}: cameras without their image are left out: {names[:200]}")
+    return [item for number, item in enumerate(items) if number not in missing]
+
+
+def _is_file(path: Path) -> bool:
+    return "\0" not in str(path) and path.is_file()
+
+
+def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+    """A path with `{frame}`, and the id of each path: the part in which they differ, with all of its digits.
+
+    Raises:
+        ValueError: the paths differ in several parts.
+    """
+    if len(set(paths)) == 1:
+        return paths[0], ("0",) * len(paths)
+    same = [takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False)) for step in (1, -1)]
+    before, after = paths[0][: len(list(same[0]))].rstrip("0123456789"), len(list(same[1]))
+    after = paths[0][len(paths[0]) - min(after, min(map(len, paths)) - len(before)) :].lstrip("0123456789")
+    ids = tuple(path[len(before) : len(path) - len(after)] for path in paths)
+    if not all(ids) or any("/" in name for name in ids):
+        raise ValueError(
+            f"expected paths that differ in a number, got {paths[0][:80]!r} and {paths[-1][:80]!r}; rename"
+        )
+    return f"{before}{{frame}}{after}", ids
 
 
 def find_mask(folder: Path, image: str) -> str | None:
@@ -160,6 +232,10 @@ def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLA
             for found in (_videos(folder, where), _folders(folder, where)):
                 if paths := match_names(names, found):
                     return collect_footage(folder, dict(zip(names, paths, strict=True)))
+    inner = [place for place in PLACES if place]
+    trials = [name for name in _subfolders(folder) if any((folder / name / place).is_dir() for place in inner)]
+    if trials:
+        raise ValueError(f"expected one recording, got a folder with {', '.join(trials)[:200]}; open one of these")
     searched = ", ".join(place or "the folder" for place in places)
     raise ValueError(
         f"expected a video or a folder of images named after each camera ({', '.join(names)[:80]}) in {searched}, "
@@ -175,7 +251,7 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
-    entries, frames, fps = {}, set(), None
+    entries, frames, fps, ids = {}, set(), None, {}
     paths = {name: _only_video(folder, path) or path for name, path in paths.items()}
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
@@ -189,12 +265,15 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         width, height = image_size_px(folder, images.first())
         entries[name] = {"width": width, "height": height, "image": images.pattern}
         frames |= images.frames
-    for name, mask in _find_masks(folder, tuple(paths)).items():
+        ids[name] = images.frames
+    masks = _find_masks(folder, tuple(paths))
+    _compare_ids(ids | {f"{name} (masks)": found for name, (_, found) in masks.items() if found and name in ids})
+    for name, (mask, _) in masks.items():
         entries[name] |= mask
     if videos:
         tracks = [video_track(name, "images", folder / paths[name]) for name in videos]
-        masks = {name: str(entry.get("mask", "")) for name, entry in entries.items()}
-        tracks += [video_track(name, "masks", folder / masks[name]) for name in videos if is_video(masks[name])]
+        films = {name: str(entry.get("mask", "")) for name, entry in entries.items()}
+        tracks += [video_track(name, "masks", folder / films[name]) for name in videos if is_video(films[name])]
         clock = match_tracks(tracks)
         frames, fps = {f"{time:06d}" for time in range(clock.end)}, clock.fps
     return Footage(tuple(sorted(frames, key=frame_order)), fps, entries)
@@ -203,12 +282,41 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
 def list_images(folder: Path, place: str) -> ImageList | None:
     """The images in a subfolder whose names differ only in a number, of the most frequent pattern; None without any."""
     named = [re.fullmatch(r"(.*?)(\d+)([^\d]*)(\.\w+)|([^.].*)()()(\.\w+)", name) for name in _files(folder / place)]
-    parts = [m.groups()[:4] if m[2] else ("", m[5], "", m[8]) for m in named if m and not is_video(m[0])]
+    images = [m for m in named if m and (m[4] or m[8]).lower() in IMAGE_SUFFIXES]
+    parts = [m.groups()[:4] if m[2] else ("", m[5], "", m[8]) for m in images]
     if not parts:
         return None
     (before, after, suffix), _ = Counter(sorted((p[0], p[2], p[3]) for p in parts)).most_common(1)[0]
     frames = frozenset(p[1] for p in parts if (p[0], p[2], p[3]) == (before, after, suffix))
     return ImageList(f"{place}/{before}{{frame}}{after}{suffix}".removeprefix("/"), frames)
+
+
+def _compare_ids(ids: dict[str, frozenset[str]]) -> None:
+    """Compare the frame ids of cameras, which have to be equal for images of one moment.
+
+    Raises:
+        ValueError: a camera shares fewer than half of its ids with most others, as with each camera's own clock.
+    """
+    ids = {name: found for name, found in ids.items() if len(found) >= COMPARABLE}
+    counts = Counter(frame for found in ids.values() for frame in found)
+    usual = {frame for frame, count in counts.items() if 2 * count > len(ids)}
+    strangers = [name for name, found in ids.items() if 2 * len(found & usual) < len(found)]
+    if strangers:
+        example = ", ".join(f"{min(ids[name], key=frame_order)} of {name}" for name in list(ids)[:3])
+        raise ValueError(
+            f"expected the same frame ids in the names of all cameras' images, got others for "
+            f"{', '.join(strangers)[:200]} (first ids: {example}); rename images of one moment alike"
+        )
+    numbers = {name: sorted(map(int, found)) for name, found in ids.items() if all(map(str.isdecimal, found))}
+    spans = Counter((found[0], found[-1]) for found in numbers.values())
+    if len(spans) > 1:
+        (first, last), _ = spans.most_common(1)[0]
+        moved = {name: found[0] for name, found in numbers.items() if found[0] - first == found[-1] - last != 0}
+        if moved:
+            warn(
+                f"the numbers of images begin at {first}, but at {', '.join(map(str, sorted(set(moved.values()))))} "
+                f"for {', '.join(moved)}; if all cameras started together, rename these images"
+            )
 
 
 def frame_order(frame: str) -> tuple[int, str]:
@@ -244,15 +352,16 @@ _KEYS: tuple[Callable[[str], Hashable], ...] = (str, _after_cam, _last_number)
 """Comparisons of names, the strictest first."""
 
 
-def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """The keys of a `cameras.json` for each camera's masks; empty if there are no masks.
+def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str, Any], frozenset[str]]]:
+    """The keys of a `cameras.json` for each camera's masks, and the frame ids of images; empty if there are no masks.
 
     Raises:
         ValueError: only some cameras have masks.
     """
-    place = next((place for place in MASK_PLACES if (folder / place).is_dir()), None)
-    if place is None:
+    places = [place for place in MASK_PLACES if (folder / place).is_dir()]
+    if not places:
         return {}
+    place = next((place for place in places if _videos(folder, place) or _folders(folder, place)), places[0])
     paths = match_names(names, _videos(folder, place)) or match_names(names, _folders(folder, place))
     if paths is None:
         raise ValueError(f"expected masks of each camera in {place}, got others; name them after the cameras")
@@ -261,7 +370,7 @@ def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]
     for name, path in zip(names, paths, strict=True):
         images = None if is_video(path) else list_images(folder, path)
         pattern = images.pattern if images else path if is_video(path) else f"{path}/{{frame}}.png"
-        found[name] = {"mask": pattern} | labels
+        found[name] = {"mask": pattern} | labels, images.frames if images else frozenset()
     return found
 
 
@@ -280,11 +389,16 @@ def _folders(folder: Path, place: str) -> list[str]:
 
 
 def _files(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
+    return [path.name for path in files_like(folder, "*")] if folder.is_dir() else []
 
 
 def _subfolders(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.is_dir() and p.name[0] != ".") if folder.is_dir() else []
+    within = folder.iterdir() if folder.is_dir() else ()
+    return sorted(path.name for path in within if path.is_dir() and not _is_hidden(path.name))
+
+
+def _is_hidden(name: str) -> bool:
+    return name.startswith(".") or name in HIDDEN
 
 
 def read_xml(data: bytes) -> Element:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from viewmend.data.formats.files import find_mask, image_size_px, names_from_paths
+from viewmend.data.formats.files import decode_text, files_like, find_mask, image_size_px, names_from_paths
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**22
@@ -13,7 +13,7 @@ NUMBERS = 21
 
 def find(folder: Path) -> Path | None:
     """The file of parameters."""
-    return next(iter(sorted(folder.glob("*_par.txt"))), None)
+    return next(iter(files_like(folder, "*_par.txt")), None)
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
@@ -22,7 +22,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     Raises:
         ValueError: a line has another number of values, or an image is missing.
     """
-    lines = [line.split() for line in bounded_bytes(file, MAX_BYTES).decode().splitlines() if line.strip()]
+    lines = [
+        line.split() for line in decode_text(bounded_bytes(file, MAX_BYTES), file.name).splitlines() if line.strip()
+    ]
     wrong = [words for words in lines[1:] if len(words) != 1 + NUMBERS]
     if not lines or wrong or lines[0] != [str(len(lines) - 1)]:
         got = f"{len(wrong[0]) - 1} after {wrong[0][0][:40]!r}" if wrong else f"{max(0, len(lines) - 1)} lines"

@@ -14,7 +14,15 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
-from viewmend.data.formats.files import find_footage, folders_containing, read_xml, to_distortion, to_rotation
+from viewmend.data.formats.files import (
+    decode_text,
+    files_like,
+    find_footage,
+    folders_containing,
+    read_xml,
+    to_distortion,
+    to_rotation,
+)
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**20
@@ -70,7 +78,7 @@ def _cameras(folder: Path) -> list[tuple[str, Path]]:
 
 def _complete_files(place: Path) -> list[Path]:
     """The files in a folder that have intrinsics and a pose; if there are none, those that are invalid."""
-    files = [path for path in sorted(place.glob("*.*")) if path.suffix.lower() in SUFFIXES and path.is_file()]
+    files = [path for path in files_like(place, "*.*") if path.suffix.lower() in SUFFIXES]
     complete, invalid = [], []
     for path in (path for path in files if b"opencv" in bounded_bytes(path, MAX_BYTES)):
         try:
@@ -107,7 +115,7 @@ def read_storage(file: Path) -> dict[str, Any]:
     if data.lstrip().startswith(b"<"):
         entries = {child.tag: _xml_value(child) for child in read_xml(data)}
     else:
-        entries = _read_yaml(data.decode(), file.name)
+        entries = _read_yaml(decode_text(data, file.name), file.name)
     found = {}
     for key, value in entries.items():
         if key == "names":

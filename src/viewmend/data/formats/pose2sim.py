@@ -1,36 +1,49 @@
-"""TOML calibrations of Pose2Sim, aniposelib and Caliscope. Footage is found by the cameras' names."""
+"""TOML calibrations of Pose2Sim, FreeMoCap, aniposelib and Caliscope. Footage is found by the cameras' names."""
 
 import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from viewmend.data.formats.files import find_footage, folders_containing, to_distortion, to_rotation
+from viewmend.data.formats.files import (
+    decode_text,
+    files_like,
+    find_footage,
+    folders_containing,
+    to_distortion,
+    to_rotation,
+    warn,
+)
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**21
 """Twelve cameras need 5 kB."""
+MILLIMETRES = 0.001
+"""The unit of FreeMoCap."""
 NAMES = re.compile(r".*(calib|camera_array).*\.toml|config\.toml", re.IGNORECASE)
 
 
 def find(folder: Path) -> Path | None:
     """The calibration, in the folder or in one with "calib" in its name."""
     for place in folders_containing(folder, "calib"):
-        named = [path for path in place.glob("*.toml") if NAMES.fullmatch(path.name) and path.is_file()]
-        for path in sorted(named, key=lambda path: (len(path.name), path.name)):
-            if re.search(rb"(?m)^matrix\s*=", bounded_bytes(path, MAX_BYTES)):
-                return path
+        named = [path for path in files_like(place, "*.toml") if NAMES.fullmatch(path.name)]
+        counts = {path: len(re.findall(rb"(?m)^matrix\s*=", bounded_bytes(path, MAX_BYTES))) for path in named}
+        usable = sorted((path for path in named if counts[path]), key=lambda path: (-counts[path], len(path.name)))
+        if usable[1:]:
+            warn(f"{usable[0]}: this calibration is used, and not {', '.join(path.name for path in usable[1:])}")
+        if usable:
+            return usable[0]
     return None
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras that are not marked as ignored.
+    """All cameras that are not marked as ignored. FreeMoCap's are in millimetres.
 
     Raises:
         ValueError: the file is not TOML, a camera lacks a number, is a fisheye, or has no footage.
     """
     try:
-        root = tomllib.loads(bounded_bytes(file, MAX_BYTES).decode())
+        root = tomllib.loads(decode_text(bounded_bytes(file, MAX_BYTES), file.name))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ValueError(f"expected TOML, got something else: {str(error)[:80]}; export it again") from None
     nested = root.get("cameras")
@@ -48,4 +61,6 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         entry = footage.entry(name, [float(side) for side in size])
         entry |= {"K": table["matrix"], "dist": to_distortion(name, table.get("distortions", []))}
         entries.append(entry | {"R": to_rotation(name, table.get("rotation", [])), "t": table.get("translation")})
-    return {"frames": footage.frames, "fps": footage.fps, "cameras": entries}
+    synchronized = any(str(entry.get("video", "")).startswith("synchronized_videos/") for entry in entries)
+    unit = MILLIMETRES if synchronized else 1.0
+    return {"metres_per_unit": unit, "frames": footage.frames, "fps": footage.fps, "cameras": entries}

@@ -103,7 +103,7 @@ def root(path: Path, file: Path) -> Path:
     """The folder of the data set, which a meta file names."""
     if path.is_dir():
         return path
-    named = file.parent / _read_meta(file).dataset.path
+    named = file.parent / _read_meta(file).dataset.path.replace("\\", "/")
     return named if named.is_dir() else file.parent
 
 
@@ -161,7 +161,7 @@ def _camera(folder: Path, camera: RiftcastCameraEntry, frames: list[str]) -> dic
     entry |= {"R": view[:3, :3].tolist(), "t": view[:3, 3].tolist()}
     entry["dist"] = to_distortion(name, camera.intrinsics.distortion_coefficients)
     entry["image"] = _pattern(folder, f"rgb/rgb_{name}", frames, (".jpeg", ".jpg", ".png"))
-    if any((folder / f"frame_{frame}" / "mask").is_dir() for frame in frames[:1]):
+    if any((folder / f"frame_{frame}" / "mask").is_dir() for frame in frames):
         entry["mask"] = _pattern(folder, f"mask/mask_{name}", frames, (RUN_LENGTH_SUFFIX, ".png"))
     return entry
 

@@ -1,19 +1,26 @@
-"""`transforms.json` of nerfstudio, instant-ngp and Blender. Each of its frames is a camera of a single frame."""
+"""`transforms.json` of nerfstudio, instant-ngp and Blender.
+
+Each of its frames is a camera of a single frame, or, if they have a `time`, a camera at one time.
+"""
 
 import math
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
-from viewmend.data.formats.files import image_size_px, names_from_paths
-from viewmend.data.images import read_rgba
+from viewmend.data.formats.files import existing, forward_slashes, frame_pattern, image_size_px, names_from_paths
+from viewmend.data.images import uses_alpha
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, bounded_bytes, read_json, typed
 
 NAMES = ("transforms.json", "transforms_train.json")
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+MILLIMETRES = 0.001
+"""The only supported unit of depth."""
+POSE_DIGITS = 6
+"""Poses that are equal to this many decimals are those of one camera."""
 Row = tuple[Number, Number, Number, Number]
 Angle = Annotated[float, Meta(gt=0, lt=3.14)]
 Side = Annotated[int, Meta(ge=1, le=2**16)]
@@ -25,6 +32,7 @@ class Lens(Struct, kw_only=True):
     camera_model: str | None = None
     is_fisheye: bool | None = None
     camera_angle_x: Angle | None = None
+    camera_angle_y: Angle | None = None
     fl_x: Number | None = None
     fl_y: Number | None = None
     cx: Number | None = None
@@ -35,8 +43,11 @@ class Lens(Struct, kw_only=True):
     k2: Number | None = None
     k3: Number | None = None
     k4: Number | None = None
+    k5: Number | None = None
+    k6: Number | None = None
     p1: Number | None = None
     p2: Number | None = None
+    rolling_shutter: list[Number] | None = None
 
 
 class TransformsFrameEntry(Lens, kw_only=True):
@@ -47,12 +58,16 @@ class TransformsFrameEntry(Lens, kw_only=True):
     """world_from_camera, OpenGL axes."""
     mask_path: str | None = None
     depth_file_path: str | None = None
+    time: Number | None = None
 
 
 class TransformsFile(Lens, kw_only=True):
     """The whole file."""
 
     frames: list[TransformsFrameEntry]
+    from_na: bool = False
+    integer_depth_scale: Number = MILLIMETRES
+    depth_unit_scale_factor: Number = MILLIMETRES
 
 
 def find(folder: Path) -> Path | None:
@@ -61,44 +76,92 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All frames. The alpha of the images is the mask if no frame names one, and the first image is not opaque.
+    """All frames. The alpha of the images is the mask if no frame names one, and an image is not opaque.
 
     Raises:
-        ValueError: a value is invalid, the lens is a fisheye, or an image is missing whose size is needed.
+        ValueError: a value is invalid, a key's meaning is not supported, `time` does not fit the poses, or an image is
+            missing whose size is needed.
     """
-    file_content = typed(read_json(bounded_bytes(file)), TransformsFile, "see docs/formats.md")
-    paths = [_with_suffix(folder, frame.file_path) for frame in file_content.frames]
-    alpha = not any(frame.mask_path for frame in file_content.frames) and bool(paths) and _uses_alpha(folder, paths[0])
+    read = typed(read_json(bounded_bytes(file)), TransformsFile, "see docs/formats.md")
+    frames = [_with_local_paths(folder, frame) for frame in read.frames]
+    if len({frame.time for frame in frames}) <= 1:
+        frames = existing(folder, frames, lambda frame: frame.file_path)
+    scales = {read.integer_depth_scale, read.depth_unit_scale_factor}
+    if read.from_na or (scales != {MILLIMETRES} and any(frame.depth_file_path for frame in frames)):
+        got = "from_na" if read.from_na else f"a scale of {max(scales)}"
+        raise ValueError(f"expected OpenGL axes and depth in millimetres (0.001), got {got}; export it again")
+    named = any(frame.mask_path for frame in frames)
+    alpha = not named and any(uses_alpha(folder / f.file_path) for f in frames if stays_inside(f.file_path))
+    cameras, ids = _cameras_of(frames)
+    paths = [camera[0].file_path for camera in cameras]
+    names = names_from_paths(paths) if len(ids) == 1 else _names_of_patterns(paths)
+    entries = []
+    for (pattern, frame), name in zip(cameras, names, strict=True):
+        entry = {"name": name, **_intrinsics(folder, frame.file_path, read, frame), **_pose(frame)}
+        files = {"image": pattern.file_path, "mask": pattern.mask_path, "depth": pattern.depth_file_path}
+        entries.append(entry | files | ({"mask": pattern.file_path} if alpha else {}))
+    return {"first_pixel_center": [0.5, 0.5], "up": [0.0, 0.0, 1.0], "frames": ids, "cameras": entries}
+
+
+def _with_local_paths(folder: Path, frame: TransformsFrameEntry) -> TransformsFrameEntry:
+    """The frame with paths as on this system, and with the suffix of the image, which files of Blender omit."""
+    mask, depth = (path and forward_slashes(path) for path in (frame.mask_path, frame.depth_file_path))
+    image = str(PurePosixPath(forward_slashes(frame.file_path)))
+    if stays_inside(image) and not (folder / image).is_file() and (folder / f"{image}.png").is_file():
+        image = f"{image}.png"
+    return structs.replace(frame, file_path=image, mask_path=mask, depth_file_path=depth)
+
+
+def _cameras_of(
+    frames: list[TransformsFrameEntry],
+) -> tuple[list[tuple[TransformsFrameEntry, TransformsFrameEntry]], tuple[str, ...]]:
+    """Each camera's entry with patterns as paths and its first frame's entry, and the frame ids in order of time."""
+    by_pose: dict[bytes, dict[float | None, TransformsFrameEntry]] = {}
+    for frame in frames:
+        pose = (np.round(frame.transform_matrix, POSE_DIGITS) + 0.0).tobytes()
+        at_pose = by_pose.setdefault(pose, {})
+        if frame.time in at_pose:
+            got = f"{at_pose[frame.time].file_path[:60]} and {frame.file_path[:60]} at the same"
+            raise ValueError(f"expected one image for each pose and 'time', got {got}; add 'time' to each frame")
+        at_pose[frame.time] = frame
+    times = {frame.time for frame in frames}
+    if len(times) <= 1:
+        return [(frame, frame) for frame in frames], ("0",)
+    ids: dict[float | None, str] = {}
     cameras = []
-    for frame, path, name in zip(file_content.frames, paths, names_from_paths(paths), strict=True):
-        entry = {"name": name, **_intrinsics(folder, path, file_content, frame), **_pose(frame), "image": path}
-        cameras.append(entry | {"mask": path if alpha else frame.mask_path, "depth": frame.depth_file_path})
-    return {"first_pixel_center": [0.5, 0.5], "up": [0.0, 0.0, 1.0], "frames": ["0"], "cameras": cameras}
+    for at_pose in by_pose.values():
+        if None in times or len(at_pose) < 2:
+            got = "frames without" if None in times else f"only {next(iter(at_pose.values())).file_path[:60]}"
+            raise ValueError(
+                f"expected a 'time' in each frame, and each camera's pose at two or more times, got {got}; add them, "
+                "or write one file for each time (a single moving camera cannot be used)"
+            )
+        entries, patterns = list(at_pose.values()), {}
+        for key in ("file_path", "mask_path", "depth_file_path"):
+            paths = [path for entry in entries if (path := getattr(entry, key))]
+            pattern, found = frame_pattern(paths) if len(paths) == len(entries) else (None, ())
+            patterns[key] = pattern
+            if any(ids.setdefault(time, name) != name for time, name in zip(at_pose, found, strict=False)):
+                raise ValueError(f"expected equal numbers in {key} for equal 'time', got others; rename the files")
+        cameras.append((structs.replace(entries[0], **patterns), entries[0]))
+    return cameras, tuple(ids[time] for time in sorted(times))  # pyright: ignore[reportArgumentType]
 
 
-def _with_suffix(folder: Path, path: str) -> str:
-    """The path of an image; files of Blender omit `.png`."""
-    plain = str(PurePosixPath(path))
-    if not stays_inside(plain) or (folder / plain).is_file() or not (folder / f"{plain}.png").is_file():
-        return plain
-    return f"{plain}.png"
-
-
-def _uses_alpha(folder: Path, path: str) -> bool:
-    if not stays_inside(path) or not (folder / path).is_file():
-        return False
-    try:
-        return bool((read_rgba(folder / path, path)[..., 3] != 255).any())
-    except ValueError:  # no alpha
-        return False
+def _names_of_patterns(patterns: list[str]) -> list[str]:
+    """A name for each camera: what its images' names share."""
+    shared = [path.rpartition(".")[0].replace("{frame}", "").rstrip("_-./ ") for path in patterns]
+    short = [path.rpartition("/")[2] for path in shared]
+    return short if len(set(short)) == len(short) and all(short) else [path.replace("/", "_") for path in shared]
 
 
 def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str, Any]:
     lens = {key: _first(getattr(frame, key), getattr(default, key)) for key in Lens.__struct_fields__}
     model = lens["camera_model"] or MODELS[0]
-    if model not in MODELS or lens["is_fisheye"] or lens["k4"]:
+    if model not in MODELS or lens["is_fisheye"] or any(lens[key] for key in ("k4", "k5", "k6")):
         got = "k4 or a fisheye" if model in MODELS else model[:40]
         raise ValueError(f"expected a camera_model among {', '.join(MODELS)}, got {got}; undistort the images first")
+    if any(lens["rolling_shutter"] or ()):
+        raise ValueError("expected images of one moment, got rolling_shutter; correct the images and set it to zeros")
     width, height = lens["w"], lens["h"]
     if width is None or height is None:
         width, height = image_size_px(folder, path)
@@ -107,8 +170,11 @@ def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str
         if lens["camera_angle_x"] is None:
             raise ValueError("expected fl_x or camera_angle_x, got neither; add the focal length")
         fx = width / (2 * math.tan(lens["camera_angle_x"] / 2))
+    fy = lens["fl_y"]
+    if fy is None:
+        fy = height / (2 * math.tan(lens["camera_angle_y"] / 2)) if lens["camera_angle_y"] else fx
     cx, cy = _first(lens["cx"], width / 2), _first(lens["cy"], height / 2)
-    K = [[fx, 0.0, cx], [0.0, _first(lens["fl_y"], fx), cy], [0.0, 0.0, 1.0]]
+    K = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
     dist = [lens[key] or 0.0 for key in ("k1", "k2", "p1", "p2", "k3")]
     return {"width": width, "height": height, "K": K, "dist": dist}
 

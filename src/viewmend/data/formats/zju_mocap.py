@@ -3,7 +3,13 @@
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from viewmend.data.formats.files import LABELS, MASK_PLACES, image_size_px, to_distortion
+from viewmend.data.formats.files import (
+    LABELS,
+    MASK_PLACES,
+    forward_slashes,
+    image_size_px,
+    to_distortion,
+)
 from viewmend.utils.safe_pickle import numbers, read_objects, unwrap
 
 MILLIMETRES = 0.001
@@ -56,7 +62,7 @@ def _paths(frame: Any, cameras: int) -> list[str]:
     found = _to_list(unwrap(frame.get("ims")) if isinstance(frame, dict) else None)
     if len(found) < cameras or not all(isinstance(path, str) and path for path in found[:cameras]):
         raise ValueError(f"expected paths of {cameras} images in each of 'ims', got others; is it ZJU-MoCap's file?")
-    return found[:cameras]
+    return [forward_slashes(path) for path in found[:cameras]]
 
 
 def _pattern(paths: list[str]) -> tuple[str, tuple[str, ...]]:

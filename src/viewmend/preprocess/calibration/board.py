@@ -174,18 +174,30 @@ class Board:
         """The board as OpenCV has it; its `generateImage` is what is printed."""
         import cv2
 
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
+        return cv2.aruco.CharucoBoard(*self._layout)
 
     @cached_property
-    def _detector(self) -> Any:
+    def _layout(self) -> tuple[Any, ...]:
         import cv2
 
-        return cv2.aruco.CharucoDetector(self.opencv)
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return (self.columns, self.rows), self.square_m, self.marker_m, dictionary
+
+    @cached_property
+    def _detectors(self) -> tuple[Any, Any]:
+        """Detectors of today's pattern, and of that of OpenCV before 4.6 and calib.io, which differs for even rows."""
+        import cv2
+
+        old = cv2.aruco.CharucoBoard(*self._layout)
+        old.setLegacyPattern(True)
+        return cv2.aruco.CharucoDetector(self.opencv), cv2.aruco.CharucoDetector(old)
 
     def find(self, grey: UInt8[np.ndarray, "height width"]) -> Corners | None:
-        """The corners that an image shows; None where they are too few, or all in a line."""
-        pixels, ids = self._detector.detectBoard(grey)[:2]
+        """The corners that an image shows, in either pattern; None where they are too few, or all in a line."""
+        new, old = self._detectors
+        pixels, ids, markers, marker_ids = new.detectBoard(grey)
+        if (ids is None or len(ids) < LEAST_CORNERS) and marker_ids is not None:
+            pixels, ids = old.detectBoard(grey, markerCorners=markers, markerIds=marker_ids)[:2]
         if pixels is None or ids is None or len(ids) < LEAST_CORNERS:
             return None
         ids = np.asarray(ids).ravel().astype(int)

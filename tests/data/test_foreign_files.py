@@ -1,0 +1,281 @@
+"""Files as other tools and systems write them: what they mean is understood, or refused by its name."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
+from reference.random_rigs import opencv, random_rig, write_images
+
+from viewmend.data.errors import CaptureError
+from viewmend.data.formats import read_any_calibration
+from viewmend.data.formats.files import frame_pattern
+from viewmend.data.native_capture import open_capture
+
+# What the values of masks mean.
+
+
+def palette(index, colours):
+    image = Image.fromarray(index, "P")
+    image.putpalette([*np.ravel(colours), *[0] * (768 - np.size(colours))])
+    return image
+
+
+def as_written(kind, inside):
+    """A mask file's content with this foreground, (height, width) of bool."""
+    label = np.where(inside, np.where(np.arange(inside.shape[1]) % 2, 1, 2), 0).astype(np.uint8)
+    several = np.array([[0, 0, 0], [0, 0, 255], [0, 128, 0]], np.uint8)
+    return {
+        "0 and 1": inside.astype(np.uint8),
+        "0 and 128": 128 * inside.astype(np.uint8),
+        "indices": label,
+        "a palette": palette(label, [[0, 0, 0], [128, 0, 0], [0, 128, 0]]),
+        "a palette with white as background": palette(label, [[255, 255, 255], [10, 0, 0], [0, 255, 0]]),
+        "a palette of greys": palette((label > 0).astype(np.uint8), [[0, 0, 0], [255, 255, 255]]),
+        "a palette with the object in black": palette(label, [[200, 0, 200], [0, 0, 0], [0, 0, 0]]),
+        "dark red": (np.array([0, 0, 128]) * inside[..., None]).astype(np.uint8),
+        "several colours": several[label],
+        "16 bit": 65535 * inside.astype(np.uint16),
+        "0 and 1 in 16 bit": inside.astype(np.uint16),
+        "indices in 16 bit": np.array([0, 1001, 1002], np.uint16)[label],
+        "two levels": Image.fromarray(inside),
+    }[kind]
+
+
+KINDS = [
+    *("0 and 1", "0 and 128", "indices", "a palette", "a palette with white as background", "a palette of greys"),
+    *("a palette with the object in black", "dark red", "several colours", "16 bit", "0 and 1 in 16 bit"),
+    *("indices in 16 bit", "two levels"),
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_masks_mean_the_same(plain, kind):
+    expected = open_capture(plain.path).read(0).mask
+    for view, name in enumerate("abcd"):
+        file, image = plain.path / f"masks/{name}_000.png", as_written(kind, (expected[view] > 0).numpy())
+        image.save(file) if isinstance(image, Image.Image) else cv2.imwrite(str(file), image)
+    assert torch.equal(open_capture(plain.path).read(0).mask, expected)
+
+
+def test_labels_are_mentioned_once_and_faint_masks_are_no_labels(plain, caplog):
+    for time in (0, 1):
+        for name in "abcd":
+            plain.put(f"masks/{name}_00{time}.png", as_written("0 and 1", plain.get(f"masks/{name}_000.png") > 0))
+    capture = open_capture(plain.path)
+    assert (capture.read(0).mask.unique() == capture.read(1).mask.unique()).all()
+    assert [record.message for record in caplog.records] == [
+        "ball: masks have no values above 1: they are read as labels, with 0 as background"
+    ]
+    plain.put("masks/b_000.png", np.full((32, 40), 255, np.uint8))  # so that 1 is nearly transparent
+    assert set(open_capture(plain.path).read(0).mask[0].unique().tolist()) == {0, 1}
+
+
+def blender(folder, pictures):
+    """A `transforms_train.json`, of which each image has a name and content; None is missing."""
+    frames = []
+    for number, (name, picture) in enumerate(pictures.items()):
+        if picture is not None:
+            cv2.imwrite(str(folder / f"{name}.png"), picture)
+        matrix = np.eye(4)
+        matrix[2, 3] = number
+        frames.append({"file_path": f"./{name}", "transform_matrix": matrix.tolist(), "w": 30, "h": 20})
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
+
+
+def test_alpha_of_any_image_counts(tmp_path, caplog):
+    cut = np.full((20, 30, 4), 255, np.uint8)
+    cut[:10, :, 3] = 0
+    opaque = cut[..., :3].copy()
+    blender(tmp_path, {"a": None, "b": cut, "c": cut.astype(np.uint16) * 257})
+    assert open_capture(tmp_path).read(0).mask.sum().item() == 2 * 300 * 255
+    assert "cameras without their image are left out: a" in caplog.text
+    for picture, got in ((opaque, "got 3 channels"), (np.dstack([opaque, opaque[..., 0]]), "got an opaque image")):
+        blender(tmp_path, {"a": picture, "b": cut, "c": cut})
+        with pytest.raises(CaptureError, match=f"a.png: camera 'a', frame '0': expected .*alpha.*{got}"):
+            open_capture(tmp_path).read(0)
+
+
+# COLMAP's models.
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_the_largest_model_of_colmap_is_read(tmp_path, binary, caplog):
+    rig = random_rig(3, 6)
+    write_images(tmp_path, rig)
+    write_colmap(tmp_path, rig, binary=binary)
+    (tmp_path / "sparse/0").rename(tmp_path / "sparse/2")
+    write_colmap(tmp_path, rig[:3], binary=not binary)
+    assert len(read_any_calibration(tmp_path).cameras) == 6
+    assert not caplog.records
+    (tmp_path / "sparse/2").rename(tmp_path / "elsewhere")
+    assert len(read_any_calibration(tmp_path).cameras) == 3
+    assert all(camera["image"].removeprefix("images/") in caplog.text for camera in rig[3:])
+
+
+def text_model(folder, change):
+    rig = random_rig(4, 3)
+    write_images(folder, rig)
+    write_colmap(folder, rig, "OPENCV", binary=False)
+    for name in ("cameras", "images"):
+        file = folder / f"sparse/0/{name}.txt"
+        file.write_bytes(change(file.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: b"\xef\xbb\xbf" + data,
+        lambda data: data.replace(b"\n", b"\n\n", 1),
+        lambda data: data.replace(b"\n", b"\r\n"),
+        lambda data: b"  # indented\n" + data + b"\n\n# the end\n",
+        lambda data: data.replace(b".png\n\n", b".png\n1.5 2.5 -1 3 4 17\n"),
+        lambda data: data.rstrip(b"\n"),
+    ],
+)
+def test_text_of_colmap_may_have_other_lines(tmp_path, change):
+    text_model(tmp_path, change)
+    assert len(read_any_calibration(tmp_path).cameras) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data.replace(b".png\n\n", b".png\n"), r"images.txt: expected the points .* in line 3, got '14 "),
+        (
+            lambda data: data.replace(b".png\n\n", b".png\n1 2\n"),
+            r"images.txt: expected the points .* in line 3, got '1 2",
+        ),
+        (lambda data: data.replace(b"OPENCV", b"OPENCV one"), r"cameras.txt: expected an id, .* in line 2"),
+        (lambda data: data.decode().encode("utf-16"), "expected cameras.txt in UTF-8, got another encoding"),
+    ],
+)
+def test_other_lines_of_colmap_are_named(tmp_path, change, message):
+    text_model(tmp_path, change)
+    with pytest.raises(CaptureError, match=message):
+        read_any_calibration(tmp_path)
+
+
+# transforms.json.
+
+
+def films(folder, times=(0, 5, 10), **more):
+    """A `transforms.json` of three cameras at three times, `image/c0_0000.png`; `more` is added to the file."""
+    rig, frames = random_rig(5, 3), []
+    write_transforms(folder, rig)
+    entries = json.loads((folder / "transforms.json").read_text())["frames"]
+    for time in times:
+        for number, entry in enumerate(entries):
+            path = f"image\\c{number}_{time:04d}.png"
+            (folder / "image").mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / path.replace("\\", "/")), np.full((entry["h"], entry["w"], 3), time, np.uint8))
+            frames.append(entry | {"file_path": path, "mask_path": None, "time": time / 10})
+    content = {"frames": frames} | more
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return content
+
+
+def test_times_of_transforms_are_frames(tmp_path):
+    films(tmp_path)
+    capture = open_capture(tmp_path)
+    assert capture.cameras.names == ("c0", "c1", "c2") and capture.frame_ids == ("0000", "0005", "0010")
+    assert not capture.gaps and capture.read(2).rgb[1, 0, 0, 0] == 10
+
+
+def spoil(content, **changes):
+    content["frames"][0] |= changes
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: spoil(c, time=None), "expected a 'time' in each frame"),
+        (lambda c: [f.pop("time") for f in c["frames"]], "got image/c0_0000.png and image/c0_0005.png at the same"),
+        (
+            lambda c: spoil(c, file_path="image/other.png"),
+            "expected equal numbers in file_path",
+        ),
+        (lambda c: c["frames"].pop(0) and c["frames"].pop(2), "only image/c0_0010.png"),
+        (lambda c: c.update(rolling_shutter=[0, 0, 0.02, 0]), "got rolling_shutter"),
+        (lambda c: c.update(from_na=True), "got from_na"),
+        (lambda c: (spoil(c, depth_file_path="d.png"), c.update(depth_unit_scale_factor=1.0)), "got a scale of 1"),
+    ],
+)
+def test_keys_that_change_the_meaning_are_not_ignored(tmp_path, change, message):
+    content = films(tmp_path)
+    change(content)
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=message):
+        open_capture(tmp_path)
+
+
+def test_a_vertical_angle_is_a_focal_length(tmp_path):
+    blender(tmp_path, {"a": np.zeros((20, 30, 3), np.uint8), "b": np.zeros((20, 30, 3), np.uint8)})
+    file = tmp_path / "transforms_train.json"
+    file.write_text(file.read_text().replace('"camera_angle_x": 0.8', '"camera_angle_x": 0.8, "camera_angle_y": 0.5'))
+    K = open_capture(tmp_path).cameras.K[0]
+    assert K[1, 1].item() == pytest.approx(10 / np.tan(0.25)) and K[0, 0].item() == pytest.approx(15 / np.tan(0.4))
+
+
+# Names of files and folders.
+
+
+def mocap(folder, ids, places=("images", "masks")):
+    """A capture of EasyMocap, whose cameras have images of these frame ids."""
+    rig = random_rig(6, len(ids))
+    write_easymocap(folder, opencv(rig))
+    for camera, own in zip(rig, ids, strict=True):
+        for place in places:
+            (folder / place / camera["name"]).mkdir(parents=True)
+            for name in own:
+                image = np.full((camera["height"], camera["width"]), 255, np.uint8)
+                cv2.imwrite(str(folder / place / camera["name"] / f"{name}.png"), image)
+    return [camera["name"] for camera in rig]
+
+
+def test_files_of_file_managers_are_not_there(tmp_path):
+    names = mocap(tmp_path, [["000", "001"]] * 3)
+    for place in (tmp_path, *(tmp_path / kind / name for kind in ("images", "masks") for name in names)):
+        for junk in ("._000.png", ".DS_Store", "Thumbs.db", "desktop.ini", "._intri.yml", "notes 1.txt"):
+            (place / junk).write_bytes(b"\0\5\x16\7")
+    for folder in ("@eaDir", "__MACOSX", ".thumbnails"):
+        (tmp_path / "images" / folder).mkdir()
+    capture = open_capture(tmp_path)
+    assert capture.frame_ids == ("000", "001") and not capture.gaps and len(capture.cameras) == 3
+
+
+def test_paths_of_windows_are_read(plain):
+    plain.edit(lambda d: [c.update(image=c["image"].replace("/", "\\")) for c in d["cameras"]])
+    assert not open_capture(plain.path).gaps
+    plain.edit(lambda d: d["cameras"][0].update(image="..\\x.png"))
+    with pytest.raises(CaptureError, match="expected a path inside the capture folder"):
+        open_capture(plain.path)
+
+
+def test_images_named_by_clocks_are_refused(tmp_path):
+    names = mocap(tmp_path, [[f"{1700000000000 + 33 * time + camera}" for time in range(4)] for camera in range(4)])
+    with pytest.raises(CaptureError, match=f"expected the same frame ids .* 1700000000001 of {names[1]}.* rename"):
+        open_capture(tmp_path)
+
+
+def test_numbers_that_begin_elsewhere_are_mentioned(tmp_path, caplog):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    names = mocap(tmp_path / "a", [["0", "1", "2"], ["1", "2", "3"], ["0", "1", "2"], ["0", "2"]])
+    open_capture(tmp_path / "a")
+    assert f"begin at 0, but at 1 for {names[1]}, {names[1]} (masks); if" in caplog.text
+    caplog.clear()
+    mocap(tmp_path / "b", [["0", "1", "2", "3"], ["1", "2", "3"], ["0", "1", "2", "3"]])  # the first image is missing
+    open_capture(tmp_path / "b")
+    assert not caplog.records
+
+
+def test_a_pattern_has_all_digits_of_the_frame():
+    assert frame_pattern(["a/0001.png", "a/0010.png"]) == ("a/{frame}.png", ("0001", "0010"))
+    assert frame_pattern(["t0/c1.png", "t16/c1.png"]) == ("t{frame}/c1.png", ("0", "16"))
+    for paths in (["a/1.png", "b/2.png"], ["a1/1.png", "a2/2.png"]):
+        with pytest.raises(ValueError, match="expected paths that differ in a number"):
+            frame_pattern(paths)

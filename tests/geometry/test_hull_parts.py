@@ -1,0 +1,55 @@
+"""Parts of a hull that float and that no mask needs are dropped; people and things that a camera sees stay."""
+
+import pytest
+import torch
+from geometry.solids import around, ball_masks, camera_at, dome
+from scipy.ndimage import label
+
+from viewmend.geometry.cameras import concatenate_cameras
+from viewmend.geometry.hull import HullConfig, visual_hull
+from viewmend.geometry.hull_parts import without_floating_parts
+
+CONFIG = HullConfig(resolution=72)
+
+
+def carve(cameras, balls, radius):
+    masks = torch.stack([ball_masks(cameras, ball, radius) for ball in balls]).amax(0)
+    grid = visual_hull(masks, cameras, around(1.1), CONFIG)
+    return grid, without_floating_parts(grid, cameras)
+
+
+def parts(grid):
+    return label((grid.values >= 0.5).numpy())[1]
+
+
+def at(grid, point):
+    """The value at a point."""
+    return grid.values[tuple(((torch.tensor(point) - grid.low) / grid.voxel_m).long())].item()
+
+
+@pytest.mark.parametrize("count", [4, 5, 7])
+def test_a_phantom_is_dropped_and_what_made_it_stays(count):
+    """Every camera sees a ball of its own in front of the middle, so that the masks allow something there."""
+    cameras = dome(count, width=192, height=160)
+    balls = [tuple(0.75 * torch.nn.functional.normalize(center, dim=0)) for center in cameras.centers]
+    before, after = carve(cameras, balls, 0.12)
+    assert parts(before) > count and at(before, (0.0, 0.0, 0.0)) > 0.9
+    assert parts(after) == count and at(after, (0.0, 0.0, 0.0)) == 0.0
+    assert all(at(after, ball) > 0.9 for ball in balls)
+    middle = (before.values > 0) & (after.values == 0)
+    assert torch.equal(after.values[~middle], before.values[~middle])
+
+
+def test_separate_people_and_things_in_the_air_stay():
+    balls = [(-0.6, 0.0, 0.1), (0.6, 0.0, -0.2), (0.1, 0.7, 0.3)]
+    before, after = carve(dome(5, width=192, height=160), balls, 0.22)
+    assert parts(before) == 3 and torch.equal(after.values, before.values)
+
+
+def test_a_ball_that_one_camera_sees_on_its_own_stays():
+    """It is in front of or behind another in all cameras but one, from above."""
+    ring = [camera_at((2.5, 0.0, 0.01 * n), width=160, height=160) for n in (-2, 0, 2)]
+    above = camera_at((0.3, 2.5, 0.0), target=(0.3, 0.0, 0.1), width=160, height=160)
+    balls = [(0.7, 0.0, 0.0), (-0.2, 0.0, 0.0)]
+    before, after = carve(concatenate_cameras([*ring, above]), balls, 0.15)
+    assert parts(before) == 2 and torch.equal(after.values, before.values)
