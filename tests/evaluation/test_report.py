@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from viewmend.evaluation.report import make_report, markdown, report_csv, report_json
+from viewmend.evaluation.report import main_grid, make_report, markdown, report_csv, report_json
 from viewmend.evaluation.report_page import Point, largest_hole, page, scene_video, trade_off, write_sheets
 from viewmend.evaluation.result_cache import CellStore
 from viewmend.evaluation.runner import run_evaluation
@@ -60,6 +60,22 @@ def test_failures_and_missing_methods_are_in_every_format(evaluated):
     assert "RuntimeError: a &lt; b" in shown and "no weights &amp; none" in shown
     assert "unfilled: failed" in shown and "<td>dstt-o-def</td><td>n/a</td>" in shown
     assert [c["error"] for c in json.loads(report_json(report))["cells"]].count("RuntimeError: a < b") == 1
+
+
+def test_tables_have_columns_with_values_and_mark_the_best(make_cell, make_frame):
+    def cells(method, scores):
+        frames = [make_frame(psnr_holes=score, psnr_whole=30.0) for score in scores]
+        return [make_cell(f"s{n}", method, "A", [frame]) for n, frame in enumerate(frames)]
+
+    found = [*cells("telea", (20.0, 22.0, 24.0)), *cells("views", (25.0, 25.0, 26.5)), *cells("rgvi", (30.0,) * 3)]
+    report = make_report(found, ("telea", "views", "rgvi"), RunSettings())
+    grid = main_grid(report.tables[0])
+    assert {"holes, dB", "whole, dB"} <= set(grid.heads)
+    assert not {"failed", "SSIM whole", "flicker", "only past"} & set(grid.heads)
+    column = grid.heads.index("holes, dB")
+    assert [row[column] for row in grid.rows[:2]] == ["22.00 ± 2.0", "**25.50 ± 0.9**"]
+    assert grid.rows[2][column] == "30.00 ± 0.0", "is given the truth"
+    assert not any("**" in row[grid.heads.index("whole, dB")] for row in grid.rows), "all are equal"
 
 
 def test_the_page_is_self_contained_and_has_all_images(evaluated):

@@ -101,6 +101,10 @@ def _try_model(model: str) -> None:
         stream.view(orbit([0.4], (TRIAL_PX, TRIAL_PX), elevation_rad=0.2))
 
 
+FEW_CAMERAS, WIDE_DEG = 6, 60.0
+"""With fewer cameras, or larger angles between neighbours, artefacts are expected."""
+
+
 def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck]":
     from viewmend.cli.console import busy, say
     from viewmend.data.checks.calibration import check_calibration, draw_check
@@ -131,6 +135,8 @@ def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dic
     """The `--json` output: properties of a capture and the results of the check. Lengths are in metres."""
     cameras, bounds, iou = capture.cameras, capture.bounds, list(check.iou.values())
     distance = (cameras.centers - check.bounds.center).norm(dim=-1)
+    directions = (cameras.centers - check.bounds.center) / distance[:, None]
+    apart = (directions @ directions.mT).clamp(-1, 1).fill_diagonal_(-1).acos().amin(1).median().rad2deg()
     hull = None if check.proxy is None or not len(check.proxy.mesh.vertices) else check.proxy.mesh.vertices
     return {
         "kind": "capture",
@@ -145,6 +151,7 @@ def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dic
         "bounds_m": None if bounds is None else [bounds.low.tolist(), bounds.high.tolist()],
         "rig_extent_m": (cameras.centers.amax(0) - cameras.centers.amin(0)).tolist(),
         "camera_distance_m": [float(distance.min()), float(distance.max())],
+        "camera_spacing_deg": float(apart),
         "masks": capture.has_masks,
         "depth": capture.has_depth,
         "gaps": capture.gaps,
@@ -201,6 +208,9 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         f"  bounds    {'none' if bounds is None else f'{_vector(bounds[0])} to {_vector(bounds[1])}'}",
         f"  rig       {_extent(capture['rig_extent_m'])}; cameras {near:.3g} to {far:.3g} from the centre",
     ]
+    few = len(capture["cameras"]) < FEW_CAMERAS or capture["camera_spacing_deg"] > WIDE_DEG
+    expected = "; expect fogged bodies and doubled limbs: 8 or more around a person, 45 degrees apart, avoid them"
+    lines.append(f"  angles    {capture['camera_spacing_deg']:.0f} degrees between neighbours{expected if few else ''}")
     if iou is not None:
         subject = capture["subject_extent_m"]
         extent = "none: the masks have no point in common" if subject is None else _extent(subject)

@@ -5,7 +5,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 from viewmend.utils.logging import printable
@@ -25,9 +25,16 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
     if total is None and hasattr(items, "__len__"):
         total = len(items)  # pyright: ignore[reportArgumentType]
     if not sys.stderr.isatty():
-        with Heartbeat(description) as heartbeat:
-            for done, item in enumerate(items):
-                heartbeat.text = f"{description}: {done}{'' if total is None else f' of {total}'}"
+        start, done = time.monotonic(), 0
+
+        def text() -> str:
+            if not total:
+                return f"{description}: {done}"
+            left_s = (time.monotonic() - start) * (total / done - 1) if done else None
+            return f"{description}: {done} of {total}{'' if left_s is None else f', {_duration(left_s)} left'}"
+
+        with Heartbeat(text):
+            for done, item in enumerate(items):  # noqa: B007 (read by `text`)
                 yield item
         return
     start, bar, task = time.monotonic(), None, None
@@ -45,6 +52,13 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
             bar.stop()
 
 
+def _duration(seconds: float) -> str:
+    """A rough length of time in words."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 def _progress_bar():
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -57,7 +71,7 @@ def _progress_bar():
 def busy(description: str) -> Iterator[None]:
     """Show that work of unknown length is going on; lines on standard error if it is not a terminal."""
     if not sys.stderr.isatty():
-        with Heartbeat(description):
+        with Heartbeat(lambda: description):
             yield
         return
     from rich.console import Console
@@ -74,10 +88,10 @@ def busy(description: str) -> Iterator[None]:
 
 
 class Heartbeat:
-    """Prints its text to standard error at a regular interval; a context manager."""
+    """Prints a text to standard error at a regular interval; a context manager."""
 
-    def __init__(self, text: str) -> None:
-        self.text = text
+    def __init__(self, text: Callable[[], str]) -> None:
+        self._text = text
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -91,7 +105,7 @@ class Heartbeat:
 
     def _run(self) -> None:
         while not self._ended.wait(INTERVAL_S):
-            say(self.text)
+            say(self._text())
 
 
 def say(message: str) -> None:

@@ -252,11 +252,14 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
     from viewmend.cli.signals import exit_on_sigterm
     from viewmend.live.auth import is_loopback
     from viewmend.live.protocol import token_query
+    from viewmend.models.registry import METHODS, shipped_models
 
     config = server_config(options)
     if not is_loopback(config.host):
         say("Ray's proxy does not limit unauthenticated connections; use another proxy that does (docs/live.md)")
-    elsewhere = {name: _absolute(getattr(options, name)) for name in ("source", "model", "error_rule")}
+    elsewhere = {name: _absolute(getattr(options, name)) for name in ("source", "error_rule")}
+    if options.model not in (*shipped_models(), *METHODS):  # which a folder of the same name does not replace
+        elsewhere["model"] = _absolute(options.model)
     remote = replace(options, **elsewhere)
     settings = import_object(RAY_SETTINGS)(
         open_source=partial(open_source, remote),

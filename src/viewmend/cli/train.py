@@ -124,7 +124,8 @@ class _Reporter:
         self.last = 0
         """Steps done; 0 until this command has made one."""
         self._live = sys.stderr.isatty()
-        self._heartbeat = Heartbeat("making the first samples")
+        self._text = "making the first samples"
+        self._heartbeat = Heartbeat(lambda: self._text)
 
     def __enter__(self) -> "_Reporter":
         if self._live:
@@ -148,7 +149,7 @@ class _Reporter:
     def report(self, progress: "Progress") -> None:
         """Show a step."""
         self.last = progress.step
-        self._heartbeat.text = _line(progress)
+        self._text = _line(progress)
         if self._live:
             self._bar.update(self._task, completed=progress.progress, text=_line(progress))
 

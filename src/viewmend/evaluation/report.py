@@ -5,6 +5,7 @@ import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
+from statistics import stdev
 
 from viewmend.evaluation.averages import (
     Record,
@@ -54,7 +55,7 @@ RULES = (
     '"Warp" is the mean absolute difference from the previous frame warped in the same way, over the holes, in 255ths; '
     '"change" is the difference in place, over the holes of both frames. The truth is not 0 in either: see its row.',
     "Milliseconds are the inpainter's step without hull and rendering, with its caches as in production, over the "
-    "frames with holes: mean (as FPS), median, 95th percentile. The first step is run twice and the second is timed, "
+    "frames with holes: median and 95th percentile. The first step is run twice and the second is timed, "
     f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
 )
 """Definitions of the figures, printed with every report."""
@@ -76,6 +77,12 @@ COLUMNS = (
     ("change", "change", "holes", 255, 2),
 )
 """Columns of the main table: heading, metric, region, factor, decimals."""
+HIGHER, LOWER = ("psnr", "ssim", "alpha_iou"), ("flicker",)
+"""Metrics whose largest, or smallest, mean is the best; the truth has no extreme of the others."""
+SPREAD = (("psnr", "holes"), ("psnr", "whole"), ("psnr", "subject"))
+"""Columns that show the standard deviation over scenes, too."""
+MIN_SPREAD_SCENES = 3
+EMPTY = ("", "-", "n/a", "0")
 READINGS = (("whole", "whole"), ("holes", "holes"), ("in mask", "holes_fg"), ("masked", "masked"))
 """Readings of each score: heading, region."""
 SCORES = (("PSNR", "psnr", 2), ("SSIM", "ssim", 5), ("LPIPS Alex", "lpips_alex", 4), ("LPIPS VGG", "lpips_vgg", 4))
@@ -170,10 +177,40 @@ def holes_line(table: Table) -> str:
 
 
 def main_grid(table: Table) -> Grid:
-    """The main scores, speed and failures; the last row is the truth's own change."""
-    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "FPS", "ms", "ms p95", "scenes", "failed")
-    rows = [_method_row(row, len(heads)) for row in table.rows]
-    return Grid(heads, (*rows, _truth_row(table.rows, len(heads))))
+    """The main scores, speed and failures, in columns that have any; the last row is the truth's own change.
+
+    The best of several values is bold, and scores over all scenes have the standard deviation over them.
+    """
+    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "ms", "ms p95", "scenes", "failed")
+    best = {column: _best(table.rows, column) for column in range(len(COLUMNS))}
+    rows = [_method_row(row, len(heads), best) for row in table.rows]
+    return _without_empty_columns(Grid(heads, (*rows, _truth_row(table.rows, len(heads)))))
+
+
+def _without_empty_columns(grid: Grid) -> Grid:
+    used = [n for n in range(len(grid.heads)) if n == 0 or any(row[n] not in EMPTY for row in grid.rows)]
+    return Grid(tuple(grid.heads[n] for n in used), tuple(tuple(row[n] for n in used) for row in grid.rows))
+
+
+def _best(rows: Sequence[Row], column: int) -> float | None:
+    """The best mean of a column, as shown; None if it has no best, or all are equal."""
+    _, metric, region, factor, digits = COLUMNS[column]
+    means = (row.scores.mean(metric, region) for row in rows if row.method not in PRIVILEGED)
+    values = {round(factor * value, digits) for value in means if value is not None}
+    if len(values) < 2 or metric not in (*HIGHER, *LOWER):
+        return None
+    return max(values) if metric in HIGHER else min(values)
+
+
+def _score_cell(row: Row, column: int, best: float | None) -> str:
+    _, metric, region, factor, digits = COLUMNS[column]
+    values = list(row.scores.by_scene(metric, region).values())
+    mean = row.scores.mean(metric, region)
+    text = number(mean, factor, digits)
+    if (metric, region) in SPREAD and len(values) >= MIN_SPREAD_SCENES:
+        text += f" ± {factor * stdev(values):.1f}"
+    is_best = best is not None and mean is not None and round(factor * mean, digits) == best
+    return f"**{text}**" if is_best and row.method not in PRIVILEGED else text
 
 
 def readings_grid(table: Table) -> Grid:
@@ -187,7 +224,7 @@ def readings_grid(table: Table) -> Grid:
             for _, region in READINGS
         ]
         rows.append((row.method, *cells, *(number(value, 1, 4, "n/a") for value in row.vfid.values())))
-    return Grid(heads, tuple(rows))
+    return _without_empty_columns(Grid(heads, tuple(rows)))
 
 
 def kinds_grid(report: Report) -> Grid:
@@ -323,15 +360,15 @@ def bullets(lines: Iterable[str]) -> str:
     return "\n".join(f"* {line}" for line in lines)
 
 
-def _method_row(row: Row, width: int) -> tuple[str, ...]:
+def _method_row(row: Row, width: int, best: dict[int, float | None]) -> tuple[str, ...]:
     if not row.scenes:
         return (row.method, *["n/a"] * (width - 1))
     name = f"{row.method} (given the true past)" if row.method in PRIVILEGED else row.method
     return (
         name,
         _signed(row.over_reference),
-        *(number(row.scores.mean(metric, of), factor, digits) for _, metric, of, factor, digits in COLUMNS),
-        *(number(getattr(row.speed, name, None), 1, 1) for name in ("fps", "ms_p50", "ms_p95")),
+        *(_score_cell(row, column, best[column]) for column in range(len(COLUMNS))),
+        *(number(getattr(row.speed, name, None), 1, 1) for name in ("ms_p50", "ms_p95")),
         str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
         f"**{row.failed}**" if row.failed else "0",
     )

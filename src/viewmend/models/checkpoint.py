@@ -126,7 +126,8 @@ def model_folder(name_or_path: str | Path) -> Path:
         )
     if missing := [name for name in (WEIGHTS, CONFIG) if not (folder / name).is_file()]:
         raise MissingCheckpointError(
-            f"{folder}: expected {WEIGHTS} and {CONFIG}, {' and '.join(missing)} missing; copy the whole folder"
+            f"expected a model's folder with {WEIGHTS} and {CONFIG} in {folder}, {' and '.join(missing)} missing; copy "
+            f"the whole folder, or name one of the shipped models {list(shipped_models())}"
         )
     return folder
 
