@@ -489,6 +489,20 @@ def test_a_clean_rig_has_no_outlier(seed):
     assert find_outlier_by_outlines(scene.read(0), scene.bounds) is None
 
 
+def test_single_points_make_no_outlier(studio, monkeypatch):
+    """Thin parts are missed by single lines of sight; the more others agree, the more one of them matters."""
+
+    def residuals(lines, rig):
+        own = (lines.view == 1) & (len(rig.K) == 8)  # only while the camera is there
+        return np.where(own & (np.cumsum(own) <= count), 16.0, 0.0)
+
+    monkeypatch.setattr(leave_one_out.LinesOfSight, "least_residuals", residuals)
+    count = 3
+    assert find_outlier_by_outlines(studio.read(0), studio.bounds) is None
+    count = 12
+    assert find_outlier_by_outlines(studio.read(0), studio.bounds)[0] == ("cam01",)
+
+
 def test_common_shifts_small_rigs_and_missing_outlines_have_no_outlier(studio):
     frame = studio.read(0)
     moved = displace(frame, "cam00", (0.06, 0.0, 0.0))

@@ -20,6 +20,9 @@ from viewmend.geometry.alignment import Alignment, shared_offset
 from viewmend.geometry.cameras import Cameras
 from viewmend.types import MultiViewFrame
 
+MAX_NAMED = 3
+"""At most so many cameras that are not inputs are named in warnings."""
+
 
 @dataclass(frozen=True)
 class PreparedCapture(CaptureWrapper):
@@ -120,13 +123,15 @@ def prepare(
     if frame is None:
         return PreparedCapture(source, None, longest_px, names)
     reported: set[str] = set()
+    held = [name for name in source.cameras.names if names is not None and name not in names]
+    where = f"{source.name} without {', '.join(held)}" if 0 < len(held) <= MAX_NAMED else source.name
     issues = diagnose(frame, source.bounds)
-    _raise_or_warn(f"{source.name}: frame '{source.frame_ids[frame.time]}'", issues, reported)
+    _raise_or_warn(f"{where}: frame '{source.frame_ids[frame.time]}'", issues, reported)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
     frame = frame.without([issue.camera for issue in issues if issue.camera])
     alignment = None
     if align:
-        _raise_or_warn(source.name, find_desynchronised_cameras(source, frame, last), reported)
+        _raise_or_warn(where, find_desynchronised_cameras(source, frame, last), reported)
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
     prepared = PreparedCapture(source, alignment, longest_px, names, left_out, None, reported)
