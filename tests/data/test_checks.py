@@ -474,7 +474,7 @@ def test_a_displaced_camera_is_found_by_outlines(studio, name, step_m):
 def test_a_displaced_camera_is_found_in_a_rough_rig(studio, seed, name):
     frame = displace(roughen(studio.read(0), 0.5, seed), name, (0.04, 0.0, 0.0))
     found = find_outlier_by_outlines(frame, studio.bounds)
-    assert found is not None and name in found[0] and 1.5 < found[1] < 2
+    assert found is not None and name in found[0] and 1.5 < found[1] < 2.5
 
 
 @pytest.mark.parametrize(("px", "seed"), [(0.5, 0), (0.5, 1), (1.0, 2), (1.0, 0)])
