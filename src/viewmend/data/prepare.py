@@ -21,7 +21,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.types import MultiViewFrame
 
 MAX_NAMED = 3
-"""At most so many cameras that are not inputs are named in warnings."""
+"""Warnings name the cameras that are not inputs if there are at most this many."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,7 @@ def prepare(
     if frame is None:
         return PreparedCapture(source, None, longest_px, names)
     reported: set[str] = set()
-    held = [name for name in source.cameras.names if names is not None and name not in names]
-    where = f"{source.name} without {', '.join(held)}" if 0 < len(held) <= MAX_NAMED else source.name
+    where = _describe(source, names)
     issues = diagnose(frame, source.bounds)
     _raise_or_warn(f"{where}: frame '{source.frame_ids[frame.time]}'", issues, reported)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
@@ -142,6 +141,12 @@ def _with_matched_colours(prepared: PreparedCapture, frame: MultiViewFrame) -> P
     cameras = replace(prepared, longest_px=None).cameras.select(frame.cameras.names)
     colours = match_colours(replace(frame, cameras=cameras), prepared.bounds)
     return replace(prepared, colours=colours) if colours is not None and colours.helps else prepared
+
+
+def _describe(source: CaptureSource, inputs: Sequence[str] | None) -> str:
+    """The source's name, and which of its cameras are held out if they are few."""
+    held = [name for name in source.cameras.names if inputs is not None and name not in inputs]
+    return f"{source.name} without {', '.join(held)}" if 0 < len(held) <= MAX_NAMED else source.name
 
 
 def _raise_or_warn(where: str, issues: Sequence[Issue], reported: set[str]) -> None:
