@@ -123,14 +123,13 @@ def prepare(
     if frame is None:
         return PreparedCapture(source, None, longest_px, names)
     reported: set[str] = set()
-    where = _describe(source, names)
     issues = diagnose(frame, source.bounds)
-    _raise_or_warn(f"{where}: frame '{source.frame_ids[frame.time]}'", issues, reported)
+    _raise_or_warn(f"{_describe(source, names)}: frame '{source.frame_ids[frame.time]}'", issues, reported)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
     frame = frame.without([issue.camera for issue in issues if issue.camera])
     alignment = None
     if align:
-        _raise_or_warn(where, find_desynchronised_cameras(source, frame, last), reported)
+        _raise_or_warn(_describe(source, names), find_desynchronised_cameras(source, frame, last), reported)
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
     prepared = PreparedCapture(source, alignment, longest_px, names, left_out, None, reported)
