@@ -1,16 +1,21 @@
 """RGVI: what the past saw is pulled into the holes along flow; the rest is filled; nothing else changes."""
 
+import sys
+from types import SimpleNamespace
+
 import pytest
 import torch
+from torch import nn
 from torch.nn.functional import avg_pool2d
 
 from viewmend.contrib.baselines.rgvi import (
     PAST_FRAMES,
-    Raft,
+    RaftFlow,
     Rgvi,
     RgviState,
     dis_flow,
     disagreeing,
+    load_raft,
     make_rgvi,
     pull,
 )
@@ -19,7 +24,7 @@ from viewmend.metrics import weights
 from viewmend.metrics.weights import KnownWeights
 from viewmend.models.base import ContextProvider, Inpainter
 from viewmend.types import IncompleteView
-from viewmend.utils.weight_files import WeightsError
+from viewmend.utils.weight_files import MissingWeightsError, WeightsError
 
 SIZE = 96
 MOTION = (3, 2)
@@ -159,14 +164,39 @@ def places(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_parts_are_what_is_there(places, monkeypatch):
+class Halves(nn.Module):
+    """In place of RAFT: how far the second image's left column lies right of the first's, everywhere."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(()))
+
+    def forward(self, image, other):
+        assert image.shape == other.shape and not any(side % 8 or side < 128 for side in image.shape[2:])
+        flow = self.gain * torch.tensor([16.0, 8.0])[:, None, None].expand(1, 2, *image.shape[2:])
+        return [torch.zeros_like(flow), flow]
+
+
+def test_raft_is_used_where_its_weights_are(places, monkeypatch, rng):
     assert make_rgvi().flow is dis_flow
+    with pytest.raises(MissingWeightsError, match="raft_large"):
+        load_raft()
     (places / "raft.pth").write_bytes(b"none")
     with pytest.raises(WeightsError, match="damaged or another"):
         make_rgvi()
-    network, loaded = Raft(), KnownWeights("raft", ("raft.pth",), "RAFT", "s", "l")
-    torch.save(network.state_dict(), places / "raft.pth")
-    monkeypatch.setattr(weights, "KNOWN", (loaded,))
+    torch.save({"gain": torch.tensor(0.5)}, places / "raft.pth")
+    monkeypatch.setattr(weights, "KNOWN", (KnownWeights("raft", ("raft.pth",), "RAFT", "s", "l"),))
+    monkeypatch.setitem(sys.modules, "torchvision.models.optical_flow", None)
+    with pytest.raises(ValueError, match="pip install torchvision"):
+        make_rgvi()
+    module = SimpleNamespace(raft_large=Halves)
+    for name in ("torchvision", "torchvision.models", "torchvision.models.optical_flow"):
+        monkeypatch.setitem(sys.modules, name, module)
     flow = make_rgvi().flow
-    assert isinstance(flow, Raft)
-    assert torch.equal(flow.state_dict()["mask_predictor.conv.bias"], network.mask_predictor.conv.bias)
+    assert isinstance(flow, RaftFlow)
+    for height, width in ((100, 130), (131, 1728)):
+        scale = min(1.0, 864 / width)
+        size = [max(128, 8 * round(side * scale / 8)) for side in (height, width)]
+        expected = torch.tensor([8.0 * width / size[1], 4.0 * height / size[0]])
+        found = flow(*torch.rand(2, 3, height, width, generator=rng))
+        torch.testing.assert_close(found, expected[:, None, None].expand(2, height, width))
