@@ -8,17 +8,7 @@ from random import Random
 
 import pytest
 import torch
-from fuzz.inputs import (
-    File,
-    fuzz,
-    fuzz_file,
-    join_tensors,
-    mutated_bytes,
-    mutated_json,
-    nested,
-    split_tensors,
-    to_json,
-)
+from fuzz.inputs import File, fuzz, fuzz_file, join_tensors, mutated_bytes, mutated_json, nested, split_tensors, to_json
 from jaxtyping import UInt8
 from safetensors.torch import save
 from torch import Tensor

@@ -5,12 +5,7 @@ import math
 import pytest
 import torch
 
-from viewmend.geometry.rigid import (
-    invert_rigid,
-    is_rotation,
-    look_at,
-    rotation_from_axis_angle,
-)
+from viewmend.geometry.rigid import invert_rigid, is_rotation, look_at, rotation_from_axis_angle
 
 UP = torch.tensor([0.0, 1.0, 0.0])
 

@@ -7,9 +7,7 @@ import torch
 from models.plates import NAMES, Rig, context, encode, tiny, view
 
 from viewmend.models.base import ContextProvider, RenderQuality
-from viewmend.models.checkpoint import build
 from viewmend.models.network import set_compute_dtype
-from viewmend.models.paper.config import paper
 from viewmend.models.paper.context import window_times
 from viewmend.models.paper.patches import any_in_patch
 
@@ -198,12 +196,3 @@ def test_a_context_frame_does_not_keep_its_batch_in_memory():
         for frame in frames:
             for tensor in (frame.tokens, frame.keys_values):
                 assert tensor.untyped_storage().nbytes() == tensor.nbytes
-
-
-@pytest.mark.slow
-def test_the_paper_size_keeps_known_pixels_too():
-    incomplete = view(5)
-    net = build(paper()).eval()
-    completed, _ = net.step(incomplete, Rig(), net.initial_state())
-    known = incomplete.error == 0
-    assert torch.equal(completed.rgb[:, known], incomplete.rgb[:, known]) and completed.rgb.isfinite().all()

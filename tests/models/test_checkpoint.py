@@ -18,7 +18,7 @@ from viewmend.models.checkpoint import (
     save_inpainter,
     shipped_models,
 )
-from viewmend.models.paper.config import PaperConfig, paper, paper_small
+from viewmend.models.paper.config import PaperConfig, paper
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.views.config import RaysConfig, ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
@@ -61,11 +61,6 @@ def test_the_config_is_compatible_with_huggingface_hubs_mixin(saved):
     assert PaperConfig(**values) == tiny().config
 
 
-@pytest.mark.parametrize("config", [paper(), paper_small()])
-def test_configs_survive_json(config):
-    assert PaperConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -83,14 +78,6 @@ def test_missing_files_are_named(saved, tmp_path):
         load_inpainter(tmp_path / "nowhere")
     (saved / "config.json").unlink()
     with pytest.raises(MissingCheckpointError, match=r"config\.json missing"):
-        load_inpainter(saved)
-
-
-@pytest.mark.parametrize("length", [0, 4, 500, -1])
-def test_truncated_weights_are_refused(saved, length):
-    path = saved / "model.safetensors"
-    path.write_bytes(path.read_bytes()[:length])
-    with pytest.raises(DamagedWeightsError, match=r"model\.safetensors.*whole"):
         load_inpainter(saved)
 
 
@@ -176,7 +163,3 @@ def test_auto_precision_is_bfloat16_for_models_trained_in_it_if_clearly_faster(
     assert load_inpainter(tmp_path / "views", precision="float32").compute_dtype == torch.float32
     with pytest.raises(ValueError, match="float32, bfloat16 or auto"):
         load_inpainter(saved, precision="half")
-
-
-def test_the_bfloat16_speedup_is_measured():
-    assert 0.02 < network.bfloat16_speedup(torch.device("cpu")) < 50

@@ -97,8 +97,7 @@ def test_names_that_a_file_does_not_have_are_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("shipped", "default"),
-    [(("rays", "views"), "views"), (("paper-small",), "paper-small"), ((), "telea")],
+    ("shipped", "default"), [(("rays", "views"), "views"), (("paper-small",), "paper-small"), ((), "telea")]
 )
 def test_the_default_mends_whole_views(monkeypatch, shipped, default):
     monkeypatch.setattr(methods, "shipped_models", lambda: shipped)

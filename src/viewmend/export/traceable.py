@@ -20,14 +20,7 @@ from viewmend.models.base import ContextProvider
 from viewmend.models.smooth_fill import from_near, spread
 from viewmend.models.views.grid import rim_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.models.views.pyramids import (
-    AREA_LEVEL,
-    SMALLEST_PX,
-    MipLevels,
-    SceneScale,
-    SourceCameras,
-    choose_levels,
-)
+from viewmend.models.views.pyramids import AREA_LEVEL, SMALLEST_PX, MipLevels, SceneScale, SourceCameras, choose_levels
 from viewmend.models.views.ray_fill import gather_ray_inputs
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
@@ -261,10 +254,7 @@ def _packed(levels: list[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def halvings(
-    images: Float[Tensor, "image channel height width"],
-    count: int,
-    change: Callable[[Tensor], Tensor],
-    constant: int,
+    images: Float[Tensor, "image channel height width"], count: int, change: Callable[[Tensor], Tensor], constant: int
 ) -> list[Float[Tensor, "image channel _height _width"]]:
     """Some images at full resolution and at `count` halved ones, each in a canvas.
 

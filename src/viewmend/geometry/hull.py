@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from types import ModuleType
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
@@ -58,6 +59,31 @@ class OccupancyGrid:
     voxel_m: float
 
 
+@dataclass(frozen=True)
+class Cubes:
+    """Equal cubes, of voxels or blocks, that cover a box."""
+
+    low: Float[Tensor, "3"]
+    side_m: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, bounds: Bounds, resolution: int) -> "Cubes":
+        """Cubes of which the box's longest side has `resolution`."""
+        sides = bounds.size_m.tolist()
+        side_m = max(sides) / resolution
+        x, y, z = (max(1, math.ceil(side / side_m - 1e-3)) for side in sides)
+        return cls(bounds.low, side_m, (x, y, z))
+
+    @property
+    def centers(self) -> Float[Tensor, "cube 3"]:
+        """The cubes' middles, the last axis first."""
+        axes = [
+            self.low[a] + (torch.arange(self.shape[a], device=self.low.device) + 0.5) * self.side_m for a in range(3)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+
+
 def visual_hull(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> OccupancyGrid:
@@ -70,15 +96,13 @@ def visual_hull(
         ValueError: there is one camera only, or no mask has any foreground.
     """
     check_masks(mask, cameras)
-    voxel_m, shape = _divide(bounds, config.resolution)
-    pool = max(1, int(_footprint_px(cameras, bounds, voxel_m) / config.pixels_per_voxel))
-    needed = needed_views(len(cameras), config)
+    voxels, needed = Cubes.of(bounds, config.resolution), needed_views(len(cameras), config)
+    pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
     if (kernels := _kernels(mask)) is None:
-        soft = soften(mask, cameras.size_px, pool)
-        values = carve(soft, pool, cameras, bounds.low, voxel_m, shape, needed)
+        values = carve(soften(mask, cameras.size_px, pool), pool, cameras, voxels, needed)
     else:
-        values = _carve_cpu(kernels, mask, pool, cameras, bounds.low, voxel_m, shape, needed)
-    return OccupancyGrid(values, bounds.low, voxel_m)
+        values = _carve_cpu(kernels, mask, pool, cameras, voxels, needed)
+    return OccupancyGrid(values, bounds.low, voxels.side_m)
 
 
 def occupied_bounds(
@@ -90,30 +114,22 @@ def occupied_bounds(
     kernels = _kernels(mask)
     tiles = None if kernels is None else _count_tiles(kernels, mask, tile)
     for _ in range(config.coarse_passes):
-        block_m, shape = _divide(bounds, config.coarse_resolution)
+        blocks = Cubes.of(bounds, config.coarse_resolution)
         if kernels is None or tiles is None:
-            occupied = occupied_blocks(mask, tile, cameras, bounds.low, block_m, shape, needed)
+            occupied = occupied_blocks(mask, tile, cameras, blocks, needed)
         else:
-            occupied = _occupied_cpu(kernels, tiles, tile, cameras, bounds.low, block_m, shape, needed)
+            occupied = _occupied_cpu(kernels, tiles, tile, cameras, blocks, needed)
         index = occupied.nonzero()
         if not len(index):
             return None
-        low = bounds.low + index.amin(0) * block_m
-        bounds = Bounds(low, torch.minimum(bounds.low + (index.amax(0) + 1) * block_m, bounds.high))
+        low = bounds.low + index.amin(0) * blocks.side_m
+        bounds = Bounds(low, torch.minimum(bounds.low + (index.amax(0) + 1) * blocks.side_m, bounds.high))
     return bounds
 
 
 def needed_views(views: int, config: HullConfig) -> int:
     """How many of `views` cameras must see a point for it to count."""
     return max(min(config.min_views, views), math.ceil(config.min_fraction * views))
-
-
-def _divide(bounds: Bounds, resolution: int) -> tuple[float, tuple[int, int, int]]:
-    """The side of the cubes of which the longest side has `resolution`, and how many cover each axis."""
-    sides = bounds.size_m.tolist()
-    cube_m = max(sides) / resolution
-    x, y, z = (max(1, math.ceil(side / cube_m - 1e-3)) for side in sides)
-    return cube_m, (x, y, z)
 
 
 def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
@@ -132,11 +148,12 @@ def _kernels(mask: Tensor) -> ModuleType | None:
     return _hull_numba
 
 
-def _projections(cameras: Cameras) -> tuple[Float[Tensor, "view 3 4"], Float[Tensor, "view 4"]]:
-    """P = K [R t], and the intrinsics that the `judge` kernel takes."""
+def _kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
+    """What the kernels take: P = K [R t], the lenses, the images' sizes, and the corner of the cubes."""
     K = cameras.K.double()
     lens = torch.stack([K[:, 0, 0] ** 2 + K[:, 0, 1] ** 2, K[:, 0, 2], K[:, 1, 1] ** 2, K[:, 1, 2]], -1)
-    return K @ cameras.camera_from_world[:, :3].double(), lens
+    P = K @ cameras.camera_from_world[:, :3].double()
+    return P.numpy(), lens.numpy(), cameras.size_px.numpy(), cubes.low.double().numpy()
 
 
 def _tile_sums(views: int, height: int, width: int, tile: int) -> Int[Tensor, "view row column 2"]:
@@ -148,18 +165,16 @@ def _carve_cpu(
     mask: UInt8[Tensor, "view height width"],
     pool: int,
     cameras: Cameras,
-    low: Float[Tensor, "3"],
-    voxel_m: float,
-    shape: tuple[int, int, int],
+    voxels: Cubes,
     needed: int,
 ) -> Float[Tensor, "x y z"]:
     views, height, width = mask.shape
     soft_rows, soft_columns = -(-height // pool), -(-width // pool)
     soft = torch.empty(views, soft_rows + 1, soft_columns + 1, dtype=torch.uint8)
     sums = _tile_sums(views, soft_rows, soft_columns, BLOCK).numpy()
-    values = torch.empty(shape)
-    masks, images, out, size = mask.numpy(), soft.numpy(), values.numpy(), cameras.size_px.numpy()
-    (P, lens), corner = (part.numpy() for part in _projections(cameras)), low.double().numpy()
+    values = torch.empty(voxels.shape)
+    masks, images, out = mask.numpy(), soft.numpy(), values.numpy()
+    P, lens, size, low = _kernel_arrays(cameras, voxels)
 
     def prepare(view: int) -> None:
         columns, rows = size[view]
@@ -168,11 +183,11 @@ def _carve_cpu(
 
     def carve(slab: int) -> None:
         kernels.carve_blocks(
-            P, lens, size, images, pool, BLOCK, sums, corner, voxel_m, needed, BLOCK, slab * BLOCK, out
+            P, lens, size, images, pool, BLOCK, sums, low, voxels.side_m, needed, BLOCK, slab * BLOCK, out
         )
 
     parallel_for(prepare, views)
-    parallel_for(carve, -(-shape[0] // BLOCK))
+    parallel_for(carve, -(-voxels.shape[0] // BLOCK))
     return values
 
 
@@ -191,19 +206,17 @@ def _occupied_cpu(
     tiles: Int[Tensor, "view row column 2"],
     tile: int,
     cameras: Cameras,
-    low: Float[Tensor, "3"],
-    block_m: float,
-    shape: tuple[int, int, int],
+    blocks: Cubes,
     needed: int,
 ) -> Bool[Tensor, "x y z"]:
-    occupied = torch.empty(shape, dtype=torch.bool)
-    sums, out, size = tiles.numpy(), occupied.numpy(), cameras.size_px.numpy()
-    (P, lens), corner = (part.numpy() for part in _projections(cameras)), low.double().numpy()
+    occupied = torch.empty(blocks.shape, dtype=torch.bool)
+    sums, out = tiles.numpy(), occupied.numpy()
+    P, lens, size, low = _kernel_arrays(cameras, blocks)
 
     def judge(slab: int) -> None:
-        kernels.occupied_blocks(P, lens, size, tile, sums, corner, block_m, needed, slab, slab + 1, out)
+        kernels.occupied_blocks(P, lens, size, tile, sums, low, blocks.side_m, needed, slab, slab + 1, out)
 
-    parallel_for(judge, shape[0])
+    parallel_for(judge, blocks.shape[0])
     return occupied
 
 
@@ -308,44 +321,29 @@ def soften(
 
 
 def carve(
-    soft: UInt8[Tensor, "view row column"],
-    pool: int,
-    cameras: Cameras,
-    low: Float[Tensor, "3"],
-    voxel_m: float,
-    shape: tuple[int, int, int],
-    needed: int,
+    soft: UInt8[Tensor, "view row column"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
 ) -> Float[Tensor, "x y z"]:
     """The smallest mask value over the cameras that see each voxel's middle; 0 where fewer than `needed` do."""
-    axes = [low[a] + (torch.arange(shape[a], device=low.device) + 0.5) * voxel_m for a in range(3)]
-    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
-    values = torch.ones(len(points), device=low.device)
-    seen = torch.zeros(len(points), dtype=torch.int32, device=low.device)
+    points = voxels.centers
+    values = torch.ones_like(points[:, 0])
+    seen = torch.zeros_like(values, dtype=torch.int32)
     for view in range(len(cameras)):
         uv, z = project(points, cameras[view])
         sees = in_view(uv, z, cameras[view])[0]
         value = sample_bilinear(soft[view].float()[None, None] / 255, uv / pool, "border")[0, :, 0]
         values = torch.where(sees, values.minimum(value), values)
         seen += sees
-    return torch.where(seen >= needed, values, 0.0).view(*shape)
+    return torch.where(seen >= needed, values, 0.0).view(voxels.shape)
 
 
 def occupied_blocks(
-    mask: UInt8[Tensor, "view height width"],
-    tile: int,
-    cameras: Cameras,
-    low: Float[Tensor, "3"],
-    block_m: float,
-    shape: tuple[int, int, int],
-    needed: int,
+    mask: UInt8[Tensor, "view height width"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
 ) -> Bool[Tensor, "x y z"]:
     """Blocks that project to some foreground in all cameras and are visible to enough cameras."""
-    axes = [low[a] + (torch.arange(shape[a], device=low.device) + 0.5) * block_m for a in range(3)]
-    centers = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
-    radius = block_m * 3**0.5 / 2
+    centers, radius = blocks.centers, blocks.side_m * 3**0.5 / 2
     P = cameras.K @ cameras.camera_from_world[:, :3]
-    empty = torch.zeros(len(centers), dtype=torch.bool, device=low.device)
-    seen = torch.zeros(len(centers), dtype=torch.int32, device=low.device)
+    empty = torch.zeros_like(centers[:, 0], dtype=torch.bool)
+    seen = torch.zeros_like(centers[:, 0], dtype=torch.int32)
     for view in range(len(cameras)):
         uv, z = project(centers, cameras[view])
         uv, z, size = uv[0], z[0], cameras.size_px[view]
@@ -358,14 +356,11 @@ def occupied_blocks(
         inside = ((first >= 0) & (last < size)).all(-1)
         empty |= in_front & inside & (_foreground_tiles(mask[view], tile, first, last) == 0)
         seen += (z + radius > NEAR_M) & ~(in_front & outside)
-    return (~empty & (seen >= needed)).view(*shape)
+    return (~empty & (seen >= needed)).view(blocks.shape)
 
 
 def _foreground_tiles(
-    mask: UInt8[Tensor, "height width"],
-    tile: int,
-    first: Float[Tensor, "block 2"],
-    last: Float[Tensor, "block 2"],
+    mask: UInt8[Tensor, "height width"], tile: int, first: Float[Tensor, "block 2"], last: Float[Tensor, "block 2"]
 ) -> Int[Tensor, "block"]:
     """How many tiles with any foreground each window of pixels, and one and a half pixels around it, touches."""
     height, width = mask.shape

@@ -128,9 +128,7 @@ def homogeneous(vertices: Float[Tensor, "vertex 3"], cameras: Cameras) -> Float[
     return torch.einsum("vij,nj->vni", P[:, :, :3], vertices.double()) + P[:, None, :, 3]
 
 
-def edge_functions(
-    corners: Float[Tensor, "*batch 3 3"],
-) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"]]:
+def edge_functions(corners: Float[Tensor, "*batch 3 3"]) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"]]:
     """Edge i as the plane q_j x q_k over (u, v, 1), and the triangle's determinant; corner by corner in dim -2."""
     a, b, c = corners.unbind(-2)
     edges = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], -2)

@@ -65,9 +65,7 @@ def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
     return tuple(sides)
 
 
-def _crossings(
-    values: Float[Tensor, "x y z"],
-) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "axis=3 x y z"]]:
+def _crossings(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "axis=3 x y z"]]:
     """Where the surface crosses grid edges, in voxels, and which vertex is on the edge from (x, y, z) along axis."""
     inside = values > ISO
     parts, vertex_of_edge = [], torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)

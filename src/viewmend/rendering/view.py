@@ -145,10 +145,7 @@ def _colour(
 
 
 def select_closest(
-    target: Cameras,
-    cameras: Cameras,
-    subject_center: Float[Tensor, "3"],
-    k: int = 3,
+    target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"], k: int = 3
 ) -> tuple[str, ...]:
     """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
 

@@ -38,10 +38,7 @@ class MismatchedWeightsError(WeightsError):
 
 
 def load_weights(
-    network: Network,
-    path: str | Path,
-    device: torch.device | str = "cpu",
-    spare: Sequence[str] = (),
+    network: Network, path: str | Path, device: torch.device | str = "cpu", spare: Sequence[str] = ()
 ) -> Network:
     """Load the weights of a file into a network, move it to `device` and set evaluation mode.
 

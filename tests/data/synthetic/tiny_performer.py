@@ -124,10 +124,7 @@ BVH_JOINTS = {
 
 
 def write_motion(
-    path: Path,
-    angles: dict[str, tuple[float, float, float]] | None = None,
-    frames: int = 4,
-    travel_cm: float = 20.0,
+    path: Path, angles: dict[str, tuple[float, float, float]] | None = None, frames: int = 4, travel_cm: float = 20.0
 ) -> Path:
     """A cgspeed-like BVH; `angles` (z, x, y in degrees) grow linearly from the first frame to the last."""
     angles = angles or {}

@@ -193,9 +193,7 @@ class FusionFeedForward(nn.Module):
         return rearrange(self.conv2(mixed), "f (r c) d -> f r c d", r=tokens.shape[1])
 
 
-def _patches(
-    features: Float[Tensor, "frame channel height width"],
-) -> Float[Tensor, "frame token patch"]:
+def _patches(features: Float[Tensor, "frame channel height width"]) -> Float[Tensor, "frame token patch"]:
     return unfold(features, PATCH_CELLS, padding=MARGIN_CELLS, stride=STEP_CELLS).transpose(1, 2)
 
 

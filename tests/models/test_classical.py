@@ -1,4 +1,4 @@
-"""The fills that know nothing but the view: against OpenCV and a search, and what all of them owe."""
+"""The final blend, and the fills that use the view alone: against OpenCV and a search."""
 
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ import torch
 from viewmend.geometry.cameras import Cameras
 from viewmend.models.base import ContextProvider, Inpainter, State
 from viewmend.models.classical import NavierStokes, NearestColour, Telea, Unfilled
+from viewmend.models.compositing import blend
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.types import IncompleteView
 
@@ -38,6 +39,16 @@ def filled(inpainter, view):
     completed, state = inpainter.step(view, no_context, inpainter.initial_state())
     assert state == State() and completed.view is view
     return completed.rgb
+
+
+def test_the_blend_is_the_formula_inside_and_a_copy_outside(rng):
+    F, filled = torch.rand(2, 3, 6, 6, generator=rng)
+    E = torch.rand(6, 6, generator=rng) * (torch.rand(6, 6, generator=rng) > 0.5)
+    coverage = (torch.rand(6, 6, generator=rng) > 0.2).float()
+    completed = blend(F, E, filled, coverage)
+    assert torch.allclose(completed[:, coverage == 1], (E * filled + (1 - E) * F)[:, coverage == 1], atol=1e-6)
+    untouched = (E == 0) | (coverage == 0)
+    assert torch.equal(completed[:, untouched], F[:, untouched])
 
 
 @pytest.mark.parametrize("kind", ALL)
