@@ -12,7 +12,6 @@ from viewmend.preprocess.masks import person
 from viewmend.preprocess.masks.masked import MaskedCapture, view_rgb
 from viewmend.preprocess.masks.person import PersonMasks, Roi
 
-pytest.importorskip("onnxruntime")
 ALONE = StudioConfig(cameras=4, frames=3, size_px=256, background="stage", seed=5)
 """One person and no furniture."""
 

@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 
 PLAYLIST, INIT = "live.m3u8", "init.mp4"
 FIRST, LISTED = 3, 6
-"""Segments that the playlist names, least and most: players begin three before its end, some refuse a shorter one."""
+"""Fewest and most segments of the playlist: players start three before its end, and some refuse a shorter one."""
 KEPT = 10
-"""Segments that can be asked for: who has an old playlist finds what it names."""
+"""Segments that are kept, also for players with an older playlist."""
 BITS_PER_S = 8_000_000
-"""The most that is spent, and saved up: a segment has at most 2 MB."""
+"""Peak bit rate, and encoder buffer: a segment has at most 2 MB."""
 MUXER = {
     "hls_time": "1",
     "hls_list_size": str(LISTED),
@@ -64,14 +64,17 @@ ENCODER = {
 
 
 class FilmSegments:
-    """A film that goes on, of one size; a context manager. Its files can be asked for from any thread."""
+    """An endless video of one size, as HLS: a playlist and segments of one second, H.264 in fragmented MP4, in memory.
+
+    A context manager. Its files can be read from any thread.
+    """
 
     def __init__(self, size_px: tuple[int, int], fps: int) -> None:
-        """Begin.
+        """Set up.
 
         Args:
             size_px: width and height, even.
-            fps: frames a second that there may be at most.
+            fps: maximum frame rate.
         """
         self._size_px, self._fps = size_px, fps
         self._files: dict[str, bytes] = {}
@@ -105,11 +108,11 @@ class FilmSegments:
         self._container.close()
 
     def add(self, picture: Image, at: int) -> None:
-        """Append a picture.
+        """Append an image.
 
         Args:
-            picture: RGB; one of another size is stretched.
-            at: when it is shown, in frames since the beginning; later than the last.
+            picture: RGB; one of another size is resized.
+            at: its time, in frames since the beginning; later than the last.
         """
         import cv2
         from av import VideoFrame
@@ -125,9 +128,9 @@ class FilmSegments:
         self._mux(self._stream.encode(frame))
 
     def _mux(self, packets: "list[Packet]") -> None:
-        """Write packets, each once the next is there: only then it is known how long it lasts.
+        """Write packets, each when the next one arrives and so sets its duration.
 
-        A segment begins, for the muxer, where the last packet before it ends.
+        The muxer starts a segment where the last packet before it ends.
         """
         for packet in packets:
             for held in self._held:
@@ -137,14 +140,14 @@ class FilmSegments:
             self._held = [packet]
 
     def file(self, name: str) -> bytes | None:
-        """The playlist, the beginning of every segment, or a segment; None where there is none of that name."""
+        """The playlist, the header of all segments, or a segment; None if there is none of that name."""
         return None if name == PLAYLIST and len(self._segments) < FIRST else self._files.get(name)
 
     def _file(self, url: str, flags: int, options: dict[str, str]) -> "_File":
         return _File(url.removeprefix("memory://"), self)
 
     def keep(self, name: str, content: bytes) -> None:
-        """Have a file that is written; the oldest segments make room."""
+        """Store a finished file; the oldest segments are dropped."""
         if name.endswith(".m4s"):
             self._segments.append(name)
             while len(self._segments) > KEPT:
@@ -153,7 +156,7 @@ class FilmSegments:
 
 
 class _File(BytesIO):
-    """A file that the muxer writes: there, and whole, once it is closed."""
+    """A file that the muxer writes; stored when it is closed."""
 
     def __init__(self, name: str, film: FilmSegments) -> None:
         super().__init__()
@@ -410,5 +413,5 @@ def broadcast_extension(text: str) -> ExtensionFactory:
     except ValueError as error:
         raise ValueError(f"--broadcast: {error}") from None
     if "h264" not in video_codecs():
-        raise ValueError("--broadcast needs PyAV with x264; install viewmend's extra 'video'")
+        raise ValueError("--broadcast needs PyAV with x264; install a PyAV with it: pip install --upgrade av")
     return partial(Broadcast, size_px=size_px)

@@ -1,4 +1,4 @@
-"""What a camera's address gives: pictures, by PyAV, and when they were taken."""
+"""Images of a camera's address, by PyAV, and when they were taken."""
 
 import time
 from bisect import bisect_left
@@ -15,25 +15,24 @@ from viewmend.data.video_clock import Track, match_tracks
 from viewmend.data.videos import decode, video_properties
 
 WINDOW_S = 10.0
-"""The least delayed packet of so long says where the sender's clock is; clocks drift apart by less than 1 ms then."""
+"""The least delayed packet of this time sets the sender's clock; clocks drift by less than 1 ms in it."""
 JUMP_S = 1.0
 """A sender has restarted if its timestamps jump by this much more or less than the elapsed time."""
 
 
 class SenderClock:
-    """Where a sender's clock is, by when its packets came.
+    """Estimates the offset of a sender's clock from the arrival of its packets.
 
-    Networks only delay. The packet that was least delayed within the last seconds tells best, and a delay of the others
-    does not change when their pictures were taken.
+    Networks only delay, so the least delayed packet of the last seconds is the best estimate.
     """
 
     def __init__(self) -> None:
         self._offsets: deque[tuple[float, float]] = deque()
-        """When a packet came and by how much that is later than the sender says, both growing."""
+        """When a packet arrived, and how much later than its timestamp; both increase."""
         self._last: tuple[float, float] | None = None
 
     def saw(self, sent_s: float, arrived_s: float) -> None:
-        """A packet of this time came just now: it did not lie in a queue here."""
+        """Take in a packet that has just arrived, without waiting in a queue here."""
         if self._last is not None:
             step_s, passed_s = sent_s - self._last[0], arrived_s - self._last[1]
             if step_s < -JUMP_S or step_s > passed_s + JUMP_S:
@@ -47,7 +46,7 @@ class SenderClock:
             self._offsets.popleft()
 
     def here_s(self, sent_s: float) -> float | None:
-        """A sender's time on this machine's clock; None before any packet was seen to come."""
+        """A sender's time on this machine's clock; None before the first packet."""
         return sent_s + self._offsets[0][1] if self._offsets else None
 
 
@@ -58,17 +57,16 @@ if TYPE_CHECKING:
 OPEN_S, SILENT_S = 5.0, 1.0
 """Seconds after which a silent address is reopened."""
 WAITED_S = 0.002
-"""A packet for which the reader had to wait so long did not lie in a queue."""
+"""A packet for which the reader waited at least this long was not in a queue."""
 TORN_S = 2.0
-"""Pictures after a torn one are built on it until the next key picture, and not shown; no longer than this."""
+"""Images after a damaged one are dropped until the next key frame, but no longer than this."""
 LAG = {"rtsp": 1, "rtp": 1, "mpegts": 2}
-"""How many packets later FFmpeg gives one, by format: its parser knows a picture's end by the next one's beginning, and
-MPEG-TS of unknown lengths that of the parser's food likewise."""
+"""By how many packets FFmpeg delays, by format: parsers detect an image's end by the start of the next."""
 UNTIMED = ("mjpeg", "mpjpeg", "h264", "hevc", "rawvideo", "image2pipe", "jpeg_pipe")
-"""FFmpeg's formats whose times mean nothing."""
+"""FFmpeg's formats without meaningful timestamps."""
 FOR_ALL = {"probesize": "500000", "analyzeduration": "500000", "fpsprobesize": "0"}
 BY_SCHEME = {"udp": {"overrun_nonfatal": "1"}, "rtsp": {"rtsp_transport": "tcp"}, "rtsps": {"rtsp_transport": "tcp"}}
-"""FFmpeg's options: little is looked at before the first picture; lost parts are lost, not the stream."""
+"""FFmpeg's options: short probing before the first image; losses do not end the stream."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +79,12 @@ class Picture:
 
 
 class Playback:
-    """Where recordings are that are played as if they were live: over and over, all of a rig at one position."""
+    """Position of recordings that are played in a loop as if live; all of a rig have the same."""
 
     def __init__(self, length_s: float = 1.0) -> None:
         self.start_s = time.monotonic()
         self.length_s = length_s
-        """Where all of them start over: at the end of the shortest."""
+        """Where all of them start again: the end of the shortest."""
         self.shifts_s: dict[str, float] = {}
         """What is added to the times in each recording, so that the first of all starts at 0; else each does."""
 
@@ -113,12 +111,12 @@ class Playback:
 
 
 def pictures_of(camera: LiveCamera, counts: "Counter[str]", playback: Playback, wait: Callable[[float], bool]) -> Any:
-    """The pictures of a camera from now on, until it fails; close it after use.
+    """Generate the images of a camera from now on, until it fails; close the generator after use.
 
     Args:
-        camera: where it is.
-        counts: "torn" and "duplicated" pictures are counted there.
-        playback: where recordings are.
+        camera: its address.
+        counts: "torn" (damaged) and "duplicated" images are counted there.
+        playback: the position of recordings.
         wait: waits for a number of seconds; True if no more images are wanted.
 
     Raises:
@@ -153,7 +151,7 @@ def _received(camera: LiveCamera, counts: "Counter[str]") -> Iterator[Picture]:
 
 
 def _played(camera: LiveCamera, playback: Playback, wait: Callable[[float], bool]) -> Iterator[Picture]:
-    """A recording's pictures when their time comes; those whose time has passed are left out."""
+    """A recording's images when they are due; overdue ones are skipped."""
     try:
         video = video_properties(Path(camera.url))
     except CaptureError as error:
@@ -177,15 +175,13 @@ def _played(camera: LiveCamera, playback: Playback, wait: Callable[[float], bool
 
 
 def _opened(camera: LiveCamera) -> "InputContainer":
-    """The container.
+    """Open the camera's address.
 
     Raises:
-        OSError: nothing answers there, or it has no video.
+        OSError: it does not answer, or has no video.
     """
-    try:
-        import av
-    except ImportError:
-        raise ValueError("live cameras need the extra 'video'; from the clone: pip install -e '.[video]'") from None
+    import av
+
     options = FOR_ALL | BY_SCHEME.get(camera.url.partition("://")[0], {}) | dict(camera.options)
     try:
         given = {} if camera.is_file else options
@@ -225,20 +221,20 @@ def _said(error: Exception) -> str:
 
 
 class _Stamps:
-    """When pictures were taken: when their packets came."""
+    """When images were taken: here, when their packets arrived."""
 
     def __init__(self) -> None:
         self._last: int | None = None
 
     def saw(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
-        """A packet has come."""
+        """Take in a packet that has arrived."""
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
-        """When it was taken; None while that is not known."""
+        """When an image was taken; None if unknown."""
         return arrived_s
 
     def is_new(self, frame: "VideoFrame", counts: "Counter[str]") -> bool:
-        """Whether the sender's own time says that the picture is another than the last one."""
+        """Whether the image has another timestamp than the last one."""
         again = frame.pts is not None and frame.pts == self._last
         self._last = frame.pts
         counts["duplicated"] += again
@@ -246,13 +242,13 @@ class _Stamps:
 
 
 class _SenderStamps(_Stamps):
-    """The sender's own times, on this machine's clock."""
+    """The sender's timestamps, on this machine's clock."""
 
     def __init__(self, lag: int = 0) -> None:
         super().__init__()
         self._clock = SenderClock()
         self._came_s: deque[float | None] = deque(maxlen=lag + 1)
-        """When the packets came that are given now and next, where that is known."""
+        """Arrival of the packets that FFmpeg still delays; None if unknown."""
 
     def saw(self, packet: "Packet", arrived_s: float, waited: bool) -> None:
         self._came_s.append(arrived_s if waited else None)
@@ -265,7 +261,7 @@ class _SenderStamps(_Stamps):
 
 
 class _KernelStamps(_SenderStamps):
-    """The kernel's times, which are on this machine's clocks where the driver keeps to the rules."""
+    """The kernel's timestamps, which are on a clock of this machine if the driver is correct."""
 
     def taken_s(self, frame: "VideoFrame", arrived_s: float) -> float | None:
         for off_s in (0.0, time.time() - time.monotonic()):
@@ -284,7 +280,7 @@ def _stamps(camera: LiveCamera, container: "InputContainer") -> _Stamps:
 
 
 class _Whole:
-    """Which pictures are whole: not torn, nor built on torn ones."""
+    """Detects damaged images, and those that depend on damaged ones."""
 
     def __init__(self, counts: "Counter[str]") -> None:
         self._counts = counts
@@ -292,12 +288,12 @@ class _Whole:
         self._torn_s: float | None = None
 
     def torn(self, now_s: float) -> None:
-        """A picture is torn. Those before the first whole one are no loss: a stream is entered in its middle."""
+        """An image is damaged. Those before the first whole one are not counted: streams are joined in the middle."""
         self._counts["torn"] += self._begun
         self._torn_s = now_s
 
     def is_good(self, frame: "VideoFrame", damaged: bool, now_s: float) -> bool:
-        """Whether this picture can be shown."""
+        """Whether this image can be used."""
         if frame.is_corrupt or damaged:
             self.torn(now_s)
             return False

@@ -1,4 +1,4 @@
-"""A live rig whose cameras this machine reads itself: viewmend serve rig.toml."""
+"""A live rig whose cameras this machine reads itself (`viewmend serve rig.toml`), and their synchronisation."""
 
 import logging
 import math
@@ -29,9 +29,9 @@ from viewmend.live.push import LiveSource
 from viewmend.types import MultiViewFrame
 
 AWAY_S = 0.5
-"""A camera that was silent for so long is not waited for."""
+"""Frames do not wait for a camera that was silent for this long."""
 FOLLOWS = 0.05
-"""How much of the cameras' median distance to its ticks a time line takes over at each of them."""
+"""Fraction of the cameras' median offset by which the time line is corrected at each tick."""
 SPARE = 4
 """Number of complete frames that are kept until they are taken; the oldest are dropped."""
 
@@ -46,55 +46,55 @@ class Taken:
 
 @dataclass
 class Together:
-    """What the cameras took at one time."""
+    """The cameras' images of one tick."""
 
     tick: int
     since_s: float
-    """When the first of them was there."""
+    """When the first of them arrived."""
     taken: dict[str, Taken] = field(default_factory=dict)
 
     @property
     def spread_s(self) -> float:
-        """Between the first and the last that was taken."""
+        """Time between the first and the last exposure."""
         times = [taken.taken_s for taken in self.taken.values()]
         return max(times) - min(times) if times else 0.0
 
 
 class TimeLine:
-    """Ticks at equal distances, which follow the cameras' own rate and phase."""
+    """Evenly spaced ticks that follow the cameras' own rate and phase."""
 
     def __init__(self, interval_s: float) -> None:
         self.interval_s = interval_s
         self._origin_s: float | None = None
 
     def nearest(self, taken_s: float) -> tuple[int, float]:
-        """The nearest tick, and how much later than it this was taken; the first that asks sets tick 0."""
+        """The nearest tick, and the offset from it; the first call sets tick 0."""
         if self._origin_s is None:
             self._origin_s = taken_s
         tick = math.floor((taken_s - self._origin_s) / self.interval_s + 0.5)
         return tick, taken_s - self._origin_s - tick * self.interval_s
 
     def follow(self, offsets_s: Sequence[float]) -> None:
-        """Move towards the cameras, which were so much later than a tick."""
+        """Correct the ticks by the cameras' offsets from one of them."""
         if self._origin_s is not None and offsets_s:
             self._origin_s += FOLLOWS * statistics.median(offsets_s)
 
 
 class Aligner:
-    """Takes pictures as they come, in any order, and gives them out together. One thread at a time.
+    """Groups images, which arrive in any order, by tick. One thread at a time.
 
-    Each camera has one place at each of the few times that wait. A time is complete when each camera has it or is past
-    it; cameras that are away are not waited for, late ones for `wait_s`.
+    A tick is complete when each camera has an image for it or a later one; cameras that are away do not count. An
+    incomplete tick waits for `wait_s`.
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:
-        """Begin.
+        """Set up.
 
         Args:
             names: of the cameras.
-            interval_s: between two times.
-            tolerance_s: how far from its time a picture may have been taken.
-            wait_s: how long a time waits after its first picture.
+            interval_s: between two ticks.
+            tolerance_s: largest offset of an image from its tick.
+            wait_s: how long a tick waits after its first image.
         """
         self._line = TimeLine(interval_s)
         self._tolerance_s, self._wait_s = tolerance_s, wait_s
@@ -107,14 +107,14 @@ class Aligner:
         self.counts: dict[str, Counter[str]] = {name: Counter() for name in names}
 
     def wants(self, taken_s: float, period_s: float) -> bool:
-        """Whether, of pictures every `period_s`, the one that was taken then would be the nearest to a tick."""
+        """Whether an image of a camera with this period is the nearest to a tick."""
         return period_s > self._line.interval_s / 1.5 or abs(self._line.nearest(taken_s)[1]) <= period_s / 2
 
     def put(self, name: str, taken: Taken, now_s: float) -> None:
-        """Take in one camera's picture. What is late, in the future or far from its time is counted and dropped."""
+        """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""
         counts = self.counts[name]
         self._heard_s[name] = now_s
-        if taken.taken_s > now_s + self._line.interval_s / 2:  # a clock that jumps must not take all others along
+        if taken.taken_s > now_s + self._line.interval_s / 2:  # a clock that jumps must not affect the others
             counts["misaligned"] += 1
             return
         tick, offset_s = self._line.nearest(taken.taken_s)
@@ -133,7 +133,7 @@ class Aligner:
             self._drop_oldest()
 
     def take(self, now_s: float) -> list[Together]:
-        """The times that are complete or waited long enough, the oldest first."""
+        """Ticks that are complete or waited long enough, the oldest first."""
         out = []
         for tick in sorted(self._waiting):
             together = self._waiting[tick]
@@ -147,7 +147,7 @@ class Aligner:
         return out
 
     def _drop_oldest(self) -> None:
-        """Drop the oldest of more times than may wait: the newest win."""
+        """Drop the oldest ticks if too many wait."""
         while len(self._waiting) > self._most:
             self._done = min(self._waiting)
             for name in self._waiting.pop(self._done).taken:
@@ -169,11 +169,11 @@ class Aligner:
 
 
 WATCH_S = 1.0
-"""Seconds between looks at the rig's file."""
+"""Seconds between checks of the rig's file."""
 REPORT_S = 30.0
-"""Seconds between lines that say what went wrong meanwhile."""
+"""Seconds between reports of losses."""
 GATHER_S = 3.0
-"""How long the first time waits for all cameras to be there: alignment and axes are taken from it."""
+"""How long the first frame, which sets alignment and axes, waits for all cameras."""
 WORTH_SAYING = ("late", "missing", "duplicated", "torn", "misaligned", "replaced", "refused")
 
 log = logging.getLogger("viewmend.live")
@@ -181,7 +181,7 @@ log = logging.getLogger("viewmend.live")
 
 @dataclass(frozen=True)
 class _OneTime:
-    """What a rig sees at one time, as a source of a single frame."""
+    """One frame of a rig as a source."""
 
     name: str
     cameras: Cameras
@@ -197,9 +197,9 @@ class _OneTime:
 
 
 class RigSource(LiveSource):
-    """Frames of the cameras that a `rig.toml` names, put together by when they were taken.
+    """Synchronised frames of the cameras in a `rig.toml`.
 
-    The file is read again when it changes: cameras come, go and are replaced while the others go on.
+    The file is read again when it changes: cameras are added, removed and replaced while the others continue.
     """
 
     def __init__(
@@ -237,7 +237,7 @@ class RigSource(LiveSource):
         self._thread.start()
 
     def stop(self) -> None:
-        """End, and let go of the cameras."""
+        """End, and close the cameras."""
         self._stopped = True
         with self._lock_cameras:
             self._lock_cameras.notify_all()
@@ -250,16 +250,16 @@ class RigSource(LiveSource):
             worker.stop()
 
     def camera_counts(self) -> dict[str, dict[str, int]]:
-        """What was counted of each camera, and whether it is there."""
+        """Event counts of each camera, and whether it is connected."""
         with self._lock_cameras:
             each = {name: (worker, self._aligner.counts[name]) for name, worker in self._workers.items()}
             return {name: {"up": int(w.up), **w.counts, **counts} for name, (w, counts) in each.items()}
 
     def _take_on(self, rig: LiveRig) -> None:
-        """Be this rig from now on. Cameras of which nothing has changed go on, others are to be opened.
+        """Switch to this rig. Unchanged cameras continue; new ones are opened by `_begin_rig`.
 
         Raises:
-            CaptureError: a clean plate or a recording cannot be used; everything is as it was.
+            CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
         """
         unchanged = {camera.key for camera in rig.cameras}
         kept = {name: worker for name, worker in self._workers.items() if worker.camera.key in unchanged}
@@ -287,7 +287,7 @@ class RigSource(LiveSource):
         return CameraWorker(camera, connect, self._deliver, lambda at_s, period_s: self._aligner.wants(at_s, period_s))
 
     def _begin_rig(self) -> None:
-        """Tell viewers of the rig, and open its cameras that are not open yet."""
+        """Announce the rig to viewers, and open its new cameras."""
         rig = self._rig_file
         bounds = None if rig.bounds_m is None else Bounds(*torch.tensor(rig.bounds_m, dtype=torch.float32).unbind(0))
         self.begin(rig.name, rig.fps, bounds, None if rig.up is None else torch.tensor(rig.up, dtype=torch.float32))
@@ -312,13 +312,13 @@ class RigSource(LiveSource):
                 self._report()
 
     def _next(self, timeout_s: float) -> list[Together]:
-        """The times that are complete."""
+        """The ticks that are complete."""
         with self._lock_cameras:
             self._lock_cameras.wait(timeout_s)
             return self._aligner.take(time.monotonic())
 
     def _show(self, together: Together) -> None:
-        """Push one time, as `viewmend mend` would read it."""
+        """Add one frame, prepared as in `viewmend mend`."""
         taken = {name: images for name, images in together.taken.items() if name in self._cameras.names}
         names = [name for name in self._cameras.names if name in taken]
         if len(names) < 2 or self._gathers(len(names)):
@@ -339,7 +339,7 @@ class RigSource(LiveSource):
         self.add(replace(self._prepared, source=source).read(0))
 
     def _gathers(self, there: int) -> bool:
-        """Whether to wait for more cameras before the first time is looked at."""
+        """Whether to wait for more cameras before the first frame."""
         now_s = time.monotonic()
         if self._gather_until is None:
             self._gather_until = now_s + GATHER_S
@@ -367,7 +367,7 @@ class RigSource(LiveSource):
         log.warning("the rig has changed: %d cameras, %d of them new", len(self._workers), len(self._new))
 
     def _miss_cameras(self) -> None:
-        """Say it to viewers while there are too few cameras."""
+        """Report an error while there are too few cameras."""
         gone = [worker for worker in self._workers.values() if not worker.up]
         there = len(self._workers) - len(gone)
         if there < 2:
@@ -377,14 +377,14 @@ class RigSource(LiveSource):
             self._is_wrong(error)
 
     def _is_wrong(self, error: str) -> None:
-        """Tell viewers by the status; the terminal too, once until something else is wrong."""
+        """Report an error in the status, and to the terminal once until it changes."""
         if self.status.error != error:
             log.warning("%s", error)
         self.status = replace(self.status, state="failing", error=error)
         self.changed()
 
     def _report(self) -> None:
-        """A line on what was lost since the last one, where anything was."""
+        """Log what was lost since the last report, if anything."""
         lines = []
         counted = self.camera_counts()
         for name, counts in counted.items():
@@ -398,7 +398,7 @@ class RigSource(LiveSource):
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
-    """What tells whether a file has changed; None while it is not there."""
+    """Time and size of a file; None if it does not exist."""
     try:
         found = path.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""A live rig's `rig.toml`: which calibration, where each camera is, how its masks are made."""
+"""A live rig's `rig.toml`: its calibration, the address of each camera, and how masks are made."""
 
 import re
 import tomllib
@@ -17,7 +17,7 @@ from viewmend.utils.untrusted_input import one_of, typed
 
 MOST_BYTES = 1_000_000
 SCHEMES = ("rtsp", "rtsps", "rtp", "http", "https", "udp", "tcp", "srt")
-"""Addresses that are opened; all else is a file or a device."""
+"""Schemes of addresses; anything else is a file or a device."""
 DEVICE = re.compile(r"/dev/video\d+|/dev/v4l/.+")
 Text = Annotated[str, Meta(min_length=1, max_length=4000)]
 Milliseconds = Annotated[float, Meta(ge=1, le=10_000)]
@@ -75,27 +75,27 @@ class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class LiveCamera:
-    """Where one camera is, and what it is."""
+    """One camera: its address, calibration and masks."""
 
     calibration: NativeCamera
-    """The calibration of the pictures as they are worked on, before undistortion."""
+    """The calibration of the (reduced) images, before undistortion."""
     taken_px: tuple[int, int]
-    """Width and height of the pictures as they come."""
+    """Width and height of the camera's own images."""
     url: str
     format: str | None
-    """FFmpeg's input format where the url does not tell."""
+    """FFmpeg's input format; None if the url determines it."""
     options: tuple[tuple[str, str], ...]
-    """FFmpeg's, for this input."""
+    """FFmpeg's options for this input."""
     clock: str
     offset_s: float
-    """Taken off the times of its pictures."""
+    """Subtracted from the times of its images."""
     mask: MaskEntry
     plate: Path
-    """The clean plate, where the method wants one."""
+    """The clean plate, for the method `plate`."""
 
     @property
     def name(self) -> str:
-        """The calibration's."""
+        """The camera's name."""
         return self.calibration.name
 
     @property
@@ -105,7 +105,7 @@ class LiveCamera:
 
     @property
     def key(self) -> str:
-        """Tells whether anything of it has changed."""
+        """Changes whenever any of its settings does."""
         return repr(self)
 
 
@@ -117,15 +117,15 @@ class LiveRig:
     cameras: tuple[LiveCamera, ...]
     fps: float
     tolerance_s: float
-    """How far from its time a picture may have been taken."""
+    """Largest distance of an image from its frame's time."""
     wait_s: float
-    """How long a time waits for pictures that are late."""
+    """How long a frame waits for late images."""
     up: Float64[np.ndarray, "3"] | None
     bounds_m: Float64[np.ndarray, "2 3"] | None
 
 
 def read_rig(path: Path, longest_px: int | None = None) -> LiveRig:
-    """Read a `rig.toml` and the calibration that it names; pictures are to be at most so long.
+    """Read a `rig.toml` and its calibration; images are reduced to `longest_px` on their longer side.
 
     Raises:
         CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
@@ -191,7 +191,7 @@ def _camera(
 
 
 def _reduced(camera: NativeCamera, longest_px: int | None) -> NativeCamera:
-    """The camera of pictures reduced to at most this length; distortion does not change with it."""
+    """The camera of images reduced to at most this length; distortion does not change."""
     longest = max(camera.width, camera.height)
     if longest_px is None or longest <= longest_px:
         return camera

@@ -1,4 +1,4 @@
-"""One worker a camera: it reads, comes back after failures, makes masks, and hands on what is done."""
+"""One worker per camera: it reads images, reconnects after failures, makes masks, and delivers the result."""
 
 import logging
 import threading
@@ -21,7 +21,7 @@ from viewmend.preprocess.masks.plate import PlateMasks, read_plate
 
 
 class ReducedMasks:
-    """Makes masks of smaller pictures, and enlarges them."""
+    """Makes masks of reduced images, and enlarges them."""
 
     def __init__(self, maker: MaskMaker, size_px: tuple[int, int]) -> None:
         self._maker = maker
@@ -40,7 +40,7 @@ class ReducedMasks:
 
 
 def reduced(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
-    """An image of this width and height; itself where it has them."""
+    """The image resized to this width and height; unchanged if it has them."""
     import cv2
 
     if rgb.shape[1::-1] == size_px:
@@ -49,7 +49,7 @@ def reduced(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
 
 
 def mask_maker(camera: LiveCamera) -> MaskMaker:
-    """What makes the masks of this camera's pictures, as its rig says.
+    """The mask maker of a camera, by its rig's settings.
 
     Raises:
         CaptureError: its clean plate is missing, unreadable or of another size.
@@ -75,14 +75,14 @@ T = TypeVar("T")
 
 
 class Slot(Generic[T]):
-    """One place between two threads: what is newer replaces what was not taken yet."""
+    """Holds the latest value for another thread; a newer one replaces one that was not taken."""
 
     def __init__(self) -> None:
         self._lock = threading.Condition()
         self._value: T | None = None
 
     def put(self, value: T) -> bool:
-        """Put a value in; whether another one was replaced."""
+        """Store a value; returns whether it replaced another."""
         with self._lock:
             replaced = self._value is not None
             self._value = value
@@ -90,7 +90,7 @@ class Slot(Generic[T]):
         return replaced
 
     def take(self, timeout_s: float) -> T | None:
-        """Take the value out, None where none came in time."""
+        """Take the value; None if there is none in time."""
         with self._lock:
             self._lock.wait_for(lambda: self._value is not None, timeout_s)
             value, self._value = self._value, None
@@ -98,16 +98,16 @@ class Slot(Generic[T]):
 
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
-"""From one attempt to reach a camera to the next: each time twice as long."""
+"""Pause between attempts to connect; it doubles each time."""
 TAKE_S = 0.2
 PERIOD_FOLLOWS = 0.05
-"""How much of a step from picture to picture the estimate of them takes over."""
+"""Weight of the newest interval in the estimate of the interval between images."""
 
 log = logging.getLogger("viewmend.live")
 
 
 class CameraInput:
-    """Makes of one camera's pictures what is rendered from: small enough, masked, straightened."""
+    """Reduces, masks and undistorts the images of one camera."""
 
     def __init__(self, camera: LiveCamera) -> None:
         """Set up.
@@ -120,7 +120,7 @@ class CameraInput:
         self._undistortion = Undistortion(camera.calibration)
 
     def images(self, picture: Picture) -> CameraImages:
-        """A picture's images.
+        """The image and mask of a picture.
 
         Raises:
             ValueError: it has another size than the calibration.
@@ -138,7 +138,7 @@ class CameraInput:
 
 
 def pauses() -> Iterator[float]:
-    """How long there is from one attempt to reach a camera to the next."""
+    """Pauses between attempts to connect, seconds."""
     pause_s = FIRST_PAUSE_S
     while True:
         yield pause_s
@@ -146,7 +146,7 @@ def pauses() -> Iterator[float]:
 
 
 class CameraWorker:
-    """Two threads of one camera: one reads and decodes, one masks. Between them is one slot, where the newest wins."""
+    """Two threads of one camera: one reads and decodes, one makes masks of the newest image."""
 
     def __init__(
         self,
@@ -158,9 +158,9 @@ class CameraWorker:
         """Set up.
 
         Args:
-            camera: where it is.
-            connect: gives the pictures from now on, as a generator (`pictures_of`).
-            deliver: takes name, time and images of a picture that is done.
+            camera: its settings.
+            connect: returns a generator of images (`pictures_of`).
+            deliver: receives the camera's name, the time and the images.
             wants: whether an image with this timestamp and interval is needed.
 
         Raises:
@@ -169,13 +169,13 @@ class CameraWorker:
         self.camera = camera
         self.counts: Counter[str] = Counter()
         self.up = False
-        """Whether pictures come."""
+        """Whether the camera delivers images."""
         self.error: str | None = None
-        """Why not, or what is wrong with them."""
+        """Why not, or what is wrong with its images."""
         self._input = CameraInput(camera)
         self._connect, self._deliver, self._wants = connect, deliver, wants
         self._since_s = time.monotonic()
-        """Since when it is up, or not."""
+        """When `up` changed last."""
         self._last_s: float | None = None
         self._period_s = 0.0
         self._slot: Slot[Picture] = Slot()
@@ -186,27 +186,27 @@ class CameraWorker:
         ]
 
     def start(self) -> None:
-        """Begin."""
+        """Start both threads."""
         for thread in self._threads:
             thread.start()
 
     def ask_to_stop(self) -> None:
-        """Begin to end; `stop` waits for it."""
+        """Request the end; `stop` waits for it."""
         self._stopped.set()
 
     def stop(self) -> None:
-        """End; a camera that is silent is left alone after some seconds."""
+        """End; a silent camera is abandoned after a few seconds."""
         self._stopped.set()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=3)
 
     def wait(self, seconds: float) -> bool:
-        """Wait; whether the worker is to end."""
+        """Wait; returns whether the worker must end."""
         return self._stopped.wait(max(0.0, seconds)) if seconds > 0 else self._stopped.is_set()
 
     def read(self) -> None:
-        """Read, and reach the camera again when it fails, until stopped."""
+        """Read images, reconnecting after failures, until stopped."""
         pause = pauses()
         while not self._stopped.is_set():
             began_s = time.monotonic()
@@ -221,13 +221,13 @@ class CameraWorker:
                             return
                 if not self._stopped.is_set():
                     self._is_down("its pictures have ended")
-            except Exception as error:  # whatever a camera does wrong, it is said, and tried again
+            except Exception as error:  # any failure is reported, and the camera tried again
                 self._is_down(str(error) or type(error).__name__)
             if self.wait(began_s + next(pause) - time.monotonic()):
                 return
 
     def work(self) -> None:
-        """Make images of the newest picture, again and again, until stopped."""
+        """Process the newest image, again and again, until stopped."""
         while not self._stopped.is_set():
             picture = self._slot.take(TAKE_S)
             if picture is None:
@@ -241,7 +241,7 @@ class CameraWorker:
             self._deliver(self.camera.name, picture.taken_s, images)
 
     def _offer(self, picture: Picture) -> None:
-        """Put a picture into the slot if its time is wanted."""
+        """Pass on an image if its time is wanted."""
         if self._last_s is not None and 0 < picture.taken_s - self._last_s < 1:
             step_s = picture.taken_s - self._last_s
             self._period_s += PERIOD_FOLLOWS * (step_s - self._period_s) if self._period_s else step_s
@@ -265,7 +265,7 @@ class CameraWorker:
         self._say(reason)
 
     def _say(self, error: str) -> None:
-        """Tell what is wrong, once until it changes."""
+        """Report an error, once until it changes."""
         if error != self.error:
             log.warning("camera '%s': %s", self.camera.name, error)
         self.error = error

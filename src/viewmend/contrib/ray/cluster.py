@@ -16,10 +16,10 @@ LOCAL = "local"
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}
 """Disables usage reports."""
 ON_LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-"""How Ray calls it that a cluster's own sockets are bound to 127.0.0.1, as on systems where it has no others."""
+"""Binds a cluster's sockets to 127.0.0.1."""
 
 AS_URGENT = {"RAY_worker_niceness": "0"}
-"""Work has the priority of the command that asks for it; by itself Ray gives it less than anything else has."""
+"""Gives work the priority of the command that started it; Ray's default is the lowest."""
 
 
 def find_ray(address: str) -> Any:
@@ -38,9 +38,7 @@ def find_ray(address: str) -> Any:
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ValueError(
-            "expected Ray for --ray, got none; install viewmend's extra 'ray', or leave --ray away"
-        ) from error
+        raise ValueError("expected Ray for --ray, got none; install viewmend's extra 'ray', or omit --ray") from error
     return ray
 
 
@@ -48,7 +46,7 @@ def connect(ray: Any, address: str, **own: object) -> None:
     """Connect to a running cluster, or start one of this machine alone.
 
     Args:
-        ray: what `find_ray` gave.
+        ray: the module, from `find_ray`.
         address: of a running cluster (HOST:PORT, ray://HOST:PORT, auto), or `LOCAL`.
         own: options of `ray.init` for a cluster that is started.
 

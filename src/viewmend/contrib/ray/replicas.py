@@ -27,16 +27,16 @@ from viewmend.utils.heap import configure_allocator, freeze_loaded_objects
 NAME = "viewmend"
 """Serve's name for the application."""
 ANSWER_S = 30.0
-"""So much longer than it was asked to wait an ingest may take for an answer: it may be carving."""
+"""Extra timeout for calls of the ingest, which may be computing a hull."""
 READY_S = 120.0
-"""A replica takes viewers when it has rendered its first view, or after this long."""
+"""A replica accepts viewers after its first rendered view, or after this time."""
 SPARE_REQUESTS = 8
-"""Requests of a replica besides its viewers: pictures, paths, /health."""
+"""Requests per replica in addition to its viewers: images, paths, /health."""
 WELL_FILLED = 0.75
-"""Replicas are added where more than this part of all places is taken."""
+"""Replicas are added if more than this fraction of all viewers' places is taken."""
 STOPPING_S = 5.0
 INGEST_SHARE, REPLICAS_SHARE = 0.4, 0.4
-"""Parts of the store: what the ingest keeps, and what all replicas of one machine may still use of what it dropped."""
+"""Fractions of the store for frames of the ingest, and for older frames that a machine's replicas still use."""
 REPLICAS_A_MACHINE = 8
 
 
@@ -45,24 +45,24 @@ class ManyViewers:
     """What is served, and how many replicas render it."""
 
     open_source: Callable[[], FrameSource]
-    """Called where the cameras are read; ValueError or OSError for a source that cannot be."""
+    """Called in the process that reads the cameras; raises ValueError or OSError."""
     load_inpainter: Callable[[], Inpainter]
     server: ServerConfig
     stream: StreamConfig
     device: str
     replicas: tuple[int, int]
-    """How many at least, and at most."""
+    """Minimum and maximum number."""
     store_mb: float
-    """A machine's shared memory."""
+    """Shared memory per machine."""
 
     @property
     def replica_mb(self) -> float:
-        """What one replica may use of it."""
+        """Shared memory per replica."""
         return REPLICAS_SHARE * self.store_mb / min(self.replicas[1], REPLICAS_A_MACHINE)
 
 
 class IngestActor:
-    """The ingest as an actor. The source is opened by the first call, so that what is wrong with it is an answer."""
+    """The ingest as an actor. The first call opens the source, so that its errors reach the caller."""
 
     def __init__(self, served: ManyViewers, put: Callable[[SharedFrame], Any]) -> None:
         configure_allocator()
@@ -89,7 +89,7 @@ class IngestActor:
 
 
 class RayIngest:
-    """The way to the ingest's actor. What it gives is read from this machine's object store, where it lies."""
+    """The connection to the ingest's actor. Frames are read from this machine's object store without copies."""
 
     def __init__(self, actor: Any) -> None:
         self._actor = actor
@@ -115,10 +115,10 @@ class RayIngest:
 
 @contextlib.contextmanager
 def serving(served: ManyViewers, address: str) -> Iterator[str]:
-    """Serve on a cluster until the context ends; the address for viewers, once replicas are ready for them.
+    """Serve on a cluster within the context; yields the viewers' address once replicas are ready.
 
     Args:
-        served: what, and how.
+        served: what is served.
         address: of a running cluster, or `cluster.LOCAL`.
 
     Raises:
@@ -136,7 +136,7 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
 
     try:
         _demand_no_serve(ray)
-        calls = 4 * served.replicas[1] + 8  # two questions a replica, and as many of those that it replaces
+        calls = 4 * served.replicas[1] + 8  # two calls per replica, and per replica that is being replaced
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_concurrency=calls)(IngestActor)
         ingest = actor.remote(served, _put)
         opened = ingest.state.remote(-1, 0.0, False)
@@ -147,7 +147,7 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
         try:
             yield f"http://{f'[{host}]' if ':' in host else host}:{port}"
         finally:
-            if address != LOCAL:  # which ends as a whole
+            if address != LOCAL:  # a local cluster ends as a whole
                 serve.shutdown()
                 ray.kill(ingest)
     finally:
@@ -155,7 +155,7 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
 
 
 def _application(serve: Any, served: ManyViewers, ingest: Any) -> Any:
-    """What Serve runs: replicas of the live server's application."""
+    """Serve's deployment: replicas of the live server's application."""
 
     def build() -> StartWhenReady:
         return _replica(served, RayIngest(ingest))
@@ -197,7 +197,7 @@ class StartWhenReady:
 
 
 class _Replica:
-    """Holds the application; Serve's ingress adds what it is called by."""
+    """Holds the application; Serve's ingress adds its methods."""
 
 
 def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
@@ -221,7 +221,7 @@ def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
 
 
 def _put(shared: SharedFrame) -> list[Any]:
-    """The time, in the object store; its reference in a list, so that who is handed it fetches it himself."""
+    """Store a frame; its reference is in a list so that Ray does not resolve it for the caller."""
     import ray  # pyright: ignore[reportMissingImports]
 
     return [ray.put(shared)]  # pyright: ignore
@@ -240,7 +240,7 @@ def _demand_no_serve(ray: Any) -> None:
 
 
 def _demand(ray: Any, opened: Any) -> None:
-    """See that the source is open; what is wrong with it is said in its own words."""
+    """Wait until the source is open; its own errors are raised."""
     try:
         ray.get(opened)
     except ray.exceptions.RayTaskError as error:
@@ -250,7 +250,7 @@ def _demand(ray: Any, opened: Any) -> None:
 
 
 def _free_port(host: str, port: int) -> int:
-    """The port, or a free one for 0: what Ray says of one that is taken is long, and comes late.
+    """The port, or a free one for 0; checked here because Ray reports a used port late and at length.
 
     Raises:
         OSError: it is in use.

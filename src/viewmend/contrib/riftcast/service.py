@@ -1,4 +1,9 @@
-"""A server for RIFTCast's clients, which request RGB-D views over plain TCP (protocol 1.3)."""
+"""A server for RIFTCast's clients, which request RGB-D views over plain TCP (protocol 1.3).
+
+A message is four bytes of length, then a head of 8 bytes (major and minor version, task). Lengths and counts are
+big-endian, heads and matrices little-endian; matrices are OpenGL's, column by column, and cameras look along -z. A
+request is answered at once: by the image of the previous request if that is finished, otherwise by "no update".
+"""
 
 import asyncio
 import contextlib
@@ -32,27 +37,27 @@ LARGEST = 4096
 STEPS_PER_M = 5000
 """Depth is sent in fifths of a millimetre."""
 BACKGROUND_M = 10.0
-"""Depth of what shows no subject: farther than clients draw."""
+"""Depth of pixels without a subject: farther than clients draw."""
 NEAR_M, FAR_M = 0.01, 10.0
-"""Projections that are sent reach from here to there."""
+"""Clipping planes of the projections that are sent."""
 
 
 @dataclass(frozen=True)
 class ImageRequest:
-    """A picture that is asked for."""
+    """A requested image."""
 
     width: int
     height: int
     camera: Camera
     world_from_clip: bytes
-    """The inverse of projection times view: goes back with the picture, so that its pixels find their places."""
+    """The inverse of projection times view, which is returned with the image to locate its pixels."""
 
 
 def parse(message: bytes) -> ImageRequest | int:
-    """What a client says: a request of a picture, or the number of another one without a body.
+    """Read a client's message: a request for an image, or the number of a request without a body.
 
     Raises:
-        ProtocolError: it is of another version, broken off, or asks for a view that is none.
+        ProtocolError: it is of another version, truncated, or requests an impossible view.
     """
     if len(message) < HEAD.size:
         raise ProtocolError(f"expected a head of {HEAD.size} bytes, got {len(message)}")
@@ -68,17 +73,17 @@ def parse(message: bytes) -> ImageRequest | int:
     (projection_bytes,) = struct.unpack_from(">I", body, 76)
     if (view_bytes, projection_bytes) != (64, 64):
         raise ProtocolError(f"expected two matrices of 64 bytes, got {view_bytes} and {projection_bytes}")
-    with np.errstate(all="ignore"):  # what comes of odd numbers is looked at
+    with np.errstate(all="ignore"):  # results are checked
         view, projection = (np.frombuffer(body, "<f4", 16, at).reshape(4, 4).T.astype(float) for at in (12, 80))
         camera = camera_of(view, projection, width, height)
         return ImageRequest(width, height, camera, _inverse(projection @ view))
 
 
 def camera_of(view: Float[np.ndarray, "4 4"], projection: Float[np.ndarray, "4 4"], width: int, height: int) -> Camera:
-    """OpenGL's matrices as a camera of ours, for pictures of this size.
+    """The camera of OpenGL's matrices, for images of this size.
 
     Raises:
-        ProtocolError: they are not finite, the view is no rigid motion, or the projection no perspective.
+        ProtocolError: they are not finite, or the projection is not a perspective one.
     """
     if not (np.isfinite(view).all() and np.isfinite(projection).all() and np.abs(view).max() < 1e4):
         raise ProtocolError("expected matrices of finite numbers, got others")
@@ -104,12 +109,12 @@ def _inverse(matrix: Float[np.ndarray, "4 4"]) -> bytes:
 
 
 def update(request: ImageRequest, jpeg: bytes, depth: Float[Tensor, "height width"]) -> bytes:
-    """A picture that was asked for, upright, and its depth, bottom-up and packed by Zstandard.
+    """A requested image, top row first, and its depth, bottom row first and compressed by Zstandard.
 
     Args:
-        request: which it answers.
-        jpeg: the picture.
-        depth: z-depth, metres; 0 where nothing is shown.
+        request: the request.
+        jpeg: the image.
+        depth: z-depth, metres; 0 without subject.
     """
     import zstandard
 
@@ -118,14 +123,14 @@ def update(request: ImageRequest, jpeg: bytes, depth: Float[Tensor, "height widt
 
 
 def depth_steps(depth: Float[Tensor, "height width"]) -> UInt16[np.ndarray, "height width"]:
-    """Depth in steps, the bottom row first; clients take numbers from 32768 on for nothing."""
+    """Depth in steps, the bottom row first; clients treat numbers from 32768 as empty."""
     z = depth.double().cpu().numpy()[::-1]
     steps = np.rint(np.where(z > 0, np.minimum(z, BACKGROUND_M), BACKGROUND_M) * STEPS_PER_M)
     return np.ascontiguousarray(steps, dtype="<u2")
 
 
 def no_update() -> bytes:
-    """There is no new picture yet."""
+    """The answer if there is no new image yet."""
     return _head(NO_UPDATE)
 
 
@@ -162,7 +167,7 @@ def _head(task: int) -> bytes:
 
 
 def framed(message: bytes) -> bytes:
-    """The message with its length before it."""
+    """The message after its length."""
     return struct.pack(">I", len(message)) + message
 
 

@@ -22,7 +22,7 @@ class NetworkMasks:
     inputs (BackgroundMattingV2) come at full size, one (MODNet) reduced. Two are in [0, 1], one is in [-1, 1].
 
     Raises:
-        ValueError: the file is no such network, it wants a plate and there is none, or onnxruntime is not installed.
+        ValueError: the file is no such network, or it needs a plate and there is none.
     """
 
     def __init__(self, file: Path, plate: Rgb | None = None):
@@ -83,10 +83,8 @@ class NetworkMasks:
 
 
 def _session(file: Path):
-    try:
-        import onnxruntime
-    except ImportError:
-        raise ValueError("--method onnx needs onnxruntime: pip install onnxruntime") from None
+    import onnxruntime
+
     if not file.is_file():
         raise ValueError(f"{file}: expected a network as an ONNX file, got no file; check --network")
     try:

@@ -56,11 +56,7 @@ class Roi:
 
 
 class PersonMasks:
-    """Masks of the people in one camera, tracked from image to image.
-
-    Raises:
-        ValueError: onnxruntime is not installed.
-    """
+    """Masks of the people in one camera, tracked from image to image."""
 
     def __init__(self) -> None:
         self._tracked: list[Roi] = []
@@ -93,10 +89,8 @@ def _same(a: Roi, b: Roi) -> bool:
 
 @cache
 def _session(name: str):
-    try:
-        import onnxruntime
-    except ImportError:
-        raise ValueError("--method person needs onnxruntime: pip install onnxruntime") from None
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     return onnxruntime.InferenceSession(WEIGHTS / f"{name}.onnx", options, providers=["CPUExecutionProvider"])
