@@ -39,7 +39,7 @@ COLLECT = """
 @contextmanager
 def served(options: list[str]) -> Iterator[str]:
     """The address of `viewmend serve` in another process."""
-    command = [sys.executable, "-m", "viewmend.cli", "serve", "--port", "0", *options]
+    command = [sys.executable, "-m", "viewmend", "serve", "--port", "0", *options]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             assert process.stdout is not None

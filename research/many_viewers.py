@@ -37,7 +37,7 @@ LOST_S = 60.0
 @contextlib.contextmanager
 def served(*options: str):
     """Process and address of a server with two replicas."""
-    command = [sys.executable, "-m", "viewmend.cli", "serve", "--ray", "local", "--port", "0", *STUDIO, *options]
+    command = [sys.executable, "-m", "viewmend", "serve", "--ray", "local", "--port", "0", *STUDIO, *options]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"}
     ) as server:

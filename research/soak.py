@@ -163,7 +163,7 @@ def main() -> int:
     parser.add_argument("--memory-mb", type=float, default=400.0, help="memory of the server's stores")
     parser.add_argument("--write", action="store_true", help="write the result to benchmarks/results")
     options = parser.parse_args()
-    command = [sys.executable, "-m", "viewmend.cli", "serve", "live", "--port", "0"]
+    command = [sys.executable, "-m", "viewmend", "serve", "live", "--port", "0"]
     command += ["--memory-mb", str(options.memory_mb), "--viewers", str(options.viewers + 4)]
     with subprocess.Popen(
         command, stderr=subprocess.PIPE, text=True, env=os.environ | {"VIEWMEND_TOKEN": TOKEN}

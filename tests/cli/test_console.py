@@ -8,7 +8,7 @@ from time import sleep
 
 import pytest
 
-from viewmend.cli import console, main, signals
+from viewmend.cli import console, main
 from viewmend.cli.console import busy, printable, say, show, track
 
 
@@ -52,7 +52,7 @@ def test_an_empty_value_is_refused(arguments, capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys):
     before = signal.getsignal(number)
-    with signals.stop_requests() as stopped:
+    with console.stop_requests() as stopped:
         assert not stopped()
         os.kill(os.getpid(), number)
         assert stopped() == number and "saving a checkpoint" in capsys.readouterr().err
@@ -65,8 +65,8 @@ def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys)
 def test_sigterm_lets_a_command_clean_up(tmp_path):
     program = (
         "import pathlib, sys, time\n"
-        "from viewmend.cli import signals\n"
-        "with signals.exit_on_sigterm():\n"
+        "from viewmend.cli import console\n"
+        "with console.exit_on_sigterm():\n"
         "    try:\n        print('begun', flush=True)\n        time.sleep(20)\n"
         "    finally:\n        pathlib.Path(sys.argv[1]).write_text('cleaned')\n"
     )

@@ -53,7 +53,7 @@ def test_a_capture_without_masks_is_refused(tmp_path, capsys):
 def test_one_command_and_a_picture(sent):
     options = ["--port", "0", "--size", "96", "--cameras", "4", "--frames", "2", "--model", "nearest"]
     options += ["--broadcast", "96x64"]
-    command = [sys.executable, "-m", "viewmend.cli", "serve", *options]
+    command = [sys.executable, "-m", "viewmend", "serve", *options]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as server:
         assert server.stderr is not None

@@ -8,8 +8,7 @@ import torch
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers
 from viewmend.geometry.rigid import look_at
-from viewmend.preprocess.masks.chroma import ChromaMasks, without_spill
-from viewmend.preprocess.masks.maker import MaskMaker, lasting
+from viewmend.preprocess.masks.maker import ChromaMasks, MaskMaker, lasting, without_spill
 from viewmend.preprocess.masks.masked import agreed
 from viewmend.preprocess.masks.plate import PlateMasks, median_plate
 

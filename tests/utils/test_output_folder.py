@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from viewmend.cli import signals
+from viewmend.cli import console
 from viewmend.cli.evaluate import report_folder
 from viewmend.data.native_writer import atomic_folder
 from viewmend.utils.output_folder import OutputFolder
@@ -46,7 +46,7 @@ def test_a_signal_waits_until_what_is_unfinished_is_gone(tmp_path, monkeypatch):
 
     for written in (OutputFolder, atomic_folder):
         out = tmp_path / written.__name__
-        with signals.exit_on_sigterm(), pytest.raises(SystemExit) as ended, written(out) as folder:
+        with console.exit_on_sigterm(), pytest.raises(SystemExit) as ended, written(out) as folder:
             (folder.draft if isinstance(folder, OutputFolder) else folder).mkdir(exist_ok=True)
             monkeypatch.setattr(shutil, "rmtree", disturbed)
         monkeypatch.undo()

@@ -17,8 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from viewmend import __version__
-from viewmend.cli.console import say
-from viewmend.cli.signals import exit_on_sigterm
+from viewmend.cli.console import exit_on_sigterm, say
 from viewmend.utils.logging import escaped_traceback, log_to_terminal
 
 

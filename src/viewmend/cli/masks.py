@@ -83,7 +83,7 @@ def _check(options: Options) -> None:
 
 def _masked(options: Options, capture: "NativeCapture", part) -> "MaskedCapture":
     from viewmend.cli.checks import chosen_times
-    from viewmend.preprocess.masks.chroma import KEYS, ChromaMasks
+    from viewmend.preprocess.masks.maker import KEYS, ChromaMasks
     from viewmend.preprocess.masks.masked import MaskedCapture
     from viewmend.preprocess.masks.network import NetworkMasks
     from viewmend.preprocess.masks.person import PersonMasks

@@ -248,8 +248,7 @@ def _make_studio(options: Options) -> "CaptureSource":
 
 def _serve_on_ray(options: Options, address: str) -> NoReturn:
     """Serve on a Ray cluster until interrupted: one process reads the rig, several render."""
-    from viewmend.cli.console import say
-    from viewmend.cli.signals import exit_on_sigterm
+    from viewmend.cli.console import exit_on_sigterm, say
     from viewmend.live.auth import is_loopback
     from viewmend.live.protocol import token_query
     from viewmend.models.registry import METHODS, shipped_models

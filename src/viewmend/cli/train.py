@@ -80,8 +80,7 @@ def run(options: Options) -> int:
     """
     import os
 
-    from viewmend.cli.console import say
-    from viewmend.cli.signals import stop_requests
+    from viewmend.cli.console import say, stop_requests
     from viewmend.training.loop import train
 
     with _Reporter() as reporter, stop_requests() as stopped:

@@ -101,7 +101,7 @@ def asked(address, path, headers):
 def started(*options):
     """The command, once it has printed its address."""
     pytest.importorskip("ray", reason="Ray is not installed")
-    command = [sys.executable, "-m", "viewmend.cli", "serve", "--ray", "local", *options]
+    command = [sys.executable, "-m", "viewmend", "serve", "--ray", "local", *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         assert server.stderr is not None
         try:
@@ -137,7 +137,7 @@ def test_a_viewer_reconnects_when_its_replica_is_killed():
 def test_an_unusable_source_is_the_same_error_as_without_ray(tmp_path):
     pytest.importorskip("ray", reason="Ray is not installed")
     (tmp_path / "empty").mkdir()
-    command = [sys.executable, "-m", "viewmend.cli", "serve", str(tmp_path / "empty"), "--ray", "local", "--port", "0"]
+    command = [sys.executable, "-m", "viewmend", "serve", str(tmp_path / "empty"), "--ray", "local", "--port", "0"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
     alone = subprocess.run([*command[:-4], "--port", "0"], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == alone.returncode == 2 and alone.stderr.strip()

@@ -11,7 +11,7 @@ import torch
 from pxr import Gf, Usd, UsdGeom
 from reference.ball import ring
 
-from viewmend.export.scene_files import blender_script, engine_from_world, usd_scene
+from viewmend.export.scene import blender_script, engine_from_world, usd_scene
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
 
 POINTS = torch.tensor([[0.1, 0.2, 0.3], [-0.3, 0.1, 0.0], [0.0, -0.2, 0.1]])

@@ -23,7 +23,7 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    command = [sys.executable, "-m", "viewmend.cli", "serve", *SCENE]
+    command = [sys.executable, "-m", "viewmend", "serve", *SCENE]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             said = []

@@ -14,8 +14,7 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import reconstruct
-from viewmend.preprocess.masks.chroma import without_spill
-from viewmend.preprocess.masks.maker import MaskMaker, Rgb, lasting
+from viewmend.preprocess.masks.maker import MaskMaker, Rgb, lasting, without_spill
 from viewmend.types import MultiViewFrame
 
 CARVED_PX = 480
