@@ -27,7 +27,7 @@ SIZE_STEP_PX = STEP_PX * ZONES
 
 
 class FeedForward(nn.Module):
-    """Linear, ReLU, linear; keys `conv.0` and `conv.3` (the official dropout between them drops nothing)."""
+    """Linear, ReLU, linear; keys `conv.0` and `conv.3` (the official dropout between them is inactive)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class DecoupledBlock(TokenBlock):
     def forward(
         self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
     ) -> tuple[TokenClips, TokenClips]:
-        """See `TokenBlock`; a spatial block looks at no memory."""
+        """See `TokenBlock`; a spatial block does not use the memory."""
         own = self.norm1(tokens)
         x = own + (self._over_time(own, memory) if self.temporal else self._over_frames(own))
         return x + self.ffn(self.norm2(x)), own

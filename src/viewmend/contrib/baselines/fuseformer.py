@@ -61,7 +61,7 @@ class PositionalEmbedding(nn.Module):
         nn.init.normal_(self.pos_emb, 0, 0.02)
 
     def forward(self, tokens: Float[Tensor, "frame rows cols 512"]) -> Float[Tensor, "frame rows cols 512"]:
-        """Tokens that know their place."""
+        """Tokens with their positional embedding."""
         everywhere = self.pos_emb.reshape(*TOKENS, DIM).movedim(-1, 0)
         return tokens + part_of(everywhere, (tokens.shape[1], tokens.shape[2])).movedim(0, -1)
 
@@ -84,7 +84,7 @@ class FuseFormer(TokenTransformer):
     def check_size(self, height: int, width: int) -> None:
         """ValueError unless the frame is 432x240: positional embedding and bias map are learned for this size.
 
-        In training smaller frames of multiples of 12 px will do: each looks at a part of these maps.
+        In training, smaller frames of multiples of 12 px are allowed; each uses a part of these maps.
         """
         part = 0 < height <= NATIVE_PX[0] and 0 < width <= NATIVE_PX[1] and not (height % STEP_PX or width % STEP_PX)
         if (height, width) != NATIVE_PX and not (self.training and part):
@@ -94,7 +94,7 @@ class FuseFormer(TokenTransformer):
             )
 
     def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
-        """Tokens of overlapping patches that know their place."""
+        """Tokens of overlapping patches with their positional embedding."""
         return self.add_pos_emb(self.ss(features))
 
     def decode(

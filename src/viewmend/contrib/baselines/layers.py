@@ -13,7 +13,7 @@ SLOPE = 0.2
 STRIDE_PX = 4
 """Pixels per feature cell."""
 SHALLOW, FEATURES = 256, 128
-"""Channels after the first four convolutions (what later ones see again) and at the end."""
+"""Channels after the first four convolutions (input of all later ones, too) and at the end."""
 
 
 class HierarchicalEncoder(nn.Module):
@@ -73,7 +73,7 @@ class FrameDecoder(nn.Sequential):
 
     def forward(self, features: Float[Tensor, "frame 128 rows cols"]) -> Float[Tensor, "frame 3 height width"]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Frames of four times the size, in [-1, 1]."""
-        # Not in bfloat16, where tanh near 1 is 1 and has no slope: who learned black would never leave it.
+        # Not in bfloat16, where tanh near 1 has no slope: a network that outputs black could never change.
         return super().forward(features).float().tanh()
 
 
@@ -86,7 +86,7 @@ def shallow_layers(channels: int = 3) -> nn.Sequential:
 def with_skips(
     layers: list[nn.Module], shallow: Float[Tensor, "frame 256 rows cols"]
 ) -> Float[Tensor, "frame channel rows cols"]:
-    """Runs the layers; every convolution but the first also sees `shallow`, a slice of it for each of its groups."""
+    """Run the layers; every convolution but the first also takes `shallow`, a slice of it per group."""
     features = shallow
     for number, layer in enumerate(layers):
         if number > 0 and isinstance(layer, nn.Conv2d):
@@ -132,7 +132,7 @@ def token_grid(height: int, width: int) -> tuple[int, int]:
 
 
 def part_of(learned: Float[Tensor, "channel rows cols"], size: tuple[int, int]) -> Float[Tensor, "channel _r _c"]:
-    """A map learned for frames of one size; in training on smaller frames, a part of it, each time another."""
+    """A map learned for frames of one size; a random part of it for smaller frames in training."""
     spare = [whole - part for whole, part in zip(learned.shape[-2:], size, strict=True)]
     top, left = (int(torch.randint(n + 1, ())) if n else 0 for n in spare)
     return learned[:, top : top + size[0], left : left + size[1]]
@@ -175,8 +175,8 @@ class SoftComposition(nn.Module):
 class FusionFeedForward(nn.Module):
     """Feed-forward whose hidden patches are averaged where they overlap; keys `conv1.0` and `conv2.<last>`.
 
-    `between` is what stands before the second linear layer and so counts in its key: FuseFormer has a ReLU and a
-    dropout (that drops nothing), `conv2.2`; E2FGVI a GELU alone, `conv2.1`.
+    `between` are the layers before the second linear layer, whose number is in its key: FuseFormer has a ReLU and an
+    (inactive) dropout, `conv2.2`; E2FGVI has a GELU, `conv2.1`.
     """
 
     def __init__(self, *between: nn.Module) -> None:

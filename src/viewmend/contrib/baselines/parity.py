@@ -1,4 +1,4 @@
-"""Does a baseline compute what the published network computes? Weights and inputs that anyone can make again."""
+"""Compares baselines with outputs of the published networks, for reproducible weights and inputs."""
 
 import math
 import zlib
@@ -18,22 +18,22 @@ from viewmend.contrib.baselines.token_transformer import NATIVE_PX, MemorySlot, 
 from viewmend.utils.untrusted_input import InputError
 
 TOLERANCE = 1e-3
-"""Largest absolute difference, in a range of [-1, 1], of two float32 networks that are the same."""
+"""Largest absolute difference, for outputs in [-1, 1], of two equal float32 networks."""
 STRIDE_PX = 6
 """Files keep every sixth row and column of the output."""
 OWN_VALUES = ("valid_ind_rolled", "update_spynet.mean", "update_spynet.std")
 """Entries of a state dict that keep their values: constants, not weights."""
 FIELDS = ("name", "frames", "seed", "output", "mean", "std")
-"""What every file has; `n_local` only those of networks that have one."""
+"""Fields of every file; files of E2FGVI also have `n_local`."""
 
 
 class ParityFileError(InputError):
-    """A file that is no parity file: what was expected, what came, the next step."""
+    """A file that is not a parity file: what was expected, what was found, the next step."""
 
 
 @dataclass(frozen=True)
 class ParityCase:
-    """One file: what was run, and what came out of the published network."""
+    """One file: the published network's name, inputs and outputs."""
 
     name: str
     frames: int
@@ -49,7 +49,7 @@ class ParityCase:
 
 @dataclass(frozen=True)
 class ParityResult:
-    """How far ours is from one file."""
+    """Differences of our network from one file."""
 
     name: str
     frames: int
@@ -67,10 +67,10 @@ class ParityResult:
 
 
 def check(path: str | Path, device: torch.device | str = "cpu") -> ParityResult:
-    """Makes the file's weights and inputs, runs our network, and compares.
+    """Generate the file's weights and inputs, run our network, and compare.
 
     Raises:
-        ParityFileError: the file is missing, damaged, of another format, or of a network that is not known.
+        ParityFileError: the file is missing, damaged, of another format, or of an unknown network.
     """
     case = read_case(path)
     output = run(case.name, case.frames, case.seed, case.n_local, device).cpu()
@@ -87,7 +87,7 @@ def check(path: str | Path, device: torch.device | str = "cpu") -> ParityResult:
 
 
 def read_case(path: str | Path) -> ParityCase:
-    """The file's contents; ParityFileError where it cannot be one."""
+    """The file's contents; ParityFileError if it is not a parity file."""
     path = Path(path)
     if not path.is_file():
         raise ParityFileError(f"{path}: expected a parity file (.npz), found none; check the path")
@@ -106,7 +106,7 @@ def read_case(path: str | Path) -> ParityCase:
 
 
 def _case(values: dict[str, np.ndarray]) -> ParityCase:
-    """ValueError or TypeError where a field is not what it must be."""
+    """ValueError or TypeError for an invalid field."""
     numbers = [values.get(field, np.array(0)).item() for field in ("frames", "seed", "n_local")]
     if any(number != int(number) for number in numbers):
         raise ValueError(f"expected whole numbers of frames, seed and n_local, got {numbers}")
@@ -133,7 +133,7 @@ def _case(values: dict[str, np.ndarray]) -> ParityCase:
 def run(
     name: str, frames: int, seed: int, n_local: int = 0, device: torch.device | str = "cpu"
 ) -> Float[Tensor, "frame 3 height width"]:
-    """What our network of this name makes of the recipe's input with the recipe's weights."""
+    """The output of our network of this name for the recipe's weights and input."""
     make, compute = NETWORKS[name]
     network = make()
     network.load_state_dict(recipe_weights(network, seed))
@@ -142,7 +142,7 @@ def run(
 
 
 def recipe_weights(network: nn.Module, seed: int) -> dict[str, Tensor]:
-    """Random weights that depend on nothing but each key, its shape and the seed."""
+    """Random weights that depend only on each key, its shape and the seed."""
     weights = {}
     for key, value in network.state_dict().items():
         if not value.is_floating_point() or key.endswith(OWN_VALUES):
@@ -164,7 +164,7 @@ def recipe_weights(network: nn.Module, seed: int) -> dict[str, Tensor]:
 
 
 def recipe_input(frames: int, seed: int) -> Float[Tensor, "frame 3 240 432"]:
-    """Coarse noise and fine noise in [-1, 1], with a hole of zeros that moves."""
+    """Coarse and fine noise in [-1, 1], with a moving hole of zeros."""
     height, width = NATIVE_PX
     generator = np.random.RandomState(seed)
     coarse = generator.uniform(-1, 1, (1, frames, 3, height // 8, width // 8)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What DSTT and FuseFormer share: frames to tokens, blocks of attention, tokens to frames; all at once or online."""
+"""Base of DSTT and FuseFormer: frames to tokens, blocks of attention, tokens to frames; all at once or online."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ NATIVE_PX = (240, 432)
 TokenClips = Float[Tensor, "sample frame rows cols 512"]
 """Tokens of clips in the grid of their patches."""
 MemorySlot = Float[Tensor, "block frame rows cols 512"]
-"""What the frames of one time leave behind: their tokens as each block's attention sees them, after its first norm."""
+"""The memory of one time: its frames' tokens as input to each block's attention, after the first norm."""
 
 
 class MultiHeadAttention(nn.Module):
-    """Scaled dot products of 4 heads; keys `query_embedding`, `key_embedding`, `value_embedding`, `output_linear`."""
+    """Attention with 4 heads; keys `query_embedding`, `key_embedding`, `value_embedding`, `output_linear`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class TokenBlock(nn.Module, ABC):
 
 
 class TokenTransformer(nn.Module, ABC):
-    """Frames with holes in, whole frames out; subclasses name the parts as the official checkpoints do."""
+    """From frames with holes to whole frames; subclasses name the parts as the official checkpoints do."""
 
     encoder: nn.Module
     transformer: nn.ModuleList
@@ -71,7 +71,7 @@ class TokenTransformer(nn.Module, ABC):
 
     @abstractmethod
     def check_size(self, height: int, width: int) -> None:
-        """ValueError for frames of a size that this network cannot take."""
+        """ValueError for frames of a size that this network does not support."""
 
     def encode(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
         """Features at a quarter of the size."""
@@ -96,7 +96,7 @@ class TokenTransformer(nn.Module, ABC):
             clips: frames in [-1, 1], 0 in the holes. Frames of a clip have no order.
 
         Raises:
-            ValueError: a size that the network cannot take.
+            ValueError: an unsupported size.
         """
         self.check_size(*clips.shape[-2:])
         features = self.encode(clips.flatten(0, 1))
@@ -112,12 +112,12 @@ class TokenTransformer(nn.Module, ABC):
     def complete_remembering(
         self, now: Frames, memory: Sequence[MemorySlot]
     ) -> tuple[Float[Tensor, "3 height width"], MemorySlot]:
-        """See `OnlineNetwork`: the frames of one time alone go through the network (Thiry et al., OM).
+        """See `OnlineNetwork`: only the frames of one time go through the network (Thiry et al., OM).
 
         The order of `memory` does not matter.
 
         Raises:
-            ValueError: a size that the network cannot take, or slots of another size.
+            ValueError: an unsupported size, or slots of another size.
         """
         self.check_size(*now.shape[-2:])
         features = self.encode(now)
