@@ -11,11 +11,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.models.base import Memory
-from viewmend.types import ContextViews, MultiViewFrame
+from viewmend.types import ContextViews, MultiViewFrame, Silhouettes
 from viewmend.utils.mmap_tensors import size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
@@ -114,13 +114,16 @@ class CachedFrame:
         return size_bytes(made)
 
 
-def cache_frame(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig) -> CachedFrame:
+def cache_frame(
+    frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig, carving: Silhouettes | None = None
+) -> CachedFrame:
     """Reconstruct the geometry proxy of one frame.
 
     Args:
         frame: the cameras' images and masks; use `frame.without` to leave out a camera.
         bounds: the volume that may contain the subject; None to find it from the masks.
         config: parameters of the visual hull.
+        carving: masks of more cameras that carve the hull, although their images are not used.
 
     Raises:
         ValueError: the frame has no masks, no foreground, or a single camera.
@@ -132,7 +135,13 @@ def cache_frame(frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig
         )
     device = frame.rgb.device
     start = now_s(device)
-    proxy = to_mmap(reconstruct(frame.mask, frame.cameras, bounds if bounds is None else bounds.to(device), config))
+    mask, cameras = frame.mask, frame.cameras
+    if carving is not None:
+        sizes = zip(mask.shape[1:], carving.mask.shape[1:], strict=True)
+        height, width = (max(both) for both in sizes)
+        padded = [F.pad(m, (0, width - m.shape[2], 0, height - m.shape[1])) for m in (mask, carving.mask)]
+        mask, cameras = torch.cat(padded), concatenate_cameras([cameras, carving.cameras])
+    proxy = to_mmap(reconstruct(mask, cameras, bounds if bounds is None else bounds.to(device), config))
     return CachedFrame(frame, proxy, ms_since(start, device))
 
 

@@ -10,6 +10,9 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from jaxtyping import Float
+from torch import Tensor
+
 from viewmend.frame_cache import CachedFrame, DepthProvider, cache_frame, evict
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -21,7 +24,14 @@ from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.error_mask import Evidence, decide_error_mask
 from viewmend.rendering.view import RenderConfig, render_view
-from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame
+from viewmend.types import (
+    CompletedView,
+    ContextViews,
+    IncompleteView,
+    MultiViewFrame,
+    Silhouettes,
+    check_target_mask,
+)
 from viewmend.utils.timing import StageTimes, ms_since, now_s
 
 
@@ -127,7 +137,9 @@ class Stream:
         """The state of a new viewer."""
         return self.inpainter.initial_state()
 
-    def add_frame(self, frame: MultiViewFrame, geometry: DepthProvider | None = None) -> CachedFrame:
+    def add_frame(
+        self, frame: MultiViewFrame, geometry: DepthProvider | None = None, carving: Silhouettes | None = None
+    ) -> CachedFrame:
         """Add a frame and compute its geometry proxy. A frame whose time is cached already is not replaced.
 
         Frames may come in any order and with gaps.
@@ -135,6 +147,7 @@ class Stream:
         Args:
             frame: the cameras' images; masks are needed unless `geometry` is given.
             geometry: replaces the visual hull. `view` and `render` need a `GeometryProxy`, `mend` any depth provider.
+            carving: masks of more cameras that carve the hull, although their images are not used.
 
         Raises:
             ValueError: no `geometry` is given, and the frame has no masks, no foreground, or a single camera.
@@ -142,7 +155,7 @@ class Stream:
         if frame.time not in self._frames:
             frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
             given = None if geometry is None else CachedFrame(frame, geometry)
-            self._frames[frame.time] = given or cache_frame(frame, self.bounds, self.config.hull)
+            self._frames[frame.time] = given or cache_frame(frame, self.bounds, self.config.hull, carving)
         self._frames.move_to_end(frame.time)
         evict(self._frames, frame.time, self.config.memory_mb)
         return self._frames[frame.time]
@@ -157,18 +170,26 @@ class Stream:
             raise ValueError(f"expected the time of a cached frame, {self.times}, got {time}; add its frame first")
         return self._frames[max(self._frames) if time is None else time]
 
-    def render(self, target: Cameras, time: int | None = None, exclude: Sequence[str] = ()) -> IncompleteView:
+    def render(
+        self,
+        target: Cameras,
+        time: int | None = None,
+        exclude: Sequence[str] = (),
+        target_mask: Float[Tensor, "height width"] | None = None,
+    ) -> IncompleteView:
         """Render a novel view from the source cameras, and decide its error mask: F, M and E of section 1.
 
         Args:
             target: the novel view's camera (one view), on the frames' device.
             time: index of the frame, by default the latest.
             exclude: names of cameras whose images must not be used.
+            target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
-            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, or no camera is left.
+            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, no camera is left, or
+                `target_mask` is not a mask of the view.
         """
-        part, evidence, crop = self._render(target, time, exclude, RenderQuality())
+        part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
         return crop.uncropped(self._with_error_mask(part, evidence, RenderQuality(), exclude), target)
 
     def mend(
@@ -190,11 +211,11 @@ class Stream:
             exclude: names of cameras whose images must not be used.
 
         Raises:
-            ValueError: the view's frame is not cached, the view names cameras that are not in the frame, or the
-                inpainter returns numbers that are not finite.
+            ValueError: the view's frame is not cached, the view names cameras that are not in the frame, its
+                `target_mask` is not a mask of it, or the inpainter returns numbers that are not finite.
         """
         quality = quality or RenderQuality()
-        view.check_cameras(self.cached_frame(view.time).frame.cameras.names)
+        view.check(self.cached_frame(view.time).frame.cameras.names)
         margin_px = self.inpainter.crop_margin_px(quality) if quality.mend else None
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
@@ -213,6 +234,7 @@ class Stream:
         time: int | None = None,
         quality: RenderQuality | None = None,
         exclude: Sequence[str] = (),
+        target_mask: Float[Tensor, "height width"] | None = None,
     ) -> StreamView:
         """Render and complete one novel view: `render`, then `mend`.
 
@@ -222,21 +244,28 @@ class Stream:
             time: index of the frame, by default the latest.
             quality: how much work the view may cost.
             exclude: names of cameras whose images must not be used.
+            target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
             ValueError: as `render` and `mend`.
         """
         quality = quality or RenderQuality()
         start = now_s(target.K.device)
-        part, evidence, crop = self._render(target, time, exclude, quality)
+        part, evidence, crop = self._render(target, time, exclude, quality, target_mask)
         rendering_ms = ms_since(start, target.K.device)
         made = self._complete(part, evidence, crop, viewer, quality, exclude, target=target)
         return replace(made, times=replace(made.times, rendering=rendering_ms))
 
     def _render(
-        self, target: Cameras, time: int | None, exclude: Sequence[str], quality: RenderQuality
+        self,
+        target: Cameras,
+        time: int | None,
+        exclude: Sequence[str],
+        quality: RenderQuality,
+        target_mask: Float[Tensor, "height width"] | None,
     ) -> tuple[IncompleteView, Evidence, Crop]:
         """Render the part of a view that shows the subject, with the inpainter's margin."""
+        check_target_mask(target_mask, target.max_size_px[::-1])
         cached = self.cached_frame(time)
         if not isinstance(cached.proxy, GeometryProxy):
             got = type(cached.proxy).__name__
@@ -246,6 +275,8 @@ class Stream:
         crop = mesh_crop(cached.proxy.mesh.vertices, target, *margin)
         camera, depth = crop.of_camera(target), cached.depth
         part, evidence = render_view(cached.frame, cached.proxy, camera, self.config.render, exclude, depth)
+        if target_mask is not None:
+            part = replace(part, target_mask=crop.of_image(target_mask).contiguous())
         return part, evidence, crop
 
     def _with_error_mask(
@@ -277,7 +308,7 @@ class Stream:
         part = self._with_error_mask(part, evidence, quality, exclude)
         if target is not None and self.inpainter.crop_margin_px(quality) is None:
             part, crop = crop.uncropped(part, target), Crop.all_of(target)
-        completed = CompletedView(part, part.rgb)
+        completed = CompletedView(part, part.cut_rgb)
         if quality.mend:
             with heavy_operations():
                 completed, viewer = self.inpainter.step_on(self.config.background, part, context, viewer)

@@ -248,6 +248,25 @@ class IncompleteView:
     re-synthesised. None: all pixels with E > 0 are."""
     part: WindowPart | None = None
     """Set if the view is a window of a larger one."""
+    target_mask: Float[Tensor, "height width"] | None = None
+    """M_t, the subject's true mask in this view, in [0, 1], where one is known: from a matting of the target camera, a
+    better silhouette, or the alpha of another model. It may be smaller than the proxy: the completed view shows nothing
+    outside of it. `rgb` is not multiplied by it. None: nothing is known beyond the proxy's silhouette."""
+
+    @property
+    def silhouette(self) -> Float[Tensor, "height width"]:
+        """Alpha of the rendered view: M, cut by `target_mask` if there is one."""
+        return self.mask if self.target_mask is None else self.mask * self.target_mask
+
+    @property
+    def cut_rgb(self) -> Float[Tensor, "3 height width"]:
+        """F, cut by `target_mask` if there is one."""
+        return self.rgb if self.target_mask is None else self.rgb * self.target_mask
+
+    @property
+    def missing(self) -> Float[Tensor, "height width"]:
+        """E where the subject may be: not outside of `target_mask`, if there is one."""
+        return self.error if self.target_mask is None else self.error * (self.target_mask > 0)
 
     @property
     def refine_mask(self) -> Bool[Tensor, "height width"]:
@@ -263,14 +282,31 @@ class IncompleteView:
         """Names of up to `count` cameras: the source views, then the closest other candidates."""
         return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
 
-    def check_cameras(self, known: Sequence[str]) -> None:
-        """ValueError if the view names cameras that are not among these."""
+    def check(self, known: Sequence[str]) -> None:
+        """ValueError if the view names cameras that are not among these, or its `target_mask` is not a mask of it."""
+        check_target_mask(self.target_mask, self.mask.shape)
         unknown = sorted({*self.source_views, *self.candidate_views} - set(known))
         if unknown:
             raise ValueError(
                 f"expected a view of cameras among {list(known)}, got {unknown}; correct source_views and "
                 "candidate_views"
             )
+
+
+def check_target_mask(mask: Tensor | None, shape: Sequence[int]) -> None:
+    """ValueError unless this is None, or numbers in [0, 1] of this height and width."""
+    if mask is None:
+        return
+    if tuple(mask.shape) != tuple(shape) or not mask.is_floating_point():
+        got = f"{mask.dtype} of shape {tuple(mask.shape)}"
+    elif not bool(((mask >= 0) & (mask <= 1)).all()):
+        got = f"values from {float(mask.min()):.3g} to {float(mask.max()):.3g}"
+    else:
+        return
+    raise ValueError(
+        f"expected a target_mask of floats in [0, 1] of shape {tuple(shape)} (height, width), got {got}; divide 8-bit "
+        "masks by 255, and give the mask of this view at its size"
+    )
 
 
 @dataclass(frozen=True)
@@ -290,10 +326,10 @@ class CompletedView:
 
     view: IncompleteView
     rgb: Float[Tensor, "3 height width"]
-    """Fhat, in [0, 1], on black; equal to `view.rgb` bit for bit where E is 0."""
+    """Fhat, in [0, 1], on black; equal to `view.cut_rgb` bit for bit where E is 0."""
     alpha: Float[Tensor, "height width"] | None = None
     """Coverage of each pixel by the subject, in [0, 1]; `rgb` is multiplied by it. None if the model does not predict
-    it: the subject is M then."""
+    it: the subject is the view's silhouette then."""
     confidence: Float[Tensor, "height width"] | None = None
     """Confidence of the model in each pixel, in [0, 1]; 0 where there is no subject. None if it predicts none."""
     depth: Float[Tensor, "height width"] | None = None
@@ -310,8 +346,8 @@ class CompletedView:
 
     @property
     def opacity(self) -> Float[Tensor, "height width"]:
-        """`alpha`, or M if the model predicts none."""
-        return self.view.mask if self.alpha is None else self.alpha
+        """`alpha`, or the view's silhouette if the model predicts none."""
+        return self.view.silhouette if self.alpha is None else self.alpha
 
     @property
     def surface_depth(self) -> Float[Tensor, "height width"]:

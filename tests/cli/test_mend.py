@@ -12,7 +12,7 @@ from live.live_servers import wait_until
 from reference import tells_all
 from reference.ball import camera_at
 
-from viewmend.cli import serve
+from viewmend.cli import main, serve
 from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
 from viewmend.data.prepare import open_masked, prepare
@@ -24,9 +24,10 @@ from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import picture
 
 KEYS = [
-    "frames", "background", "hole_fraction", "mended_fraction", "psnr_whole", "psnr_whole_rendered",
-    "psnr_whole_unseen", "ssim_whole", "psnr_subject", "alpha_iou", "psnr_valid", "psnr_holes", "psnr_holes_telea",
-    "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou", "stage_ms",
+    "frames", "protocol", "background", "hole_fraction", "mended_fraction", "psnr_whole", "psnr_whole_rendered",
+    "psnr_whole_unseen", "ssim_whole", "lpips_whole", "lpips_subject", "psnr_subject", "alpha_iou",
+    "psnr_valid", "psnr_holes", "psnr_holes_telea", "psnr_holes_fg", "psnr_holes_fg_telea", "hull_iou",
+    "stage_ms",
 ]  # fmt: skip
 
 
@@ -51,6 +52,21 @@ def test_a_camera_left_out_is_rendered_and_scored(folder, tmp_path, mend):
     sheet = cv2.imread(str(tmp_path / "out" / "contact_sheet.png"))
     assert sheet.shape[1] > 8 * 260 and sheet.std() > 20
     assert [f.name for f in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_protocol_says_what_is_known_of_the_camera_left_out(folder, tmp_path, mend, capsys):
+    reports = {}
+    for protocol in ("strict", "target-mask", "hull-with-target-mask"):
+        options = ("--leave-out", "held", "--frames", "0:1", "--protocol", protocol)
+        code, reports[protocol], _ = mend(folder, tmp_path / protocol, *options)
+        assert code == 0 and reports[protocol]["protocol"] == protocol
+    strict, given, carved = reports.values()
+    assert min(given["psnr_whole"], carved["psnr_whole"]) > strict["psnr_whole"] + 1
+    assert given["hole_fraction"] == strict["hole_fraction"] and given["alpha_iou"] > 0.99
+    assert given["hull_iou"]["held"] == strict["hull_iou"]["held"] < carved["hull_iou"]["held"]
+    command = ["mend", str(folder), "--out", str(tmp_path / "o"), "--path", "orbit", "--protocol", "target-mask"]
+    assert main(command) == 2
+    assert "expected --leave-out with --protocol target-mask" in capsys.readouterr().err
 
 
 def test_the_whole_subject_may_be_mended(folder, tmp_path, mend):

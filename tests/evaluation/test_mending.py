@@ -29,13 +29,15 @@ def test_each_figure_has_its_own_name():
         fill: ViewScores(**{name: (int if name in counts else float)(100 * n + k) for k, name in enumerate(names)})
         for n, fill in enumerate(("unfilled", "telea", "holes_only", "ours"), 1)
     }
-    summary = MendSummary()
+    summary = MendSummary("target-mask")
     summary._scores.append(FillScores(**fills))
     report = summary.as_json()
     for kind in ("holes", "holes_fg"):
         assert report[f"psnr_{kind}_telea"] == getattr(fills["telea"], f"psnr_{kind}")
     for name in ("psnr_whole", "psnr_subject", "psnr_valid", "psnr_holes", "psnr_holes_fg", "ssim_whole", "alpha_iou"):
         assert report[name] == getattr(fills["ours"], name)
+    assert report["lpips_whole"] == fills["ours"].lpips_alex_whole and report["protocol"] == "target-mask"
+    assert report["lpips_subject"] == fills["ours"].lpips_alex_subject
     assert report["psnr_whole_unseen"] == fills["holes_only"].psnr_whole
     assert report["psnr_whole_rendered"] == fills["unfilled"].psnr_whole
 

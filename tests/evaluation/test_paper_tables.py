@@ -2,14 +2,27 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import pytest
 
 from viewmend import cli
-from viewmend.evaluation.paper_tables import OURS, PaperRow, ablation_models, paper_grid, paper_rows
+from viewmend.cli import paper_table
+from viewmend.evaluation.paper_tables import (
+    OURS,
+    PaperRow,
+    Training,
+    ablation_models,
+    paper_grid,
+    paper_rows,
+    row_label,
+    training_of,
+)
 from viewmend.evaluation.report import make_report
 from viewmend.evaluation.scene_run import RunSettings
 from viewmend.metrics.weights import FOLDERS_VARIABLE
+from viewmend.models.checkpoint import build, save_inpainter
+from viewmend.models.paper.config import paper_small
 from viewmend.models.registry import BASELINES
 
 TABLE_3 = ["single-camera-no-masks", "single-camera", "no-past", "no-rope", "full"]
@@ -74,13 +87,48 @@ def test_the_command_writes_the_table_in_every_format(tmp_path, monkeypatch, cap
     command = ["evaluate", "paper-table", "1", "--out", str(tmp_path), "--ours", "nearest", "--no-video"]
     assert cli.main([*command, "--frames", "1", "--scenes", "1", "--size", "128"]) == 0
     text, lines = capsys.readouterr().out, json.loads((tmp_path / "table1.json").read_text())
-    assert len(lines) == 24 and lines[19]["here"] == "nearest" and lines[1]["PSNR (here)"] == "n/a"
+    assert len(lines) == 25 and lines[19]["here"] == "none" and lines[1]["PSNR (here)"] == "n/a"
+    assert (lines[20]["row"], lines[20]["here"]) == ("not in the paper", "nearest")
     assert "Here: 1 scenes, 1 frames of 128 x 128; holes" in text
-    assert float(lines[0]["PSNR (here)"]) > 10 and lines[0]["PSNR (paper)"] == "33.478"
+    assert lines[0]["PSNR (here)"] == "n/a" and lines[0]["PSNR (paper)"] == "33.478", "RGVI needs RAFT"
+    assert float(lines[20]["PSNR (here)"]) > 10 and 0 < float(lines[20]["LPIPS (here)"]) < 1
     with (tmp_path / "table1.csv").open() as file:
         assert list(csv.DictReader(file)) == lines
     assert text == (tmp_path / "table1.md").read_text()
     assert text.count("dstt-o-def, dstt-o-win, dstt-o-mul: expected") == 1, "one line per reason"
+
+
+def test_only_a_model_of_the_papers_recipe_has_the_papers_row(tmp_path):
+    card = "# m\n\nTrained by `viewmend train {}` from {}: 9 steps of 4 samples\nx 1 streams in 81 minutes, seed 0.\n"
+    net = build(replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, blocks=1))
+    expected = {
+        ("paper_small", "random weights"): "the paper's model",
+        ("paper", "`masked`"): "the paper's model, pre-trained (masked)",
+        ("finetune", "random weights"): "the paper's architecture, trained otherwise",
+    }
+    for number, ((recipe, start), label) in enumerate(expected.items()):
+        save_inpainter(net, tmp_path / str(number), card.format(recipe, start))
+        assert row_label(str(tmp_path / str(number))) == label
+    assert training_of(tmp_path / "0") == Training("paper_small", None, 81)
+    labels = {name: row_label(name) for name in ("paper-small", "views", "rays", "telea")}
+    assert labels == {
+        "paper-small": "the paper's architecture, trained otherwise", "views": "ours, not the paper's",
+        "rays": "ours, not the paper's", "telea": "not in the paper",
+    }  # fmt: skip
+
+
+def test_a_network_trained_from_scratch_is_not_called_fine_tuned(tmp_path, monkeypatch):
+    folder = tmp_path / "finetuned" / "dstt"
+    folder.mkdir(parents=True)
+    (folder / "model.safetensors").touch()
+    monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
+    row = PaperRow("DSTT finetuned, def", "dstt-o-def-finetuned")
+    for start, label in (
+        ("random weights", "DSTT finetuned, def (here trained from scratch, 81 minutes)"),
+        ("`dstt.pth`", "DSTT finetuned, def"),
+    ):
+        (folder / "README.md").write_text(f"Trained by `viewmend train dstt` from {start}: 9 steps in 81 minutes.")
+        assert paper_table._relabelled(row, None).label == label
 
 
 @pytest.mark.parametrize(

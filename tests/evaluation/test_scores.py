@@ -8,6 +8,7 @@ import torch
 
 from viewmend.evaluation import scores as module
 from viewmend.evaluation.averages import tables, vfid
+from viewmend.evaluation.report import main_grid
 from viewmend.evaluation.result_cache import CellStore
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
@@ -245,6 +246,8 @@ def test_cells_store_features_and_tables_have_vfid(networks, small_scenes, tmp_p
     sides = [torch.from_numpy(getattr(c, name)["whole_eval"]) for name in ("features", "true_features") for c in own]
     expected = frechet_distance(torch.cat(sides[:2]), torch.cat(sides[2:]))
     assert table.rows[0].vfid["whole_eval"] == pytest.approx(expected) and expected > 0
+    shown = dict(zip(main_grid(table).heads, main_grid(table).rows[0], strict=True))
+    assert shown["VFID"] == f"{expected:.4f}" and float(shown["LPIPS whole"]) > 0
     assert vfid(cells[:1])["whole_eval"] is None, "a single video"
     for path in tmp_path.glob("*.npz"):
         path.write_bytes(path.read_bytes()[:100])

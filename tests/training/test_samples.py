@@ -77,7 +77,11 @@ def test_a_sample_does_not_depend_on_the_image_of_the_held_out_camera(studio):
 def test_training_views_equal_evaluated_views():
     config = StudioConfig(seed=3, cameras=5, frames=2, size_px=96, background="stage")
     scene = StudioScene(name="s", set="A", rig="", style="", config=config, held="cam02")
-    rig = LeaveOneOut({time: scene.studio().read(time) for time in range(2)})
+    studio = scene.studio()
+    rig = LeaveOneOut(
+        {time: studio.read(time) for time in range(2)},
+        true_view=lambda held, time: studio.truth(studio.true_cameras.select([held]), time),
+    )
     camera, stream = HeldOutCamera(rig, scene.held, HullConfig()), Stream(Unfilled())
     for frame in scene.frames("cpu"):
         cached, time = stream.add_frame(frame.inputs), frame.inputs.time

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from viewmend.data.source import CaptureSource
     from viewmend.evaluation.mending import MendSummary
     from viewmend.geometry.cameras import Cameras
+    from viewmend.rendering.view import RenderConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +25,8 @@ class Options:
     With --leave-out, the view of that camera is rendered without its image and mask, and compared with them: PSNR in dB
     of the whole image (also as rendered, and with only the holes inpainted: unseen), of the subject (inside the true
     mask), of the pixels that a camera colours (valid), and of the holes (fg: inside the true mask), the last two also
-    for OpenCV's Telea fill; SSIM of the whole image; IoU of alpha and the true mask. PSNRs are means over frames; in
+    for OpenCV's Telea fill; SSIM of the whole image; LPIPS (AlexNet) of the whole image and of the
+    subject; IoU of alpha and the true mask. PSNRs are means over frames; in
     the holes, over frames with at least 50 such pixels, if there are any. hole_fraction is the fraction of the hull's
     pixels that are holes, mended_fraction the fraction with E > 0.
 
@@ -46,6 +48,11 @@ class Options:
     """Format of the capture (docs/formats.md); recognised by default."""
     num_source_views: int = 3
     """Number of source cameras, which colour a view and are the inpainter's context."""
+    protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
+    """What is known of the camera of --leave-out: nothing ('strict'); its mask, by which the view is cut and composited
+    ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
+    view_selection: Literal["angle", "direction"] = "angle"
+    """Which source cameras are closest: 'angle' at the subject, or 'direction' of view, an alternative of RIFTCast."""
     error_rule: str | None = None
     """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
     themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
@@ -93,12 +100,9 @@ def run(options: Options) -> int:
     from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.models.base import RenderQuality
     from viewmend.models.registry import error_model_for
-    from viewmend.rendering.view import RenderConfig
     from viewmend.stream import StreamConfig
 
-    render = RenderConfig(
-        cameras=options.num_source_views, error_rule=options.error_rule, refine_fraction=options.refine_fraction
-    )
+    render = _render_config(options)
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
@@ -111,8 +115,8 @@ def run(options: Options) -> int:
     log_preparation(capture)
     error_model = error_model_for(inpainter, options.device) if render.error_rule == "predicted" else None
     config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
-    mender = Mender(inpainter, config, capture.bounds, held, quality, error_model)
-    summary = MendSummary()
+    mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol)
+    summary = MendSummary(options.protocol)
     plan = [(time, target) for time, target in _plan(options, capture, times, usable[0]) if time in usable]
     frames, frame = prefetch(capture, usable), None
     with MendOutput(options.out, capture.fps or 15.0, options.alpha, options.depth) as output:
@@ -137,12 +141,25 @@ def _check(options: Options) -> None:
     """Raise a ValueError for options that contradict each other or are out of range."""
     if (options.leave_out is None) == (options.path is None):
         raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
+    if options.leave_out is None and options.protocol != "strict":
+        raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path: no camera has its mask")
     if options.num_source_views < 1:
         raise ValueError(f"expected --num-source-views of at least 1, got {options.num_source_views}; the paper uses 3")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     if options.top_k is not None and options.top_k < 1:
         raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; omit it to keep all")
+
+
+def _render_config(options: Options) -> "RenderConfig":
+    from viewmend.rendering.view import RenderConfig
+
+    return RenderConfig(
+        cameras=options.num_source_views,
+        selection=options.view_selection,
+        error_rule=options.error_rule,
+        refine_fraction=options.refine_fraction,
+    )
 
 
 def _in_words(summary: "MendSummary") -> list[str]:
@@ -159,7 +176,7 @@ def _in_words(summary: "MendSummary") -> list[str]:
         return lines
     whole = [in_db(summary.mean(fill, "psnr_whole")) for fill in ("ours", "unfilled", "holes_only")]
     lines += [
-        f"PSNR on {summary.background}, dB",
+        f"PSNR on {summary.background}, dB; protocol {summary.protocol}",
         f"  whole image           {whole[0]}   rendered {whole[1]}   only holes inpainted {whole[2]}",
     ]
     lines.append(f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}")
@@ -168,6 +185,8 @@ def _in_words(summary: "MendSummary") -> list[str]:
     for kind, metric in holes.items():
         ours, telea = summary.mean("ours", metric), summary.mean("telea", metric)
         lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
+    lpips = [summary.mean("ours", f"lpips_alex_{region}") for region in ("whole", "subject")]
+    lines.append(f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}")
     return lines
 
 

@@ -10,6 +10,7 @@ import tyro
 from viewmend.cli.evaluate import RunOptions
 
 if TYPE_CHECKING:
+    from viewmend.evaluation.paper_tables import PaperRow
     from viewmend.evaluation.report import Report
 
 EXTRA_ROWS = ("telea", "navier-stokes", "nearest", "reprojection")
@@ -29,7 +30,8 @@ class Options(RunOptions):
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[P|Q|CAPTURE...]")] = ()
     """Sets as for viewmend evaluate; by default P, and Q with --performers. Table 2 needs captures."""
     ours: str = "paper-small"
-    """Our models, by name or folder, separated by commas; the first takes the row of the paper's model."""
+    """Models to add, by name or folder, separated by commas. The first that was trained by the recipe paper or
+    paper_small takes the row of the paper's model; all others have rows of their own."""
     models: Path | None = None
     """Table 3: a folder of models named full, no-rope, no-past, single-camera, single-camera-no-masks; with -s0, -s1
     ... appended for several seeds, as research/ablation.py leaves them in OUT/models."""
@@ -39,8 +41,17 @@ def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.console import show
     from viewmend.cli.evaluate import evaluate, exit_code, report_folder
-    from viewmend.evaluation.paper_tables import OURS, PaperRow, ablation_models, paper_grid, paper_rows
+    from viewmend.evaluation.paper_tables import (
+        OURS,
+        PAPERS_MODEL,
+        PaperRow,
+        ablation_models,
+        paper_grid,
+        paper_rows,
+        row_label,
+    )
     from viewmend.evaluation.report import csv_text, markdown_table
+    from viewmend.metrics.weights import find_weights, known_weights
     from viewmend.models.registry import method_names
     from viewmend.utils.atomic_writes import write_text
 
@@ -56,9 +67,13 @@ def run(options: Options) -> int:
             raise ValueError("expected captures for table 2, got none; name their folders after the 2")
         if not options.ours.strip():
             raise ValueError("expected --ours with a model's name or folder, got none; leave it out for the default")
-        first, *others = method_names(options.ours)
-        methods = {OURS: (first,)}
-        rows += [PaperRow("not in the paper", name) for name in (*others, *EXTRA_ROWS)]
+        ours = method_names(options.ours)
+        trained = next((name for name in ours if row_label(name).startswith(PAPERS_MODEL)), None)
+        methods = {OURS: () if trained is None else (trained,)}
+        if find_weights(known_weights("raft")) is None:
+            methods["rgvi"] = ()  # without RAFT it is not RGVI
+        rows = [_relabelled(row, trained) for row in rows]
+        rows += [PaperRow(row_label(name), name) for name in (*ours, *EXTRA_ROWS) if name != trained]
     names = [name for row in rows for name in methods.get(row.method, (row.method,))]
     with report_folder(options.out):
         report = evaluate(options, sets, ",".join(dict.fromkeys(names)))
@@ -72,6 +87,23 @@ def run(options: Options) -> int:
     return exit_code(report)
 
 
+def _relabelled(row: "PaperRow", trained: str | None) -> "PaperRow":
+    """The row, whose label says what our network in it was trained from, if that is not what the paper's was."""
+    from viewmend.contrib.baselines.published import finetuned_weights
+    from viewmend.evaluation.paper_tables import OURS, row_label, training_of
+    from viewmend.metrics.weights import find_weights
+
+    if row.method == OURS and trained is not None:
+        return replace(row, label=row_label(trained))
+    if not row.method.endswith("-finetuned"):
+        return row
+    weights = find_weights(finetuned_weights(row.method.split("-")[0]))
+    training = weights and training_of(weights.parent)
+    if not training or training.start is not None:
+        return row
+    return replace(row, label=f"{row.label} (here trained from scratch, {training.minutes} minutes)")
+
+
 def _text(table: int, sets: tuple[str, ...], grid: str, report: "Report") -> str:
     from viewmend.evaluation.report import bullets, holes_line, not_available, setting_lines
 
@@ -80,7 +112,8 @@ def _text(table: int, sets: tuple[str, ...], grid: str, report: "Report") -> str
         f"# Table {table}, on {', '.join(sets)}",
         "Columns (here) were measured here, columns (paper) are printed in the paper: other data, image size and GPU. "
         "Compare only within a column.",
-        "The paper's PSNR of inpainted regions is (a) by its text; its values are in the range of (b).",
+        "The paper's PSNR of inpainted regions (36 to 42 dB) is reading (b), the error inside E over all pixels: "
+        "compare it with PSNR masked (b), which grows as the share of holes falls.",
         *(f"Here: {scenes} scenes, {holes_line(table)}" for table in report.tables[:1]),
         "\n".join(setting_lines(report)),
         grid,

@@ -22,8 +22,10 @@ class Options:
     subject: str = "(.*)"
     """Regular expression whose first group in a capture's name is the subject: '^(.*)_' for DNA-Rendering's 0012_11.
     By default every capture is a subject of its own."""
-    test_fraction: float = 0.1
-    """Smallest fraction of the scenes for tests."""
+    test_fraction: float = 7 / 79
+    """Smallest fraction of the scenes for tests; by default the paper's, 7 of 79."""
+    scenes: int | None = None
+    """Use only this many of the captures, drawn at random by the seed; all by default. The paper has 79."""
     seed: int = 0
     """Chooses subjects and cameras."""
     format: str | None = None
@@ -46,12 +48,15 @@ def run(options: Options) -> int:
         raise ValueError(
             f"expected --test-fraction between 0 and 1, got {options.test_fraction}; the paper has 7 of 79"
         )
+    if options.scenes is not None and options.scenes < 2:
+        raise ValueError(f"expected --scenes of at least 2, got {options.scenes}; leave it out for all captures")
     remove_partial_file(options.out)
     splits = make_splits(
         options.captures,
         options.out.parent,
         seed=options.seed,
         test_fraction=options.test_fraction,
+        scenes=options.scenes,
         subject=options.subject,
         kind=options.format,
     )

@@ -9,7 +9,8 @@ from typing import Literal
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.evaluation.scores import Scorers, ViewScores, mean_over_frames, score_view, true_view
+from viewmend.data.holdout.scenes import Protocol, revealed
+from viewmend.evaluation.scores import Scorers, ViewScores, load_scorers, mean_over_frames, score_view, true_view
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.alignment import silhouette_iou
 from viewmend.geometry.bounds import Bounds
@@ -18,7 +19,7 @@ from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, Stat
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import Background, composite
 from viewmend.stream import Stream, StreamConfig, StreamView
-from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame
+from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 from viewmend.utils.timing import StageTimes
 
 Fill = Literal["unfilled", "telea", "holes_only", "ours"]
@@ -40,6 +41,7 @@ class Mender:
         exclude: Sequence[str] = (),
         quality: RenderQuality | None = None,
         error_model: Inpainter | None = None,
+        protocol: Protocol = "strict",
     ) -> None:
         """Create a viewer of an empty stream.
 
@@ -50,6 +52,7 @@ class Mender:
             exclude: names of cameras whose images must not be used.
             quality: how much work a view may cost.
             error_model: predicts errors in place of `inpainter` (`registry.error_model_for`).
+            protocol: what `mend` may know of the mask of the held-out camera.
         """
         self.stream = Stream(inpainter, config or StreamConfig(memory_mb=None), bounds, error_model)
         self.background: Background = inpainter.background or self.stream.config.background
@@ -57,11 +60,13 @@ class Mender:
         self.state: State | None = None
         """The viewer's state; None before the first view."""
         self._exclude, self._quality = exclude, quality
+        self._protocol: Protocol = protocol
+        self._scorers: Scorers | None = None
         self._warm_up: Stream | None = None
         self._holes_state: State | None = None
 
-    def add_frame(self, frame: MultiViewFrame | CachedFrame) -> CachedFrame:
-        """Add a frame, with its proxy and depths if another stream computed them already."""
+    def add_frame(self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None) -> CachedFrame:
+        """Add a frame, with its proxy and depths if another stream computed them; `carving` as for `Stream`."""
         given = frame.frame if isinstance(frame, CachedFrame) else frame
         if not self.stream.times:
             self._warm_up = Stream(
@@ -71,10 +76,16 @@ class Mender:
             if stream is not None and isinstance(frame, CachedFrame):
                 stream.add_frame(given, frame.proxy).depths.update(frame.depths)
             elif stream is not None:
-                stream.add_frame(given)
+                stream.add_frame(given, carving=carving)
         return self.stream.cached_frame(given.time)
 
-    def view(self, target: Cameras, time: int, history_of: IncompleteView | None = None) -> StreamView:
+    def view(
+        self,
+        target: Cameras,
+        time: int,
+        history_of: IncompleteView | None = None,
+        target_mask: Float[Tensor, "height width"] | None = None,
+    ) -> StreamView:
         """Complete a view of a frame that was added.
 
         Args:
@@ -82,27 +93,28 @@ class Mender:
             time: index of the frame.
             history_of: the rendered view. Its context in frames that were added without a view is encoded first,
                 outside of the measured time.
+            target_mask: the subject's mask in the novel view, if it is known.
         """
         for stream in (self._warm_up, self.stream):
             if stream is None:
                 continue
             if history_of is not None:
                 stream.inpainter.encode_history(history_of, _context(stream))
-            made = stream.view(target, self.state, time, self._quality, self._exclude)
+            made = stream.view(target, self.state, time, self._quality, self._exclude, target_mask)
             if stream is self._warm_up and made.times.inpainting >= SLOW_MS:
                 self.stream = stream
                 break
         self._warm_up, self.state = None, made.viewer
         return made
 
-    def skip(self, target: Cameras, time: int) -> None:
+    def skip(self, target: Cameras, time: int, target_mask: Float[Tensor, "height width"] | None = None) -> None:
         """Advance the state past a frame whose view is not needed."""
         if type(self.stream.viewer()) is State:
             return  # nothing is carried from view to view
-        state = self.stream.advance(self.stream.render(target, time, self._exclude), self.state)
-        self.state = (
-            self.stream.view(target, self.state, time, self._quality, self._exclude).viewer if state is None else state
-        )
+        state = self.stream.advance(self.stream.render(target, time, self._exclude, target_mask), self.state)
+        if state is None:
+            state = self.stream.view(target, self.state, time, self._quality, self._exclude, target_mask).viewer
+        self.state = state
 
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> "MendStep":
         """Complete and score the next view; several views of the same frame may follow each other.
@@ -115,21 +127,24 @@ class Mender:
         Raises:
             ValueError: the inpainter returns colours that are not finite.
         """
-        cached = self.add_frame(frame)
-        made = self.view(target, frame.time)
+        target_mask, carving = revealed(self._protocol, truth)
+        cached = self.add_frame(frame, carving)
+        made = self.view(target, frame.time, target_mask=target_mask)
         iou = _input_iou(cached)
         if truth is None:
             return MendStep(frame, made.completed, self.background, None, None, iou, made.times)
         true = true_view(truth, self.background)
-        with_ssim, psnr_only = Scorers(self.background), Scorers(self.background, ssim=None)
+        psnr_only = Scorers(self.background, ssim=None)
+        if self._scorers is None:
+            self._scorers = load_scorers(self.background, "gaussian", ("lpips-alex",), str(true.rgb.device))
         view = made.completed.view
         holes = replace(view, error=view.holes.to(view.rgb))
         telea, _ = Telea().step_on(self.background, holes, ContextProvider(lambda *_: None), State())
         scores = FillScores(
-            unfilled=score_view(CompletedView(view, view.rgb), true, psnr_only),
+            unfilled=score_view(CompletedView(view, view.cut_rgb), true, psnr_only),
             telea=score_view(telea, true, psnr_only),
             holes_only=score_view(self._fill_holes(made.completed, holes), true, psnr_only),
-            ours=score_view(made.completed, true, with_ssim),
+            ours=score_view(made.completed, true, self._scorers),
         )
         if scores.ours.hull_iou is not None:
             iou[truth.cameras.names[0]] = scores.ours.hull_iou
@@ -179,14 +194,14 @@ class MendStep:
     @property
     def rendered(self) -> Float[Tensor, "3 height width"]:
         """The rendered view on the background; holes are black."""
-        return composite(self.background, self.completed.view.rgb, self.completed.view.mask)
+        return composite(self.background, self.completed.view.cut_rgb, self.completed.view.silhouette)
 
 
 class MendSummary:
     """Collects scores and times of a run, without images."""
 
-    def __init__(self) -> None:
-        self.frames = 0
+    def __init__(self, protocol: Protocol = "strict") -> None:
+        self.protocol, self.frames = protocol, 0
         self.background: Background = "black"
         self.hull_iou: dict[str, list[float]] = {}
         """IoU of each camera, frame by frame."""
@@ -221,6 +236,7 @@ class MendSummary:
         """The scores of `mend --json`; None where there are no such pixels, or no truth. Times are medians in ms."""
         return {
             "frames": self.frames,
+            "protocol": self.protocol,
             "background": self.background,
             "hole_fraction": self.hole_fraction,
             "mended_fraction": self.mended_fraction,
@@ -228,6 +244,8 @@ class MendSummary:
             "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
             "psnr_whole_unseen": self.mean("holes_only", "psnr_whole"),
             "ssim_whole": self.mean("ours", "ssim_whole"),
+            "lpips_whole": self.mean("ours", "lpips_alex_whole"),
+            "lpips_subject": self.mean("ours", "lpips_alex_subject"),
             "psnr_subject": self.mean("ours", "psnr_subject"),
             "alpha_iou": self.mean("ours", "alpha_iou"),
             "psnr_valid": self.mean("ours", "psnr_valid"),

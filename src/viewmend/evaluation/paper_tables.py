@@ -14,11 +14,15 @@ from pathlib import Path
 
 from viewmend.evaluation.averages import Row, mean
 from viewmend.evaluation.report import Grid, Report, number
+from viewmend.models.checkpoint import CARD, SHIPPED, shipped_models
+from viewmend.models.paper.patch_transformer import PatchTransformer
+from viewmend.models.registry import METHODS, make_method
 
 OURS = "ours"
 """Method of the paper's own row: stands for a model that is named at run time."""
 PAPER_COLUMNS = ("psnr", "ssim", "lpips", "vfid", "psnr_holes", "ssim_holes", "lpips_holes", "fps")
-"""`psnr_holes` is over the pixels of E by the paper's text; the values look more like those of masked images."""
+"""`psnr_holes` is over the pixels of E by the paper's text; its values follow reading (b), that of masked images."""
+PAPERS_MODEL = "the paper's model"
 COLUMNS = (
     ("PSNR", "psnr", "whole", 3),
     ("SSIM", "ssim", "whole", 4),
@@ -27,6 +31,7 @@ COLUMNS = (
     ("PSNR holes (a)", "psnr", "holes", 3),
     ("PSNR masked (b)", "psnr", "masked", 3),
     ("SSIM masked", "ssim", "masked", 5),
+    ("LPIPS holes", "lpips_alex", "holes", 4),
     ("LPIPS masked", "lpips_alex", "masked", 5),
     ("FPS", "speed", "fps", 2),
     ("ms p95", "speed", "ms_p95", 1),
@@ -51,6 +56,43 @@ def paper_rows(table: int) -> list[PaperRow]:
     text = (files("viewmend.evaluation") / "paper_tables.csv").read_text()
     rows = [row for row in csv.DictReader(text.splitlines()) if row["table"] == str(table)]
     return [PaperRow(row["label"], row["method"], tuple(row[name] for name in PAPER_COLUMNS)) for row in rows]
+
+
+@dataclass(frozen=True)
+class Training:
+    """How `viewmend train` made a model, from its card."""
+
+    recipe: str
+    start: str | None
+    """The model that it started from; None for random weights."""
+    minutes: int
+
+
+def training_of(folder: Path) -> Training | None:
+    """The training of the model in a folder; None if its card does not say."""
+    card = folder / CARD
+    text = " ".join(card.read_text("utf-8", "replace").split()) if card.is_file() else ""
+    found = re.search(r"Trained by `viewmend train ([\w-]+)` from (random weights|`[^`]*`): .*? in (\d+) minutes", text)
+    if found is None:
+        return None
+    return Training(found[1], None if found[2] == "random weights" else found[2].strip("`"), int(found[3]))
+
+
+def row_label(name: str) -> str:
+    """The label of a method's row. `PAPERS_MODEL` begins only that of a model trained by the paper's own recipe.
+
+    Raises:
+        ValueError: there is no such method.
+    """
+    folder = SHIPPED / name if name in shipped_models() else Path(name)
+    if name in METHODS or not (name in shipped_models() or folder.is_dir()):
+        return "not in the paper"
+    if not isinstance(make_method(name), PatchTransformer):
+        return "ours, not the paper's"
+    training = training_of(folder)
+    if training is None or training.recipe not in ("paper", "paper_small"):
+        return "the paper's architecture, trained otherwise"
+    return PAPERS_MODEL if training.start is None else f"{PAPERS_MODEL}, pre-trained ({training.start})"
 
 
 def ablation_models(folder: Path) -> dict[str, tuple[str, ...]]:

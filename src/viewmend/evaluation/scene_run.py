@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import torch
 
-from viewmend.data.holdout.scenes import LeaveOneOutScene
+from viewmend.data.holdout.scenes import LeaveOneOutScene, Protocol, revealed
 from viewmend.evaluation.mending import SLOW_MS, Mender
 from viewmend.evaluation.scores import (
     Features,
@@ -48,6 +48,8 @@ class RunSettings:
     """Background of views and truth, and of the input of methods that have none of their own."""
     networks: tuple[str, ...] = ()
     """Networks of metrics (`scores.NETWORKS`) to use."""
+    protocol: Protocol = "strict"
+    """What is known of the mask of the held-out camera."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,9 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
     config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
     for frame in scene.frames(settings.device):
         stream = Stream(Unfilled(), config, frame.bounds)
-        cached = stream.add_frame(frame.inputs)
-        view = stream.render(frame.truth.cameras)
+        target_mask, carving = revealed(settings.protocol, frame.truth)
+        cached = stream.add_frame(frame.inputs, carving=carving)
+        view = stream.render(frame.truth.cameras, target_mask=target_mask)
         holes, scored = int(view.holes.sum()), frame.inputs.time >= scene.scored_from
         past = None if frame.seen is None else frame.seen.by_past_alone(view.source_views)
         truth = true_view(frame.truth, settings.background, frame.backward_flow_px, past)
@@ -150,7 +153,7 @@ class _SharedImages:
 
     def add(self, frame: _Frame) -> None:
         view, truth = frame.view, frame.truth
-        rendered = composite(self._background, view.rgb, view.mask)
+        rendered = composite(self._background, view.cut_rgb, view.silhouette)
         self.videos.add(truth.rgb, view.holes)
         if frame.largest:
             self.images = picture(rendered), picture(view.error[None]), picture(truth.rgb)
@@ -190,7 +193,7 @@ class _MethodStream:
             if frame.scored:
                 self._score(mender, frame)
             else:
-                mender.skip(frame.view.camera, frame.view.time)
+                mender.skip(frame.view.camera, frame.view.time, frame.view.target_mask)
             if mender.state is not None:
                 mender.state = mender.stream.inpainter.reveal_truth(mender.state, frame.truth.rgb)
         except Exception as error:
@@ -205,7 +208,7 @@ class _MethodStream:
         return Mender(inpainter, config, bounds, error_model=error_model)
 
     def _score(self, mender: Mender, frame: _Frame) -> None:
-        made = mender.view(frame.view.camera, frame.view.time, frame.view)
+        made = mender.view(frame.view.camera, frame.view.time, frame.view, frame.view.target_mask)
         completed = made.completed
         _check(completed)
         rgb = composite(self._settings.background, completed.rgb, completed.opacity)
@@ -236,7 +239,7 @@ def _check(completed: CompletedView) -> None:
     rgb, view = completed.rgb, completed.view
     if rgb.shape != view.rgb.shape:
         raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view")
-    changed = int(((rgb != view.rgb).any(0) & (view.error == 0)).sum())
+    changed = int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum())
     if changed:
         raise ValueError(f"expected pixels with E = 0 as they were rendered, got {changed} changed; blend by E")
 

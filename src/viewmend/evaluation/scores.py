@@ -118,10 +118,13 @@ class ViewScores:
     lpips_alex_holes: float | None = None
     lpips_alex_holes_fg: float | None = None
     lpips_alex_masked: float | None = None
+    lpips_alex_subject: float | None = None
+    """Mean of the map inside the true mask."""
     lpips_vgg_whole: float | None = None
     lpips_vgg_holes: float | None = None
     lpips_vgg_holes_fg: float | None = None
     lpips_vgg_masked: float | None = None
+    lpips_vgg_subject: float | None = None
     alpha_iou: float | None = None
     """IoU of the true mask and alpha above one half (M for an inpainter without alpha)."""
     hull_iou: float | None = None
@@ -189,7 +192,7 @@ def score_view(
     """All scores of one completed view; the temporal ones need the previous frame."""
     view, background = completed.view, scorers.background
     rgb = composite(background, completed.rgb, completed.opacity)
-    rendered = composite(background, view.rgb, view.mask)
+    rendered = composite(background, view.cut_rgb, view.silhouette)
     hull, holes = view.mask > 0.5, view.holes
     past = torch.zeros_like(holes) if truth.by_past_alone is None else truth.by_past_alone & holes
     height, width = holes.shape
@@ -240,13 +243,15 @@ def _readings(
     holes: Bool[Tensor, "height width"],
     true_mask: Bool[Tensor, "height width"],
 ) -> dict[str, float | None]:
-    """The four readings of a score that has a map; NaN values of the map do not count."""
+    """The readings of a score that has a map; NaN values of the map do not count."""
     image, truth = images
     scored = score(image, truth)
     if scored is None:
         return {}
     masked = score(image * holes, truth * holes) if bool(holes.any()) else None
     maps = {"whole": scored, "holes": scored[holes], "holes_fg": scored[holes & true_mask], "masked": masked}
+    if name != "ssim":
+        maps["subject"] = scored[true_mask]
     return {f"{name}_{region}": _finite_mean(values) for region, values in maps.items()}
 
 

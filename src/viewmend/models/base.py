@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.models.compositing import Background, from_background, to_background
+from viewmend.models.compositing import Background, cut, from_background, to_background
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.mmap_tensors import to_mmap
 from viewmend.utils.timing import ms_since, now_s
@@ -214,6 +214,8 @@ class Inpainter:
     ) -> tuple[CompletedView, State]:
         """`step` with a view on black as input and output, but the inpainter's input on this background.
 
+        The completed view is cut by `view.target_mask`, if there is one.
+
         Args:
             background: ignored by an inpainter that has one of its own, which it composites its input on itself.
             view: as for `step`.
@@ -222,7 +224,7 @@ class Inpainter:
         """
         given = "black" if self.background is not None else background
         completed, state = self.step(to_background(given, view), context, state)
-        return from_background(given, completed, view), state
+        return cut(from_background(given, completed, view)), state
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
         """Margin around the subject within which a crop of the view gives the same result as the whole view, pixels.

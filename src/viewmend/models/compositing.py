@@ -45,6 +45,15 @@ def painted_alpha(view: IncompleteView) -> Float[Tensor, "height width"]:
     return 1 - (1 - view.mask) * (1 - view.error)
 
 
+def cut(completed: CompletedView) -> CompletedView:
+    """A completed view, composited by the target's mask: nothing outside of it is shown. Unchanged without one."""
+    mask = completed.view.target_mask
+    if mask is None:
+        return completed
+    alpha = completed.view.mask if completed.alpha is None else completed.alpha
+    return replace(completed, rgb=completed.rgb * mask, alpha=alpha * mask)
+
+
 def to_background(background: Background, view: IncompleteView) -> IncompleteView:
     """A view on black as a view on this background; its holes stay black."""
     return view if background == "black" else replace(view, rgb=view.rgb + (1 - painted_alpha(view)))

@@ -63,9 +63,9 @@ class Crop:
         camera, images = view.camera, part.images
         images = {name: self._padded(image, camera) for name, image in images.items() if name != "rgb"}
         fade = None if part.view.fade is None else self._padded(part.view.fade, camera)
-        whole, rgb = replace(view, error=self._padded(part.view.error, camera), fade=fade), view.rgb
+        whole, rgb = replace(view, error=self._padded(part.view.error, camera), fade=fade), view.cut_rgb
         if part.rgb is not part.view.rgb:
-            rgb = view.rgb.clone()
+            rgb = rgb.clone()
             self.of_image(rgb).copy_(part.rgb)
         return CompletedView(whole, rgb, **images)
 
@@ -76,7 +76,7 @@ class Crop:
 
 def _images(view: IncompleteView) -> dict[str, Tensor]:
     """The image fields of a view that are not None."""
-    fields = ("rgb", "mask", "error", "depth", "weights", "fade")
+    fields = ("rgb", "mask", "error", "depth", "weights", "fade", "target_mask")
     return {name: image for name in fields if (image := getattr(view, name)) is not None}
 
 

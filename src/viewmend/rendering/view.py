@@ -17,6 +17,8 @@ from viewmend.rendering.blending import BlendConfig, blend
 from viewmend.rendering.error_mask import MIN_WEIGHT, Evidence, error_rule, holes
 from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 
+SELECTIONS = ("angle", "direction")
+"""Rules by which cameras are closest to a view."""
 SourceDepth = Callable[[tuple[str, ...]], Float[Tensor, "view height width"]]
 """The proxy's depth in the frame's cameras of these names."""
 
@@ -32,7 +34,9 @@ class RenderConfig:
     """
 
     cameras: int = 3
-    """Number of source cameras that colour a view: those closest to it in angle (the paper: 3)."""
+    """Number of source cameras that colour a view: those closest to it (the paper: 3)."""
+    selection: str = "angle"
+    """Which cameras are closest: 'angle' at the subject's centre, or 'direction' of view, which RIFTCast offers."""
     blend: BlendConfig = field(default_factory=BlendConfig)
     """How the source cameras' colours are weighted."""
     error_rule: str | None = None
@@ -43,6 +47,8 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         error_rule(self.error_rule or "holes")
+        if self.selection not in SELECTIONS:
+            raise ValueError(f"expected a selection of views by 'angle' or 'direction', got '{self.selection}'")
         if not 0 < self.refine_fraction <= 1:
             raise ValueError(f"expected a refine_fraction above 0 and up to 1, got {self.refine_fraction}")
 
@@ -127,7 +133,7 @@ def _colour(
     """The view of a surface in the colours of the closest cameras."""
     usable, (depth, normals, center, size_m) = _without(frame.cameras, exclude), surface
     mask = (depth > 0).to(depth)
-    candidate_views = select_closest(target, usable, center, len(usable))
+    candidate_views = select_closest(target, usable, center, len(usable), config.selection)
     source_views = candidate_views[: config.cameras]
     sources = ContextViews(frame.select(source_views), source_depth(source_views))
     blended = blend(target, depth, normals, sources, config.blend.depth_bias * size_m, config.blend)
@@ -145,15 +151,23 @@ def _colour(
 
 
 def select_closest(
-    target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"], k: int = 3
+    target: Cameras,
+    cameras: Cameras,
+    subject_center: Float[Tensor, "3"],
+    k: int = 3,
+    selection: str = "angle",
 ) -> tuple[str, ...]:
     """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
 
     The paper does not define closeness. Here it is the angle at the subject's centre between the directions to the two
-    cameras: the angle decides how similar the images are, the distance only changes their scale. Returns fewer than k
-    names if there are fewer cameras.
+    cameras: the angle decides how similar the images are, the distance only changes their scale. With the selection
+    'direction' it is the angle between the optical axes, for cameras that look at different places. Returns fewer than
+    k names if there are fewer cameras.
     """
-    angle = angles_to(target, cameras, subject_center).tolist()
+    if selection == "direction":
+        angle = (-(cameras.world_from_camera[:, :3, 2] @ target.world_from_camera[0, :3, 2])).tolist()
+    else:
+        angle = angles_to(target, cameras, subject_center).tolist()
     return tuple(cameras.names[view] for view in sorted(range(len(cameras)), key=lambda view: angle[view])[:k])
 
 

@@ -42,7 +42,7 @@ class SceneConfig:
     """Fraction of the studio scenes with noise, colour differences, and errors in masks and calibration."""
     hard_fraction: float = 0.0
     """Fraction of the imperfect scenes whose errors are up to 2.5 times as large."""
-    with_backdrop: bool = False
+    with_backdrop: Annotated[bool, HIDDEN] = False
     """Place every studio scene on a stage, not only half of the imperfect ones; the others are on black."""
     performers: Path | None = None
     """Folder of glTF characters for half of the studio scenes; without it, all people are procedural."""
@@ -55,6 +55,8 @@ class SceneConfig:
     hold_out: str | None = None
     """Camera of the captures that training never sees, nor their last tenth of frames: the run is validated on both,
     and keeps the best weights. 'auto' chooses a camera, in rigs of five or more."""
+    protocols: tuple[Literal["strict", "target-mask", "hull-with-target-mask"], ...] = ("strict",)
+    """What is known of the mask of a held-out camera (docs/evaluation.md); each camera draws one of several."""
     captures_fraction: float = 0.75
     """Fraction of the scenes that come from the captures, if any are given; the rest comes from the studio."""
     data_device: str = "cpu"

@@ -42,8 +42,11 @@ class PaperObjective(Objective[PatchTransformer]):
         """All terms of a batch of samples of any sizes."""
         predictions = self.model([s.view for s in batch], [s.context for s in batch])
         truth = [true_image(s, self.model.config.background) for s in batch]
-        image = paper_image_loss(predictions, [s.view.error for s in batch], truth)
-        judged = Judged(truth, [p.composited.float() for p in predictions], [s.view.error for s in batch])
+        missing = [s.view.missing for s in batch]
+        masks = [s.view.target_mask for s in batch]
+        inside = [torch.ones_like(s.view.mask) if mask is None else mask for s, mask in zip(batch, masks, strict=True)]
+        image = paper_image_loss(predictions, missing, truth, inside)
+        judged = Judged(truth, [p.composited.float() for p in predictions], missing)
         return StepOutput(image, image.inside + image.outside, judged)
 
 

@@ -13,6 +13,8 @@ from viewmend.training.paper import PaperObjectiveConfig
 from viewmend.training.rays import RaysObjectiveConfig
 from viewmend.training.views import ViewsObjectiveConfig
 
+PROTOCOLS = ("target-mask", "hull-with-target-mask", "strict")
+"""What the paper's model may know of the held-out mask in training."""
 SUBJECT_SIZES_PX = (224, 320, 416, 576)
 """Image sizes of `views` and `rays`; each is at most 1.5 times the one before, so subjects of all sizes occur."""
 
@@ -62,11 +64,14 @@ def rays() -> TrainConfig:
 
 
 def paper() -> TrainConfig:
-    """The paper's model at its full size, with the paper's objective; for a data-centre GPU."""
+    """The paper's model at its full size, with the paper's objective; for a data-centre GPU.
+
+    M_t is given in two of three rigs; with --captures, all scenes are captures.
+    """
     return TrainConfig(
         name="paper",
         objective=PaperObjectiveConfig(),
-        scenes=SceneConfig(sizes_px=(320, 512)),
+        scenes=SceneConfig(sizes_px=(320, 512), protocols=PROTOCOLS, captures_fraction=1.0),
         steps=200_000,
         new_per_batch=4,
         learning_rate=1e-4,
@@ -81,6 +86,7 @@ def paper_small() -> TrainConfig:
     return TrainConfig(
         name="paper_small",
         objective=PaperObjectiveConfig(model=paper_small_model()),
+        scenes=SceneConfig(protocols=PROTOCOLS, captures_fraction=1.0),
         steps=20_000,
         batch=4,
         new_per_batch=1,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from viewmend.data.holdout.scenes import LeaveOneOut
+from viewmend.data.holdout.scenes import LeaveOneOut, Protocol, revealed
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.hull import HullConfig
 from viewmend.models.classical import Unfilled
@@ -75,14 +75,18 @@ def to_device(value: Any, device: torch.device | str) -> Any:
 class HeldOutCamera:
     """A rig without one of its cameras; the hull of each frame is computed once."""
 
-    def __init__(self, rig: LeaveOneOut, held: str, hull: HullConfig) -> None:
+    def __init__(self, rig: LeaveOneOut, held: str, hull: HullConfig, protocol: Protocol = "strict") -> None:
         self.rig = rig
         self.held = held
+        self.protocol: Protocol = protocol
         self.stream = Stream(Unfilled(), StreamConfig(hull=hull, memory_mb=None), rig.bounds)
 
     def frame(self, time: int) -> CachedFrame:
         """The other cameras at a frame, with their hull."""
-        return self.stream.add_frame(self.rig.inputs(self.held, time))
+        carving = None
+        if self.protocol == "hull-with-target-mask":
+            _, carving = revealed(self.protocol, self.rig.truth(self.held, time))
+        return self.stream.add_frame(self.rig.inputs(self.held, time), carving=carving)
 
     def sample(
         self,
@@ -95,13 +99,15 @@ class HeldOutCamera:
         """The sample at frame `time` with context of these frames, its own first; None if its holes are too small."""
         now = self.frame(time)
         target = self.rig.calibration(self.held, time).select([self.held])
-        view = self.stream.with_render_config(render).render(target, time)
-        if float(view.error.sum()) < min_hole_px:
+        known = None if self.protocol == "strict" else self.rig.truth(self.held, time)  # rendered only if needed
+        target_mask, _ = revealed(self.protocol, known)
+        view = self.stream.with_render_config(render).render(target, time, target_mask=target_mask)
+        if float(view.missing.sum()) < min_hole_px:
             return None
         names = view.closest_views(max(len(view.source_views), sampling.min_context_views))
         context = [self.frame(past).context(names) for past in context_times]
         ray_views = now.context(view.closest_views(sampling.num_ray_views))
-        truth = self.rig.truth(self.held, time)
+        truth = known or self.rig.truth(self.held, time)
         assert truth.mask is not None, "scenes for training have masks"
         black = truth.rgb[0].float() * (truth.mask[0].float() / 255)
         seen = tuple(views for views in context if views is not None)
@@ -134,7 +140,8 @@ def rig_samples(
     names = [n for n in rig.frames[times[-1]].cameras.names if held_out in (None, n)]
     samples = []
     for held in random.sample(names, min(scenes.num_holdout_views, len(names))):
-        others = HeldOutCamera(rig, held, HullConfig(resolution=scenes.hull_resolution))
+        protocol = scenes.protocols[0] if len(scenes.protocols) == 1 else random.choice(scenes.protocols)
+        others = HeldOutCamera(rig, held, HullConfig(resolution=scenes.hull_resolution), protocol)
         for end in random.sample(ends, min(sampling.num_target_frames, len(ends))):
             render, sample = RenderConfig(cameras=draw_source_views(sampling, random)), None
             for time in range(end - sampling.clip_length + 1, end + 1):

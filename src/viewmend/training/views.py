@@ -78,7 +78,7 @@ class ViewsLossWeights:
     """Additional weight of pixels that no source view colours."""
     log_error: Annotated[float, HIDDEN] = 0.5
     """Weight of log10 of the squared error of a crop."""
-    gradient: float = 0.3
+    gradient: Annotated[float, HIDDEN] = 0.3
     """Weight of L1 of differences between neighbouring pixels, which keeps textures sharp."""
     cell_colour: Annotated[float, HIDDEN] = 0.5
     """L1 of the mean colour over the samples of a ray."""

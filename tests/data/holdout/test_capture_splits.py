@@ -9,7 +9,8 @@ from reference.ball import BallCapture, ring
 
 from viewmend.cli import main
 from viewmend.cli.evaluate import RunOptions, scenes_of
-from viewmend.data.holdout.capture_scenes import is_splits, make_splits, read_splits, split_scenes
+from viewmend.data.holdout import capture_scenes
+from viewmend.data.holdout.capture_scenes import SplitScene, is_splits, make_splits, read_splits, split_scenes
 from viewmend.data.native_writer import write_capture
 
 
@@ -102,3 +103,22 @@ def test_what_cannot_be_split_is_refused(captures, tmp_path, capsys):
         assert main(["splits", *arguments, "--out", str(tmp_path / "a.json")]) == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "a.json").exists()
+
+
+def test_by_default_7_of_79_are_for_tests_and_scenes_are_a_random_subset(captures, monkeypatch):
+    def scene(path, base, seed, subject, kind):
+        return SplitScene(
+            name=path.name, path=path.name, subject=path.name, split="training", left_out="a", closest=(),
+            calibration_sha256="",
+        )  # fmt: skip
+
+    monkeypatch.setattr(capture_scenes, "_scene", scene)
+    paths = [captures / f"{number:04d}" for number in range(100)]
+    for count in (79, 158):
+        many = make_splits([captures / f"{number:04d}" for number in range(count)], captures)
+        assert sum(scene.split == "test" for scene in many.scenes) == 7 * count // 79
+    drawn = [{s.name for s in make_splits(paths, captures, seed=seed, scenes=10).scenes} for seed in (0, 0, 1)]
+    assert drawn[0] == drawn[1] != drawn[2] and len(drawn[0]) == len(drawn[2]) == 10
+    assert drawn[0] != {path.name for path in paths[:10]}
+    with pytest.raises(ValueError, match=r"at least the 101 captures of --scenes, got 100"):
+        make_splits(paths, captures, scenes=101)

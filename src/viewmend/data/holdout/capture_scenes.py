@@ -37,15 +37,21 @@ class CaptureScene(LeaveOneOutScene):
     """Hash of the capture's files."""
     kind: str | None = None
     """The capture's format, None to recognise it."""
+    align: bool = True
+    """Whether a common shift of all images is undone (`prepare`)."""
+    match_colours: bool = True
+    """Whether the cameras' colours are matched (`prepare`)."""
 
     @property
     def definition(self) -> str:
-        """The capture's fingerprint, which cameras, how many frames."""
-        return repr((self.fingerprint, self.held, self.inputs, self.count))
+        """The capture's fingerprint, which cameras, how many frames, and what is not prepared."""
+        raw = [name for name in ("align", "match_colours") if not getattr(self, name)]
+        return repr((self.fingerprint, self.held, self.inputs, self.count, *raw))
 
     def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """Frames in which the camera that was left out, and at least two of the inputs, have images."""
-        capture = prepare(open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.kind), self.inputs)
+        opened = open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.kind)
+        capture = prepare(opened, self.inputs, align=self.align, match_colours=self.match_colours)
         bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):
             frame = capture.read(time).to(device)
@@ -158,7 +164,8 @@ def make_splits(
     base: Path,
     *,
     seed: int = 0,
-    test_fraction: float = 0.1,
+    test_fraction: float = 7 / 79,
+    scenes: int | None = None,
     subject: str = "(.*)",
     kind: str | None = None,
 ) -> SplitFile:
@@ -172,25 +179,29 @@ def make_splits(
         base: the folder that paths are relative to.
         seed: chooses subjects and cameras.
         test_fraction: at least this part of the scenes is for tests; at least one subject.
+        scenes: use only this many captures, drawn by the seed; None uses all.
         subject: a regular expression, whose first group in a capture's name is its subject.
         kind: the captures' format, None to recognise it.
 
     Raises:
         ValueError: fewer than two subjects, a name without a subject, two scenes of one name, or fewer than 4 cameras.
     """
-    scenes = [_scene(path, base, seed, subject, kind) for path in captures]
-    names = [scene.name for scene in scenes]
+    made = [_scene(path, base, seed, subject, kind) for path in captures]
+    names = [scene.name for scene in made]
     twice = sorted({name for name in names if names.count(name) > 1})
-    subjects = sorted({scene.subject for scene in scenes}, key=lambda one: _hash(seed, "subject", one))
+    if scenes is not None and scenes > len(made):
+        raise ValueError(f"expected at least the {scenes} captures of --scenes, got {len(made)}; name more captures")
+    made = sorted(made, key=lambda one: _hash(seed, "scene", one.name))[:scenes]
+    subjects = sorted({scene.subject for scene in made}, key=lambda one: _hash(seed, "subject", one))
     if twice or len(subjects) < 2:
         got = f"{twice[:3]} twice" if twice else f"the subjects {subjects}"
         raise ValueError(f"expected captures of different names and of two subjects or more, got {got}; see --subject")
     tested: set[str] = set()
     for one in subjects[:-1]:
-        if tested and sum(scene.subject in tested for scene in scenes) >= test_fraction * len(scenes):
+        if tested and sum(scene.subject in tested for scene in made) >= test_fraction * len(made) - 1e-9:
             break
         tested.add(one)
-    split = [structs.replace(s, split="test" if s.subject in tested else "training") for s in scenes]
+    split = [structs.replace(s, split="test" if s.subject in tested else "training") for s in made]
     return SplitFile(format=FORMAT, seed=seed, scenes=tuple(sorted(split, key=lambda s: (s.split, s.subject, s.name))))
 
 

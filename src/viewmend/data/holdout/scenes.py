@@ -12,9 +12,12 @@ from torch import Tensor
 from viewmend.data.holdout.true_visibility import SurfaceSeen
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.types import MultiViewFrame
+from viewmend.types import MultiViewFrame, Silhouettes
 
 Split = Literal["training", "validation", "test"]
+
+Protocol = Literal["strict", "target-mask", "hull-with-target-mask"]
+"""What is known of the held-out camera: nothing; its mask, as M_t of the view; or its mask, which carves the hull."""
 
 PROCEDURAL_SEEDS: Mapping[Split, range] = {
     "training": range(9000),
@@ -42,6 +45,18 @@ def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
             f"'{TEST_FOLDER}'; give the one for training"
         )
     return () if split == "validation" else tuple(places)
+
+
+def revealed(
+    protocol: Protocol, truth: MultiViewFrame | None
+) -> tuple[Float[Tensor, "height width"] | None, Silhouettes | None]:
+    """What a protocol reveals of the held-out camera (one view): M_t, and a silhouette that carves the hull."""
+    if protocol == "strict" or truth is None:
+        return None, None
+    assert truth.mask is not None, "held-out cameras have masks"
+    if protocol == "target-mask":
+        return truth.mask[0].float() / 255, None
+    return None, Silhouettes(truth.mask, truth.cameras)
 
 
 @dataclass(frozen=True)

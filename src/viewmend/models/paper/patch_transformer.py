@@ -30,11 +30,17 @@ class Prediction:
     """Fhat = E Ftilde + (1 - E) F, with F on black. Bit-identical to F where E is 0."""
     alpha: Float[Tensor, "height width"] | None
     """Alpha of a view painted on white: M, and 1 on all of E. None for a model on black, where alpha is M."""
+    target_mask: Float[Tensor, "height width"] | None = None
+    """M_t, by which Fhat is yet to be composited; None if it is not known."""
 
     @property
     def composited(self) -> Float[Tensor, "3 height width"]:
-        """Fhat on the model's background."""
-        return self.completed if self.alpha is None else self.completed + (1 - self.alpha)
+        """Fhat on the model's background, composited by M_t."""
+        own = self.completed if self.alpha is None else self.completed + (1 - self.alpha)
+        if self.target_mask is None:
+            return own
+        behind = 0 if self.alpha is None else 1 - self.target_mask
+        return own * self.target_mask + behind
 
 
 class PatchTransformer(Network):
@@ -143,7 +149,7 @@ class PatchTransformer(Network):
         with self.autocast():
             tokens = self.tokeniser(stacks).split([len(stack.places) for stack in stacks])
         return [
-            Target(view, stack.places, own, any_in_patch(view.error[None] > 0)[stack.kept])
+            Target(view, stack.places, own, any_in_patch(view.missing[None] > 0)[stack.kept])
             for view, stack, own in zip(views, stacks, tokens, strict=True)
         ]
 
@@ -165,11 +171,13 @@ class PatchTransformer(Network):
         view = target.view
         alpha = painted_alpha(view) if self.config.background == "white" else None
         if patches is None:
-            return Prediction(torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb, alpha)
+            return Prediction(
+                torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb, alpha, view.target_mask
+            )
         height, width = view.mask.shape
         (inpainted,), (coverage,) = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
         completed = blend(view.rgb, view.error, inpainted, coverage, clamp=False)
-        return Prediction(inpainted, coverage, completed, alpha)
+        return Prediction(inpainted, coverage, completed, alpha, view.target_mask)
 
 
 def _split_by_camera(

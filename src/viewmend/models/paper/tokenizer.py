@@ -46,6 +46,8 @@ def build_context_input(views: ContextViews, config: PaperConfig) -> EncoderInpu
     inside = torch.ones_like(mask)
     for image, (width, height) in zip(inside, frame.cameras.size_px.tolist(), strict=True):
         image[height:], image[:, width:] = 0, 0
+    if not config.use_mask:  # neither matting nor pruning of patches
+        return _stack_channels(rgb, mask, views.depth, inside > 0, config, views.part)
     rgb = rgb * mask[:, None]
     if config.background == "white":
         rgb = rgb + (inside * (1 - mask))[:, None]  # a smaller image of the stack is padded with black
@@ -53,11 +55,14 @@ def build_context_input(views: ContextViews, config: PaperConfig) -> EncoderInpu
 
 
 def build_target_input(view: IncompleteView, config: PaperConfig) -> EncoderInput:
-    """Encoder input of a novel view. Missing pixels are black and count as foreground."""
-    rgb, mask = view.rgb[None], view.mask[None]
+    """Encoder input of a novel view. Missing pixels are black and count as foreground, but not where M_t is 0."""
+    if not config.use_mask:  # F as it was rendered, and every patch
+        everywhere = torch.ones_like(view.mask[None])
+        return _stack_channels(view.rgb[None], everywhere, view.depth[None], everywhere > 0, config, view.part)
+    rgb, mask, missing = view.cut_rgb[None], view.silhouette[None], view.missing
     if config.background == "white":
-        rgb = (rgb + (1 - mask)) * (1 - view.error)
-    foreground = (mask > 0) | (view.error[None] > 0)
+        rgb = (rgb + (1 - mask)) * (1 - missing)
+    foreground = (mask > 0) | (missing[None] > 0)
     return _stack_channels(rgb, mask, view.depth[None], foreground, config, view.part)
 
 

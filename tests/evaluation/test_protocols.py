@@ -1,0 +1,164 @@
+"""The three protocols: what is known of the held-out camera, in the hull, the model's input and the completed view."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from models.plates import Rig, context, view
+from reference.ball import BallCapture, camera_at, ring
+
+from viewmend.data.holdout.scenes import LeaveOneOut, revealed
+from viewmend.evaluation.mending import Mender
+from viewmend.geometry.hull import HullConfig
+from viewmend.models.checkpoint import build
+from viewmend.models.classical import Telea
+from viewmend.models.paper.config import paper, paper_small
+from viewmend.models.paper.tokenizer import build_context_input, build_target_input
+from viewmend.models.smooth_fill import SmoothFill
+from viewmend.rendering.view import RenderConfig, select_closest
+from viewmend.stream import Stream
+from viewmend.training.config import SamplingConfig
+from viewmend.training.samples import HeldOutCamera
+from viewmend.types import check_target_mask
+
+TARGET = camera_at(75, "t", height_m=0.3)
+
+
+def truth_with_half_a_mask():
+    """What the target camera sees; its mask is soft at the edge, and shows the left half alone."""
+    truth = BallCapture(TARGET, 1).read(0)
+    mask = truth.mask.clone()
+    mask[..., mask.shape[-1] // 2 :] = 0
+    mask[..., mask.shape[-1] // 2] //= 2
+    return replace(truth, mask=mask)
+
+
+def mended(protocol, inpainter=None):
+    mender = Mender(inpainter or SmoothFill(), protocol=protocol)
+    return mender.mend(BallCapture(ring(6), 1).read(0), TARGET, truth_with_half_a_mask())
+
+
+def test_with_the_target_mask_nothing_outside_of_it_is_painted():
+    truth = truth_with_half_a_mask()
+    mask = truth.mask[0].float() / 255
+    strict, cut = mended("strict"), mended("target-mask")
+    assert strict.completed.rgb[:, mask == 0].any() and strict.completed.view.target_mask is None
+    assert torch.equal(cut.completed.view.target_mask, mask) and torch.equal(
+        cut.completed.view.rgb, strict.completed.view.rgb
+    )
+    torch.testing.assert_close(cut.completed.rgb, strict.completed.rgb * mask)
+    torch.testing.assert_close(cut.completed.opacity, strict.completed.opacity * mask)
+    known = cut.completed.view.error == 0
+    assert torch.equal(cut.completed.rgb[:, known], cut.completed.view.cut_rgb[:, known])
+    assert torch.equal(cut.rendered, strict.rendered * mask)
+    assert cut.scores.ours.psnr_whole > strict.scores.ours.psnr_whole + 1
+    assert cut.scores.ours.hole_px == strict.scores.ours.hole_px, "the same holes in every protocol"
+
+
+def test_the_hull_with_the_target_mask_lies_inside_of_it():
+    truth = truth_with_half_a_mask()
+    strict, carved = mended("strict"), mended("hull-with-target-mask")
+    outside = truth.mask[0] == 0
+    assert carved.completed.view.target_mask is None
+    assert int(((carved.completed.view.mask > 0) & outside).sum()) < 0.05 * int((strict.completed.view.mask > 0).sum())
+    assert int(((strict.completed.view.mask > 0) & outside).sum()) > 0.3 * int((strict.completed.view.mask > 0).sum())
+
+
+def test_classical_fills_see_the_uncut_view_and_are_cut_afterwards():
+    seen = []
+
+    class Spy(Telea):
+        def step(self, view, context, state):
+            seen.append(view)
+            return super().step(view, context, state)
+
+    cut = mended("target-mask", Spy())
+    assert torch.equal(seen[-1].rgb, cut.completed.view.rgb) and seen[-1].rgb[:, seen[-1].target_mask == 0].any()
+
+
+def test_the_papers_model_sees_m_t_white_where_it_is_0_and_black_where_it_is_missing():
+    incomplete = view(5)
+    mask = torch.ones_like(incomplete.mask)
+    mask[:, :40] = 0
+    error = torch.zeros_like(incomplete.error)
+    error[10:30, 20:60] = 1
+    given = replace(incomplete, error=error, target_mask=mask)
+    own = build_target_input(given, paper())
+    assert torch.equal(own.channels[0, 3], incomplete.mask * mask)
+    assert (own.channels[0, :3, :, :40] == 1).all() and not own.channels[0, :3, 10:30, 40:60].any()
+    assert not own.foreground[0, :, :40].any() and bool(own.foreground[0, 10:30, 40:60].all())
+    net = build(paper_small()).eval()
+    completed, _ = net.step_on("black", given, Rig(), net.initial_state())
+    assert not completed.rgb[:, :, :40].any() and torch.equal(
+        completed.opacity, torch.maximum(incomplete.mask, error) * mask
+    )
+    shown = net([given], [[context(5)]])[0].composited
+    assert (shown[:, :, :40] == 1).all(), "training sees what is scored"
+
+
+def test_without_masks_nothing_is_cut_and_no_patch_is_dropped():
+    config = replace(paper_small(), use_mask=False)
+    views, incomplete = context(5), view(5)
+    frame = replace(views.frame, mask=torch.zeros_like(views.frame.mask))
+    made = build_context_input(replace(views, frame=frame), config)
+    assert torch.equal(made.channels[:, :3], views.frame.rgb.float() / 255) and bool(made.kept.all())
+    given = replace(incomplete, mask=torch.zeros_like(incomplete.mask), target_mask=torch.zeros_like(incomplete.mask))
+    target = build_target_input(given, config)
+    assert torch.equal(target.channels[0, :3], incomplete.rgb) and bool(target.kept.all())
+    assert made.channels.shape[1] == 4, "RGB and depth"
+
+
+def test_a_wrong_target_mask_is_refused():
+    source = BallCapture(ring(6), 1).read(0)
+    stream = Stream(SmoothFill())
+    stream.add_frame(source)
+    rendered = stream.render(TARGET)
+    for mask, got in (
+        (torch.ones(3, 4), r"of shape \(3, 4\)"),
+        (torch.full(rendered.mask.shape, 255.0), "values from 255 to 255"),
+        (torch.ones(rendered.mask.shape, dtype=torch.uint8), "uint8"),
+    ):
+        with pytest.raises(ValueError, match=f"expected a target_mask of floats .* got .*{got}.*; divide"):
+            check_target_mask(mask, rendered.mask.shape)
+    with pytest.raises(ValueError, match=r"of shape \(48, 48\) \(height, width\), got .* of shape \(3, 4\)"):
+        stream.view(TARGET, target_mask=torch.ones(3, 4))
+    with pytest.raises(ValueError, match="values from 255 to 255"):
+        stream.mend(replace(rendered, target_mask=torch.full(rendered.mask.shape, 255.0)))
+
+
+def test_a_view_of_another_renderer_may_have_a_target_mask():
+    stream = Stream(SmoothFill())
+    stream.add_frame(BallCapture(ring(6), 1).read(0))
+    rendered = stream.render(TARGET)
+    mask = (torch.arange(rendered.mask.shape[1]) < 30).float().expand_as(rendered.mask).contiguous()
+    made = stream.mend(replace(rendered, target_mask=mask)).completed
+    assert not made.rgb[:, :, 30:].any() and not made.opacity[:, 30:].any() and made.rgb.any()
+
+
+def test_training_samples_follow_the_protocol():
+    source = BallCapture(ring(6), 1)
+    held = source.read(0).cameras.names[0]
+    samples = {}
+    for protocol in ("strict", "target-mask", "hull-with-target-mask"):
+        camera = HeldOutCamera(LeaveOneOut({0: source.read(0)}), held, HullConfig(resolution=48), protocol)
+        samples[protocol] = camera.sample(0, (0,), RenderConfig(), SamplingConfig())
+    truth = source.read(0).select([held])
+    assert torch.equal(samples["target-mask"].view.target_mask, truth.mask[0].float() / 255)
+    assert samples["strict"].view.target_mask is samples["hull-with-target-mask"].view.target_mask is None
+    outside = {name: int((s.view.mask[truth.mask[0] == 0] > 0).sum()) for name, s in samples.items()}
+    assert outside["hull-with-target-mask"] < outside["strict"] == outside["target-mask"]
+    assert revealed("strict", truth) == (None, None)
+
+
+def test_views_are_selected_by_angle_or_by_direction():
+    target, cameras = camera_at(0, "t"), ring(7)
+    centre = torch.zeros(3)
+    by_angle = select_closest(target, cameras, centre, 3)
+    pose = cameras.camera_from_world.clone()
+    first = cameras.names.index(by_angle[0])
+    pose[first] = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ pose[first]  # the closest camera looks away
+    away = replace(cameras, camera_from_world=pose)
+    assert select_closest(target, away, centre, 7) == select_closest(target, cameras, centre, 7)
+    assert select_closest(target, away, centre, 7, "direction")[-1] == by_angle[0]
+    with pytest.raises(ValueError, match="expected a selection of views by 'angle' or 'direction', got 'colour'"):
+        RenderConfig(selection="colour")
