@@ -89,7 +89,7 @@ def test_viewers_are_independent(model, inpainter):
 def test_every_camera_image_is_encoded_once_for_all_viewers(model, encoded):
     stream = Stream(model, CONFIG)
     walk(stream, range(3), A, B, A, camera_at(145, "c"))
-    assert len(encoded) == len(set(encoded)) and len(encoded) >= 3 * 4
+    assert len(encoded) == len(set(encoded)) and len(encoded) >= 3 * 3, "B has no holes"
     before = len(encoded)
     stream.view(camera_at(320, "d"), None, 2, RenderQuality(context_times=0))  # other cameras, no context
     for time in (0, 2, 1):  # seeking needs no new encoding

@@ -28,9 +28,10 @@ from viewmend.utils.logging import printable
 RULES = (
     "One camera is held out, image and mask. Its view is rendered from the other cameras and completed frame by frame, "
     "using past frames only. All methods complete the same views.",
-    'The protocol says what else is known of the held-out camera. "strict": nothing. "target-mask": its mask, which '
-    'the paper\'s model receives as M_t; every completed view is cut and composited by it. "hull-with-target-mask": its '
-    "mask carves the hull together with the others, as in RIFTCast's exporter, and is not used otherwise.",
+    'The protocol says what else is known of the held-out camera. "strict": nothing. "target-mask": its mask, M_t for '
+    "the paper's model, by which every completed view is cut and composited. "
+    '"hull-with-target-mask": its mask carves the hull together with the others, as in RIFTCast\'s exporter, and is '
+    "not used otherwise.",
     'Holes are the pixels of the geometry proxy that no source camera colours, not dilated: the error rule "holes". '
     "Scores use these pixels whatever a method is asked to inpaint. The truth is the held-out image on black or white, "
     "as the settings say. On white, classical fills and published networks receive the view on white, too; our models "
