@@ -1,5 +1,6 @@
 """Batches that depend only on the config, the seed and the step, so that a resumed run makes the same steps."""
 
+import gc
 import signal
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -96,16 +97,22 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
     if workers:
         # Through files: descriptors would run out with a buffer of samples.
         torch.multiprocessing.set_sharing_strategy("file_system")
-        loaded = iter(
-            DataLoader(
-                numbered,
-                batch_size=None,
-                sampler=count(first),  # pyright: ignore[reportArgumentType]
-                num_workers=workers,
-                prefetch_factor=2,
-                worker_init_fn=_ignore_signals,
-            )
+        loader = DataLoader(
+            numbered,
+            batch_size=None,
+            sampler=count(first),  # pyright: ignore[reportArgumentType]
+            num_workers=workers,
+            prefetch_factor=2,
+            worker_init_fn=_ignore_signals,
         )
+        # Forked workers must not collect what this process left behind: a decoder, say, would wait for its threads,
+        # which exist here only.
+        gc.collect()
+        gc.freeze()
+        try:
+            loaded = iter(loader)
+        finally:
+            gc.unfreeze()
     else:
         loaded = (numbered[number] for number in count(first))
     empty = 0
