@@ -54,7 +54,7 @@ def test_a_large_subject_is_judged_at_half_the_resolution_if_nothing_is_predicte
     half = errors.predict(view, sources, nothing)
     for one, other in zip(half, whole, strict=True):
         assert not torch.equal(one, other) and not bool(one[~there].any()) and float(one[there].min()) > 0
-    assert float(torch.stack([half.alpha[there], whole.alpha[there]]).corrcoef()[0, 1]) > 0.85
+    assert float(torch.stack([half.alpha[there], whole.alpha[there]]).corrcoef()[0, 1]) > 0.8
 
 
 def test_holes_and_the_highest_gains_are_selected(scene):

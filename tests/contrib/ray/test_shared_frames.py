@@ -214,7 +214,10 @@ def test_a_rendering_process_renders_the_same_pixels(link, follow):
         camera = view_camera(Camera(azimuth=33.0), renderer.home, (64, 64))
         fetch(source, 2)
         result = renderer.render(RenderRequest(2, (camera,), RenderQuality()), None)
-        results.append((result.completed[0].rgb, result.times.geometry, renderer.rig_json))
+        own = {
+            name: value for name, value in renderer.rig_json.items() if name != "assets"
+        }  # a version of each process
+        results.append((result.completed[0].rgb, result.times.geometry, own))
     alone.stop()
     assert torch.equal(results[0][0], results[1][0]) and results[0][0].any()
     assert results[0][2] == results[1][2]

@@ -14,14 +14,14 @@ from viewmend.data.native_writer import write_capture
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """A ball, and the same ball but for one camera, whose images and masks lie six pixels beside."""
+    """A ball, and the same ball but for one camera, whose images and masks lie nine pixels beside."""
     exact = tmp_path_factory.mktemp("scenes") / "ball"
     write_capture(BallCapture(ring(6)), exact, images="png")
     other = exact.with_name("other")
     shutil.copytree(exact, other)
     for kind in ("image", "mask"):
         for file in (other / kind / "c2").iterdir():
-            cv2.imwrite(str(file), np.roll(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), 6, 1))
+            cv2.imwrite(str(file), np.roll(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), 9, 1))
     return exact, other
 
 
@@ -33,7 +33,7 @@ def test_what_the_camera_left_out_saw_changes_the_truth_alone(folders):
         assert torch.equal(one.inputs.cameras.K, two.inputs.cameras.K), "the rig is aligned without it"
         assert torch.equal(one.inputs.rgb, two.inputs.rgb) and torch.equal(one.inputs.mask, two.inputs.mask)
         assert torch.equal(one.truth.cameras.K, two.truth.cameras.K)
-        assert torch.equal(one.truth.rgb.roll(6, 3), two.truth.rgb) and not torch.equal(one.truth.rgb, two.truth.rgb)
+        assert torch.equal(one.truth.rgb.roll(9, 3), two.truth.rgb) and not torch.equal(one.truth.rgb, two.truth.rgb)
     assert not torch.equal(exact[0].truth.rgb, exact[1].truth.rgb), "each time is another"
 
 
