@@ -38,6 +38,7 @@ LPIPS_DB = 40.0
 PATIENCE = 6
 """Validations without a new best score after which a run ends."""
 PADDING_PX = 8
+TILE_PX = (320, 480)
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,7 @@ class HeldBackValidation:
             _row(view, [("tuned", completed)], background)
             for view, (_, completed) in zip(self._views, made, strict=True)
         ]
-        write_image(image, contact_sheet(rows[:4]))
+        write_image(image, contact_sheet(rows[:4], *TILE_PX))
         psnr_db, lpips = (
             sum(values) / len(made) for values in zip(*((s.psnr_db, s.lpips) for s, _ in made), strict=True)
         )
@@ -208,7 +209,7 @@ def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, she
             f"| {view.camera}{note} | {old.psnr_db:.2f} | {new.psnr_db:.2f} | {old.lpips:.4f} | {new.lpips:.4f} |"
         )
         rows.append(_row(view, [("before", old_view), ("after", new_view)], after.background or "black"))
-    write_image(sheet, contact_sheet(rows))
+    write_image(sheet, contact_sheet(rows, *TILE_PX))
     return "\n".join(
         ["| camera | PSNR before, dB | after | LPIPS before | after |", "| --- | --- | --- | --- | --- |", *lines]
     )
