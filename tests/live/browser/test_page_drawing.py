@@ -135,11 +135,12 @@ def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, 
         for step in range(10):
             view.page.mouse.move(x + 40 + 8 * step, y)
             view.page.wait_for_timeout(30)
-        assert session.newest_look is None and len(session.recent) == before, "the page draws alone"
+        moved = len(session.recent)
+        assert session.newest_look is None and moved <= before + 1, "the page draws alone, but for a view in progress"
         assert np.abs(view.picture() - shown).mean() > 0.2
         view.page.mouse.up()
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
-        assert len(session.recent) > before
+        assert len(session.recent) > moved
 
 
 def test_playing_costs_the_server_no_views(browser, balls):
