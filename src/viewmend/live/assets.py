@@ -114,7 +114,7 @@ class AssetStore:
         """Bytes of all assets that are kept."""
 
     async def get(self, index: int, version: str) -> FrameAssets:
-        """The assets of a frame; whoever asks for the same frame meanwhile waits for the same result.
+        """The assets of a frame; simultaneous requests for the same frame share one result.
 
         Those of another version, that is, of another rig, are dropped.
 

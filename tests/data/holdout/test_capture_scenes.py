@@ -14,7 +14,7 @@ from viewmend.data.native_writer import write_capture
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """A ball, and the same ball but for one camera, whose images and masks lie nine pixels beside."""
+    """A ball, and the same ball with the images and masks of one camera shifted by nine pixels."""
     exact = tmp_path_factory.mktemp("scenes") / "ball"
     write_capture(BallCapture(ring(6)), exact, images="png")
     other = exact.with_name("other")
