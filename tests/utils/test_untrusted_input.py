@@ -4,7 +4,6 @@ import pickle
 
 import pytest
 
-from viewmend.contrib.baselines.parity import ParityFileError
 from viewmend.data.errors import CaptureError
 from viewmend.live.protocol import ProtocolError
 from viewmend.training.run_files import RunError
@@ -12,7 +11,7 @@ from viewmend.training.shards import ShardError
 from viewmend.utils.untrusted_input import MOST_CHARACTERS, InputError, bounded_bytes
 from viewmend.utils.weight_files import MismatchedWeightsError
 
-KINDS = (CaptureError, MismatchedWeightsError, ParityFileError, ProtocolError, RunError, ShardError)
+KINDS = (CaptureError, MismatchedWeightsError, ProtocolError, RunError, ShardError)
 
 
 @pytest.mark.parametrize("kind", KINDS)

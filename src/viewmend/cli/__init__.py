@@ -22,7 +22,7 @@ from viewmend.utils.logging import escaped_traceback, log_to_terminal
 
 
 class Command(NamedTuple):
-    """A subcommand. Its name is one or two words; `evaluate parity` is matched before `evaluate`."""
+    """A subcommand. Its name is one or two words; `weights get` is matched before `weights`."""
 
     name: str
     module: str
@@ -37,7 +37,6 @@ COMMANDS = (
     Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),
     Command("make-dataset", "viewmend.cli.make_dataset", "Generate training samples in advance."),
     Command("evaluate", "viewmend.cli.evaluate", "Compare methods on standard scenes and on captures."),
-    Command("evaluate parity", "viewmend.cli.parity", "Compare the baselines with their published implementations."),
     Command("evaluate paper-table", "viewmend.cli.paper_table", "Compute the paper's tables on your own data."),
     Command("benchmark", "viewmend.cli.benchmark", "Measure the time per view, stage by stage."),
     Command("weights", "viewmend.cli.weights", "List and check third-party weights."),
