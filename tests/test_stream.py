@@ -1,5 +1,6 @@
 """Streams and their viewers: what is shared is computed once, the rest is separate."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -9,12 +10,14 @@ from reference.ball import camera_at, photograph, proxy, ring
 from viewmend.frame_cache import cache_frame
 from viewmend.geometry.hull import HullConfig
 from viewmend.models.base import ContextProvider, RenderQuality
+from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.classical import ReprojectionFill, Telea
 from viewmend.models.paper.config import paper_small
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.rendering.view import render_view
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import IncompleteView, MultiViewFrame
+from viewmend.utils.cancellation import CancelledError, cancellable
 
 CONFIG = StreamConfig(hull=HullConfig(resolution=32))
 
@@ -84,6 +87,24 @@ def test_viewers_are_independent(model, inpainter):
     assert (together[1] - alone[1]).abs().max() < TOLERANCE
     assert (together[2] - alone[0]).abs().max() < TOLERANCE
     assert (together[0] - together[1]).abs().max() > 0.2
+
+
+@pytest.mark.parametrize("name", ["model", "views"])
+def test_a_view_can_be_cancelled_at_any_step(model, name):
+    """A cancelled view ends early, and leaves nothing behind that changes the next one."""
+    inpainter = model if name == "model" else load_inpainter("views")
+    (frame,) = frames(1)
+    fresh, steps = Stream(inpainter, CONFIG), []
+    fresh.add_frame(frame)
+    with cancellable(lambda: bool(steps.append(0))):
+        expected = fresh.view(A).completed.rgb
+    assert len(steps) >= 8
+    for end in range(0, len(steps), 5):
+        stream, count = Stream(inpainter, CONFIG), itertools.count()
+        stream.add_frame(frame)
+        with pytest.raises(CancelledError), cancellable(lambda count=count, end=end: next(count) >= end):
+            stream.view(A)
+        assert (stream.view(A).completed.rgb - expected).abs().max() < TOLERANCE
 
 
 def test_every_camera_image_is_encoded_once_for_all_viewers(model, encoded):

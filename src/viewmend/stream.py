@@ -32,6 +32,7 @@ from viewmend.types import (
     Silhouettes,
     check_target_mask,
 )
+from viewmend.utils.cancellation import stop_if_cancelled
 from viewmend.utils.timing import StageTimes, ms_since, now_s
 
 
@@ -266,6 +267,7 @@ class Stream:
     ) -> tuple[IncompleteView, Evidence, Crop]:
         """Render the part of a view that shows the subject, with the inpainter's margin."""
         check_target_mask(target_mask, target.max_size_px[::-1])
+        stop_if_cancelled()
         cached = self.cached_frame(time)
         if not isinstance(cached.proxy, GeometryProxy):
             got = type(cached.proxy).__name__
@@ -305,7 +307,9 @@ class Stream:
         cached, viewer = self.cached_frame(part.time), viewer or self.viewer()
         context = ContextProvider(self._context, quality, exclude, self._memory)
         start = now_s(part.rgb.device)
+        stop_if_cancelled()
         part = self._with_error_mask(part, evidence, quality, exclude)
+        stop_if_cancelled()
         if target is not None and self.inpainter.crop_margin_px(quality) is None:
             part, crop = crop.uncropped(part, target), Crop.all_of(target)
         completed = CompletedView(part, part.cut_rgb)

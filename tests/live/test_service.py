@@ -12,6 +12,7 @@ from viewmend.live.protocol import Camera, FrameTimes
 from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
 from viewmend.models.base import RenderQuality, State
+from viewmend.utils.cancellation import stop_if_cancelled
 from viewmend.utils.timing import StageTimes
 
 HOME = home_view(ring(4), torch.zeros(3), None)
@@ -41,6 +42,7 @@ class FakeRenderer(Renderer):
     def render(self, request, viewer):
         if request.quality.top_k == 13:
             raise RuntimeError("bad luck")
+        stop_if_cancelled()
         return RenderResult(request.time, (), State(), StageTimes(geometry=3.0, rendering=4.0))
 
 
@@ -48,6 +50,7 @@ class Eager:
     """A session that always requests a view."""
 
     viewer = None
+    is_cancelled = False
 
     def __init__(self, name, log, top_k=None, bad=False):
         self.name, self.log, self.top_k, self.bad = name, log, top_k, bad
@@ -61,6 +64,9 @@ class Eager:
     def deliver(self, request, result):
         self.log.append(self.name)
         return FrameTimes(**vars(result.times), encode=2.0)
+
+    def give_up(self):
+        self.log.append(f"{self.name} gave up")
 
     def fail(self, message):
         self.failures.append(message)
@@ -90,8 +96,20 @@ def test_a_failure_is_reported_to_its_session_only(service):
     for _ in range(6):
         service.serve_next()
     assert log == ["a"] * 3 and unlucky.failures == ["RuntimeError: bad luck"] * 3 and len(odd.failures) >= 3
-    assert service.counts == {"errors": 3, "frames": 3, "shared": 0}
+    assert service.counts == {"errors": 3, "frames": 3, "shared": 0, "cancelled": 0}
     assert (service.times.encode, service.times.rendering, service.times.total) == (6.0, 12.0, 27.0)
+
+
+def test_a_cancelled_view_is_neither_delivered_nor_a_failure(service):
+    log = []
+    session = Eager("a", log)
+    service.join(session)
+    session.is_cancelled = True
+    assert service.serve_next()
+    session.is_cancelled = False
+    assert service.serve_next()
+    assert log == ["a gave up", "a"] and service.counts["cancelled"] == 1 and not session.failures
+    assert service.error is None
 
 
 def test_a_session_that_left_is_not_served(service):

@@ -128,6 +128,25 @@ def test_a_cancelled_look_is_neither_rendered_nor_sent(ball_view):
     assert [unpack(message)[0]["look"] for message in desk.sent] == [2]
 
 
+def test_only_a_final_view_is_cancelled_by_what_replaces_it():
+    desk = Desk(budget_ms=50.0)
+    desk.pause()
+    desk.look(id=1)
+    assert desk.due() is not None
+    desk.look(id=2)
+    assert not desk.session.is_cancelled, "the views of a movement are shown"
+    assert desk.due() is not None and desk.due(FULL_S) is not None
+    desk.look(id=3)
+    assert desk.session.is_cancelled, "a better view of what was left behind"
+    desk.session.give_up()
+    desk.look(id=4, full=True)
+    assert desk.due() is not None and not desk.session.is_cancelled
+    desk.change_clock(seek=5)
+    assert desk.session.is_cancelled
+    desk.session.give_up()
+    assert desk.due().time == 5 and desk.due() is None, "the same look is rendered at the new time"
+
+
 def test_a_still_view_is_refined_in_two_steps():
     desk = Desk(budget_ms=50.0)
     desk.pause()

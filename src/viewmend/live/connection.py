@@ -151,6 +151,7 @@ class ViewerConnection:
         finally:
             self._service.leave(self._session)
             with self._service.lock:
+                self._session.cancel()
                 for extension in self._registry.extensions:
                     extension.leave(self._session)
             if self._session in sessions:

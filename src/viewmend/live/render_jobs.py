@@ -112,6 +112,14 @@ class RenderJob(ABC, Generic[Result]):
         self.encode(result)
         return FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
 
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether the client has gone."""
+        return self.done.done()
+
+    def give_up(self) -> None:
+        """The job ends without a result."""
+
     def finish(self, result: Result) -> None:
         """Set the result, unless the job was cancelled."""
         with suppress(InvalidStateError):

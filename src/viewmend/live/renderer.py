@@ -22,6 +22,7 @@ from viewmend.models.base import Inpainter, RenderQuality, State
 from viewmend.rendering.proxy_views import hull_points, shaded_hull, vertex_colours
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.types import CompletedView, MultiViewFrame
+from viewmend.utils.cancellation import CancelledError
 from viewmend.utils.timing import StageTimes
 
 WARM_UP_PX = 64
@@ -224,6 +225,8 @@ class Renderer:
         """One view; with its holes if the model fails."""
         try:
             view = stream.view(camera, viewer, index, quality)
+        except CancelledError:
+            raise
         except Exception as error:
             if not quality.mend:
                 raise

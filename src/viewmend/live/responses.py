@@ -105,6 +105,7 @@ def metrics_text(registry: SessionRegistry) -> str:
         *metric("viewmend_frames_total", "counter", "Rendered views.", counts["frames"]),
         *metric("viewmend_shared_total", "counter", "Views of a frame with known geometry.", counts["shared"]),
         *metric("viewmend_dropped", "gauge", "Looks of present viewers replaced before they were rendered.", dropped),
+        *metric("viewmend_cancelled_total", "counter", "Views that were not needed any more.", counts["cancelled"]),
         *metric("viewmend_errors_total", "counter", "Views that failed.", counts["errors"]),
         *metric("viewmend_source_frames", "gauge", "Frames that can be requested.", source.span.end),
         *metric("viewmend_stage_seconds_total", "counter", "Seconds spent in each stage.", stages),

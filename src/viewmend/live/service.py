@@ -12,6 +12,7 @@ from viewmend.live.poses import HomeView
 from viewmend.live.protocol import FrameTimes
 from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
 from viewmend.live.sessions import PlaybackState, Session, ViewerSession
+from viewmend.utils.cancellation import CancelledError, cancellable
 from viewmend.utils.heap import HeapTrimmer
 
 TICK_S = 0.004
@@ -30,7 +31,7 @@ class RenderService:
         self.lock = threading.Condition()
         self.error: str | None = None
         """The error of the last view, or of the rig's first frame."""
-        self.counts = Counter(frames=0, shared=0, errors=0)
+        self.counts = Counter(frames=0, shared=0, errors=0, cancelled=0)
         self.times = FrameTimes()
         """Times of all frames together; like the counts, for /metrics."""
         self._sessions: list[Session] = []
@@ -66,7 +67,7 @@ class RenderService:
             self.lock.notify_all()
 
     def leave(self, session: Session) -> None:
-        """Stop serving a session; a view that is being rendered for it is still delivered."""
+        """Stop serving a session."""
         with self.lock:
             if session in self._sessions:
                 self._sessions.remove(session)
@@ -116,11 +117,16 @@ class RenderService:
             return False
         session, request = found
         try:
-            result = self.renderer.render(request, session.viewer)
+            with cancellable(lambda: session.is_cancelled or self._stopped):
+                result = self.renderer.render(request, session.viewer)
             times = session.deliver(request, result)
             if isinstance(session, ViewerSession):
                 pixels = sum(int(camera.size_px.prod()) for camera in request.cameras)
                 self._resolution_limit.record(pixels, session.rendered_level, self.now() - now)
+        except CancelledError:
+            self.counts["cancelled"] += 1
+            session.give_up()
+            return True
         except Exception as error:  # reported to this session only
             log.exception("while rendering a view")
             self.error = f"{type(error).__name__}: {error}"[:400]

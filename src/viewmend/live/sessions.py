@@ -58,6 +58,15 @@ class Session(Protocol):
         """Report that the view could not be rendered."""
         ...
 
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether the view that is being rendered is not needed any more; called often, without the lock."""
+        ...
+
+    def give_up(self) -> None:
+        """Note that the view was not rendered, because it was cancelled."""
+        ...
+
 
 @dataclass(frozen=True)
 class SentFrame:
@@ -104,7 +113,9 @@ class ViewerSession:
         self._advanced_at = now()
         self._requested: tuple[Look | None, int] = (None, -1)
         """Look and frame of the last request."""
-        self._is_full = self._is_cancelled = False
+        self.is_cancelled = False
+        """Whether the view that is being rendered is not needed any more."""
+        self._is_full = self._is_refined = False
         self._awaited = (-1, 0.0)
         """The frame that is being read, and since when; -1 for none."""
         self._level, self._wait_ms = FULL, 0.0
@@ -117,11 +128,24 @@ class ViewerSession:
         if self._look is not self._requested[0]:
             self.dropped += 1
         self._look, self._look_at = look, self._now()
+        self._cancel_final_view()
         self._encoders.key_frame |= look.key  # kept until a frame is encoded, even if this look is dropped
 
     def cancel(self) -> None:
-        """Drop the look; a view that is being rendered is not sent."""
-        self._look, self._is_cancelled = None, True
+        """Drop the look, and the view that is being rendered for it."""
+        self._look, self.is_cancelled = None, True
+
+    def _cancel_final_view(self) -> None:
+        """Give up the view that is being rendered if only a resting viewer has use for it.
+
+        Views of a movement are finished, as they show it best: each would be replaced before it is done.
+        """
+        look = self._requested[0]
+        self.is_cancelled |= look is not None and (look.full or self._is_refined)
+
+    def give_up(self) -> None:
+        """Render the view again if it is asked for again."""
+        self._requested = (None, -1)
 
     @property
     def newest_look(self) -> Look | None:
@@ -131,6 +155,7 @@ class ViewerSession:
     def change_clock(self, change: ClockChange, span: Span) -> None:
         """Play, pause, seek, change the speed, or follow the edge."""
         self.clock.change(change, span)
+        self._cancel_final_view()
 
     def is_active(self, now: float) -> bool:
         """Whether a frame was sent within the last second, or the newest look waits for its first one."""
@@ -165,7 +190,7 @@ class ViewerSession:
             return None
         if is_new and not is_new_look and self.clock.playing:
             self.dropped += max(0, index - self._requested[1] - 1)
-        self._level, self._is_full, self._is_cancelled = level, level == FULL, False
+        self._level, self._is_full, self._is_refined, self.is_cancelled = level, level == FULL, not is_new, False
         self.rendered_level = playback.resolution_limit.apply(
             level, look.pixels, playback.active_viewers, playback.has_company
         )
@@ -226,7 +251,8 @@ class ViewerSession:
         look = self._requested[0]
         assert look is not None, "a view is rendered for a look"
         self.viewer = result.viewer
-        if self._is_cancelled:
+        if self.is_cancelled:
+            self.give_up()
             return FrameTimes(**vars(result.times))
         fields = {"frame": next(self._frame_numbers), "full": self._is_full, "dropped": self.dropped}
         message, times = encode_frame(look, request, result, self._encoders, self._wait_ms, **fields)

@@ -21,9 +21,16 @@ def choose(view, name: str) -> None:
 
 def test_modes_show_their_pictures(view):
     seen = {}
-    for name in ("Output", "Rendered", "Holes", "Depth", "Source cameras"):
+    shown = {
+        "Output": "mended",
+        "Rendered": "rendered",
+        "Holes": "holes",
+        "Depth": "depth",
+        "Source cameras": "coverage",
+    }
+    for name, mode in shown.items():
         choose(view, name)
-        assert view.server.looks[-1]["modes"] == [name.lower()]
+        assert view.server.looks[-1]["modes"] == [mode]
         seen[name] = view.picture()
     assert share(seen["Holes"], scene.PINK) > 0.004 > share(seen["Output"], scene.PINK)
     black = {name: (pixels.max(-1) < 20).mean() for name, pixels in seen.items()}

@@ -60,7 +60,7 @@ def test_while_it_is_lost_there_is_a_button(desktop):
     desktop.until(lambda: not cover(desktop) or (desktop.page.locator("#cover-retry").click() or False), 20)
 
 
-@pytest.mark.parametrize(("code", "words"), [(4401, "asks for a token"), (4426, "Reload the page")])
+@pytest.mark.parametrize(("code", "words"), [(4401, "needs a token"), (4426, "Reload the page")])
 def test_a_final_refusal_says_what_to_do(browser, server, code, words):
     server.refuse = code
     for view in opened(browser, server, "phone"):

@@ -217,7 +217,7 @@ class BroadcastSession(ViewerSession):
             look, camera=centred_camera(look), eyes=None, modes=look.modes[:1], width=width, height=height
         )
         # Not as moving: the viewer may leave with this look, which is then shown at rest.
-        super().look(replace(resized, scale=1.0, depth=False, moving=False))
+        super().look(replace(resized, scale=1.0, depth=False, moving=False, full=False))
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the edge."""

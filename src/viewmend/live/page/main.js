@@ -225,7 +225,7 @@ class Page {
   /** Whether the page draws moving views by itself. */
   get drawing() {
     const drawn = this.settings.modes.every((mode) => DRAWN_MODES.includes(mode));
-    return drawn && this.assets.usable && this.settings.get("render") === "page" && !this.headset.session && this.motion.pose !== null;
+    return drawn && this.assets.usable && this.settings.get("render") === "page" && !this.headset.session && !this.onAir.wanted && this.motion.pose !== null;
   }
 
   /** Choose the frame to draw, and ask for the next ones. @param {number} now ms */

@@ -11,6 +11,7 @@ from torch.nn import functional as F
 from viewmend.models.paper.config import ENCODER_GROUPS, PaperConfig
 from viewmend.models.paper.patches import PATCH_CELLS, STEP_CELLS, STEP_PX, any_in_patch, crop, padded_size, split
 from viewmend.types import ContextViews, IncompleteView, WindowPart
+from viewmend.utils.cancellation import stop_if_cancelled
 
 RECEPTIVE_RADIUS_PX = 29
 """Distance from a cell of the feature map within which pixels influence its features."""
@@ -131,6 +132,7 @@ class Encoder(nn.Module):
         x = images.contiguous(memory_format=torch.channels_last)
         early = x
         for number, layer in enumerate(self.layers):
+            stop_if_cancelled()
             if number > 4:
                 x = _interleave(early, x, ENCODER_GROUPS[number])
             x = F.leaky_relu(layer(x), SLOPE, inplace=True)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.models.paper.config import PaperConfig
+from viewmend.utils.cancellation import stop_if_cancelled
 
 LONGEST = 2.0
 """Wavelength of the slowest rotation, in image widths (or temporal windows)."""
@@ -217,6 +218,7 @@ class Transformer(nn.Module):
         kept: Tensor | None = None
         weight: Tensor | None = None
         for number in range(self.config.blocks):
+            stop_if_cancelled()
             index = group * self.config.blocks + number
             block = self.blocks[index]
             assert isinstance(block, Block)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from viewmend.types import RIM_PX, IncompleteView
+from viewmend.utils.cancellation import stop_if_cancelled
 
 CELL_PX = 2
 """Side of the cells in which depth hypotheses are judged."""
@@ -194,9 +195,11 @@ class UNet(nn.Module):
         """All but the first layer."""
         scales = [F.relu(x + self.first(x))]
         for layer in self.down:
+            stop_if_cancelled()
             scales.append(layer(scales[-1]))
         x = scales.pop()
         for scale, up, join in reversed(list(zip(scales, self.up, self.join, strict=True))):
+            stop_if_cancelled()
             coarse = F.interpolate(up(x), size=scale.shape[2:], mode="bilinear", align_corners=False)
             x = F.relu(scale + join(F.relu(coarse + scale)))
         return x
@@ -241,6 +244,7 @@ def run_tiled(
     values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
     outputs = []
     for part in _parts(len(tiles)):
+        stop_if_cancelled()
         at = rows[part] // TILE_PX, columns[part] // TILE_PX
         fine = F.interpolate(near[:, *at].movedim(0, 1), scale_factor=CELL_PX, mode="bilinear", align_corners=False)
         cut = CELL_PX * cell_halo - halo

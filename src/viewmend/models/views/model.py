@@ -41,6 +41,7 @@ from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
 from viewmend.models.views.sampler import Rays, sample_rays
 from viewmend.types import CompletedView, ContextViews, IncompleteView
+from viewmend.utils.cancellation import stop_if_cancelled
 
 IMAGE_CHANNELS = 7
 """RGB of the first guess, M, whether a pixel is coloured, its largest source weight, and whether it is predicted."""
@@ -180,13 +181,15 @@ class ViewSynthNet(Network):
         beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image)
         with self.autocast():
-            parts = [
-                self.sample_aggregator(sample_rays(part, sources, view.source_views, float(CELL_PX), scale))
-                for part in rays
-            ]
+            parts = []
+            for part in rays:
+                stop_if_cancelled()
+                samples = sample_rays(part, sources, view.source_views, float(CELL_PX), scale)
+                parts.append(self.sample_aggregator(samples))
             samples = AggregatedSamples(*map(torch.cat, zip(*parts, strict=True)))
             inputs = samples.features.flatten(1).to(self.compute_dtype)
             images = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(inputs)
+            stop_if_cancelled()
             with heavy_operations():
                 features = self.unet.forward_points(inputs, cells, concatenate_channels(images))
             logits = self.depth_logits(features)[0, :, cells[:, 0], cells[:, 1]].T.float() + samples.score.float()
@@ -202,6 +205,7 @@ class ViewSynthNet(Network):
         distribution: DepthDistribution,
     ) -> ViewPrediction:
         """Samples the cameras at the depth of each pixel, and blends them."""
+        stop_if_cancelled()
         hypothesis, offset, certainty = self._depth_offset(pixels, distribution)
         cell = distribution.cell_index[tuple((pixels // CELL_PX).T)]
         own, front = view.depth[tuple(pixels.T)], distribution.depth[tuple(distribution.cells.T)][cell]
@@ -209,6 +213,7 @@ class ViewSynthNet(Network):
         depth = front + scale.size_m * offset
         rays = Rays(view.camera, pixels.flip(1).double() + 0.5, depth.detach()[:, None])
         samples = sample_rays(rays, sources, view.source_views, 1.0, scale, cubic=True)
+        stop_if_cancelled()
         with self.autocast():
             blended = self.pixel_aggregator(samples, distribution.samples.trust[cell, hypothesis][:, None])
         sharp = unpremultiply(blended.colour[:, 0], blended.mask[:, 0])

@@ -29,6 +29,7 @@ from viewmend.models.views.sampler import (
     sample_fill_rays,
 )
 from viewmend.types import IncompleteView
+from viewmend.utils.cancellation import stop_if_cancelled
 
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Points on a ray: z-depth behind the proxy, in subject sizes."""
@@ -139,8 +140,11 @@ class RayFill(CoarseFill):
         with self.autocast():
             far = [self.far(_rounded_up(part)).flatten(1)[: len(part)] for part in neighbourhoods.split(size)]
             per_pixel = features, smallest, window, torch.cat(far)[index]
-            chunks = zip(*(values.split(size) for values in per_pixel), strict=True)
-            return torch.cat([self._mix(*map(_rounded_up, chunk))[: len(chunk[0])] for chunk in chunks])
+            mixed = []
+            for chunk in zip(*(values.split(size) for values in per_pixel), strict=True):
+                stop_if_cancelled()
+                mixed.append(self._mix(*map(_rounded_up, chunk))[: len(chunk[0])])
+            return torch.cat(mixed)
 
     def _mix(
         self,
