@@ -94,59 +94,34 @@ class NativeCapture:
         path = path.parent if path.name == CALIBRATION and path.is_file() else path
         calibration = read_any_calibration(path, format)
         self.folder = folder = calibration.folder
-        self._name = path.stem if path.is_file() else folder.resolve().name
+        self.name = path.stem if path.is_file() else folder.resolve().name
+        """Name of the folder, or of the file that was opened."""
         self._file = calibration.file
         self._entries = _select(calibration.cameras, cameras, self._file)
         if alpha:
             self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
-        self._calibration = calibration
+        self.cameras = pinhole_cameras(self._entries)
+        """All cameras, after undistortion, in metres."""
         self.clock = read_clock(calibration)
         """When the films' frames were taken; None for a capture of images."""
-        self._frame_ids = calibration.frames[: None if self.clock is None else len(self.clock.times_s)]
+        self.frame_ids = calibration.frames[: None if self.clock is None else len(self.clock.times_s)]
+        """Frame ids in temporal order."""
+        self._listed = len(calibration.frames)
+        self.fps = calibration.fps
+        """Frames per second; None if unknown or static."""
+        self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
+        """World up, unit length; None if unknown."""
+        corners = calibration.bounds_m
+        self.bounds = None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
+        """The volume that contains the subject, in metres; None if unknown."""
+        self.metres_per_unit = calibration.metres_per_unit
+        """Length of the folder's own unit. All values of this class are in metres."""
         self.has_masks = self._all_or_none("mask")
         self.has_depth = self._all_or_none("depth")
-        self._readers = tuple(CameraReader(folder, camera, self._frame_ids, self.clock) for camera in self._entries)
+        self._readers = tuple(CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries)
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
         self._masks_are_opaque = self._warned_of_labels = False
-        self._cameras = pinhole_cameras(self._entries)
-
-    @property
-    def name(self) -> str:
-        """Name of the folder, or of the file that was opened."""
-        return self._name
-
-    @property
-    def cameras(self) -> Cameras:
-        """All cameras, after undistortion, in metres."""
-        return self._cameras
-
-    @property
-    def frame_ids(self) -> tuple[str, ...]:
-        """Frame ids in temporal order."""
-        return self._frame_ids
-
-    @property
-    def fps(self) -> float | None:
-        """Frames per second; None if unknown or static."""
-        return self._calibration.fps
-
-    @property
-    def up(self) -> Float[Tensor, "3"] | None:
-        """World up, unit length; None if unknown."""
-        up = self._calibration.up
-        return None if up is None else torch.tensor(up, dtype=torch.float32)
-
-    @property
-    def bounds(self) -> Bounds | None:
-        """The volume that contains the subject, in metres; None if unknown."""
-        corners = self._calibration.bounds_m
-        return None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
-
-    @property
-    def metres_per_unit(self) -> float:
-        """Length of the folder's own unit. All values of this class are in metres."""
-        return self._calibration.metres_per_unit
 
     @property
     def gaps(self) -> tuple[tuple[str, str], ...]:
@@ -159,7 +134,7 @@ class NativeCapture:
         """Films whose times differ from the others'."""
         if self.clock is None:
             return ()
-        listed, found = len(self._calibration.frames), len(self._frame_ids)
+        listed, found = self._listed, len(self.frame_ids)
         text = f"expected {listed} frames as listed, got films with {found} common times; the other frames are left out"
         short = (Issue(text),) if found < listed else ()
         return short + self.clock.issues(self.cameras.names)
@@ -183,7 +158,7 @@ class NativeCapture:
         views = [view for view, image in zip(views, images, strict=True) if image is not None]
         if not views:
             raise CaptureError(f"{self.folder}: frame '{frame_id}': expected a frame in one film or more, got none")
-        frame = stack_images([image for image in images if image is not None], self._cameras[views], time)
+        frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
         if frame.mask is not None and not self._masks_are_opaque:
             frame = self._from_labels(frame)
         if frame.mask is not None and (highest := int(frame.mask.max())) <= FOREGROUND:
@@ -251,31 +226,28 @@ class NativeCapture:
         present = np.array([[reader.has(time, exists) for time in times] for reader in self._readers], bool)
         for camera, row in zip(self._entries, present, strict=True):
             if not row.any():
-                raise CaptureError(self._never_present(camera, exists))
+                absent: list[FileKind] = [
+                    k for k in camera.file_kinds if not any(exists(camera.file(k, f)) for f in self.frame_ids)
+                ]
+                wanted = f"{' and '.join(camera.file_kinds)} of the camera in the same frame"
+                wanted = f"the camera's {absent[0]} in one frame or more" if absent else wanted
+                raise CaptureError(
+                    f"{self._example(camera, absent)}: expected {wanted}, found in none of "
+                    f"{len(self.frame_ids)}; correct the paths in {self._file}, or leave the camera out"
+                )
         for frame, column in zip(self.frame_ids, present.T, strict=True):
             if not column.any():
-                first = self._entries[0]
                 raise CaptureError(
-                    f"{self.folder / first.file(first.file_kinds[0], frame)}: camera '{first.name}', frame '{frame}': "
-                    f"expected this file or another camera's, got none of any camera; add them, or remove the frame "
-                    f"from {self._file}"
+                    f"{self._example(self._entries[0], frame=frame)}: expected this file or another camera's, got none "
+                    f"of any camera; add them, or remove the frame from {self._file}"
                 )
         return present
 
-    def _never_present(self, camera: NativeCamera, exists: Callable[[str], bool]) -> str:
-        """The error message for a camera that is in no frame."""
-        frames, kinds = self.frame_ids, camera.file_kinds
-        absent: list[FileKind] = [
-            kind for kind in kinds if not any(exists(camera.file(kind, frame)) for frame in frames)
-        ]
-        expected = f"{' and '.join(kinds)} of the camera in the same frame"
-        if absent:
-            expected = f"the camera's {absent[0]} in one frame or more"
-        example = self.folder / camera.file((absent or kinds)[0], frames[0])
-        return (
-            f"{example}: camera '{camera.name}', frame '{frames[0]}': expected {expected}, found in none of "
-            f"{len(frames)}; correct the paths in {self._file}, or leave the camera out"
-        )
+    def _example(self, camera: NativeCamera, kinds: Sequence[FileKind] = (), frame: str | None = None) -> str:
+        """A missing file of a camera, to start an error message."""
+        frame = self.frame_ids[0] if frame is None else frame
+        path = self.folder / camera.file((*kinds, *camera.file_kinds)[0], frame)
+        return f"{path}: camera '{camera.name}', frame '{frame}'"
 
 
 def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file: Path) -> tuple[NativeCamera, ...]:

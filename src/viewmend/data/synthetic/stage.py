@@ -88,9 +88,16 @@ class Studio:
         self.performer = performer or _cast(config, performer_seed)
         rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
         cameras = config.cameras if isinstance(config.cameras, Cameras) else rig(config.cameras, size, seed=rig_seed)
+        self.name = f"studio {config.seed}: {self.performer.description}"
+        self.frame_ids = tuple(f"{time:06d}" for time in range(config.frames))
+        """Six digits each, from 000000."""
+        self.fps = float(config.fps) if config.frames > 1 else None
+        """Frames per second, None for a single frame."""
+        self.up = torch.tensor([0.0, 1.0, 0.0], device=config.device)
         self.true_cameras = cameras.to(config.device)
         """True poses of the cameras; `cameras` has the calibration errors of the capture."""
-        self._cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
+        self.cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
+        """The calibration of the capture, including its errors."""
         self._lights = stage_lights(light_seed).to(config.device)
         self._backdrop = None
         if config.background == "stage":
@@ -99,31 +106,6 @@ class Studio:
         self._last_surface: tuple[int, Surface] | None = None
         self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
         self._bounds: Bounds | None = None
-
-    @property
-    def name(self) -> str:
-        """Seed and performer."""
-        return f"studio {self.config.seed}: {self.performer.description}"
-
-    @property
-    def cameras(self) -> Cameras:
-        """The calibration of the capture, including its errors."""
-        return self._cameras
-
-    @property
-    def frame_ids(self) -> tuple[str, ...]:
-        """Six digits each, from 000000."""
-        return tuple(f"{time:06d}" for time in range(self.config.frames))
-
-    @property
-    def fps(self) -> float | None:
-        """Frames per second, None for a single frame."""
-        return float(self.config.fps) if self.config.frames > 1 else None
-
-    @property
-    def up(self) -> Float[Tensor, "3"] | None:
-        """+y."""
-        return torch.tensor([0.0, 1.0, 0.0], device=self.config.device)
 
     @property
     def bounds(self) -> Bounds | None:
@@ -151,7 +133,7 @@ class Studio:
             raise IndexError(f"expected a time from 0 to {self.config.frames - 1}, got {time}")
         frame = self._draw(self.true_cameras, time, self._backdrop)
         frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, self._backdrop)
-        return replace(frame, cameras=self._cameras)
+        return replace(frame, cameras=self.cameras)
 
     def truth(self, cameras: Cameras, time: int) -> MultiViewFrame:
         """What perfect cameras anywhere would see at index `time`, with exact mask and depth.
