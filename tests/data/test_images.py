@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from viewmend.data import images
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import (
     PNG_CHUNK_OVERHEAD,
@@ -70,9 +71,10 @@ def test_truncated_jpegs_are_rejected(share, tmp_path):
         read_rgb(tmp_path / "a.jpg", "here")
 
 
-def test_the_number_of_pixels_is_limited():
-    assert decode_image(PNG, cv2.IMREAD_COLOR, 32 * 24) is not None
-    assert decode_image(PNG, cv2.IMREAD_COLOR, 32 * 24 - 1) is None
+def test_the_number_of_pixels_is_limited(monkeypatch):
+    for limit in (32 * 24, 32 * 24 - 1):
+        monkeypatch.setattr(images, "MAX_PIXELS", limit)
+        assert (decode_image(PNG, cv2.IMREAD_COLOR) is None) == (limit < 32 * 24)
 
 
 def test_16_bit_images_need_their_full_range(tmp_path):

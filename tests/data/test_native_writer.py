@@ -57,11 +57,10 @@ def test_png_captures_round_trip_exactly(plain, tmp_path):
     assert description["cameras"][0]["image"] == "image/a/{frame}.png"
 
 
-@pytest.mark.parametrize("options", [{"images": "jpeg"}, {"video": True}])
-def test_jpeg_and_video_lose_little(plain, tmp_path, options):
+def test_jpeg_loses_little(plain, tmp_path):
     smooth = torch.linspace(0, 255, 40).expand(4, 3, 32, 40).byte()
     source = Changed(open_capture(plain.path), lambda frame: replace(frame, rgb=smooth.clone()))
-    write_capture(source, tmp_path / "copy", **options)
+    write_capture(source, tmp_path / "copy", images="jpeg")
     assert_same(open_capture(tmp_path / "copy"), source, tolerance=2)
 
 
@@ -73,13 +72,6 @@ def test_depth_is_kept_to_half_a_millimetre(plain, tmp_path, rng):
     far = Changed(open_capture(plain.path), lambda frame: replace(frame, depth=torch.full(depth.shape, 70.0)))
     with pytest.raises(CaptureError, match=r"0 to 65\.535 m, got 70"):
         write_capture(far, tmp_path / "far")
-
-
-def test_videos_cannot_have_gaps(plain, tmp_path):
-    (plain.path / "images/d_001.png").unlink()
-    with pytest.raises(CaptureError, match=r"frame '001'.*cannot have gaps.*\['d'\].*write images"):
-        write_capture(open_capture(plain.path), tmp_path / "copy", video=True)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["ball"]
 
 
 def test_folders_in_use_are_not_changed(plain, tmp_path):

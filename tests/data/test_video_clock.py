@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from reference.ball import BallCapture, photograph, ring
-from reference.films import write_film
+from reference.films import write_film, write_film_capture
 
 from viewmend.cli import main
 from viewmend.data.native_capture import open_capture
@@ -117,7 +117,7 @@ def darkness(frame, camera):
 def ball(tmp_path):
     """A capture of four films of eight frames and numbered masks, and the frames of each camera."""
     source = BallCapture(ring(4), 8)
-    write_capture(source, tmp_path / "ball", video=True)
+    write_film_capture(source, tmp_path / "ball")
     return tmp_path / "ball", [source.read(time) for time in range(8)]
 
 

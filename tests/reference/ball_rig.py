@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 from reference.ball import BallCapture, ring
+from reference.films import write_film_capture
 
 from viewmend.data.images import write_image
-from viewmend.data.native_writer import write_capture
 
 CAMERAS = ring(6)
 
@@ -23,7 +23,7 @@ def rig_text(names=CAMERAS.names, **changes: str | None) -> str:
 
 def make_rig(folder: Path) -> Path:
     """The rig's file, beside it calibration, videos of eight frames, and clean plates."""
-    write_capture(BallCapture(CAMERAS, 8), folder / "take", video=True)
+    write_film_capture(BallCapture(CAMERAS, 8), folder / "take")
     for name in CAMERAS.names:
         write_image(folder / f"plates/{name}.png", np.zeros((48, 48, 3), np.uint8))
     (folder / "rig.toml").write_text(rig_text())

@@ -1,11 +1,17 @@
 """Small films for tests, written by PyAV."""
 
+import json
+import shutil
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
+
+from viewmend.data.images import read_rgb
+from viewmend.data.native_writer import write_capture
+from viewmend.data.source import CaptureSource
 
 SIZE = (64, 48)
 MATRICES = {
@@ -67,6 +73,19 @@ def _mux(film, packets, earlier_s: float) -> None:
             shift = round(earlier_s / float(packet.time_base))
             packet.pts, packet.dts = packet.pts - shift, packet.dts - shift
         film.mux(packet)
+
+
+def write_film_capture(source: CaptureSource, folder: Path) -> None:
+    """Write a capture with a nearly lossless film of each camera, and numbered masks."""
+    write_capture(source, folder, images="png")
+    content = json.loads((folder / "cameras.json").read_text())
+    for camera in content["cameras"]:
+        images = sorted((folder / camera.pop("image")).parent.glob("*.png"))
+        camera["video"] = f"video/{camera['name']}.mp4"
+        frames = [read_rgb(path, "") for path in images]
+        write_film(folder / camera["video"], frames, fps=10, pix_fmt="yuv444p", options={"crf": "8"})
+    shutil.rmtree(folder / "image")
+    (folder / "cameras.json").write_text(json.dumps(content))
 
 
 def set_matrix(path: Path, name: str) -> Path:

@@ -56,7 +56,7 @@ def _check_file(path: Path, name: str | None) -> dict[str, str]:
         raise ValueError(f"{path}: expected a file of weights, found none; check the path")
     if name is None:
         by_name = [k.name for k in KNOWN if any(Path(file).name == path.name for file in k.files)]
-        by_hash = [k.name for k in KNOWN if (k.sha256 or k.git_sha1) and has_published_hash(path, k)]
+        by_hash = [k.name for k in KNOWN if k.sha256 and has_published_hash(path, k)]
         if not by_name + by_hash:
             names = ", ".join(k.name for k in KNOWN)
             raise ValueError(
@@ -74,12 +74,12 @@ def _check_file(path: Path, name: str | None) -> dict[str, str]:
 
 
 def _describe(name: str, path: Path | None) -> dict[str, str]:
-    from viewmend.metrics.weights import known_weights, stated_hashes, verify_weights
+    from viewmend.metrics.weights import known_weights, stated_hash, verify_weights
     from viewmend.utils.weight_files import WeightsError
 
     known, status, problem = known_weights(name), "missing", ""
     if path is not None:
-        status = "right" if known.sha256 or known.git_sha1 else "there (no hash was published; loading checks shapes)"
+        status = "right" if known.sha256 else "there (no hash was published; loading checks shapes)"
         try:
             verify_weights(path, known)
         except WeightsError as error:
@@ -92,6 +92,6 @@ def _describe(name: str, path: Path | None) -> dict[str, str]:
         "what": known.what,
         "source": known.source,
         "licence": known.licence,
-        "hash": stated_hashes(known),
+        "hash": stated_hash(known),
         "error": problem,
     }

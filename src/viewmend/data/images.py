@@ -186,9 +186,9 @@ def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.
     return np.repeat(values.astype(np.uint8), runs).reshape(height, width)
 
 
-def encode_run_lengths(mask: UInt8[np.ndarray, "height width"], threshold: int = 127) -> bytes:
-    """Encode a mask as run lengths; values above the threshold are foreground."""
-    flat = mask.ravel() > threshold
+def encode_run_lengths(mask: UInt8[np.ndarray, "height width"]) -> bytes:
+    """Encode a mask as run lengths; values above 127 are foreground."""
+    flat = mask.ravel() > 127
     ends = np.append(np.flatnonzero(flat[1:] != flat[:-1]) + 1, flat.size)
     return np.concatenate([[int(flat[0])], ends]).astype("<i4").tobytes()
 
@@ -242,7 +242,7 @@ def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
     return image
 
 
-def decode_image(data: bytes, flags: int, max_pixels: int = MAX_PIXELS) -> np.ndarray | None:
+def decode_image(data: bytes, flags: int) -> np.ndarray | None:
     """Decode untrusted image data with these OpenCV flags; None if it is not an image, truncated or too large.
 
     The size in the header and the lengths of PNG chunks are checked before any memory is allocated for them.
@@ -250,7 +250,7 @@ def decode_image(data: bytes, flags: int, max_pixels: int = MAX_PIXELS) -> np.nd
     import cv2
 
     width, height = size_from_header(data) or (0, 0)
-    if not data or width * height > max_pixels or not _is_complete(data):
+    if not data or width * height > MAX_PIXELS or not _is_complete(data):
         return None
     try:
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -277,9 +277,7 @@ def _is_complete(data: bytes) -> bool:
 
 
 def write_image(
-    path: Path,
-    image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width channel"],
-    jpeg_quality: int = 95,
+    path: Path, image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width channel"]
 ) -> None:
     """Write a grey image, RGB, or RGB with straight alpha; the suffix (.png, .jpg, ...) selects the format.
 
@@ -290,7 +288,7 @@ def write_image(
     import cv2
 
     # No chroma subsampling (4:4:4), which would blur coloured edges.
-    jpeg = (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
+    jpeg = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
     options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)
     swapped = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
     _write(path, cv2.cvtColor(image, swapped[image.shape[2]]) if image.ndim == 3 else image, options)

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
-from torch import Tensor
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from viewmend.data.containers import names_in
 from viewmend.data.errors import CaptureError, Issue

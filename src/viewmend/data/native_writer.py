@@ -17,7 +17,6 @@ from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_depth, write_image
 from viewmend.data.native_format import (
     CALIBRATION,
-    FILE_KINDS,
     FileKind,
     NativeCalibration,
     NativeCamera,
@@ -25,7 +24,6 @@ from viewmend.data.native_format import (
     write_calibration,
 )
 from viewmend.data.source import CaptureSource, prefetch
-from viewmend.data.videos import VideoWriter
 from viewmend.types import MultiViewFrame
 from viewmend.utils.atomic_writes import defer_signals, is_running, name_path_in_errors
 
@@ -35,21 +33,19 @@ def write_capture(
     out: Path,
     *,
     images: Literal["jpeg", "png"] = "jpeg",
-    video: bool = False,
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
 ) -> None:
     """Write all frames of a source to the folder `out`: images, masks and depth if present, and `cameras.json`.
 
     With PNG, reading the folder returns the same frames bit for bit (depth to half a millimetre). JPEG (quality 95,
-    no chroma subsampling) and `video` (one nearly lossless H.264 file per camera) are smaller; masks and depth are
-    always PNG. The folder is complete or absent, see `atomic_folder`. `progress` wraps the iterated frame indices.
+    no chroma subsampling) is smaller; masks and depth are always PNG. The folder is complete or absent, see
+    `atomic_folder`. `progress` wraps the iterated frame indices.
 
     Raises:
-        CaptureError: `out` exists and is not an empty folder, the source cannot be read, or `video` is set for a source
-            with gaps.
+        CaptureError: `out` exists and is not an empty folder, or the source cannot be read.
     """
     with atomic_folder(out) as unfinished:
-        writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png", video)
+        writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png")
         writer.write(range(len(source.frame_ids)) if progress is None else progress(range(len(source.frame_ids))))
 
 
@@ -89,11 +85,11 @@ def remove_unfinished(out: Path) -> None:
 class _Writer:
     """Writes the files of one capture into a new folder."""
 
-    def __init__(self, source: CaptureSource, folder: Path, suffix: str, video: bool):
+    def __init__(self, source: CaptureSource, folder: Path, suffix: str):
         self.source = source
         self.folder = folder
         self.suffix = suffix
-        self.kinds: set[FileKind] = {"video" if video else "image"}
+        self.kinds = set[FileKind]()
         names = source.cameras.names
         self.folder_names = {name: _folder_name(name, index) for index, name in enumerate(names)}
         if len({name.lower() for name in self.folder_names.values()}) < len(names):
@@ -103,29 +99,12 @@ class _Writer:
             expected = "frame ids that can be file names"
             raise CaptureError(f"{source.name}: expected {expected}, got {unsafe}; rename the frames")
         folder.mkdir()
-        self.videos: dict[str, VideoWriter] = {}
-        if video:
-            fps = source.fps or 25.0
-            self.videos = {name: VideoWriter(folder / self._path(name, "video"), fps, True) for name in names}
 
     def write(self, times: Iterable[int]) -> None:
-        try:
-            with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-                for frame in prefetch(self.source, times):
-                    self._check_gaps(frame)
-                    list(pool.map(lambda view, frame=frame: self._write_view(frame, view), range(len(frame.cameras))))
-        finally:
-            for writer in self.videos.values():
-                writer.close()
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            for frame in prefetch(self.source, times):
+                list(pool.map(lambda view, frame=frame: self._write_view(frame, view), range(len(frame.cameras))))
         write_calibration(self.folder, self._calibration())
-
-    def _check_gaps(self, frame: MultiViewFrame) -> None:
-        absent = [name for name in self.videos if name not in frame.cameras.names]
-        if absent:
-            raise CaptureError(
-                f"{self.source.name}: frame '{self.source.frame_ids[frame.time]}': expected every camera, since "
-                f"a video cannot have gaps, got none of {absent}; write images instead"
-            )
 
     def _write_view(self, frame: MultiViewFrame, view: int) -> None:
         name, frame_id = frame.cameras.names[view], self.source.frame_ids[frame.time]
@@ -135,19 +114,13 @@ class _Writer:
             self.kinds.add(kind)
             return self.folder / self._path(name, kind).replace("{frame}", frame_id)
 
-        rgb = frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
-        if self.videos:
-            self.videos[name].add(rgb)
-        else:
-            write_image(file("image"), rgb)
+        write_image(file("image"), frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy())
         if frame.mask is not None:
             write_image(file("mask"), frame.mask[view, :height, :width].contiguous().cpu().numpy())
         if frame.depth is not None:
             write_depth(file("depth"), frame.depth[view, :height, :width].float().contiguous().cpu().numpy())
 
     def _path(self, camera: str, kind: FileKind) -> str:
-        if kind == "video":
-            return f"video/{self.folder_names[camera]}.mp4"
         return f"{kind}/{self.folder_names[camera]}/{{frame}}{self.suffix if kind == 'image' else '.png'}"
 
     def _calibration(self) -> NativeCalibration:
@@ -167,7 +140,6 @@ class _Writer:
         camera = self.source.cameras[view].to("cpu")
         name, pose = camera.names[0], camera.camera_from_world[0].double().numpy()
         width, height = camera.max_size_px
-        image, video, mask, depth = (self._path(name, kind) if kind in self.kinds else None for kind in FILE_KINDS)
         return NativeCamera(
             name=name,
             width=width,
@@ -176,10 +148,10 @@ class _Writer:
             R=pose[:3, :3],
             t_m=pose[:3, 3],
             dist=np.zeros(5),
-            image=image,
-            video=video,
-            mask=mask,
-            depth=depth,
+            image=self._path(name, "image"),
+            video=None,
+            mask=self._path(name, "mask") if "mask" in self.kinds else None,
+            depth=self._path(name, "depth") if "depth" in self.kinds else None,
         )
 
 

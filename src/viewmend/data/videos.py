@@ -296,17 +296,15 @@ class VideoFile:
 class VideoWriter:
     """Writes an H.264 MP4 of RGB frames, which all have the size of the first. A context manager.
 
-    By default the video plays everywhere (4:2:0), and an odd last row or column is dropped. `faithful` keeps every
-    pixel and nearly exact colours, for captures that are processed further. `threads` is the number of encoder
+    The video plays everywhere (4:2:0); an odd last row or column is dropped. `threads` is the number of encoder
     threads, 0 for one per core.
     """
 
-    def __init__(self, file: Path | BytesIO, fps: float, faithful: bool = False, threads: int = 0):
-        self._faithful = faithful
+    def __init__(self, file: Path | BytesIO, fps: float, threads: int = 0):
         self._container, self._stream = _open_output(file, "mp4", "libx264", fps)
-        self._stream.pix_fmt = "yuv444p" if faithful else "yuv420p"
+        self._stream.pix_fmt = "yuv420p"
         tag_colours(self._stream.codec_context)
-        self._stream.options = {"crf": "8" if faithful else "18", "preset": "veryfast"}
+        self._stream.options = {"crf": "18", "preset": "veryfast"}
         self._stream.codec_context.thread_count = threads
         self._started = False
 
@@ -320,8 +318,7 @@ class VideoWriter:
         """Append a frame."""
         from av import VideoFrame
 
-        if not self._faithful:
-            rgb = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
+        rgb = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
         if not self._started:
             self._stream.height, self._stream.width = rgb.shape[:2]
             self._started = True

@@ -29,8 +29,6 @@ class KnownWeights:
     licence: str
     sha256: str = ""
     """SHA-256 of the file, or its first digits; "" if none was published."""
-    git_sha1: str = ""
-    """The file's git object name; "" if it is in no repository."""
 
 
 KNOWN: tuple[KnownWeights, ...] = (
@@ -114,7 +112,7 @@ def checked_weights(known: KnownWeights) -> Path:
     if path is None:
         where = ", ".join(str(folder) for folder in weight_folders())
         raise MissingWeightsError(
-            f"expected {known.what} as {' or '.join(known.files)} ({stated_hashes(known)}) in one of {where}, found "
+            f"expected {known.what} as {' or '.join(known.files)} ({stated_hash(known)}) in one of {where}, found "
             f"none; get it from {known.source} and put it there, or name its folder in {FOLDERS_VARIABLE}"
         )
     verify_weights(path, known)
@@ -124,27 +122,24 @@ def checked_weights(known: KnownWeights) -> Path:
 def verify_weights(path: Path, known: KnownWeights) -> None:
     """Raise MismatchedWeightsError if the file does not have the published hash."""
     if not has_published_hash(path, known):
-        sha256, git_sha1 = _hashes(path)
         raise MismatchedWeightsError(
-            f"{path}: expected {known.what} ({stated_hashes(known)}), got a file of {path.stat().st_size} bytes with "
-            f"SHA-256 {sha256}, git name {git_sha1}; it is damaged or another version, get it from {known.source}"
+            f"{path}: expected {known.what} ({stated_hash(known)}), got a file of {path.stat().st_size} bytes with "
+            f"SHA-256 {_sha256(path)}; it is damaged or another version, get it from {known.source}"
         )
 
 
 def has_published_hash(path: Path, known: KnownWeights) -> bool:
     """Whether a file has the published hash; True if none was published."""
-    sha256, git_sha1 = _hashes(path)
-    return sha256.startswith(known.sha256) and git_sha1.startswith(known.git_sha1)
+    return _sha256(path).startswith(known.sha256)
 
 
-def stated_hashes(known: KnownWeights) -> str:
-    """The published hashes as text."""
-    hashes = [("SHA-256", known.sha256, 64), ("git name", known.git_sha1, 40)]
-    shown = [f"{kind} {value}{'...' * (len(value) < whole)}" for kind, value, whole in hashes if value]
-    return ", ".join(shown) or "no hash was published"
+def stated_hash(known: KnownWeights) -> str:
+    """The published hash as text."""
+    if not known.sha256:
+        return "no hash was published"
+    return f"SHA-256 {known.sha256}{'...' if len(known.sha256) < 64 else ''}"
 
 
-def _hashes(path: Path) -> tuple[str, str]:
-    """A file's SHA-256 and its git object name."""
-    data = path.read_bytes()
-    return hashlib.sha256(data).hexdigest(), hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

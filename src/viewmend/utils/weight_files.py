@@ -1,6 +1,5 @@
 """Strict loading of network weights: no code is executed, and every name and shape must match."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -37,23 +36,19 @@ class MismatchedWeightsError(WeightsError):
     """A file that does not hold weights, or holds those of another network."""
 
 
-def load_weights(
-    network: Network, path: str | Path, device: torch.device | str = "cpu", spare: Sequence[str] = ()
-) -> Network:
+def load_weights(network: Network, path: str | Path, device: torch.device | str = "cpu") -> Network:
     """Load the weights of a file into a network, move it to `device` and set evaluation mode.
 
     Args:
         network: modified in place and returned.
         path: a .safetensors file, or a PyTorch file, read with `weights_only=True`.
         device: where the network computes.
-        spare: prefixes of additional names that the file may contain.
 
     Raises:
         DamagedWeightsError: the file is missing, unreadable or truncated.
         MismatchedWeightsError: a tensor is missing, unknown, of another shape or dtype, or not finite.
     """
     path, weights, own = Path(path), read_weights(path), network.state_dict()
-    weights = {key: value for key, value in weights.items() if key in own or not key.startswith(tuple(spare))}
     reshaped = [
         f"{key} {tuple(value.shape)} for {tuple(own[key].shape)}"
         for key, value in sorted(weights.items())
