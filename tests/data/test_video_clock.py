@@ -60,6 +60,13 @@ def test_one_fast_camera_does_not_set_the_pace():
     assert clock.frames["a", "images"].tolist() == list(range(0, 48, 4)) and clock.fps == 30.0 and not said(clock)
 
 
+def test_half_of_the_cameras_being_slow_is_said():
+    fast, slow = range(24), (range(12), 15)
+    clock = match_tracks(tracks(a=fast, b=fast, c=slow, d=slow))
+    assert clock.fps == 15.0 and clock.frames["a", "images"].tolist() == list(range(0, 24, 2))
+    assert ["cameras 'a', 'b' have 30 frames per second, not the others' 15" in text for text in said(clock)] == [True]
+
+
 def test_variable_rates_and_drift_do_not_lose_frames():
     rng = np.random.default_rng(0)
     jitter = [np.arange(300) + rng.uniform(-0.2, 0.2, 300) + phase for phase in (0, 0.48, -0.3)]

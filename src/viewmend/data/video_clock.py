@@ -135,6 +135,10 @@ class VideoClock:
         if track.fps and track.fps < rate * (1 - RATE_TOLERANCE):
             text = f"{what} have {track.fps:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
             faults.append(f"{text}, and the camera is absent in between")
+        faster = [other for other in images if other.fps and other.fps > rate * (1 + RATE_TOLERANCE)]
+        if track.kind == "images" and len(faster) > 1 and any(track is other for other in faster):
+            text = f"{what} have {track.fps:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+            faults.append(f"{text}, and their frames in between are not used; leave out the slow cameras to use them")
         if track.gaps:
             lost, from_s = sum(count for _, count in track.gaps), track.gaps[0][0]
             text = f"{what} lack {lost} frame{'s' if lost > 1 else ''} from {from_s:.2f} s on"

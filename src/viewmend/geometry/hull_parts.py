@@ -1,12 +1,12 @@
 """Floating parts of a hull that no mask needs: where rays through different things cross by chance."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import max_pool3d, pad
+from torch.nn.functional import pad
 
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.hull import OccupancyGrid
@@ -16,26 +16,31 @@ BLOCK = 2
 """Side in voxels of the blocks that are labelled: parts less than a block apart count as one."""
 CELL = 1.25
 """Side of the cells in which images are compared, relative to the nearest voxel's image: no cell inside is missed."""
+COVERED = 0.5
+"""A part is not needed if the others cover this share of its image in every camera. Masks of real cameras disagree by
+strips at the outline, which a part can cover by chance."""
+MANY = 2000
+"""From this count on, distinct numbers are found by marking them instead of by sorting."""
 
 
 def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGrid:
-    """The hull without the parts whose image other parts cover in every camera, the smallest first.
+    """The hull without the parts whose image other parts mostly cover in every camera, the smallest first.
 
     What a camera sees on its own, such as a second person or a ball in the air, stays.
     """
-    occupied = _any_in_blocks(grid.values >= 0.5)
+    inside = grid.values >= 0.5
+    occupied = _any_in_blocks(inside)
     labels, count = _labels(occupied)
     if count < 2:
         return grid
-    part = torch.from_numpy(labels).to(occupied.device)
-    index = _surface(grid.values >= 0.5).nonzero()
+    index = _surface(inside).nonzero()
     points = grid.low + (index + 0.5) * grid.voxel_m
-    dropped = _unneeded(part[tuple((index // BLOCK).T)], points, cameras, grid.voxel_m)
-    if not len(dropped):
+    dropped = _unneeded(labels[tuple((index // BLOCK).T.cpu().numpy())], points, cameras, grid.voxel_m)
+    if not dropped:
         return grid
-    blocks = torch.isin(part, dropped)
+    blocks = torch.from_numpy(np.isin(labels, dropped)).to(occupied.device)
     # Around a part, soft values fade out.
-    faint = max_pool3d(blocks[None, None].float(), 3, 1, 1)[0, 0] > 0
+    faint = _grown(blocks)
     kept = occupied & ~blocks
     x, y, z = grid.values.shape
     remove = _to_voxels(blocks)[:x, :y, :z] | (_to_voxels(faint & ~kept)[:x, :y, :z] & (grid.values < 0.5))
@@ -43,14 +48,27 @@ def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGr
 
 
 def _any_in_blocks(voxels: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x_block y_block z_block"]:
-    sides = [end for side in reversed(voxels.shape) for end in (0, -side % BLOCK)]
-    return max_pool3d(pad(voxels, sides)[None, None].float(), BLOCK)[0, 0] > 0
+    padded = pad(voxels, [end for side in reversed(voxels.shape) for end in (0, -side % BLOCK)])
+    for axis in range(3):
+        padded = padded.unflatten(axis, (-1, BLOCK)).any(axis + 1)
+    return padded
+
+
+def _grown(blocks: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
+    """The blocks and all that share a corner with them."""
+    for axis, side in enumerate(blocks.shape):
+        grown = blocks.clone()
+        grown.narrow(axis, 1, side - 1).logical_or_(blocks.narrow(axis, 0, side - 1))
+        grown.narrow(axis, 0, side - 1).logical_or_(blocks.narrow(axis, 1, side - 1))
+        blocks = grown
+    return blocks
 
 
 def _surface(inside: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
-    """The voxels with a neighbour that is outside."""
-    outside = pad(~inside, [1] * 6, value=True)[None, None].float()
-    return inside & (max_pool3d(outside, 3, 1)[0, 0] > 0)
+    """The voxels with a face that is outside: all that can be seen."""
+    around, (x, y, z) = pad(inside, [1] * 6), (slice(1, -1),) * 3
+    core = around[:-2, y, z] & around[2:, y, z] & around[x, :-2, z] & around[x, 2:, z]
+    return inside & ~(core & around[x, y, :-2] & around[x, y, 2:])
 
 
 def _to_voxels(blocks: Bool[Tensor, "x_block y_block z_block"]) -> Bool[Tensor, "x y z"]:
@@ -68,33 +86,71 @@ def _labels(occupied: Bool[Tensor, "x y z"]) -> tuple[Int[np.ndarray, "x y z"], 
 
 
 def _unneeded(
-    part: Int[Tensor, "voxel"], points: Float[Tensor, "voxel 3"], cameras: Cameras, voxel_m: float
-) -> Int[Tensor, "dropped"]:
-    """The parts that can go, one after another, while every cell of every image stays covered, or next to one that is.
+    part: Int[np.ndarray, "voxel"], points: Float[Tensor, "voxel 3"], cameras: Cameras, voxel_m: float
+) -> list[int]:
+    """The parts that can go, one after another, while nearly all of every image stays covered.
 
-    A part that nothing demands has edges where others have theirs, as the same masks have carved both.
+    What lies next to a covered cell counts as covered: a part that nothing demands has edges where others have theirs,
+    as the same masks have carved both.
     """
-    sizes = torch.bincount(part)
+    sizes = np.bincount(part)
     uv, z = project(points, cameras)
     sees = in_view(uv, z, cameras)
-    cells = []  # of each camera: cells and parts there, once each; cells and parts there or next to it; parts of a cell
-    around = torch.tensor([-1, 0, 1], device=part.device)
+    views = []  # of each camera: how many parts each cell is covered by, and the cells of each part
     for view in range(len(cameras)):
-        if bool(sees[view].any()):
-            own = sees[view]
-            cell_px = CELL * cameras.K[view, 0, 0] * voxel_m / z[view, own].min()
-            x, y = (uv[view, own] / cell_px).long().unbind(-1)
-            row = int(x.max()) + 3
-            pairs = (((y + 1) * row + x + 1) * len(sizes) + part[own]).unique()
-            place, parts = pairs // len(sizes), pairs % len(sizes)
-            near = place[:, None, None] + around[:, None] * row + around
-            near = (near.flatten() * len(sizes) + parts.repeat_interleave(9)).unique()
-            near, near_parts = near // len(sizes), near % len(sizes)
-            cells.append((place, parts, near, near_parts, torch.bincount(near)))
+        own = sees[view].cpu().numpy()
+        if own.any():
+            cell_px = CELL * float(cameras.K[view, 0, 0]) * voxel_m / float(z[view, sees[view]].min())
+            x, y = (uv[view, sees[view]].cpu().numpy() / cell_px).astype(np.int64).T + 1
+            views.append(_Cells.of(part[own], y, x))
     dropped = []
-    for candidate in sizes.argsort()[(sizes == 0).sum() :].tolist():
-        if all(bool((count[place[parts == candidate]] > 1).all()) for place, parts, _, _, count in cells):
+    for candidate in sizes.argsort(kind="stable")[(sizes == 0).sum() :].tolist():
+        if all(cells.covered_by_others(candidate) >= COVERED for cells in views):
             dropped.append(candidate)
-            for _, _, near, near_parts, count in cells:
-                count[near[near_parts == candidate]] -= 1
-    return torch.tensor(dropped, dtype=part.dtype, device=part.device)
+            for cells in views:
+                cells.drop(candidate)
+    return dropped
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """What the parts cover of a camera's image."""
+
+    count: Int[np.ndarray, "cell"]
+    """How many parts cover a cell, or one next to it."""
+    of_part: dict[int, tuple[Int[np.ndarray, "own"], Int[np.ndarray, "near"]]]
+    """The cells of each part, and those with their neighbours."""
+
+    @classmethod
+    def of(cls, part: Int[np.ndarray, "point"], y: Int[np.ndarray, "point"], x: Int[np.ndarray, "point"]) -> "_Cells":
+        """Of the cells that each part's points fall into."""
+        width = int(x.max()) + 2
+        place, count = y * width + x, np.zeros((int(y.max()) + 2) * width, np.int64)
+        around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
+        order = part.argsort(kind="stable")
+        numbers, first = np.unique(part[order], return_index=True)
+        of_part = {}
+        for number, places in zip(numbers.tolist(), np.split(place[order], first[1:]), strict=True):
+            own = _distinct(places, len(count))
+            near = _distinct((own[:, None] + around).ravel(), len(count))
+            count[near] += 1
+            of_part[number] = own, near
+        return cls(count, of_part)
+
+    def covered_by_others(self, number: int) -> float:
+        """The share of a part's image that others cover too; 1 for one that is not in it."""
+        return float((self.count[self.of_part[number][0]] > 1).mean()) if number in self.of_part else 1.0
+
+    def drop(self, number: int) -> None:
+        """Take a part away."""
+        if number in self.of_part:
+            self.count[self.of_part[number][1]] -= 1
+
+
+def _distinct(values: Int[np.ndarray, "value"], end: int) -> Int[np.ndarray, "distinct"]:
+    """The distinct ones of non-negative values below `end`."""
+    if len(values) < MANY:
+        return np.unique(values)
+    found = np.zeros(end, bool)
+    found[values] = True
+    return np.flatnonzero(found)

@@ -55,8 +55,13 @@ def find_desynchronised_cameras(
 
 
 def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> tuple[list[MultiViewFrame], int]:
-    """The frames around a time, of the cameras of `frame` that all of them have, and the time's position among them."""
-    times = range(max(0, time - MAX_DELAY), min(len(source.frame_ids), time + MAX_DELAY + 1))
+    """Frames around a time, of the cameras of `frame` that all of them have, and the position of the one to judge.
+
+    That is the nearest one with as many frames before as after it, if there are enough.
+    """
+    count = len(source.frame_ids)
+    time = min(max(time, min(MAX_DELAY, count // 2)), max(count - 1 - MAX_DELAY, count // 2))
+    times = range(max(0, time - MAX_DELAY), min(count, time + MAX_DELAY + 1))
     frames = [frame if other == frame.time else source.read(other) for other in times]
     names = [name for name in frame.cameras.names if all(name in other.cameras.names for other in frames)]
     return [other.select(names) for other in frames], time - times[0]
