@@ -145,7 +145,7 @@ def made_of(size=400_000):
     return FrameAssets(Asset(bytes(size), "text/plain"), ())
 
 
-def store_of(make=lambda frame: made_of()):
+def store_of(make=lambda frame, without: made_of()):
     """A store of one megabyte whose frames are all in memory, except for one."""
     return AssetStore(lambda index: None if index == 99 else FRAME, make, 1.0)
 
@@ -167,7 +167,7 @@ def test_memory_is_bounded_and_the_last_used_is_kept():
 def test_a_frame_is_made_once_for_all_who_wait():
     made = []
 
-    def make(frame):
+    def make(frame, without):
         made.append(made_of())
         return made[-1]
 
@@ -182,7 +182,7 @@ def test_a_frame_is_made_once_for_all_who_wait():
 def test_frames_in_the_making_are_limited_and_a_late_one_ends(monkeypatch):
     go = threading.Event()
 
-    def make(frame):
+    def make(frame, without):
         assert go.wait(WAIT_S)
         return made_of(1000)
 
@@ -203,7 +203,7 @@ def test_frames_in_the_making_are_limited_and_a_late_one_ends(monkeypatch):
 
 
 def test_a_frame_without_a_subject_has_no_assets():
-    def make(frame):
+    def make(frame, without):
         raise ValueError("no foreground")
 
     async def use():

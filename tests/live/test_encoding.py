@@ -28,8 +28,8 @@ def test_every_mode(ball_view):
     assert images["rendered"][22, 22].tolist() == [0, 0, 0]
     assert images["holes"][22, 22].tolist() == [255, 38, 140] == images["coverage"][22, 22].tolist()
     assert (images["holes"][12] == images["rendered"][12]).all()
-    depth = images["depth"][..., 0]
-    assert depth[0, 0] == 0 and depth[24, 24] > depth[24, 12] > 0
+    near, far = images["depth"][24, 24].tolist(), images["depth"][24, 10].tolist()
+    assert not images["depth"][0, 0].any() and near[0] > near[2] and far[2] > near[2], "red is near"
     left, right = images["coverage"][24, 18].astype(float), images["coverage"][24, 30].astype(float)
     assert np.allclose(left / left.max(), np.array(COLOURS[0]) / max(COLOURS[0]), atol=0.02)
     assert np.allclose(right / right.max(), np.array(COLOURS[1]) / max(COLOURS[1]), atol=0.02)

@@ -19,11 +19,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from viewmend.geometry.cameras import concatenate_cameras
 from viewmend.geometry.proxy import GeometryProxy
@@ -51,6 +51,9 @@ MAX_MAKING = 16
 """Frames whose assets are being made at a time."""
 MEMORY_MB = 64.0
 COMPRESSION = 6
+Names = tuple[str, ...]
+Key = tuple[int, Names]
+"""A frame, and the cameras that are left out."""
 
 
 class AssetQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -61,6 +64,8 @@ class AssetQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Number of the camera in the frame's list; None for the shape."""
     v: protocol.ShortText = ""
     """The version in the message `rig`, with which the response never changes."""
+    without: Annotated[str, Meta(max_length=4096)] = ""
+    """Names of cameras that are not used, separated by commas."""
     token: str = ""
 
 
@@ -101,20 +106,20 @@ class AssetStore:
     def __init__(
         self,
         read: Callable[[int], MultiViewFrame | None],
-        make: Callable[[MultiViewFrame], FrameAssets],
+        make: Callable[[MultiViewFrame, Names], FrameAssets],
         memory_mb: float = MEMORY_MB,
     ) -> None:
         """Begin empty; `read` returns None while a frame is not in memory, and `make` is called on a thread."""
         self._read, self._make, self._max_bytes = read, make, 1e6 * memory_mb
-        self._kept: OrderedDict[int, FrameAssets] = OrderedDict()
-        self._making: dict[int, asyncio.Task[FrameAssets]] = {}
+        self._kept: OrderedDict[Key, FrameAssets] = OrderedDict()
+        self._making: dict[Key, asyncio.Task[FrameAssets]] = {}
         self._turn = asyncio.Lock()
         self._version: str | None = None
         self.size_bytes = 0
         """Bytes of all assets that are kept."""
 
-    async def get(self, index: int, version: str) -> FrameAssets:
-        """The assets of a frame; simultaneous requests for the same frame share one result.
+    async def get(self, index: int, version: str, without: Names = ()) -> FrameAssets:
+        """The assets of a frame without some cameras; simultaneous requests for the same frame share one result.
 
         Those of another version, that is, of another rig, are dropped.
 
@@ -127,34 +132,35 @@ class AssetStore:
             self._kept.clear()
             self._making.clear()  # those of the rig before end without being kept
             self._version, self.size_bytes = version, 0
-        if (kept := self._kept.get(index)) is not None:
-            self._kept.move_to_end(index)
+        key = index, without
+        if (kept := self._kept.get(key)) is not None:
+            self._kept.move_to_end(key)
             return kept
-        if (task := self._making.get(index)) is None:
+        if (task := self._making.get(key)) is None:
             if len(self._making) >= MAX_MAKING:
                 raise BusyError("too many frames are being prepared; try again")
-            task = self._making[index] = asyncio.create_task(self._prepare(index, version))
+            task = self._making[key] = asyncio.create_task(self._prepare(key, version))
             task.add_done_callback(lambda done: done.cancelled() or done.exception())  # its waiters may have left
         return await asyncio.shield(task)
 
-    async def _prepare(self, index: int, version: str) -> FrameAssets:
+    async def _prepare(self, key: Key, version: str) -> FrameAssets:
         end = time.monotonic() + READ_S
         try:
-            while (frame := self._read(index)) is None:
+            while (frame := self._read(key[0])) is None:
                 if time.monotonic() > end:
                     raise TimeoutError("the frame was not available in time; see /health")
                 await asyncio.sleep(POLL_S)
             async with self._turn:
-                made = await asyncio.to_thread(self._make, frame)
+                made = await asyncio.to_thread(self._make, frame, key[1])
             if version == self._version:
-                self._keep(index, made)
+                self._keep(key, made)
             return made
         finally:
             if version == self._version:
-                self._making.pop(index, None)
+                self._making.pop(key, None)
 
-    def _keep(self, index: int, made: FrameAssets) -> None:
-        self._kept[index] = made
+    def _keep(self, key: Key, made: FrameAssets) -> None:
+        self._kept[key] = made
         self.size_bytes += made.size_bytes
         while self.size_bytes > self._max_bytes and len(self._kept) > 1:
             self.size_bytes -= self._kept.popitem(last=False)[1].size_bytes

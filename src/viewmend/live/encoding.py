@@ -13,7 +13,7 @@ from torch import Tensor
 
 from viewmend.geometry.threads import light_operations
 from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import BLACK, HULL_MODES, MENDED_MODES, FrameTimes, Look, pack
+from viewmend.live.protocol import BLACK, EXTRA_MODES, MENDED_MODES, FrameTimes, Look, pack
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.video import STRINGS, VideoStream
 from viewmend.models.views.grid import rim_depth
@@ -28,24 +28,29 @@ DEPTH_STRIDES = ((160, 1), (400, 2))
 """Pairs (longest side, stride): image pixels per depth pixel for images of at most this size."""
 COARSEST_STRIDE = 4
 """Image pixels per depth pixel in larger images."""
+LARGE_ERROR = 0.25
+"""Error of a channel, in [0, 1], that has the brightest colour in a map of errors."""
 
 
 def draw_mode(
-    completed: CompletedView, mode: str, background: str = BLACK, hulls: Mapping[str, Tensor] | None = None
+    completed: CompletedView, mode: str, background: str = BLACK, extra: Mapping[str, Tensor] | None = None
 ) -> Image:
     """Draw one of the protocol's modes as 8-bit RGB on a background (hexadecimal RGB).
 
     rendered: F. holes: F with the pixels that no camera colours in pink, whatever the error rule. mended: Fhat. depth:
-    bright is near. coverage: the colours of the source views, missing pixels in pink. confidence: from violet (low)
-    to yellow (high); grey if the inpainter does not predict it. hull and points: as in `RenderResult.hulls`.
+    from red (near) to blue, over `depth_range`. error: from black to yellow (`LARGE_ERROR`). coverage: the colours of
+    the source views, missing pixels in pink. confidence: from violet (low) to yellow (high); grey if the inpainter
+    does not predict it. The others: as in `RenderResult.extra`.
     """
-    hull = (hulls or {})[mode] if mode in HULL_MODES else None
-    image = _draw_on_black(completed, mode) if hull is None else _to_8bit(hull[:3])
+    own = (extra or {})[mode] if mode in EXTRA_MODES else None
+    if mode == "error" and own is not None:
+        return heat_map(own[0] / LARGE_ERROR, "inferno")
+    image = _draw_on_black(completed, mode) if own is None else _to_8bit(own[:3])
     if background == BLACK:
         return image
     import cv2
 
-    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if hull is None else hull[3]
+    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if own is None else own[3]
     transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
     channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
     return cv2.add(image, cv2.merge(channels))
@@ -58,7 +63,9 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
     if mode == "confidence":
         return _draw_confidence(completed)
     if mode == "depth":
-        return _to_8bit(_shade(view.depth).expand(3, -1, -1))
+        near, far = depth_range(view.depth)
+        colours = heat_map((far - view.depth) / max(far - near, 1e-6), "turbo")
+        return colours * (view.depth > 0).cpu().numpy()[..., None]
     base = _draw_coverage(view) if mode == "coverage" else view.rgb
     if mode == "rendered":
         return _to_8bit(base)
@@ -83,13 +90,25 @@ def mean_confidence(completed: CompletedView) -> float | None:
     return round(float((completed.confidence * completed.opacity).sum() / completed.opacity.sum().clamp(min=1)), 4)
 
 
-def _draw_confidence(completed: CompletedView) -> Image:
+def depth_range(depth: Float[Tensor, "height width"]) -> tuple[float, float]:
+    """The smallest and the largest depth of the surface, metres; 0 without one."""
+    surface = depth[depth > 0]
+    near, far = surface.aminmax() if surface.numel() else (torch.zeros(()), torch.zeros(()))
+    return float(near), float(far)
+
+
+def heat_map(values: Float[Tensor, "height width"], colours: str) -> Image:
+    """Values in [0, 1] in one of OpenCV's colour maps."""
     import cv2
 
+    levels = (values.clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{colours.upper()}"))[..., ::-1].copy()
+
+
+def _draw_confidence(completed: CompletedView) -> Image:
     if completed.confidence is None:
         return _to_8bit(completed.rgb.mean(0).expand(3, -1, -1))
-    confidence = (completed.confidence.clamp(0, 1) * 255).round().byte().cpu().numpy()
-    heat = torch.from_numpy(cv2.applyColorMap(confidence, cv2.COLORMAP_VIRIDIS)[..., ::-1].copy())
+    heat = torch.from_numpy(heat_map(completed.confidence, "viridis"))
     return _to_8bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
 
 
@@ -98,14 +117,6 @@ def _draw_coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:
     colours = [COLOURS[n % len(COLOURS)] for n in range(len(view.source_views))]
     mixed = torch.einsum("chw,cr->rhw", view.weights, torch.tensor(colours, device=view.rgb.device) / 255)
     return mixed * (0.45 + 0.55 * view.rgb.mean(0))
-
-
-def _shade(depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    surface = depth > 0
-    if not bool(surface.any()):
-        return torch.zeros_like(depth)
-    near, far = depth[surface].aminmax()
-    return torch.where(surface, 1 - 0.8 * (depth - near) / (far - near).clamp(min=1e-6), 0.0)
 
 
 def _to_8bit(rgb: Float[Tensor, "3 height width"]) -> Image:
@@ -199,9 +210,9 @@ def encode_frame(
     """Build the message of a frame, with more `fields` in its header; returns it with the times of all stages."""
     start = time.perf_counter()
     parts, data = [], []
-    for eye, (completed, hulls) in enumerate(result.eyes):
+    for eye, (completed, extra) in enumerate(result.eyes):
         for mode in look.modes:
-            image = draw_mode(completed, mode, look.background or result.background, hulls)
+            image = draw_mode(completed, mode, look.background or result.background, extra)
             part, encoded = encoders.encode(image, eye, mode, look)
             parts.append(part)
             data.append(encoded)
@@ -224,6 +235,7 @@ def encode_frame(
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(float(first.holes.sum()) / max(1.0, float((first.mask > 0).sum())), 5),
         "confidence": mean_confidence(result.completed[0]),
+        "depth_m": [round(value, 3) for value in depth_range(first.depth)],
         "top_k": request.quality.top_k,
         "context_times": request.quality.context_times,
         "refine_fraction": request.quality.refine_fraction,

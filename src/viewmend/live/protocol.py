@@ -12,16 +12,17 @@ from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
 from viewmend.geometry.rigid import is_rotation
+from viewmend.models.checkpoint import shipped_models
 from viewmend.rendering.error_mask import ERROR_RULES
 from viewmend.utils.timing import StageTimes
 from viewmend.utils.untrusted_input import LARGEST_INTEGER, InputError, one_of, read_json, typed
 
 VERSION = 1
-MODES = ("rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points")
+MODES = ("rendered", "holes", "mended", "compared", "depth", "coverage", "confidence", "hull", "points")
 MENDED_MODES = frozenset({"mended", "confidence"})
 """Modes that need the model's output."""
-HULL_MODES = frozenset({"hull", "points"})
-"""Modes that show the geometry proxy alone."""
+EXTRA_MODES = frozenset({"compared", "error", "hull", "points"})
+"""Modes that show something else than the server's own model: another one, its errors, or the geometry proxy alone."""
 CODECS = ("jpeg", "vp9", "h264")
 MAGIC = b"VMF1"
 MAX_PARTS = 512
@@ -47,12 +48,14 @@ PrincipalPoint = Annotated[float, Meta(ge=-1e5, le=1e5)]
 Side = Annotated[int, Meta(ge=16)]
 Mode = Annotated[str, one_of(*MODES)]
 Rule = Annotated[str, one_of(*ERROR_RULES)]
+Model = Annotated[str, one_of(*shipped_models())]
 TopK = Annotated[int, Meta(ge=1, le=1_000_000)]
 Quality = Annotated[int, Meta(ge=30, le=95)]
 Colour = Annotated[str, Meta(pattern="^[0-9a-f]{6}\\Z")]
 """Red, green and blue in hexadecimal."""
 BLACK, WHITE = "000000", "ffffff"
 ShortText = Annotated[str, Meta(max_length=40)]
+Names = Annotated[tuple[ShortText, ...], Meta(max_length=128)]
 
 
 class ProtocolError(InputError):
@@ -127,8 +130,14 @@ class Look(Struct, frozen=True, kw_only=True, tag="look"):
     quality: Quality = 85
     background: Colour | None = None
     """Background colour; None for the model's own."""
+    without: Names = ()
+    """Cameras that are not used as inputs, neither their images nor their masks."""
+    model: Model | None = None
+    """The shipped model whose output is the mode "compared"."""
 
     def __post_init__(self) -> None:
+        if "compared" in self.modes and self.model is None:
+            raise ProtocolError("expected 'model' for the mode 'compared', got none; `welcome` lists the models")
         force_setattr(self, "modes", tuple(dict.fromkeys(self.modes)))
 
     @property

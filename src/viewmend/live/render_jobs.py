@@ -4,6 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
+from dataclasses import replace
 from io import BytesIO
 from typing import Annotated, Generic, Literal, TypeVar
 
@@ -14,11 +15,21 @@ from viewmend.data.videos import VideoWriter
 from viewmend.live import protocol
 from viewmend.live.encoding import Image, draw_mode, to_jpeg
 from viewmend.live.poses import stereo_pair, view_camera
-from viewmend.live.protocol import HULL_MODES, MENDED_MODES, Camera, FrameTimes, Limits, ProtocolError, read_message
+from viewmend.live.protocol import (
+    EXTRA_MODES,
+    MENDED_MODES,
+    MODES,
+    Camera,
+    FrameTimes,
+    Limits,
+    ProtocolError,
+    read_message,
+)
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.sessions import PlaybackState
 from viewmend.models.base import RenderQuality, State
 from viewmend.types import MultiViewFrame
+from viewmend.utils.untrusted_input import one_of
 
 MAX_POSES = 900
 SOURCE_QUALITY = 90
@@ -35,6 +46,12 @@ class ViewOptions(Struct, frozen=True, kw_only=True):
     top_k: protocol.TopK | None = None
     error_rule: protocol.Rule | None = None
     background: protocol.Colour | None = None
+    model: protocol.Model | None = None
+    """As in `protocol.Look`."""
+
+
+NameList = Annotated[str, Meta(max_length=4096)]
+"""Names of cameras, separated by commas."""
 
 
 class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -46,10 +63,25 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
     fov_y: protocol.FieldOfView | None = None
     quality: protocol.Quality = 85
     time: Literal["live"] | protocol.Count = "live"
+    camera: protocol.ShortText | None = None
+    """A camera of the rig, whose pose, lens and size the view has, and whose image it is scored by."""
+    mode: Annotated[str, one_of(*MODES, "error")] = "mended"
+    without: NameList = ""
     token: str = ""
 
+    def __post_init__(self) -> None:
+        if self.mode == "error" and self.camera is None:
+            raise ProtocolError("expected 'camera' for the mode 'error', got none; give its name")
+        if self.mode == "compared" and self.model is None:
+            raise ProtocolError("expected 'model' for the mode 'compared', got none; give its name")
+
     @property
-    def camera(self) -> Camera:
+    def left_out(self) -> tuple[str, ...]:
+        """The names in `without`."""
+        return tuple(name.strip() for name in self.without.split(",") if name.strip())
+
+    @property
+    def pose(self) -> Camera:
         """The view's camera."""
         return Camera(azimuth=self.azimuth, elevation=self.elevation, distance=self.distance, fov_y=self.fov_y)
 
@@ -69,6 +101,7 @@ class PathBody(ViewOptions, frozen=True, kw_only=True):
     poses: Annotated[tuple[Camera, ...], Meta(min_length=1, max_length=MAX_POSES)]
     times: Annotated[tuple[protocol.Count, ...], Meta(min_length=1, max_length=MAX_POSES)] | None = None
     fps: Annotated[float, Meta(ge=1, le=120)] = 30.0
+    without: protocol.Names = ()
     stereo_m: Annotated[float, Meta(ge=0.001, le=1)] | None = None
     """Distance of the two eyes of a side-by-side stereo video, each `width` wide; None for a single view."""
 
@@ -141,7 +174,12 @@ class ImageJob(RenderJob[tuple[bytes, RenderResult]]):
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The view; None while its frame is being read."""
         index = playback.edge if self._asked.time == "live" else self._asked.time
-        return None if self.done.done() else request_view(self._asked, self._asked.camera, index, playback)
+        return None if self.done.done() else self._request(index, playback)
+
+    def _request(self, index: float | int, playback: PlaybackState) -> RenderRequest | None:
+        request = request_view(self._asked, self._asked.pose, index, playback)
+        asked = self._asked
+        return None if request is None else replace(request, without=asked.left_out, truth=asked.camera)
 
     def encode(self, result: RenderResult) -> None:
         """Encode the image."""
@@ -170,7 +208,8 @@ class PathJob(RenderJob[bytes]):
         if self._times is None:  # the edge at the start of the job
             self._times = (int(playback.span.clamp(playback.edge)),) * len(self._path.poses)
         pose, index = self._path.poses[self._count], self._times[self._count]
-        return request_view(self._path, pose, index, playback, self._path.stereo_m)
+        request = request_view(self._path, pose, index, playback, self._path.stereo_m)
+        return None if request is None else replace(request, without=self._path.without)
 
     def encode(self, result: RenderResult) -> None:
         """Encode one more view; the last one ends the job."""
@@ -191,14 +230,14 @@ def request_view(
         return None
     camera = view_camera(pose, playback.home, (asked.width, asked.height))
     eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, playback.home.center)
-    quality = RenderQuality(mend=asked.mode in MENDED_MODES, top_k=asked.top_k)
-    return RenderRequest(index, eyes, quality, asked.error_rule, HULL_MODES & {asked.mode})
+    quality = RenderQuality(mend=asked.mode in MENDED_MODES | {"error"}, top_k=asked.top_k)
+    return RenderRequest(index, eyes, quality, asked.error_rule, EXTRA_MODES & {asked.mode}, model=asked.model)
 
 
 def draw_eyes(asked: ViewOptions, result: RenderResult) -> Image:
     """The images of all eyes side by side."""
     background = asked.background or result.background
-    return np.hstack([draw_mode(view, asked.mode, background, hulls) for view, hulls in result.eyes])
+    return np.hstack([draw_mode(view, asked.mode, background, extra) for view, extra in result.eyes])
 
 
 def source_jpeg(frame: MultiViewFrame, name: str) -> bytes:

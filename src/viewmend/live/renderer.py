@@ -2,23 +2,30 @@
 
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.frame_cache import CachedFrame, cache_frame
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.assets import FrameAssets, make_assets
 from viewmend.live.budget import ladder_for
 from viewmend.live.frame_source import FrameSource, RigInfo
 from viewmend.live.poses import HomeView, bounds_json, cameras_json, home_view, view_camera
 from viewmend.live.protocol import BLACK, WHITE, Camera
+from viewmend.metrics.image_quality import psnr
 from viewmend.models.base import Inpainter, RenderQuality, State
+from viewmend.models.checkpoint import load_inpainter
+from viewmend.models.compositing import Background, composite
 from viewmend.rendering.proxy_views import hull_points, shaded_hull, vertex_colours
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.types import CompletedView, MultiViewFrame
@@ -26,6 +33,8 @@ from viewmend.utils.cancellation import CancelledError
 from viewmend.utils.timing import StageTimes
 
 WARM_UP_PX = 64
+MAX_VARIANTS, VARIANT_MB = 3, 200.0
+"""Streams of other models or fewer cameras that are kept, and the memory of each."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +48,14 @@ class RenderRequest:
     quality: RenderQuality
     error_rule: str | None = None
     """None for the renderer's own."""
-    hull_modes: frozenset[str] = frozenset()
-    """Images of the geometry proxy to render as well."""
+    extra_modes: frozenset[str] = frozenset()
+    """Images that are not of the renderer's own model, to make as well."""
+    without: tuple[str, ...] = ()
+    """Cameras that are not used, neither their images nor their masks."""
+    model: str | None = None
+    """The shipped model of "compared", and of "error" if given."""
+    truth: str | None = None
+    """A camera whose image the view is scored by. It replaces `cameras`."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +71,15 @@ class RenderResult:
     """Times of all eyes together; geometry and context are 0 if an earlier view has computed them."""
     background: str = BLACK
     """Default background, as hexadecimal RGB: the model's own."""
-    hulls: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
-    """Images of the proxy by mode, one mapping per eye: RGB in [0, 1] and coverage."""
+    extra: tuple[Mapping[str, Float[Tensor, "4 height width"]], ...] = ()
+    """Images by mode of `RenderRequest.extra_modes`, one mapping per eye: RGB in [0, 1], times alpha, and alpha."""
+    psnr_db: float | None = None
+    """PSNR inside the true mask of `RenderRequest.truth`, of the model that was asked for."""
 
     @property
     def eyes(self) -> Iterator[tuple[CompletedView, Mapping[str, Tensor]]]:
-        """The view of each eye with its images of the proxy."""
-        return zip(self.completed, self.hulls or repeat({}), strict=False)
+        """The view of each eye with its images of other modes."""
+        return zip(self.completed, self.extra or repeat({}), strict=False)
 
 
 class FrameNotReadyError(Exception):
@@ -90,6 +107,10 @@ class Renderer:
         self._draws_in_page = draws_in_page
         self._rig: RigInfo | None = None
         self._stream: Stream | None = None
+        self._variants: OrderedDict[tuple[str | None, tuple[str, ...]], Stream] = OrderedDict()
+        """Streams of other models, and of fewer cameras; the ones used last at the end."""
+        self._models: dict[str, Inpainter] = {}
+        """Other models, loaded on demand."""
         self.home: HomeView | None = None
         """The initial view; None before the first frame."""
         self.rig_json: dict[str, Any] | None = None
@@ -137,6 +158,7 @@ class Renderer:
         self.assets_version = secrets.token_hex(4)
         rig_json["assets"] = self.assets_version if self._draws_in_page else None
         self.rig_json = rig_json | home.as_json() | {"fps": self._source.span.fps or None}
+        self._variants.clear()
         self._rig, self._stream, self.home = rig, stream, home
         return True
 
@@ -145,50 +167,128 @@ class Renderer:
 
         Raises:
             FrameNotReadyError: the frame has not been read yet.
-            ValueError: the frame has no geometry.
+            ValueError: the frame has no geometry, fewer than two cameras are left, or the true camera is unknown.
         """
         if self._stream is None:
             raise FrameNotReadyError
-        cached = self._add_frame(self._stream, request.time)
-        before = viewer or self._stream.viewer()
-        stream = self._stream
+        without = self.left_out(request.without)
+        stream = self._stream_of(None, without)
+        cached = self._add_frame(stream, request.time, without)
+        before = viewer or stream.viewer()
+        truth = None if request.truth is None else self._true_frame(request.time, request.truth)
         if request.error_rule is not None:
             stream = stream.with_render_config(replace(stream.config.render, error_rule=request.error_rule))
-        cameras = [camera.to(self._device) for camera in request.cameras]
+        asked = request.cameras if truth is None else (truth.cameras,)
+        cameras = [camera.to(self._device) for camera in asked]
         views = [self._view(stream, camera, before, request.time, request.quality) for camera in cameras]
         start = time.perf_counter()
-        hulls = tuple(self._render_proxy(cached, camera, request.hull_modes) for camera in cameras)
+        extra = tuple(self._render_proxy(cached, camera, request.extra_modes) for camera in cameras)
         times = sum((v.times for v in views), StageTimes(rendering=1000 * (time.perf_counter() - start)))
-        completed = tuple(view.completed for view in views)
-        return RenderResult(request.time, completed, views[0].viewer, times, self.background, hulls)
+        completed = [view.completed for view in views]
+        inpainter, scored = self._inpainter, completed[0]
+        if request.model is not None:
+            others = [self._complete_by(request.model, cached, camera, without, request.quality) for camera in cameras]
+            for images, other in zip(extra, others, strict=True):
+                images["compared"] = torch.cat([other.rgb, other.opacity[None]])
+            times += StageTimes(inpainting=1000 * (time.perf_counter() - start) - times.rendering)
+            inpainter, scored = self._models[request.model], others[0]
+        psnr_db = None
+        if truth is not None:
+            background = inpainter.background or self._config.background
+            psnr_db, extra[0]["error"] = self._score(scored, truth, background)
+        return RenderResult(request.time, tuple(completed), views[0].viewer, times, self.background, extra, psnr_db)
 
-    def make_assets(self, frame: MultiViewFrame) -> FrameAssets:
-        """What a page needs to draw views of a frame; callable from any thread.
+    def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of these names that are cameras of the rig, in its order.
+
+        Raises:
+            ValueError: fewer than two cameras are left.
+        """
+        own = [camera["name"] for camera in (self.rig_json or {"cameras": []})["cameras"]]
+        if names and len(set(own) - set(names)) < 2:
+            raise ValueError(f"expected two input cameras or more, got {len(set(own) - set(names))}; leave out fewer")
+        return tuple(name for name in own if name in names)
+
+    def make_assets(self, frame: MultiViewFrame, without: tuple[str, ...] = ()) -> FrameAssets:
+        """What a page needs to draw views of a frame without some of its cameras; callable from any thread.
 
         Raises:
             ValueError: the frame has no geometry.
         """
-        return make_assets(frame, self.geometry(frame), self._config.render)
+        return make_assets(frame.without(without), self.geometry(frame, without), self._config.render)
 
-    def geometry(self, frame: MultiViewFrame) -> GeometryProxy:
-        """The proxy of a frame, on the CPU; callable from any thread.
+    def geometry(self, frame: MultiViewFrame, without: tuple[str, ...] = ()) -> GeometryProxy:
+        """The proxy of a frame without some of its cameras, on the CPU; callable from any thread.
 
         Raises:
             ValueError: the frame has no geometry, or no rig has been prepared yet.
         """
-        shared = self._source.read_cached(frame.time)
+        shared = None if without else self._source.read_cached(frame.time)
         if shared is not None and isinstance(shared.proxy, GeometryProxy):
             return shared.proxy.to("cpu")
-        stream = self._stream
+        stream = self._variants.get((None, without)) if without else None
+        stream = stream or self._stream
         if stream is None:
             raise ValueError("expected a rig, got none yet; see /health")
-        try:
-            cached = stream.cached_frame(frame.time)
-        except ValueError:  # not shown by the server so far: carved without keeping it
-            cached = cache_frame(frame.to(self._device), stream.bounds, stream.config.hull)
+        cached = None
+        if not without or stream is not self._stream:
+            with suppress(ValueError):  # not shown by the server so far: carved without keeping it
+                cached = stream.cached_frame(frame.time)
+        if cached is None:
+            cached = cache_frame(frame.without(without).to(self._device), stream.bounds, stream.config.hull)
         proxy = cached.proxy
         assert isinstance(proxy, GeometryProxy), "streams carve hulls"
         return proxy.to("cpu")
+
+    def _stream_of(self, model: str | None, without: tuple[str, ...]) -> Stream:
+        """The stream of a model, None for the renderer's own, that uses all but some cameras."""
+        assert self._stream is not None, "there is a rig"
+        if model is None and not without:
+            return self._stream
+        key, config = (model, without), replace(self._config, memory_mb=VARIANT_MB)
+        if key not in self._variants:
+            inpainter, errors = self._inpainter, self._error_model
+            if model is not None:  # by the error rule that it is made for
+                inpainter, errors = self._load(model), errors if errors is not None else self._inpainter
+                config = replace(config, render=replace(config.render, error_rule=None))
+            self._variants[key] = Stream(inpainter, config, self._stream.bounds, errors)
+        self._variants.move_to_end(key)
+        while len(self._variants) > MAX_VARIANTS:
+            self._variants.popitem(last=False)
+        return self._variants[key]
+
+    def _load(self, model: str) -> Inpainter:
+        if model not in self._models:
+            self._models[model] = load_inpainter(model, self._device)
+        return self._models[model]
+
+    def _complete_by(
+        self, model: str, cached: CachedFrame, camera: Cameras, without: tuple[str, ...], quality: RenderQuality
+    ) -> CompletedView:
+        """The view by another model, behind the same geometry."""
+        stream = self._stream_of(model, without)
+        stream.add_frame(cached.frame, cached.proxy).depths = cached.depths
+        return stream.view(camera, None, cached.frame.time, replace(quality, mend=True)).completed
+
+    def _true_frame(self, index: int, name: str) -> MultiViewFrame:
+        """A camera's own image; ValueError if the frame has no such camera."""
+        frame = self._read(index)
+        if name not in frame.cameras.names:
+            raise ValueError(
+                f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got another"
+            )
+        return frame.select([name])
+
+    def _score(
+        self, completed: CompletedView, truth: MultiViewFrame, background: Background
+    ) -> tuple[float | None, Tensor]:
+        """PSNR inside the true mask on a background, as `evaluation.scores` has it, and each pixel's largest error."""
+        assert truth.mask is not None, "frames with geometry have masks"
+        alpha = truth.mask[0].float() / 255
+        true = composite(background, truth.rgb[0].float() / 255 * alpha, alpha)
+        seen = composite(background, completed.rgb, completed.opacity)
+        errors = (seen - true).abs().amax(0)
+        return psnr(seen, true, truth.mask[0] > FOREGROUND), torch.stack([*[errors] * 3, torch.ones_like(errors)])
 
     def _render_proxy(self, cached: CachedFrame, camera: Cameras, modes: frozenset[str]) -> dict[str, Tensor]:
         """Images of the proxy; the vertex colours are computed once per frame."""
@@ -210,8 +310,10 @@ class Renderer:
             raise FrameNotReadyError
         return frame.to(self._device)
 
-    def _add_frame(self, stream: Stream, index: int) -> CachedFrame:
+    def _add_frame(self, stream: Stream, index: int, without: tuple[str, ...] = ()) -> CachedFrame:
         """Add a frame to the stream, with everything that another process has computed for it."""
+        if without:
+            return stream.add_frame(self._read(index).without(without))
         shared = self._source.read_cached(index)
         if shared is None:
             return stream.add_frame(self._read(index))

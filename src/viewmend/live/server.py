@@ -44,6 +44,7 @@ from viewmend.live.responses import (
 )
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
+from viewmend.models.checkpoint import shipped_models
 from viewmend.utils.plugins import import_object
 
 IMAGE_S, SOURCE_IMAGE_S, EXPORT_S = 60.0, 5.0, 3600.0
@@ -110,6 +111,7 @@ class LiveServer:
             "budget_ms": config.budget_ms,
             "limits": asdict(config.limits),
             "codecs": ["jpeg", *video_codecs()],
+            "models": [name for name in shipped_models() if name != config.model],
             "export": can_write_mp4(),
             "token_needed": bool(config.token),
             "broadcast": False,
@@ -208,6 +210,7 @@ class LiveServer:
 
     async def _image(self, request: Request) -> Response:
         asked = parse_query(dict(request.query_params), self._config.limits)
+        self._check_cameras(asked.camera, asked.left_out)
         if self._num_images >= MAX_IMAGES:
             return error_response(429, TOO_MANY_IMAGES)
         job = ImageJob(asked)
@@ -220,7 +223,22 @@ class LiveServer:
             self._num_images -= 1
         timing = ", ".join(f"{stage};dur={ms:.1f}" for stage, ms in vars(result.times).items())
         headers = {"Server-Timing": timing, "X-Viewmend-Time": str(result.time), "Cache-Control": "no-store"}
+        if result.psnr_db is not None:
+            headers["X-Viewmend-PSNR"] = f"{result.psnr_db:.3f}"
         return Response(image, media_type="image/jpeg", headers=headers)
+
+    def _check_cameras(self, camera: str | None, without: tuple[str, ...]) -> None:
+        """Raise a ProtocolError if a camera is not the rig's, or too few are left."""
+        renderer = self._service.renderer
+        if renderer.rig_json is None:
+            return
+        names = [known["name"] for known in renderer.rig_json["cameras"]]
+        if camera is not None and camera not in names:
+            raise ProtocolError(f"expected a camera among {', '.join(names)[:200]}, got another")
+        try:
+            renderer.left_out(without)
+        except ValueError as error:
+            raise ProtocolError(str(error)) from None
 
     async def _source_image(self, request: Request) -> Response:
         asked: SourceImageQuery = read_message(dict(request.query_params), SourceImageQuery, strict=False)
@@ -247,7 +265,8 @@ class LiveServer:
         if version is None or not span.first <= asked.time < span.end:
             return error_response(404, f"expected a frame from {span.first} to {span.end - 1}; see /health")
         try:
-            made = await self.assets.get(asked.time, version)
+            without = self._service.renderer.left_out(asked.without.split(","))
+            made = await self.assets.get(asked.time, version, without)
         except BusyError as error:
             return error_response(429, str(error))
         except TimeoutError as error:

@@ -12,7 +12,7 @@ from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLe
 from viewmend.live.encoding import Encoders, encode_frame
 from viewmend.live.frame_source import Clock, Span
 from viewmend.live.poses import HomeView, view_camera
-from viewmend.live.protocol import HULL_MODES, MENDED_MODES, ClockChange, FrameTimes, Look
+from viewmend.live.protocol import EXTRA_MODES, MENDED_MODES, ClockChange, FrameTimes, Look
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.models.base import RenderQuality, State
 
@@ -244,7 +244,8 @@ class ViewerSession:
         )
         scale = look.scale * self.rendered_level.scale
         cameras = tuple(view_camera(eye, home, (look.width, look.height), scale) for eye in look.cameras)
-        return RenderRequest(index, cameras, quality, look.error_rule, HULL_MODES & {*look.modes})
+        extra = EXTRA_MODES & {*look.modes}
+        return RenderRequest(index, cameras, quality, look.error_rule, extra, look.without, look.model)
 
     def deliver(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Encode and send a frame, and record its times."""

@@ -163,5 +163,5 @@ def test_a_file_that_is_no_path_is_said_and_changes_nothing(desktop, tmp_path, t
     file = tmp_path / "none.json"
     file.write_text(text)
     desktop.page.locator("#path-file").set_input_files(file)
-    desktop.until(lambda: "none.json is no camera path" in desktop.page.locator("#toasts").inner_text())
+    desktop.until(lambda: "none.json is not a camera path" in desktop.page.locator("#toasts").inner_text())
     assert "2 views" in desktop.page.locator("#path-text").inner_text()

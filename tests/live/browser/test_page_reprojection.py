@@ -120,7 +120,7 @@ def test_a_headset_gets_two_eyes_of_one_state(browser, server):
     page.add_init_script(HEADSET)
     page.goto(server.url)
     page.wait_for_selector("#picture[data-frame]")
-    page.get_by_role("button", name="Enter the headset").click()
+    page.get_by_role("button", name="Enter VR").click()
     page.wait_for_timeout(1500)
     look = server.looks[-1]
     assert look["depth"] is True
@@ -143,8 +143,8 @@ def test_without_a_headset_there_is_no_button(desktop):
 
 def test_where_the_processor_draws_some_refreshes_are_left_out(desktop):
     counts = desktop.page.evaluate(
-        "import('/page/draw/resolution.js').then(({ ResolutionLimit }) => [false, true].map((software) => {"
-        "  const pace = new ResolutionLimit(software);"
+        "import('/page/draw/resolution.js').then(({ Pace }) => [false, true].map((software) => {"
+        "  const pace = new Pace(software);"
         "  return Array.from({ length: 60 }, (_, n) => pace.due((1000 / 60) * n)).filter(Boolean).length; }))"
     )
     assert counts[0] == 60

@@ -231,9 +231,9 @@ class BroadcastSession(ViewerSession):
         start, look = time.perf_counter(), self._requested[0]
         assert look is not None, "a view is rendered for a look"
         self.viewer: State | None = result.viewer
-        completed, hulls = next(result.eyes)
+        completed, extra = next(result.eyes)
         with light_operations():
-            image = draw_mode(completed, look.modes[0], look.background or result.background, hulls)
+            image = draw_mode(completed, look.modes[0], look.background or result.background, extra)
         with self._lock:
             if self._is_open:
                 self._image = image

@@ -8,13 +8,14 @@ import { Assets, rankedCameras } from "./link/assets.js";
 import { Connection } from "./link/connection.js";
 import { decodable } from "./link/pictures.js";
 import { ViewerLink } from "./link/viewer.js";
-import { Settings } from "./settings.js";
+import { Settings, modeOf } from "./settings.js";
 import { CameraList } from "./ui/cameras.js";
 import { buildControls } from "./ui/controls.js";
 import { byId } from "./ui/dom.js";
 import { Layout } from "./ui/layout.js";
-import { MODES, buildModes, placeDivider } from "./ui/modes.js";
+import { MODES, buildModes, offerModels, placeDivider } from "./ui/modes.js";
 import { Original } from "./ui/original.js";
+import { showScale } from "./ui/scale.js";
 import { Notices } from "./ui/notices.js";
 import { OnAir } from "./ui/on_air.js";
 import { PathPanel } from "./ui/paths.js";
@@ -57,8 +58,11 @@ class Page {
     this.place = new Place();
     this.motion.first = poseOf(query.get("pose"));
     this.layout = new Layout(this.settings, () => this.wake());
-    this.cameras = new CameraList((camera) => this.snap(camera));
-    this.original = new Original(token);
+    this.cameras = new CameraList(this.settings, (camera) => this.snap(camera));
+    this.original = new Original(token, (mode, camera, image) => {
+      this.stage.photo(mode, camera, image);
+      this.wake();
+    });
     /** The camera that the view was put to, and the pose that it got there. @type {any} */
     this.snapped = null;
     this.headset = new Headset(this.stage, {
@@ -93,6 +97,7 @@ class Page {
       KeyR: () => this.reset(), Home: () => this.reset(),
       KeyF: () => this.controls.movement(this.motion.mode === "fly" ? "orbit" : "fly"),
       KeyN: () => this.cameras.next(1), KeyB: () => this.cameras.next(-1),
+      KeyX: () => this.cameras.toggleInput(),
       KeyG: flip("rig"), KeyT: flip("reproject"), KeyH: flip("panel"),
       KeyP: tools.shot, KeyC: () => this.paths.toggleRecording(), "?": tools.help,
       Space: () => transport.toggle(), KeyL: () => transport.live(),
@@ -123,6 +128,7 @@ class Page {
     on(this.link, "welcome", (welcome) => {
       this.limits = welcome.limits;
       this.controls.codecs(welcome.codecs);
+      offerModels(this.settings, welcome.model, welcome.models ?? []);
       this.controls.rules(welcome.error_rules, welcome.error_rule);
       this.settings.set("modelGround", welcome.background ?? "000000", false);
       this.paths.offer(welcome.export);
@@ -217,6 +223,8 @@ class Page {
       error_rule: settings.get("errorRule") || null,
       adaptive: settings.get("adaptive"),
       background: settings.ground,
+      without: settings.without,
+      model: settings.model,
       depth: settings.get("reproject") || settings.get("rig"),
       codec: settings.get("codec"),
     };
@@ -231,6 +239,7 @@ class Page {
   /** Choose the frame to draw, and ask for the next ones. @param {number} now ms */
   choose(now) {
     const { transport, motion, assets } = this;
+    assets.leaveOut(this.settings.get("without"));
     transport.drawing = this.drawing;
     const fps = motion.rig?.fps ?? 0;
     const time = transport.drawing ? transport.timeAt(now, fps) : -1;
@@ -283,6 +292,7 @@ class Page {
       pose: motion.atHome || !motion.goal ? null : poseText(motion.goal),
       time: transport.still < 0 ? null : String(transport.still),
       mode: settings.get("mode") === "mended" ? null : settings.get("mode"),
+      without: settings.get("without") || null,
       left: split ? settings.get("left") : null,
       right: split ? settings.get("right") : null,
     });
@@ -293,7 +303,7 @@ class Page {
     const { settings } = this;
     const split = settings.get("mode") === "split";
     const parts = split
-      ? [{ mode: settings.get("left"), until: divider }, { mode: settings.get("right"), until: 1 }]
+      ? [{ mode: modeOf(settings.get("left")), until: divider }, { mode: modeOf(settings.get("right")), until: 1 }]
       : [{ mode: settings.get("mode"), until: 1 }];
     return { parts, reproject: settings.get("reproject"), rig: settings.get("rig"), frame: this.drawing ? this.drawn : null };
   }
@@ -312,10 +322,23 @@ class Page {
     this.stage.clear(this.settings.ground);
     this.stage.draw(viewer, viewport, this.wish(divider));
     this.cameras.place(this.settings.get("rig"), viewer, box);
-    const there = this.settings.get("originals") && this.motion.goal === this.snapped?.goal;
-    this.original.show(there ? this.snapped.camera : null, this.transport.shown);
+    this.compare();
     this.statistics.painted(this.drawing && this.drawn ? this.stage.scene.cost : null);
     this.controls.fov(this.motion.pose?.fov ?? 50);
+  }
+
+  /** The image of the camera that the view is at, and the view's score if that camera is left out. */
+  compare() {
+    const { settings, transport, motion } = this;
+    const camera = motion.goal === this.snapped?.goal ? this.snapped?.camera ?? null : null;
+    this.cameras.at(camera);
+    const split = settings.shown.includes("original");
+    const leftOut = camera && settings.without.includes(camera.name);
+    this.original.show(settings.get("originals") || split || leftOut ? camera : null, transport.shown, settings.get("originals") && !split || leftOut);
+    const scored = leftOut && !transport.playing && !motion.moving && transport.shown >= 0;
+    const models = [null, ...(settings.model ? [settings.model] : [])];
+    this.original.scores.show(scored ? { camera, time: transport.shown, without: settings.get("without"), models } : null);
+    showScale(settings, this.stage.header);
   }
 
   /** Repaint at the display's next refresh, and on while something moves. */

@@ -3,8 +3,9 @@
 /**
  * @typedef {object} Choices
  * @property {"rendered" | "holes" | "mended" | "split" | "depth" | "coverage" | "confidence" | "hull" | "points"} mode
- * @property {string} left mode on the divider's left
+ * @property {string} left mode on the divider's left, or one of `COMPARED`
  * @property {string} right mode on its right
+ * @property {string} without names of cameras that are not used, separated by commas
  * @property {number} divider where it is, 0 to 1 of the free part's width
  * @property {number | null} topK
  * @property {string} errorRule what is mended; "" for what the server was started with
@@ -25,6 +26,7 @@
 
 const DEFAULTS = {
   mode: "mended",
+  without: "",
   left: "rendered",
   right: "mended",
   divider: 0.5,
@@ -46,11 +48,16 @@ const DEFAULTS = {
 };
 
 const PICTURES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"];
+/** What a split view shows besides: another model's output, the image of the camera that the view is at, and the difference. */
+export const COMPARED = /^(compared:[\w.-]+|original|error)$/;
+/** The mode that the server knows, or the page's own. @param {string} value */
+export const modeOf = (value) => value.split(":")[0];
+const HERE = ["original", "error"];
 /** What a choice may be, where not everything is one. @type {Record<string, (value: string) => boolean>} */
 const SENSIBLE = {
   mode: (value) => value === "split" || PICTURES.includes(value),
-  left: (value) => PICTURES.includes(value),
-  right: (value) => PICTURES.includes(value),
+  left: (value) => PICTURES.includes(value) || COMPARED.test(value),
+  right: (value) => PICTURES.includes(value) || COMPARED.test(value),
   theme: (value) => value === "dark" || value === "light",
   modelGround: () => false,
   render: (value) => value === "page" || value === "server",
@@ -60,7 +67,7 @@ const SENSIBLE = {
 
 /** Storage key of the settings; those in the URL are not stored. */
 const KEPT = "viewmend.settings";
-const IN_ADDRESS = ["mode", "left", "right", "size"];
+const IN_ADDRESS = ["mode", "left", "right", "size", "without"];
 
 /** What the person chose before, as texts by name. @returns {Record<string, string>} */
 function kept() {
@@ -120,9 +127,24 @@ export class Settings extends EventTarget {
 
   /** The modes that the server must render. @returns {string[]} */
   get modes() {
-    if (this.values.mode !== "split") return [this.values.mode];
-    const { left, right } = this.values;
-    return left === right ? [left] : [left, right];
+    const asked = [...new Set(this.shown.map(modeOf))].filter((mode) => !HERE.includes(mode));
+    return asked.length ? asked : ["mended"];
+  }
+
+  /** What is shown, from left to right. @returns {string[]} */
+  get shown() {
+    const { mode, left, right } = this.values;
+    return mode === "split" ? [left, right] : [mode];
+  }
+
+  /** The other model that is shown; null for none. @returns {string | null} */
+  get model() {
+    return this.shown.find((value) => value.startsWith("compared:"))?.slice("compared:".length) ?? null;
+  }
+
+  /** Names of cameras that are not used. @returns {string[]} */
+  get without() {
+    return this.values.without.split(",").filter(Boolean);
   }
 
   /** Call now and on every change of one of `names`. @param {(keyof Choices)[]} names @param {() => void} react */

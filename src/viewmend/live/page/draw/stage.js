@@ -5,6 +5,7 @@ import { LinePainter } from "./lines.js";
 import { clipFromPicture, clipFromPixels, clipFromWorld, samePlace } from "./projection.js";
 import { Scene, filling } from "./scene.js";
 import { planeOf } from "./surface.js";
+import { length, sub } from "../view/matrix.js";
 import { eyeOfCamera } from "../view/pose.js";
 
 /** @typedef {import("./projection.js").Viewpoint} Viewpoint */
@@ -54,6 +55,8 @@ void main() {
 const STRETCHED_TONE = 0.6;
 /** Time in which the server's picture appears over the drawn one. */
 const FADE_MS = 250;
+/** A view is at a camera if it is no further from it than this share of its distance. */
+const AT_CAMERA = 0.01;
 
 export class Stage {
   /** @param {HTMLCanvasElement} canvas */
@@ -70,6 +73,8 @@ export class Stage {
     this.header = null;
     /** @type {any[]} */
     this.eyes = [];
+    /** Images of cameras, by mode: "original" and "error". @type {Record<string, {camera: any, picture: WebGLTexture, quad: any} | null>} */
+    this.photos = { original: null, error: null };
     this.ground = [0, 0, 0];
     this.prepare();
   }
@@ -78,6 +83,7 @@ export class Stage {
   prepare() {
     this.header = null;
     this.eyes = [];
+    this.photos = { original: null, error: null };
     this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground", "opacity"]);
     this.scene = new Scene(this.gl, filling(this.software));
     /** When the last picture came, and the share of it that was drawn last. */
@@ -104,6 +110,22 @@ export class Stage {
     this.eyes.length = shown.eyes.length;
     this.header = shown.header;
     this.taken = { at: performance.now(), shown: 0 };
+  }
+
+  /** Show an image in the place of the camera that took it. @param {string} mode @param {any} camera of the rig @param {TexImageSource | null} image null to show none */
+  photo(mode, camera, image) {
+    const { gl } = this;
+    const kept = this.photos[mode];
+    if (!image) {
+      if (kept) gl.deleteTexture(kept.picture);
+      this.photos[mode] = null;
+      return;
+    }
+    const picture = kept?.picture ?? texture(gl);
+    gl.bindTexture(gl.TEXTURE_2D, picture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+    const quad = upload(gl, kept?.quad ?? null, planeOf(camera.width, camera.height, 1));
+    this.photos[mode] = { camera, picture, quad };
   }
 
   /** Whether the server's picture is still appearing over the drawn one. */
@@ -140,7 +162,8 @@ export class Stage {
       for (const { mode, until } of wish.parts) {
         const [from, to] = [Math.round(start * width), Math.round(until * width)];
         gl.scissor(x + from, y, Math.max(0, to - from), height);
-        this.#picture(viewer, kept, kept.textures[kept.modes.includes(mode) ? mode : kept.modes[0]], wish, eye);
+        if (mode in this.photos) this.#photo(viewer, mode);
+        else this.#picture(viewer, kept, kept.textures[kept.modes.includes(mode) ? mode : kept.modes[0]], wish, eye);
         start = until;
       }
       gl.scissor(x, y, width, height);
@@ -169,12 +192,38 @@ export class Stage {
       const [from, to] = [Math.round(start * width), Math.round(until * width)];
       gl.scissor(x + from, y, Math.max(0, to - from), height);
       const over = kept?.modes.includes(mode) ? opacity : 0;
+      start = until;
+      if (mode in this.photos) {
+        this.#photo(viewer, mode);
+        continue;
+      }
       if (over < 1 || wish.rig) this.scene.draw(frame, sources, viewer, place, mode);
       if (over > 0) this.#overlay(kept, kept.textures[mode], over);
-      start = until;
     }
     gl.scissor(x, y, width, height);
     if (wish.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
+  }
+
+  /** A camera's image, where the view is at that camera. @param {Viewpoint & {distance?: number}} viewer @param {string} mode */
+  #photo(viewer, mode) {
+    const { gl } = this;
+    const photo = this.photos[mode];
+    if (!photo) return;
+    const { camera, picture, quad } = photo;
+    const distance = viewer.distance ?? 1;
+    if (length(sub(eyeOfCamera(viewer), camera.center)) > AT_CAMERA * distance) return;
+    const { program, at } = /** @type {any} */ (this.painter);
+    gl.disable(gl.DEPTH_TEST);
+    gl.useProgram(program);
+    gl.bindTexture(gl.TEXTURE_2D, picture);
+    gl.uniform2f(at.size, camera.width, camera.height);
+    gl.uniform1f(at.tone, 1);
+    gl.uniform1f(at.opacity, 1);
+    gl.uniform3fv(at.ground, this.ground);
+    gl.uniformMatrix4fv(at.clip, false, this.#clip(camera, viewer, {}));
+    gl.bindVertexArray(quad.array);
+    gl.drawElements(gl.TRIANGLES, quad.solid, gl.UNSIGNED_INT, 0);
+    gl.enable(gl.DEPTH_TEST);
   }
 
   /** @param {any} kept @param {WebGLTexture} picture @param {number} opacity */

@@ -42,6 +42,8 @@ export class Assets extends EventTarget {
     this.fillers = fillers;
     /** The version that the server's message `rig` names; null if the server draws. @type {string | null} */
     this.version = null;
+    /** Names of cameras that are not used, separated by commas. */
+    this.without = "";
     /** @type {Map<number, Frame>} the one used last at the end */
     this.frames = new Map();
     /** The frame that is shown: it is kept. @type {Frame | null} */
@@ -49,6 +51,8 @@ export class Assets extends EventTarget {
     /** @type {Set<string>} */
     this.waiting = new Set();
     this.failures = 0;
+    /** Grows when all frames are let go of: what was asked for before is of no use. */
+    this.round = 0;
     this.bytes = 0;
     /** Time from asking for a frame until it can be drawn, ms. */
     this.latency = 150;
@@ -64,14 +68,27 @@ export class Assets extends EventTarget {
   /** @param {any} rig the message */
   open(rig) {
     if (rig.assets === this.version) return;
-    this.shown = null;
-    for (const frame of this.frames.values()) this.#forget(frame);
-    this.waiting.clear();
+    this.#clear();
     this.version = rig.assets ?? null;
     this.failures = 0;
     if (this.version === null || this.worker) return;
     this.worker = new Worker(new URL("./asset_worker.js", import.meta.url), { type: "module" });
     this.worker.onmessage = ({ data }) => this.#take(data);
+  }
+
+  /** Frames of all cameras but some. @param {string} without names, separated by commas */
+  leaveOut(without) {
+    if (without === this.without) return;
+    this.without = without;
+    this.failures = 0;
+    this.#clear();
+  }
+
+  #clear() {
+    this.shown = null;
+    for (const frame of this.frames.values()) this.#forget(frame);
+    this.waiting.clear();
+    this.round += 1;
   }
 
   /**
@@ -143,11 +160,12 @@ export class Assets extends EventTarget {
 
   /** @param {string} path @param {any} camera */
   #ask(path, camera) {
-    const key = `${this.version} ${path}`;
+    const key = `${this.round} ${path}`;
     if (this.waiting.has(key) || this.waiting.size >= REQUESTS) return;
     this.waiting.add(key);
     const url = address(`assets/${path}`, this.token);
     url.searchParams.set("v", this.version ?? "");
+    if (this.without) url.searchParams.set("without", this.without);
     this.worker?.postMessage({ key, url: url.href, camera });
   }
 
@@ -179,9 +197,9 @@ export class Assets extends EventTarget {
   /** @param {import("./asset_worker.js").News} news */
   #take({ key, shape, image, bytes, failed }) {
     this.waiting.delete(key);
-    const [version, path] = key.split(" ");
+    const [round, path] = key.split(" ");
     const [time, camera] = path.split("/").map(Number);
-    const frame = version === this.version ? this.frames.get(time) : undefined;
+    const frame = Number(round) === this.round ? this.frames.get(time) : undefined;
     if (!frame) image?.picture.close();
     else if (shape) frame.shape = shape;
     else if (image) frame.images.set(camera, image);

@@ -7,13 +7,19 @@ import { byId, element } from "./dom.js";
 const css = (colour) => `rgb(${colour.map(Math.round).join(" ")})`;
 
 export class CameraList {
-  /** @param {(camera: any) => void} snap */
-  constructor(snap) {
+  /** @param {import("../settings.js").Settings} settings @param {(camera: any) => void} snap */
+  constructor(settings, snap) {
+    this.settings = settings;
     this.snap = snap;
+    /** The camera that the view is at. @type {any} */
+    this.here = null;
+    byId("input").addEventListener("change", () => this.toggleInput());
+    byId("inputs-all").addEventListener("click", () => settings.set("without", ""));
     /** @type {any[]} */
     this.cameras = [];
     this.last = -1;
     this.used = "";
+    settings.watch(["without"], () => this.#inputs());
   }
 
   /** @param {any} rig */
@@ -28,7 +34,43 @@ export class CameraList {
     byId("cameras").replaceChildren(...this.cameras.map(make));
     byId("labels").replaceChildren(...this.cameras.map(make));
     for (const label of byId("labels").children) label.tabIndex = -1;
+    this.#inputs();
     this.use([], undefined);
+  }
+
+  /** Leave the camera that the view is at out, or use it again. */
+  toggleInput() {
+    if (!this.here || byId("input").disabled) return;
+    const { settings, here: { name } } = this;
+    const without = settings.without;
+    const leaves = !without.includes(name);
+    settings.set("without", (leaves ? [...without, name] : without.filter((/** @type {string} */ other) => other !== name)).join(","));
+    if (!leaves || settings.shown.includes("original") || settings.shown.includes("error")) return;
+    settings.set("left", "mended");
+    settings.set("right", "original");
+    settings.set("mode", "split");
+  }
+
+  /** @param {any} camera the one that the view is at; null for none */
+  at(camera) {
+    if (camera === this.here) return;
+    this.here = camera;
+    this.#inputs();
+  }
+
+  /** Which cameras are inputs. */
+  #inputs() {
+    const without = this.settings.without;
+    for (const list of ["cameras", "labels"]) {
+      this.cameras.forEach(({ name }, index) => byId(list).children[index]?.toggleAttribute("data-off", without.includes(name)));
+    }
+    const off = this.here && without.includes(this.here.name);
+    byId("input-row").hidden = !this.here;
+    byId("input-name").textContent = this.here ? `Use ${this.here.name} as an input` : "";
+    byId("input").checked = !off;
+    byId("input").disabled = !off && this.cameras.length - without.length <= 2; // a hull needs two
+    byId("inputs-all").hidden = !without.length;
+    this.used = "";
   }
 
   /** @param {number} index */
@@ -57,7 +99,8 @@ export class CameraList {
         else button.style.removeProperty("--colour");
       }
     });
-    byId("camera-count").textContent = `${sources.length} of ${this.cameras.length} used for this view`;
+    const out = this.settings.without.length;
+    byId("camera-count").textContent = `${sources.length} of ${this.cameras.length} used for this view${out ? `, ${out} left out` : ""}`;
     return true;
   }
 

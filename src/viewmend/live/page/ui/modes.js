@@ -2,6 +2,7 @@
 
 import { clamp } from "../view/matrix.js";
 import { byId, element, radioGroup } from "./dom.js";
+import { modeOf } from "../settings.js";
 
 /** @typedef {import("../settings.js").Settings} Settings */
 
@@ -16,6 +17,27 @@ export const MODES = {
   hull: "Hull",
   points: "Points",
 };
+
+/** The server's model. */
+let model = MODES.mended;
+/** Of what is shown on one side of the divider. @param {string} value */
+const nameOf = (value) =>
+  ({ ...MODES, mended: model, original: "Original", error: "Error map", compared: value.slice("compared:".length) })[modeOf(value)] ?? value;
+
+/** What can be compared, once the server said which models it has. @param {Settings} settings @param {string} own model's name @param {string[]} models the others */
+export function offerModels(settings, own, models) {
+  model = own;
+  const others = [...models.map((name) => `compared:${name}`), "original", "error"];
+  for (const side of /** @type {("left" | "right")[]} */ (["left", "right"])) {
+    const list = byId(`split-${side}`);
+    for (const option of [...list.options]) if (!(option.value in MODES)) option.remove();
+    list.append(...others.map((value) => element("option", { value, textContent: nameOf(value) })));
+    if (![...list.options].some(({ value }) => value === settings.get(side))) settings.set(side, "mended");
+    list.value = settings.get(side);
+    for (const option of list.options) option.textContent = nameOf(option.value);
+    byId(`${side}-name`).textContent = nameOf(settings.get(side));
+  }
+}
 
 /** @param {Settings} settings */
 export function buildModes(settings) {
@@ -37,7 +59,7 @@ export function buildModes(settings) {
     list.addEventListener("change", () => settings.set(side, list.value));
     settings.watch([side, "mode"], () => {
       list.value = settings.get(side);
-      byId(`${side}-name`).textContent = /** @type {any} */ (MODES)[settings.get(side)];
+      byId(`${side}-name`).textContent = nameOf(settings.get(side));
       byId(`${side}-name`).hidden = settings.get("mode") !== "split";
       byId("split-modes").hidden = settings.get("mode") !== "split";
     });

@@ -1,25 +1,36 @@
-// The original image of a camera, next to the view, while the view is at that camera.
+// The image of the camera that the view is at, next to the view, and how far the view is from it if the camera is left out.
 
 import { address } from "../link/connection.js";
 import { byId } from "./dom.js";
+import { Scores } from "./scores.js";
 
 /** Between two pictures while time runs. */
 const GAP_MS = 250;
 
 export class Original {
-  /** @param {string | null} token */
-  constructor(token) {
+  /** @param {string | null} token @param {(mode: "original" | "error", camera: any, image: TexImageSource | null) => void} paint shows an image in the camera's place */
+  constructor(token, paint) {
     this.token = token;
     this.asked = "";
     this.askedAt = -Infinity;
+    this.paint = paint;
+    /** Of the image that is shown. @type {any} */
+    this.camera = null;
+    this.shown = true;
     const image = byId("original-image");
-    image.addEventListener("load", () => (byId("original").hidden = this.asked === ""));
+    image.addEventListener("load", () => {
+      byId("original").hidden = this.asked === "" || !this.shown;
+      if (this.asked) paint("original", this.camera, image);
+    });
     image.addEventListener("error", () => (byId("original").hidden = true));
+    this.scores = new Scores(token, (asked, score) => this.#score(asked, score));
   }
 
-  /** @param {any} camera the one that the view stands at; null where it stands nowhere @param {number} time the frame's index */
-  show(camera, time) {
+  /** @param {any} camera the one that the view is at; null if it is at none @param {number} time the frame's index @param {boolean} shown whether next to the view */
+  show(camera, time, shown) {
+    this.shown = shown;
     if (!camera || time < 0) {
+      if (this.asked) this.paint("original", null, null);
       this.asked = "";
       byId("original").hidden = true;
       return;
@@ -32,8 +43,28 @@ export class Original {
     if (url.href === this.asked || busy) return;
     this.asked = url.href;
     this.askedAt = performance.now();
+    this.camera = camera;
     image.alt = `Image of ${camera.name}`;
     byId("original-name").textContent = `${camera.name}, original`;
     image.src = url.href;
+  }
+
+  /** @param {import("./scores.js").Asked | null} asked @param {import("./scores.js").Score | null} score */
+  #score(asked, score) {
+    const [picture, name] = [byId("error-image"), byId("error-name")];
+    picture.hidden = name.hidden = !score;
+    if (!asked || !score) {
+      name.textContent = "";
+      this.paint("error", null, null);
+      return;
+    }
+    const text = `${score.model ? `${score.model}: ` : ""}${score.psnr.toFixed(1)} dB`;
+    name.textContent = name.textContent ? `${name.textContent} · ${text}` : `Error map, subject ${text}`;
+    if (score.model) return;
+    picture.onload = () => {
+      this.paint("error", asked.camera, picture);
+      URL.revokeObjectURL(picture.src);
+    };
+    picture.src = URL.createObjectURL(score.blob);
   }
 }

@@ -139,7 +139,7 @@ export class PathPanel {
     const times = moments.map((seconds) =>
       still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
     );
-    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground, stereo_m: stereo ? EYES_M : null };
+    return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground, without: settings.without, model: settings.model, stereo_m: stereo ? EYES_M : null };
   }
 
   async #export() {

@@ -1,0 +1,91 @@
+"""Models are compared, and cameras left out, while one looks: split view, original, error map and score."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+from live.browser.test_page_drawing import SCREENSHOT_S, opened
+from live.live_servers import CAMERAS, Running, get, running
+
+NAME = CAMERAS.names[0]
+
+
+@pytest.fixture(scope="module")
+def ball() -> Iterator[Running]:
+    with running() as server:
+        yield server
+
+
+def texts(view, *names: str) -> list[str]:
+    return [view.page.locator(f"#{name}").inner_text() for name in names]
+
+
+def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
+    with opened(browser, ball, "time=0") as view:
+        view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
+        (session,) = ball.live.registry.sessions
+        assert view.page.locator("#input-row").is_hidden()
+        view.page.keyboard.press("n")
+        view.until(lambda: view.page.locator("#input-row").is_visible())
+        view.page.keyboard.press("x")
+        view.until(lambda: session.newest_look is not None and session.newest_look.without == (NAME,), SCREENSHOT_S)
+        view.until(lambda: "dB" in view.page.locator("#error-name").inner_text(), SCREENSHOT_S)
+        assert texts(view, "left-name", "right-name") == ["views", "Original"]
+        asked = f"{ball.url}/frame.jpg?time=0&mode=error&camera={NAME}&without={NAME}"
+        score = float(get(asked)[1]["X-Viewmend-PSNR"])
+        assert f"subject {score:.1f} dB" in view.page.locator("#error-name").inner_text()
+        view.until(lambda: f"without={NAME}" in view.page.url)
+        view.page.get_by_role("button", name="Use all cameras").click()
+        view.until(lambda: session.newest_look is not None and session.newest_look.without == (), SCREENSHOT_S)
+        view.until(lambda: view.page.locator("#error-name").is_hidden())
+
+
+def test_the_original_lies_behind_the_divider_in_its_place(browser, ball):
+    with opened(browser, ball, "time=0&mode=split&left=original&right=mended") as view:
+        view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
+        view.page.keyboard.press("n")
+        view.until(lambda: view.page.locator("#original-image").evaluate("i => i.complete && i.naturalWidth > 0"))
+        view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
+        divider = view.page.locator("#divider").bounding_box()
+        box = view.page.evaluate("Object.assign({}, document.querySelector('#divider').dataset)")
+        left, width = float(box["left"]), float(box["width"])
+        shown = []
+        for share in (0.98, 0.02):
+            view.page.mouse.move(divider["x"] + divider["width"] / 2, divider["y"] + divider["height"] / 2)
+            view.page.mouse.down()
+            view.page.mouse.move(left + share * width, divider["y"] + divider["height"] / 2, steps=3)
+            view.page.mouse.up()
+            view.page.wait_for_timeout(600)
+            shown.append(view.picture())
+            divider = view.page.locator("#divider").bounding_box()
+        original, output = shown
+        inside = (output.max(-1) > 40) & (original.max(-1) > 40)
+        assert inside.sum() > 5000
+        outlines = [(image.max(-1) > 40).astype(np.uint8) for image in shown]
+        overlap = (outlines[0] & outlines[1]).sum() / (outlines[0] | outlines[1]).sum()
+        assert overlap > 0.9, "the same place and size"
+        grey = [cv2.GaussianBlur(image.mean(-1), (0, 0), 4)[inside] for image in shown]
+        assert np.corrcoef(*grey)[0, 1] > 0.8
+
+
+def test_two_models_are_compared(browser, ball):
+    with opened(browser, ball, "time=0&mode=split") as view:
+        view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
+        view.page.locator("#split-left").select_option("mended")
+        view.page.locator("#split-right").select_option("compared:paper-small")
+        (session,) = ball.live.registry.sessions
+        view.until(
+            lambda: session.newest_look is not None and session.newest_look.modes == ("mended", "compared"),
+            SCREENSHOT_S,
+        )
+        assert session.newest_look.model == "paper-small"
+        view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
+        assert texts(view, "right-name") == ["paper-small"] and ball.service.error is None
+
+
+def test_depth_and_errors_have_a_scale(browser, ball):
+    with opened(browser, ball, "time=0&mode=depth") as view:
+        view.until(lambda: view.page.locator("#scale").is_visible(), SCREENSHOT_S)
+        far, near = (float(text.split()[0]) for text in texts(view, "scale-low", "scale-high"))
+        assert far > near > 0
