@@ -20,7 +20,7 @@ from reference.foreign_images import write_agisoft, write_middlebury
 from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import named, random_rig
 
-from viewmend.contrib.riftcast import service as riftcast
+from viewmend.contrib import riftcast
 from viewmend.data.camera_path import read_camera_path
 from viewmend.data.images import read_mask, read_rgb
 from viewmend.data.native_capture import open_capture

@@ -6,8 +6,8 @@ import pytest
 import torch
 from reference.ball import camera_at, ring
 
-from viewmend.data.synthetic.rigs import orbit
 from viewmend.geometry.cameras import concatenate_cameras, project
+from viewmend.geometry.orbit import orbit
 from viewmend.live.poses import cameras_json, home_view, view_camera
 from viewmend.live.protocol import Camera
 
@@ -15,11 +15,17 @@ CENTER = torch.tensor([0.1, 0.2, 0.3])
 HOME = home_view(ring(4), torch.zeros(3), None)
 
 
+def around(center, degrees, radius_m, elevation_deg):
+    azimuths, elevation = [math.radians(d) for d in degrees], math.radians(elevation_deg)
+    shown = {"center": center, "up": torch.tensor([0.0, 1.0, 0.0]), "visible_m": 2.4}
+    return orbit(azimuths, (64, 64), radius_m=radius_m, elevation_rad=elevation, **shown)
+
+
 def test_azimuths_are_those_of_orbits():
     frame = home_view(ring(4), CENTER, torch.tensor([0.0, 2.0, 0.0]))
     for degrees in (0, 35, 250):
         ours = view_camera(Camera(azimuth=float(degrees), elevation=12.0, distance=2.5), frame, (64, 64))
-        theirs = orbit([math.radians(degrees)], (64, 64), radius_m=2.5, elevation_rad=math.radians(12), center=CENTER)
+        theirs = around(CENTER, [degrees], radius_m=2.5, elevation_deg=12)
         assert torch.allclose(ours.camera_from_world, theirs.camera_from_world, atol=1e-5)
 
 
@@ -33,7 +39,7 @@ def test_the_initial_view_of_a_ring():
 
 @pytest.mark.parametrize("degrees", [(60, 20, 100, 40), (340, 10, 50, 140), (200, 230)])
 def test_the_initial_view_of_an_arc(degrees):
-    arc = orbit([math.radians(d) for d in degrees], (64, 64), radius_m=2.0, elevation_rad=0.0, center=CENTER)
+    arc = around(CENTER, degrees, radius_m=2.0, elevation_deg=0)
     middle = {(60, 20, 100, 40): 60, (340, 10, 50, 140): 60, (200, 230): -145}[degrees]
     assert home_view(arc, CENTER, torch.tensor([0.0, 1.0, 0.0])).azimuth == pytest.approx(middle, abs=0.02)
 

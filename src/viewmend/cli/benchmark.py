@@ -1,4 +1,4 @@
-"""`viewmend benchmark`: the time of a view on this machine, stage by stage, and how it grows."""
+"""`viewmend benchmark`: the time of a view on this machine, stage by stage."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,9 +8,8 @@ from pathlib import Path
 class Options:
     """Measure the cost of views on this machine, with a procedural scene and a ring of cameras.
 
-    Prints median and 95th percentile milliseconds of each stage, and how the time of a frame grows with pixels,
-    cameras, refined pixels (models that choose them) and viewers, as exponents. Other work on the machine slows it
-    down: the report includes the load.
+    Prints median and 95th percentile milliseconds of each stage. Other work on the machine slows it down: the report
+    includes the load.
     """
 
     out: Path | None = None
@@ -20,9 +19,9 @@ class Options:
     model: str = "views"
     """Name of a shipped model, or a model's folder; 'telea' and 'nearest' are classical fills."""
     size: int = 256
-    """Width and height of all images; views of half to 1.41 times this size are measured, too."""
+    """Width and height of all images."""
     cameras: int = 8
-    """Cameras of the ring; half and twice as many are measured, too."""
+    """Cameras of the ring."""
     repeats: int = 3
     """Repetitions of each measurement, after one for warm-up."""
 
@@ -36,20 +35,19 @@ def run(options: Options) -> int:
 
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import busy, say, show
-    from viewmend.evaluation.cost import CostBench, CostReport, compare, read_report
+    from viewmend.evaluation.cost import CostReport, compare, measure_stages, read_report
     from viewmend.evaluation.provenance import provenance
 
     before = None if options.versus is None else read_report(options.versus)
     machine = provenance("cpu", torch.get_num_threads(), 1)
     with busy("measuring"):
-        bench = CostBench(load_named(options.model, "cpu"), options.size, options.cameras, options.repeats)
+        inpainter = load_named(options.model, "cpu")
         report = CostReport(
             model=options.model,
             size_px=options.size,
             cameras=options.cameras,
             machine=machine,
-            stages=bench.stages(),
-            growth=bench.growth(),
+            stages=measure_stages(inpainter, options.size, options.cameras, options.repeats),
         )
     show(*report.lines())
     if before is not None:

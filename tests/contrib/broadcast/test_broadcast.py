@@ -13,8 +13,8 @@ import torch
 from live.live_servers import PIPELINE, WAIT_S, FakeClock, running, wait_until
 from reference.ball import ring
 
-from viewmend.contrib.broadcast import broadcast as broadcast_module
-from viewmend.contrib.broadcast.broadcast import (
+from viewmend.contrib import broadcast as broadcast_module
+from viewmend.contrib.broadcast import (
     PLAYLIST,
     Broadcast,
     BroadcastSession,

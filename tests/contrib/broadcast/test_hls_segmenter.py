@@ -5,7 +5,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from viewmend.contrib.broadcast.broadcast import FIRST, INIT, KEPT, LISTED, PLAYLIST, FilmSegments
+from viewmend.contrib.broadcast import FIRST, INIT, KEPT, LISTED, PLAYLIST, FilmSegments
 from viewmend.live.video import video_codecs
 
 av = pytest.importorskip("av")

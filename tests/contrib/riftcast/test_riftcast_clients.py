@@ -15,8 +15,8 @@ import zstandard
 from live.live_servers import CAMERAS, WAIT_S, running, wait_until
 from reference.ball import BallCapture, camera_at, photograph
 
-from viewmend.contrib.riftcast import service as riftcast_service
-from viewmend.contrib.riftcast.service import RiftcastClient, RiftcastService, camera_of, listen, parse
+from viewmend.contrib import riftcast as riftcast_service
+from viewmend.contrib.riftcast import RiftcastClient, RiftcastService, camera_of, listen, parse
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.protocol import Limits, ProtocolError
 

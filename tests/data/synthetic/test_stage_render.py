@@ -25,9 +25,10 @@ from viewmend.data.synthetic.render import (
     unshadowed_torch,
     visibility,
 )
-from viewmend.data.synthetic.rigs import orbit, ring_rig
+from viewmend.data.synthetic.rigs import SUBJECT_CENTER_M, ring_rig
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
 from viewmend.geometry.mesh import Mesh, vertex_normals
+from viewmend.geometry.orbit import orbit
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.rigid import look_at
 
@@ -59,7 +60,9 @@ def square(size_m: float, texture: torch.Tensor) -> TexturedMesh:
 
 
 def front(size: int = 64, visible_m: float = 2.0) -> Cameras:
-    return orbit([0.0], (size, size), elevation_rad=0.0, visible_m=visible_m)
+    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor([0.0, 1.0, 0.0])
+    shown = {"radius_m": 3.0, "elevation_rad": 0.0, "visible_m": visible_m}
+    return orbit([0.0], (size, size), center=center, up=up, **shown)
 
 
 def test_depth_is_the_rasterisers():

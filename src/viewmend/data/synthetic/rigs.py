@@ -1,4 +1,4 @@
-"""Camera rigs: rings and domes around the stage, rigs of real stages, orbits for novel views."""
+"""Camera rigs of the studio: rings and domes around the stage, and orbits for novel views."""
 
 import math
 from collections.abc import Sequence
@@ -16,15 +16,19 @@ SUBJECT_CENTER_M = (0.0, 0.95, 0.0)
 """Target of all rigs: the middle of a standing person at the centre of the stage."""
 VISIBLE_M = 2.4
 """Height and width that an image holds at the stage's centre: a person of 1.75 m fills three quarters."""
+RADIUS_M = 3.0
+"""Distance of the cameras from the stage's axis, or from the subject in a dome."""
+DOME_RAD = (0.0, 1.2)
+"""Elevations above the horizon between which a dome's cameras stand."""
+UP = (0.0, 1.0, 0.0)
 
 
 def ring_rig(
     count: int,
     size_px: tuple[int, int] = (512, 512),
     *,
-    radius_m: float = 3.0,
+    radius_m: float = RADIUS_M,
     heights_m: Sequence[float] = (1.1, 1.8),
-    visible_m: float = VISIBLE_M,
     jitter: float = 1.0,
     seed: int = 0,
 ) -> Cameras:
@@ -35,71 +39,58 @@ def ring_rig(
         size_px: width and height of the images.
         radius_m: distance of the cameras from the stage's axis.
         heights_m: heights above the floor; camera n stands at the n-th, again from the first after the last.
-        visible_m: height and width that each image holds at the stage's centre.
         jitter: 0 for an exact ring; 1 for errors as of careful hands (degrees, centimetres).
         seed: of the jitter.
     """
     azimuth = torch.arange(_positive(count)) * 2 * math.pi / count
     height = torch.tensor([heights_m[n % len(heights_m)] for n in range(count)])
     eyes = torch.stack([radius_m * azimuth.sin(), height, radius_m * azimuth.cos()], -1)
-    return _stand(eyes, size_px, visible_m, jitter, seed)
+    return _stand(eyes, size_px, jitter, seed)
 
 
-def dome_rig(
-    count: int,
-    size_px: tuple[int, int] = (512, 512),
-    *,
-    radius_m: float = 3.0,
-    elevations_rad: tuple[float, float] = (0.0, 1.2),
-    visible_m: float = VISIBLE_M,
-    jitter: float = 1.0,
-    seed: int = 0,
-) -> Cameras:
-    """Cameras spread evenly over a part of a sphere around the subject, between two elevations above the horizon."""
-    low, high = (math.sin(e) for e in elevations_rad)
+def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
+    """Cameras spread evenly over a part of a sphere around the subject, with errors as of careful hands."""
+    low, high = (math.sin(e) for e in DOME_RAD)
     y = low + (high - low) * (torch.arange(_positive(count)) + 0.5) / count
     angle = torch.arange(count) * math.pi * (3 - math.sqrt(5))
     around = (1 - y * y).sqrt()
-    eyes = radius_m * torch.stack([around * angle.sin(), y, around * angle.cos()], -1) + torch.tensor(SUBJECT_CENTER_M)
-    return _stand(eyes, size_px, visible_m, jitter, seed)
+    eyes = RADIUS_M * torch.stack([around * angle.sin(), y, around * angle.cos()], -1) + torch.tensor(SUBJECT_CENTER_M)
+    return _stand(eyes, size_px, 1.0, seed)
 
 
 def orbit(
     azimuths_rad: Sequence[float],
     size_px: tuple[int, int] = (512, 512),
     *,
-    radius_m: float = 3.0,
+    radius_m: float = RADIUS_M,
     elevation_rad: float = 0.15,
-    center: Float[Tensor, "3"] | None = None,
-    up: Float[Tensor, "3"] | None = None,
-    visible_m: float = VISIBLE_M,
 ) -> Cameras:
-    """Novel cameras on a circle around `center`, by default the middle of who stands on the stage.
+    """Novel cameras on a circle around the middle of who stands on the stage.
 
-    On the stage azimuth 0 is in front (+z), and azimuths grow towards +x.
+    Azimuth 0 is in front (+z), and azimuths grow towards +x.
     """
-    center = torch.tensor(SUBJECT_CENTER_M) if center is None else center
-    up = torch.tensor([0.0, 1.0, 0.0]) if up is None else up
     return orbit_of(
-        azimuths_rad, size_px, radius_m=radius_m, elevation_rad=elevation_rad, center=center, up=up, visible_m=visible_m
+        azimuths_rad,
+        size_px,
+        radius_m=radius_m,
+        elevation_rad=elevation_rad,
+        center=torch.tensor(SUBJECT_CENTER_M),
+        up=torch.tensor(UP),
+        visible_m=VISIBLE_M,
     )
 
 
-def _stand(
-    eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], visible_m: float, jitter: float, seed: int
-) -> Cameras:
+def _stand(eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], jitter: float, seed: int) -> Cameras:
     """Cameras at `eyes` that look at the subject, a little off by the jitter."""
     generator = torch.Generator().manual_seed(seed)
     off = jitter * torch.randn(len(eyes), 3, 3, generator=generator)
-    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor([0.0, 1.0, 0.0])
+    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor(UP)
     views = []
     for n, eye in enumerate(eyes):
         eye = eye + 0.04 * off[n, 0]
-        # Looking straight down, no up is the image's top: the side takes its place.
-        top = up if float((eye - center)[[0, 2]].norm()) > 0.05 else torch.tensor([0.0, 0.0, -1.0])
-        pose = look_at(eye, center + 0.02 * off[n, 1], top)
+        pose = look_at(eye, center + 0.02 * off[n, 1], up)
         pose[:3] = rotation_from_axis_angle(torch.tensor([0.0, 0.0, 0.01 * float(off[n, 2, 0])])) @ pose[:3]
-        fov = fov_y_showing(size_px, visible_m, float((eye - center).norm()) * (1 + 0.01 * float(off[n, 2, 1])))
+        fov = fov_y_showing(size_px, VISIBLE_M, float((eye - center).norm()) * (1 + 0.01 * float(off[n, 2, 1])))
         views.append(pinhole(fov, *size_px, pose, f"cam{n:02d}"))
     return concatenate_cameras(views)
 

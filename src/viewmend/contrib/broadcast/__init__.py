@@ -1,1 +1,0 @@
-"""Broadcasting one view to any number of browsers as HLS."""

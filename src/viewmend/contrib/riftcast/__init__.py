@@ -1,1 +1,0 @@
-"""The RIFTCast wire protocol."""
