@@ -239,8 +239,9 @@ def bounds_from_cameras(cameras: Cameras) -> Bounds:
     Raises:
         ValueError: the cameras look away from each other.
     """
-    world = cameras.world_from_camera
-    return _cube_around(cameras, world[:, :3, 2], _half_view(cameras))
+    focal = torch.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], -1)
+    half_view = (cameras.size_px / 2 / focal).amin(-1)  # half of the narrower field of view, at distance 1
+    return _cube_around(cameras, cameras.world_from_camera[:, :3, 2], half_view)
 
 
 def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> Bounds:
@@ -268,12 +269,6 @@ def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras
 def _mask_box(mask: UInt8[Tensor, "height width"]) -> Float[Tensor, "4"]:
     columns, rows = mask.any(0).nonzero()[:, 0], mask.any(1).nonzero()[:, 0]
     return torch.stack([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]).float()
-
-
-def _half_view(cameras: Cameras) -> Float[Tensor, "view"]:
-    """Half of the narrower field of view of each camera, at distance 1."""
-    focal = torch.stack([cameras.K[:, 0, 0], cameras.K[:, 1, 1]], -1)
-    return (cameras.size_px / 2 / focal).amin(-1)
 
 
 def _cube_around(

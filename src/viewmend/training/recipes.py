@@ -1,6 +1,5 @@
 """The recipes: named `TrainConfig`s, each of which states only what differs from the defaults."""
 
-import importlib
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from viewmend.training.config import SceneConfig, TrainConfig
 from viewmend.training.paper import PaperObjectiveConfig
 from viewmend.training.rays import RaysObjectiveConfig
 from viewmend.training.views import ViewsObjectiveConfig
+from viewmend.utils.plugins import import_object
 
 PROTOCOLS = ("target-mask", "hull-with-target-mask", "strict")
 """What the paper's model may know of the held-out mask in training."""
@@ -129,16 +129,15 @@ def finetune(start: str = "views") -> TrainConfig:
     )
 
 
+BASELINES = ("dstt", "fuseformer", "e2fgvi", "e2fgvi-hq")
+"""Published networks; their recipe takes the network's name."""
 RECIPES: dict[str, str] = {
     "views": "viewmend.training.recipes:views",
     "rays": "viewmend.training.recipes:rays",
     "paper": "viewmend.training.recipes:paper",
     "paper_small": "viewmend.training.recipes:paper_small",
     "finetune": "viewmend.training.recipes:finetune",
-    "dstt": "viewmend.contrib.baselines.training:dstt",
-    "fuseformer": "viewmend.contrib.baselines.training:fuseformer",
-    "e2fgvi": "viewmend.contrib.baselines.training:e2fgvi",
-    "e2fgvi-hq": "viewmend.contrib.baselines.training:e2fgvi_hq",
+    **dict.fromkeys(BASELINES, "viewmend.contrib.baselines.training:recipe"),
 }
 """MODULE:NAME of the function that makes each recipe; a module is imported when its recipe is requested."""
 
@@ -152,6 +151,6 @@ def make_recipe(name: str, start: str | None = None) -> TrainConfig:
     """
     if name not in RECIPES:
         raise ValueError(f"expected a recipe among {', '.join(RECIPES)}, got '{name}'; see --help")
-    module, _, function = RECIPES[name].partition(":")
-    make: Callable[..., TrainConfig] = getattr(importlib.import_module(module), function)
-    return make(start) if name == "finetune" and start is not None else make()
+    make: Callable[..., TrainConfig] = import_object(RECIPES[name])
+    argument = name if name in BASELINES else start if name == "finetune" else None
+    return make() if argument is None else make(argument)

@@ -88,8 +88,8 @@ class OutputFolder:
         known = self._read()
         for file in self._files(patterns):
             name = file.relative_to(self.path).as_posix()
-            digests = known.get(name, _any(known, name))
-            if digests != [] and (digests is None or _digest(file) not in digests):
+            changing = any(value == [] and fnmatch(name, pattern) for pattern, value in known.items())
+            if not changing and _digest(file) not in known.get(name, ()):
                 raise ValueError(
                     f"{file}: expected no such file, or an unchanged one from an earlier run, got a file of yours; "
                     "move it away, or choose another folder"
@@ -143,11 +143,6 @@ class OutputFolder:
     def _write(self, files: dict[str, list[str]]) -> None:
         text = json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True)
         write_text(self._manifest, text)
-
-
-def _any(known: dict[str, list[str]], name: str) -> list[str] | None:
-    """An empty list if a pattern of changing files matches the name, else None."""
-    return [] if any(value == [] and fnmatch(name, pattern) for pattern, value in known.items()) else None
 
 
 def _below(root: Path, names: Iterable[str]) -> Iterator[Path]:

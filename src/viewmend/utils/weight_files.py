@@ -49,17 +49,21 @@ def load_weights(network: Network, path: str | Path, device: torch.device | str 
         MismatchedWeightsError: a tensor is missing, unknown, of another shape or dtype, or not finite.
     """
     path, weights, own = Path(path), read_weights(path), network.state_dict()
-    reshaped = [
-        f"{key} {tuple(value.shape)} for {tuple(own[key].shape)}"
-        for key, value in sorted(weights.items())
-        if key in own and value.shape != own[key].shape
-    ]
+    both = {key: (value, own[key]) for key, value in sorted(weights.items()) if key in own}
     wrong = {
         "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),
         "unknown": sorted(weights.keys() - own.keys()),
-        "of another shape": reshaped,
-        "of another kind of number": _of_other_numbers(weights, own),
-        "not finite": sorted(key for key, value in weights.items() if key in own and not _is_finite(value, own[key])),
+        "of another shape": [
+            f"{key} {tuple(value.shape)} for {tuple(wanted.shape)}"
+            for key, (value, wanted) in both.items()
+            if value.shape != wanted.shape
+        ],
+        "of another kind of number": [key for key, (value, wanted) in both.items() if not _is_same_kind(value, wanted)],
+        "not finite": [  # in the precision of the network's own tensor
+            key
+            for key, (value, wanted) in both.items()
+            if value.dtype in FLOATS and not bool(value.to(wanted.dtype).isfinite().all())
+        ],
     }
     if any(wrong.values()):
         counts = ", ".join(f"{len(keys)} {what} ({', '.join(keys[:2])} ...)" for what, keys in wrong.items() if keys)
@@ -72,22 +76,10 @@ def load_weights(network: Network, path: str | Path, device: torch.device | str 
     return network.to(device).eval()
 
 
-def _of_other_numbers(weights: dict[str, Tensor], own: dict[str, Tensor]) -> list[str]:
-    kinds = {
-        key: value.dtype in FLOATS if own[key].is_floating_point() else not _has_a_point(value)
-        for key, value in weights.items()
-        if key in own
-    }
-    return sorted(key for key, fits in kinds.items() if not fits)
-
-
-def _has_a_point(value: Tensor) -> bool:
-    return value.is_floating_point() or value.is_complex()
-
-
-def _is_finite(value: Tensor, own: Tensor) -> bool:
-    """Whether the values are finite in the precision of the network's own tensor."""
-    return value.dtype not in FLOATS or bool(value.to(own.dtype).isfinite().all())
+def _is_same_kind(value: Tensor, wanted: Tensor) -> bool:
+    if wanted.is_floating_point():
+        return value.dtype in FLOATS
+    return not (value.is_floating_point() or value.is_complex())
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:

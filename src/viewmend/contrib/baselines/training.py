@@ -228,28 +228,11 @@ class BaselineObjectiveConfig(ObjectiveConfig):
         return sample_scenes(scenes, self.sampling, seed)
 
 
-def dstt() -> TrainConfig:
-    """DSTT (Liu et al. 2021)."""
-    return _recipe("dstt")
+def recipe(network: str) -> TrainConfig:
+    """Training of one of `published.NETWORKS` with the authors' parameters, but for the number of steps.
 
-
-def fuseformer() -> TrainConfig:
-    """FuseFormer (Liu et al. 2021)."""
-    return _recipe("fuseformer")
-
-
-def e2fgvi() -> TrainConfig:
-    """E2FGVI (Li et al. 2022)."""
-    return _recipe("e2fgvi")
-
-
-def e2fgvi_hq() -> TrainConfig:
-    """E2FGVI-HQ (Li et al. 2022)."""
-    return _recipe("e2fgvi-hq")
-
-
-def _recipe(network: str) -> TrainConfig:
-    """The authors' parameters, except for the number of steps: no warm-up, no averaging."""
+    There is no warm-up, and weights are not averaged.
+    """
     return TrainConfig(
         name=network,
         objective=BaselineObjectiveConfig(network=network),

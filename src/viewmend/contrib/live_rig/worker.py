@@ -56,19 +56,16 @@ def mask_maker(camera: LiveCamera) -> MaskMaker:
     """
     size_px = camera.calibration.width, camera.calibration.height
     small_px = max(1, round(size_px[0] * camera.mask.scale)), max(1, round(size_px[1] * camera.mask.scale))
-    maker = _maker(camera, small_px)
-    return maker if small_px == size_px else ReducedMasks(maker, small_px)
-
-
-def _maker(camera: LiveCamera, size_px: tuple[int, int]) -> MaskMaker:
     if camera.mask.method == "person":
-        return PersonMasks()
-    where = f"{camera.plate}: the clean plate of camera '{camera.name}'"
-    plate = read_plate(camera.plate, where)
-    if plate.shape[1::-1] != camera.taken_px:
-        expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
-        raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
-    return PlateMasks(reduced(plate, size_px))
+        maker = PersonMasks()
+    else:
+        where = f"{camera.plate}: the clean plate of camera '{camera.name}'"
+        plate = read_plate(camera.plate, where)
+        if plate.shape[1::-1] != camera.taken_px:
+            expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
+            raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
+        maker = PlateMasks(reduced(plate, small_px))
+    return maker if small_px == size_px else ReducedMasks(maker, small_px)
 
 
 T = TypeVar("T")

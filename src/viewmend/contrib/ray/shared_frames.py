@@ -215,11 +215,14 @@ class Ingest:
 
     def frame(self, index: int, wait_s: float) -> tuple[str, Any] | None:
         """As `IngestLink.frame`, with the reference that `put` returned instead of the frame."""
-        kept = self._find(index)
-        if kept is None and (frame := self._read(index, wait_s)) is not None:
-            with self._preparing:  # one after the other: each uses all cores
-                kept = self._find(index) or self._prepare(frame)
-        return kept
+        if (kept := self._find(index)) is not None:
+            return kept
+        with self._changed:
+            self._changed.wait_for(lambda: self._source.read(index) is not None, wait_s)
+        if (frame := self._source.read(index)) is None:
+            return None
+        with self._preparing:  # one after the other: each uses all cores
+            return self._find(index) or self._prepare(frame)
 
     def _advance_edge(self) -> float:
         """The present edge, whether its frame is prepared or not."""
@@ -261,11 +264,6 @@ class Ingest:
         with self._changed:
             self._version += 1
             self._changed.notify_all()
-
-    def _read(self, index: int, wait_s: float) -> MultiViewFrame | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._source.read(index) is not None, wait_s)
-        return self._source.read(index)
 
     def _find(self, index: int) -> tuple[str, Any] | None:
         with self._changed:
@@ -365,7 +363,10 @@ class SharedSource(FrameSource):
             try:
                 state = self._ingest.state(known, WAIT_S, self._is_edge_watched)
             except ConnectionError:
-                self._fail()
+                if self.status.error != INGEST_ENDED:
+                    log.warning("while reading: %s", INGEST_ENDED)
+                self.status = replace(self.status, state="failing", error=INGEST_ENDED)
+                self.changed()
                 self._stopped.wait(RETRY_S)
                 known = -1
                 continue
@@ -374,12 +375,6 @@ class SharedSource(FrameSource):
                 known = state.version
                 self._apply(state)
                 self.changed()
-
-    def _fail(self) -> None:
-        if self.status.error != INGEST_ENDED:
-            log.warning("while reading: %s", INGEST_ENDED)
-        self.status = replace(self.status, state="failing", error=INGEST_ENDED)
-        self.changed()
 
     def _apply(self, state: SourceState) -> None:
         with self._lock:

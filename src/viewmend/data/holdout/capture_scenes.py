@@ -132,7 +132,6 @@ def _fingerprint(folder: Path, kind: str | None) -> str:
 
 FORMAT = "viewmend-splits/1"
 CLOSEST = 3
-MOST_BYTES = 2**26
 
 
 class SplitScene(Struct, frozen=True, kw_only=True):
@@ -226,8 +225,6 @@ def read_splits(file: Path) -> SplitFile:
         ValueError: it is none.
         OSError: it cannot be read.
     """
-    if file.stat().st_size > MOST_BYTES:
-        raise ValueError(f"{file}: expected splits, got {file.stat().st_size} bytes; is it the right file?")
     try:
         return typed(read_json(bounded_bytes(file)), SplitFile, "see viewmend splits --help")
     except ValueError as error:

@@ -16,7 +16,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rasterize import rasterize
 from viewmend.rendering.view import select_closest
-from viewmend.types import IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.types import IncompleteView, Silhouettes
 
 NEAR_M, FAR_M = 0.01, 1000.0
 """The planes between which the exporter's window depth is, 0 to 1; 1 is background."""
@@ -96,8 +96,9 @@ class RiftcastViews:
         folder, frame = self._frame(time), self.capture.read(time)
         camera = self.capture.cameras.select([name])
         width, height = camera.max_size_px
-        rgb = read_rgb(folder / f"rgb/rgb_{name}.png", str(folder / f"rgb/rgb_{name}.png"))
-        mask, error = (self._image(folder / f"{kind}/{kind}_{name}.png") for kind in ("mask", "error"))
+        files = {kind: folder / f"{kind}/{kind}_{name}.png" for kind in ("rgb", "mask", "error")}
+        rgb = read_rgb(files["rgb"], str(files["rgb"]))
+        mask, error = (to_mask(read_mask(files[kind], str(files[kind]))) for kind in ("mask", "error"))
         depth = self._depth(folder / f"depth/depth_{name}.bin", width, height)
         for image in (rgb, mask, error):
             if image.shape[:2] != (height, width):
@@ -119,7 +120,7 @@ class RiftcastViews:
             weights=(coloured / len(sources)).expand(len(sources), -1, -1).contiguous(),
             time=time,
             candidate_views=candidates,
-            silhouettes=_silhouettes(others),
+            silhouettes=None if others.mask is None else Silhouettes(others.mask, others.cameras),
         )
 
     def _middle(self, time: int) -> Float[Tensor, "3"]:
@@ -128,9 +129,6 @@ class RiftcastViews:
 
     def _frame(self, time: int) -> Path:
         return self.folder / f"frame_{int(self.capture.frame_ids[time]):05d}"
-
-    def _image(self, file: Path) -> np.ndarray:
-        return to_mask(read_mask(file, str(file)))
 
     def _depth(self, file: Path, width: int, height: int) -> Float[Tensor, "height width"]:
         """z-depth of a file of window depths, whose first row is the lowest."""
@@ -171,7 +169,3 @@ class RiftcastViews:
             for row in rows.tolist()
         ]
         return {n: {k: v for k, v in zip(names, row, strict=True) if v} for n, row in enumerate(chosen)}
-
-
-def _silhouettes(frame: MultiViewFrame) -> Silhouettes | None:
-    return None if frame.mask is None else Silhouettes(frame.mask, frame.cameras)

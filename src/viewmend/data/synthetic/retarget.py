@@ -220,8 +220,10 @@ def retarget(character: Character, motion: Motion) -> Retarget:
     driver = [-1] * len(character.nodes)
     for place, part in enumerate(parts):
         driver[node_of[part]] = place
-    hips = _joint_path(motion, joint_of["Hips"]) @ turn.T
-    path = _hips_path(own, actor, rotations[:, joint_of["Hips"]], hips)
+    # s (p + G_root o_b) - G_root o_a, scaled by leg length: the middle of the hip joints moves as the actor's.
+    hips, hips_turn = _joint_path(motion, joint_of["Hips"]) @ turn.T, rotations[:, joint_of["Hips"]]
+    scale = _leg_length(own) / _leg_length(actor)
+    path = scale * (hips + hips_turn @ _hip_middle(actor)) - hips_turn @ _hip_middle(own)
     return Retarget(
         *(character, upright, tuple(driver), torch.stack(driven, 1), node_of["Hips"], path, motion.seconds_per_frame)
     )
@@ -303,17 +305,6 @@ def smallest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Ten
     zero = torch.zeros(())
     skew = torch.stack([zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero]).reshape(3, 3)
     return torch.eye(3) + skew + skew @ skew / (1 + cosine)
-
-
-def _hips_path(
-    own: Rest, actor: Rest, turn: Float[Tensor, "frame 3 3"], hips: Float[Tensor, "frame 3"]
-) -> Float[Tensor, "frame 3"]:
-    """Where the hips are, s (p + G_root o_b) - G_root o_a: the middle of the hip joints moves as the actor's.
-
-    Scaled by leg length, s.
-    """
-    scale = _leg_length(own) / _leg_length(actor)
-    return scale * (hips + turn @ _hip_middle(actor)) - turn @ _hip_middle(own)
 
 
 def _joint_path(motion: Motion, joint: int) -> Float[Tensor, "frame 3"]:

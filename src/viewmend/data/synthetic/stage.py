@@ -84,7 +84,8 @@ class Studio:
                 f"expected at least one frame, a positive rate and size, got {config.frames} frames at "
                 f"{config.fps}/s of {size} pixels; correct the studio's config"
             )
-        performer_seed, rig_seed, light_seed, backdrop_seed, self._error_seed = _seeds(config.seed)
+        seeds = map(int, np.random.SeedSequence(config.seed).generate_state(5))
+        performer_seed, rig_seed, light_seed, backdrop_seed, self._error_seed = seeds
         self.performer = performer or _cast(config, performer_seed)
         rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
         cameras = config.cameras if isinstance(config.cameras, Cameras) else rig(config.cameras, size, seed=rig_seed)
@@ -167,11 +168,6 @@ class Studio:
         pyramid = texture_pyramid(textures).to(self.config.device)
         self._last_pyramid = (textures, pyramid)
         return pyramid
-
-
-def _seeds(seed: int) -> tuple[int, ...]:
-    """Independent seeds for performer, rig, lights, backdrop and errors."""
-    return tuple(int(s) for s in np.random.SeedSequence(seed).generate_state(5))
 
 
 def _cast(config: StudioConfig, seed: int) -> Performer:
