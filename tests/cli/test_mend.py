@@ -107,7 +107,7 @@ def test_rendered_views_and_the_truth_lie_beside_the_mended_ones(folder, tmp_pat
     assert (rendered[holes] == 0).all() and (mended[holes] > 0).any() and (rendered == mended)[~holes].all()
     true = prepare(open_masked(folder), [f"c{n}" for n in range(6)]).read(1).select(["held"])
     assert np.abs(truth - picture(true.rgb[0] / 255 * (true.mask[0] / 255)).astype(int)).max() <= 1
-    mend(folder, tmp_path, "--path", "orbit")  # nobody knows its truth
+    mend(folder, tmp_path, "--path", "orbit:seconds=0.2")  # nobody knows its truth
     assert not (tmp_path / "truth").exists() and (tmp_path / "compared.mp4").exists()
 
 
@@ -173,9 +173,18 @@ def test_without_holes_there_is_null(folder, tmp_path, mend):
     assert (report["psnr_holes_fg"] is None) or report["psnr_holes"] is not None
 
 
-def test_an_orbit_follows_the_frames(folder, tmp_path, mend):
-    code, report, _ = mend(folder, tmp_path / "out", "--path", "orbit")
-    assert code == 0 and report["frames"] == 2
+def test_an_orbit_shows_the_whole_motion(folder, tmp_path, mend):
+    path = "orbit:seconds=0.5,fps=12,size=64x40,background=white"
+    code, report, _ = mend(folder, tmp_path / "out", "--path", path)
+    assert code == 0 and report["frames"] == 6
+    views = pictures(tmp_path / "out" / "rendered").astype(int)
+    assert views.shape == (6, 40, 64, 3)
+    subject = views.min(-1) < 250
+    assert subject.any((1, 2)).all() and not subject[:, [0, -1]].any() and not subject[:, :, [0, -1]].any()
+    rows = subject.any((0, 2)).nonzero()[0]
+    assert rows[-1] - rows[0] > 30, "it fills the image"
+    with av.open(str(tmp_path / "out" / "mended.mp4")) as film:
+        assert film.streams.video[0].average_rate == 12
     assert report["psnr_whole"] is None and report["psnr_holes_telea"] is None
     assert report["hole_fraction"] < 0.9 and min(report["hull_iou"].values()) > 0.9
 

@@ -1,5 +1,6 @@
 """Where novel views are looked at from."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from reference.ball import camera_at
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, project
-from viewmend.geometry.orbit import orbit_around
+from viewmend.geometry.orbit import fit_to, orbit_around
 
 CENTER = torch.tensor([0.1, 0.0, -0.1])
 
@@ -36,6 +37,28 @@ def test_a_rig_on_one_side_is_swung_over():
     assert around.min() >= -65 and around.max() <= 56
     assert around.max() - around.min() > 100
     assert around[0] == pytest.approx(float(around[-1]), abs=3)
+
+
+@pytest.mark.parametrize("arc_deg", [40, 360])
+def test_an_arc_is_swung_around_the_rigs_middle(arc_deg):
+    rig = concatenate_cameras([camera_at(angle, f"c{angle}") for angle in (-60, -20, 10, 50)])
+    path = orbit_around(CENTER, rig, None, 40, 40, math.radians(arc_deg), (80, 48))
+    around = degrees_around(path)
+    assert path.size_px[0].tolist() == [80, 48]
+    if arc_deg == 360:
+        assert (around.diff() % 360).sub(9).abs().max() < 0.1
+    else:
+        assert around.mean() == pytest.approx(-5, abs=5) and around.max() - around.min() == pytest.approx(40, abs=0.5)
+
+
+def test_a_path_is_fitted_to_all_points():
+    rig = concatenate_cameras([camera_at(30 * n, f"c{n}") for n in range(12)])
+    points = CENTER + 0.4 * torch.randn(200, 3, generator=torch.manual_seed(0)).clamp(-1, 1)
+    uv_px, _ = project(points, fit_to(orbit_around(CENTER, rig, None, 9, 9, size_px=(90, 50)), points))
+    size = torch.tensor([90.0, 50.0])
+    assert (uv_px > 0).all() and (uv_px < size).all()
+    free = torch.minimum(uv_px, size - uv_px) / size
+    assert free.min() == pytest.approx(0.03, abs=1e-3), "and no further"
 
 
 def test_images_upside_down_do_not_tilt_the_orbit():

@@ -1,12 +1,14 @@
 """`viewmend mend`: render and inpaint novel views of a capture, and score them against a held-out camera."""
 
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 if TYPE_CHECKING:
+    from viewmend.data.camera_path import Turntable
     from viewmend.data.native_capture import NativeCapture
     from viewmend.data.source import CaptureSource
     from viewmend.evaluation.mending import MendSummary
@@ -40,8 +42,10 @@ class Options:
     leave_out: str | None = None
     """Name of the camera to hold out, whose view is rendered. Give either this or --path."""
     path: str | None = None
-    """'orbit', or a JSON file: a list of 4x4 world_from_camera matrices (metres, OpenCV axes), or an object with
-    "world_from_camera" and optionally "K", "width" and "height". One pose per frame, or one for all."""
+    """'orbit' circles the subject so that all of its motion is in view; options follow, as in
+    orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON file: a list of 4x4
+    world_from_camera matrices (metres, OpenCV axes), or an object with "world_from_camera" and optionally "K", "width"
+    and "height". One pose per frame, or one for all."""
     use_cameras: str | None = None
     """Comma-separated names of the input cameras; all by default."""
     format: str | None = None
@@ -84,9 +88,8 @@ class Options:
     """Write the scores to standard output as one JSON object, and nothing else."""
 
 
-STATIC_VIEWS = 60
-"""Views of an orbit around a capture of one frame."""
-FRAMES_PER_TURN = 150
+FITTED_FRAMES, FITTED_RESOLUTION = 24, 64
+"""Frames from which the extent of a motion is taken, and the resolution of their hulls."""
 
 
 def run(options: Options) -> int:
@@ -95,6 +98,7 @@ def run(options: Options) -> int:
     from viewmend.cli.checks import chosen_times, load_named, log_preparation
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import MendOutput
+    from viewmend.data.camera_path import STATIC_FPS, parse_turntable
     from viewmend.data.prepare import prepare
     from viewmend.data.source import prefetch
     from viewmend.evaluation.mending import Mender, MendSummary
@@ -103,6 +107,7 @@ def run(options: Options) -> int:
     from viewmend.stream import StreamConfig
 
     render = _render_config(options)
+    turntable = parse_turntable(options.path or "")
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
@@ -117,9 +122,13 @@ def run(options: Options) -> int:
     config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
     mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol)
     summary = MendSummary(options.protocol)
-    plan = [(time, target) for time, target in _plan(options, capture, times, usable[0]) if time in usable]
-    frames, frame = prefetch(capture, usable), None
-    with MendOutput(options.out, capture.fps or 15.0, options.alpha, options.depth) as output:
+    if turntable is not None:
+        mender.background = turntable.background or mender.background
+    plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
+    frames, frame = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)]), None
+    with MendOutput(
+        options.out, (turntable and turntable.fps) or capture.fps or STATIC_FPS, options.alpha, options.depth
+    ) as output:
         if output.replaces:
             say(f"{options.out}: the results of an earlier run will be replaced")
         for time, target in track(plan, "inpainting"):
@@ -224,23 +233,40 @@ def _usable(capture: "NativeCapture", times: range, held: tuple[str, ...]) -> li
     return usable
 
 
-def _plan(options: Options, capture: "CaptureSource", times: range, first: int) -> "list[tuple[int, Cameras]]":
-    """Frame indices and the camera of each view, in order; an orbit's centre is the subject in the `first` frame."""
+def _plan(
+    options: Options, capture: "CaptureSource", times: range, usable: list[int], turntable: "Turntable | None"
+) -> "list[tuple[int, Cameras]]":
+    """Frame indices and the camera of each view, in order."""
     from viewmend.data.camera_path import pair_with_frames, read_camera_path
 
     if options.leave_out is not None:
         return [(time, capture.cameras.select([options.leave_out])) for time in times]
-    if options.path == "orbit":
-        return pair_with_frames(_orbit(capture, times, first), times)
+    if turntable is not None:
+        return _circle(turntable, capture, usable)
     return pair_with_frames(read_camera_path(Path(str(options.path)), capture.cameras), times)
 
 
-def _orbit(capture: "CaptureSource", times: range, first_time: int) -> "Cameras":
-    from viewmend.geometry.orbit import orbit_around
+def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int]) -> "list[tuple[int, Cameras]]":
+    """Frame indices and the camera of each view of a turntable, whose images show the whole motion."""
+    import math
+
+    import torch
+
+    from viewmend.geometry.hull import HullConfig
+    from viewmend.geometry.orbit import fit_to, orbit_around
     from viewmend.geometry.proxy import reconstruct
 
-    first = capture.read(first_time)
-    assert first.mask is not None, "captures without masks are refused"
-    center = reconstruct(first.mask, first.cameras, capture.bounds).mesh.vertices.mean(0)
-    views, turn = (STATIC_VIEWS, STATIC_VIEWS) if len(times) == 1 else (len(times), FRAMES_PER_TURN)
-    return orbit_around(center, capture.cameras, capture.up, views, turn)
+    shown, points = turntable.times(usable, capture.fps), []
+    moments = sorted(set(shown))
+    for time in moments[:: -(-len(moments) // FITTED_FRAMES)]:
+        frame = capture.read(time)
+        assert frame.mask is not None, "captures without masks are refused"
+        proxy = reconstruct(frame.mask, frame.cameras, capture.bounds, HullConfig(resolution=FITTED_RESOLUTION))
+        points.append(proxy.mesh.vertices)
+    extent = torch.cat(points)
+    center, arc = (extent.amin(0) + extent.amax(0)) / 2, turntable.arc
+    arc_rad = None if arc is None else math.radians(arc)
+    views = len(shown)
+    path = orbit_around(center, capture.cameras, capture.up, views, views, arc_rad, turntable.size_px)
+    path = fit_to(path, extent)
+    return [(time, path[view]) for view, time in enumerate(shown)]

@@ -1,15 +1,15 @@
-"""Camera paths: reading poses from a JSON file, and pairing them with frames."""
+"""Camera paths: reading poses from a JSON file, turntables, and pairing poses with frames."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from msgspec import Meta, Struct
 
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import invert_rigid, is_rotation
-from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, shown, typed
+from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, one_of, read_json, shown, typed
 
 Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
@@ -60,6 +60,64 @@ def read_camera_path(file: Path, like: Cameras) -> Cameras:
     size = first.size_px.cpu() if path.width is None else torch.tensor([[path.width, path.height]])
     names = tuple(f"view{n:03d}" for n in range(count))
     return Cameras(names, K.repeat(count, 1, 1), invert_rigid(poses), size.repeat(count, 1))
+
+
+STATIC_VIEWS, STATIC_FPS = 60, 15.0
+"""Views of a turntable by default, at least; and its rate for a capture without one."""
+
+
+class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How a view circles the subject."""
+
+    arc: Annotated[float, Meta(ge=1, le=360)] | None = None
+    """Degrees to swing over; 360 is a whole turn. None: what the rig covers."""
+    seconds: Annotated[float, Meta(gt=0, le=600)] | None = None
+    """None: as long as the motion, and `STATIC_VIEWS` views at least."""
+    fps: Annotated[float, Meta(ge=1, le=240)] | None = None
+    """None: the capture's."""
+    loop: Annotated[str, one_of("bounce", "repeat")] = "bounce"
+    """What a motion does that is shorter: it plays back and forth, or again."""
+    size: Annotated[str, Meta(pattern=r"^[1-9]\d{1,3}x[1-9]\d{1,3}\Z")] | None = None
+    """WIDTHxHEIGHT in pixels; None: the first camera's."""
+    background: Literal["black", "white"] | None = None
+    """None: the model's."""
+
+    @property
+    def size_px(self) -> tuple[int, int] | None:
+        """Width and height."""
+        if self.size is None:
+            return None
+        width, height = self.size.split("x")
+        return int(width), int(height)
+
+    def times(self, recorded: Sequence[int], fps: float | None) -> list[int]:
+        """The frame of each view, from those of a capture with this rate."""
+        own_fps = fps or STATIC_FPS
+        rate, last = self.fps or own_fps, len(recorded) - 1
+        views = max(STATIC_VIEWS, round(len(recorded) / own_fps * rate))
+        if self.seconds is not None:
+            views = max(1, round(self.seconds * rate))
+        steps = [int(view * own_fps / rate + 1e-6) for view in range(views)]
+        if self.loop == "repeat" or last == 0:
+            return [recorded[step % (last + 1)] for step in steps]
+        return [recorded[last - abs(last - step % (2 * last))] for step in steps]
+
+
+def parse_turntable(text: str) -> Turntable | None:
+    """A turntable from "orbit" or "orbit:arc=180,seconds=6"; None for any other text.
+
+    Raises:
+        ValueError: a key or a value is wrong.
+    """
+    word, _, values = text.partition(":")
+    if word != "orbit":
+        return None
+    pairs = [pair.partition("=") for pair in values.split(",") if pair.strip()]
+    try:
+        given = {key.strip(): value.strip() for key, _, value in pairs}
+        return typed(given, Turntable, "as in orbit:arc=180,seconds=6,fps=30,size=1280x720", strict=False)
+    except ValueError as error:
+        raise ValueError(f"--path {text}: {error}") from None
 
 
 def pair_with_frames(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:

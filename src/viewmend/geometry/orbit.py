@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, project
 from viewmend.geometry.rigid import look_at
 
 AGREED = 0.5
@@ -34,6 +35,8 @@ def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[T
     return front, torch.linalg.cross(up, front)
 
 
+MARGIN = 0.06
+"""Part of half an image that stays free around what it is fitted to."""
 FULL_TURN_GAP_RAD = math.radians(130)
 """A rig with a larger gap does not surround the subject: its orbit swings back and forth."""
 
@@ -77,12 +80,18 @@ def fov_y_showing(size_px: tuple[int, int], visible_m: float, distance_m: float)
 
 
 def orbit_around(
-    center: Float[Tensor, "3"], cameras: Cameras, up: Float[Tensor, "3"] | None, views: int, frames_per_turn: int
+    center: Float[Tensor, "3"],
+    cameras: Cameras,
+    up: Float[Tensor, "3"] | None,
+    views: int,
+    frames_per_turn: int,
+    arc_rad: float | None = None,
+    size_px: tuple[int, int] | None = None,
 ) -> Cameras:
     """Novel cameras on a circle about `center`, as far and as high as the rig's cameras on average.
 
     A rig all around is circled once every `frames_per_turn` views; for a rig on one side the path swings from its one
-    end to the other and back. Images are as large, and show as much, as the first camera's.
+    end to the other and back. Images show as much as the first camera's.
 
     Args:
         center: the subject's middle, metres.
@@ -91,18 +100,20 @@ def orbit_around(
             upside down), the normal of the plane that the cameras lie in.
         views: how many cameras to give.
         frames_per_turn: length of a whole turn, or of a swing there and back.
+        arc_rad: angle to swing over; a whole turn circles. By default what the rig covers.
+        size_px: width and height of the images; by default the first camera's.
     """
     up = upright(cameras) if up is None else up.to(center) / up.norm()
     offsets = cameras.centers - center
     distance = offsets.norm(dim=-1)
     elevation = torch.asin((offsets @ up / distance).clamp(-1, 1)).mean()
     front, side = horizontal_axes(up)
-    azimuths = _swing(torch.atan2(offsets @ side, offsets @ front).tolist(), views, frames_per_turn)
+    azimuths = _swing(torch.atan2(offsets @ side, offsets @ front).tolist(), views, frames_per_turn, arc_rad)
     width, height = (int(side) for side in cameras.size_px[0].tolist())
     visible_m = min(width, height) / float(cameras.K[0, 1, 1]) * float(distance.mean())
     return orbit(
         azimuths,
-        (width, height),
+        size_px or (width, height),
         radius_m=float(distance.mean()),
         elevation_rad=float(elevation),
         center=center.cpu(),
@@ -111,14 +122,28 @@ def orbit_around(
     )
 
 
-def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int) -> list[float]:
+def fit_to(path: Cameras, points: Float[Tensor, "point 3"]) -> Cameras:
+    """The cameras of a path, of one image size, with the focal length at which all images show all points."""
+    path, points = path.to("cpu"), points.cpu()
+    uv_px, z = project(points, path)
+    half = path.size_px[:, None].float() / 2
+    ratio = (((uv_px - half) / half).abs().amax(-1) * (z > 0)).max()
+    K = path.K.clone()
+    K[:, 0, 0], K[:, 1, 1] = (K[:, axis, axis] * (1 - MARGIN) / ratio for axis in (0, 1))
+    return replace(path, K=K)
+
+
+def _swing(azimuths: Sequence[float], views: int, frames_per_turn: int, arc_rad: float | None = None) -> list[float]:
     """Azimuths of a path over the rig's own, beginning in the middle of its widest gap's far end."""
     ordered = sorted(a % (2 * math.pi) for a in azimuths)
     gaps = [(after - before) % (2 * math.pi) for before, after in zip(ordered, [*ordered[1:], ordered[0]], strict=True)]
     widest = max(range(len(gaps)), key=lambda n: gaps[n])
     start = ordered[(widest + 1) % len(ordered)]
     phases = [view / frames_per_turn for view in range(views)]
-    if len(ordered) > 1 and gaps[widest] < FULL_TURN_GAP_RAD:
-        return [start + 2 * math.pi * phase for phase in phases]
-    arc = (2 * math.pi - gaps[widest]) % (2 * math.pi) if len(ordered) > 1 else math.pi / 6
-    return [start + arc * (0.5 - 0.5 * math.cos(2 * math.pi * phase)) for phase in phases]
+    surrounds = len(ordered) > 1 and gaps[widest] < FULL_TURN_GAP_RAD
+    covered = (2 * math.pi - gaps[widest]) % (2 * math.pi) if len(ordered) > 1 else math.pi / 6
+    middle = start if surrounds else start + covered / 2
+    arc = arc_rad if arc_rad is not None else 2 * math.pi if surrounds else covered
+    if arc > 2 * math.pi - 1e-6:
+        return [middle + 2 * math.pi * phase for phase in phases]
+    return [middle - arc / 2 * math.cos(2 * math.pi * phase) for phase in phases]

@@ -2,6 +2,7 @@
 
 import { DRAWN_MODES } from "./draw/scene.js";
 import { Stage } from "./draw/stage.js";
+import { surfaceAt } from "./draw/projection.js";
 import { rigLines } from "./draw/rig.js";
 import { Headset, headsetThere } from "./headset.js";
 import { Assets, rankedCameras } from "./link/assets.js";
@@ -33,6 +34,8 @@ import { Pace, Resolution } from "./draw/resolution.js";
 
 const query = new URLSearchParams(location.search);
 const token = query.get("token");
+/** How much closer a double-click comes. */
+const CLOSER = 0.7;
 const LIMITS = { max_side_px: 2048, max_pixels: 2 ** 21 };
 
 class Page {
@@ -79,10 +82,14 @@ class Page {
       notices,
       reset: () => this.reset(),
       shot: () => screenshot(this.canvas, () => this.paint(), `viewmend-${String(transport.shown).padStart(4, "0")}.png`, notices),
+      link: () => {
+        this.tell();
+        return this.place.link();
+      },
       headset: () => this.headset.enter(motion.rig, motion.pose),
     });
     this.keys = new Keys(motion, this.actions(), () => this.wake());
-    listenToGestures(this.canvas, motion, () => this.viewer().lens.fx, () => this.wake());
+    listenToGestures(this.canvas, motion, () => this.viewer().lens.fx, () => this.wake(), (x, y) => this.focus(x, y));
     settings.addEventListener("change", () => this.wake());
     this.listen();
   }
@@ -108,6 +115,15 @@ class Page {
 
   reset() {
     if (this.motion.rig) this.motion.reset();
+    this.wake();
+  }
+
+  /** Turn about the surface that is seen there. @param {number} x CSS pixels @param {number} y */
+  focus(x, y) {
+    const [viewer, { goal }] = [this.viewer(), this.motion];
+    const point = this.drawn?.shape ? surfaceAt(this.drawn.shape.positions, viewer, x - viewer.box.left, y - viewer.box.top) : null;
+    if (!goal || !point) return;
+    this.motion.jump({ ...goal, target: point, distance: Math.max(CLOSER * goal.distance, 0.1 * this.motion.rig.home.distance) });
     this.wake();
   }
 
@@ -305,7 +321,7 @@ class Page {
     const parts = split
       ? [{ mode: modeOf(settings.get("left")), until: divider }, { mode: modeOf(settings.get("right")), until: 1 }]
       : [{ mode: settings.get("mode"), until: 1 }];
-    return { parts, reproject: settings.get("reproject"), rig: settings.get("rig"), frame: this.drawing ? this.drawn : null };
+    return { parts, reproject: settings.get("reproject"), rig: settings.get("rig") ? this.motion.rig : null, frame: this.drawing ? this.drawn : null };
   }
 
   paint() {

@@ -65,6 +65,22 @@ export function samePlace(source, width, height, viewer) {
   return most(K, source.K) < 0.05 && most(viewer.R, source.R) < 1e-4 && most(viewer.T, source.T) < 1e-4;
 }
 
+/** How far a vertex may be from where the surface is looked for, pixels. */
+const NEAR_PX = 14;
+
+/** The nearest vertex that is seen about there; null for none. @param {Float32Array} positions @param {Viewpoint} viewer @param {number} u pixels of its lens @param {number} v */
+export function surfaceAt(positions, viewer, u, v) {
+  let [best, nearest] = [/** @type {number[] | null} */ (null), Infinity];
+  for (let at = 0; at < positions.length; at += 3) {
+    const point = [positions[at], positions[at + 1], positions[at + 2]];
+    const seen = project(viewer, point);
+    if (!seen || Math.hypot(seen[0] - u, seen[1] - v) > NEAR_PX) continue;
+    const z = apply(viewer.R, point)[2];
+    if (z < nearest) [best, nearest] = [point, z];
+  }
+  return best;
+}
+
 /** Where a point of the world lands in the viewer's picture, in its lens's pixels; null behind it. */
 export function project(/** @type {Viewpoint} */ { R, T, lens }, /** @type {number[]} */ point) {
   const [x, y, z] = add(apply(R, point), T);

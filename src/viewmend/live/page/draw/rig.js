@@ -10,9 +10,12 @@ const BOX = [0.62, 0.67, 0.74, 0.35];
 /** A pyramid's height as a share of the distance between camera and subject. */
 const PYRAMID = 0.11;
 
+/** Depth of the picture at the foot of a camera's pyramid, metres. @param {any} camera @param {number[]} center */
+export const pyramidDepth = (camera, center) => PYRAMID * length(sub(center, camera.center));
+
 /** @param {any} camera @param {number[]} center @returns {number[][]} apex, then the corners of its picture */
 function pyramid(camera, center) {
-  const size = PYRAMID * length(sub(center, camera.center));
+  const size = pyramidDepth(camera, center);
   const world = transpose(camera.R);
   const inverse = invertIntrinsics(camera.K);
   const { width, height } = camera;

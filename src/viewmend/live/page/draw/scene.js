@@ -164,6 +164,14 @@ export class Scene {
     return there.map((/** @type {number} */ n) => own.sources.get(n));
   }
 
+  /** The cut-outs of all images that are there, with their cameras; as `prepare`. @param {Frame} frame */
+  cutOuts(frame) {
+    const own = this.kept.get(frame);
+    const { cameras } = /** @type {any} */ (frame.shape).header;
+    for (const n of frame.images.keys()) if (!own.sources.has(n)) own.sources.set(n, this.#source(frame, own, n));
+    return [...own.sources].map(([n, source]) => ({ camera: cameras[n], picture: source.picture }));
+  }
+
   /** Draw into the current viewport and scissor. @param {Frame} frame @param {any[]} sources @param {Viewpoint} viewer @param {number[]} eye @param {string} mode */
   draw(frame, sources, viewer, eye, mode) {
     const { gl } = this;

@@ -2,6 +2,7 @@
 
 import { buildProgram } from "./program.js";
 import { LinePainter } from "./lines.js";
+import { pyramidDepth } from "./rig.js";
 import { clipFromPicture, clipFromPixels, clipFromWorld, samePlace } from "./projection.js";
 import { Scene, filling } from "./scene.js";
 import { planeOf } from "./surface.js";
@@ -22,7 +23,7 @@ import { eyeOfCamera } from "../view/pose.js";
  * @typedef {object} Wish
  * @property {{mode: string, until: number}[]} parts modes from left to right, each until a share of the viewport's width
  * @property {boolean} reproject
- * @property {boolean} rig
+ * @property {any} rig the cameras to show; null to show none
  * @property {import("../link/assets.js").Frame | null} [frame] drawn here, under the server's picture of the same view
  */
 
@@ -84,6 +85,8 @@ export class Stage {
     this.header = null;
     this.eyes = [];
     this.photos = { original: null, error: null };
+    /** Plane of the image that is drawn. @type {any} */
+    this.quad = null;
     this.painter = buildProgram(this.gl, VERTEX, FRAGMENT, ["clip", "size", "tone", "ground", "opacity"]);
     this.scene = new Scene(this.gl, filling(this.software));
     /** When the last picture came, and the share of it that was drawn last. */
@@ -176,6 +179,7 @@ export class Stage {
     const { gl, header } = this;
     const place = eyeOfCamera(viewer);
     const sources = this.scene.prepare(frame, place);
+    const cutOuts = wish.rig ? this.scene.cutOuts(frame) : [];
     const kept = this.eyes[Math.min(eye, this.eyes.length - 1)];
     const source = header?.cameras[Math.min(eye, header.cameras.length - 1)];
     const same = header && kept && header.time === frame.time && samePlace(source, header.width, header.height, viewer);
@@ -201,7 +205,29 @@ export class Stage {
       if (over > 0) this.#overlay(kept, kept.textures[mode], over);
     }
     gl.scissor(x, y, width, height);
-    if (wish.rig) this.lines?.draw(clipFromWorld(viewer), width, height);
+    if (!wish.rig) return;
+    for (const { camera, picture } of cutOuts) {
+      const depth = pyramidDepth(camera, wish.rig.center);
+      if (length(sub(place, camera.center)) < 1.5 * depth) continue; // it would hide the view
+      this.quad = upload(gl, this.quad, planeOf(camera.width, camera.height, depth));
+      this.#image(camera, picture, this.quad, clipFromPicture(camera, viewer));
+    }
+    this.lines?.draw(clipFromWorld(viewer), width, height);
+  }
+
+  /** A camera's image on a plane. @param {any} camera @param {WebGLTexture} picture @param {any} quad @param {Float32Array} clip */
+  #image(camera, picture, quad, clip) {
+    const { gl } = this;
+    const { program, at } = /** @type {any} */ (this.painter);
+    gl.useProgram(program);
+    gl.bindTexture(gl.TEXTURE_2D, picture);
+    gl.uniform2f(at.size, camera.width, camera.height);
+    gl.uniform1f(at.tone, 1);
+    gl.uniform1f(at.opacity, 1);
+    gl.uniform3fv(at.ground, this.ground);
+    gl.uniformMatrix4fv(at.clip, false, clip);
+    gl.bindVertexArray(quad.array);
+    gl.drawElements(gl.TRIANGLES, quad.solid, gl.UNSIGNED_INT, 0);
   }
 
   /** A camera's image, where the view is at that camera. @param {Viewpoint & {distance?: number}} viewer @param {string} mode */
@@ -212,17 +238,8 @@ export class Stage {
     const { camera, picture, quad } = photo;
     const distance = viewer.distance ?? 1;
     if (length(sub(eyeOfCamera(viewer), camera.center)) > AT_CAMERA * distance) return;
-    const { program, at } = /** @type {any} */ (this.painter);
     gl.disable(gl.DEPTH_TEST);
-    gl.useProgram(program);
-    gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.uniform2f(at.size, camera.width, camera.height);
-    gl.uniform1f(at.tone, 1);
-    gl.uniform1f(at.opacity, 1);
-    gl.uniform3fv(at.ground, this.ground);
-    gl.uniformMatrix4fv(at.clip, false, this.#clip(camera, viewer, {}));
-    gl.bindVertexArray(quad.array);
-    gl.drawElements(gl.TRIANGLES, quad.solid, gl.UNSIGNED_INT, 0);
+    this.#image(camera, picture, quad, this.#clip(camera, viewer, {}));
     gl.enable(gl.DEPTH_TEST);
   }
 

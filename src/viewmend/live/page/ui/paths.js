@@ -1,10 +1,11 @@
 // The section "Camera path": record, add views, play, and export as MP4 by the server.
 
 import { lensOf } from "../view/lens.js";
-import { FPS, Track } from "../view/camera_path.js";
+import { FPS, MOST_POSES, Track } from "../view/camera_path.js";
 import { extrinsicsOf } from "../view/pose.js";
 import { pathFile, pointsOf } from "../view/camera_path_file.js";
-import { byId, download } from "./dom.js";
+import { byId, download, element } from "./dom.js";
+import { clamp } from "../view/matrix.js";
 import { Film } from "./film.js";
 
 /** How far a film's two eyes are apart, metres; players know by the name's end, _SBS, that they lie side by side. */
@@ -31,6 +32,7 @@ export class PathPanel {
     /** The film that is being rendered. @type {Film | null} */
     this.film = null;
     this.progressText = "";
+    this.listed = "";
     this.canExport = true;
     byId("path-record").addEventListener("click", () => this.toggleRecording());
     byId("path-add").addEventListener("click", () => this.#add());
@@ -40,6 +42,7 @@ export class PathPanel {
       this.playing = null;
       this.#show();
     });
+    byId("path-turntable").addEventListener("click", () => this.#turntable());
     byId("path-export").addEventListener("click", () => this.#export());
     byId("path-cancel").addEventListener("click", () => this.film?.cancel());
     byId("path-save").addEventListener("click", () => this.#save());
@@ -69,6 +72,50 @@ export class PathPanel {
     this.recording = false;
     this.track.add(motion.goal, transport.shown);
     this.#show();
+  }
+
+  #turntable() {
+    const { motion, transport } = this.around;
+    if (!motion.goal) return;
+    this.recording = false;
+    this.playing = null;
+    const seconds = clamp(Number(byId("path-seconds").value) || 6, 1, (MOST_POSES - 1) / FPS);
+    this.track.turntable(motion.goal, Number(byId("path-arc").value), seconds, Math.max(0, transport.shown));
+    this.#show();
+  }
+
+  /** The views that were added, to be put in order. */
+  #list() {
+    const { points, recordingSince } = this.track;
+    const change = (/** @type {() => void} */ edit) => () => {
+      edit();
+      this.playing = null;
+      this.#show();
+    };
+    const button = (/** @type {string} */ text, /** @type {string} */ label, /** @type {() => void} */ act, disabled = false) => {
+      const made = element("button", { type: "button", textContent: text, title: label, disabled });
+      made.setAttribute("aria-label", label);
+      made.addEventListener("click", act);
+      return made;
+    };
+    const rows = recordingSince >= 0 ? [] : points.map(({ pose, seconds }, index) => {
+      const view = `view ${index + 1}`;
+      const moment = element("input", { type: "number", min: 0, step: 0.1, value: seconds.toFixed(1), disabled: index === 0 });
+      moment.setAttribute("aria-label", `Seconds of ${view}`);
+      moment.addEventListener("change", change(() => this.track.retime(index, Number(moment.value))));
+      return element("li", {},
+        button(String(index + 1), `Go to ${view}`, () => {
+          this.around.motion.jump(pose);
+          this.around.wake();
+        }),
+        moment, element("span", { textContent: "s" }),
+        button("↑", `Move ${view} up`, change(() => this.track.move(index, -1)), index === 0),
+        button("↓", `Move ${view} down`, change(() => this.track.move(index, 1)), index === points.length - 1),
+        button("✕", `Delete ${view}`, change(() => this.track.remove(index))),
+      );
+    });
+    byId("path-views").replaceChildren(...rows);
+    byId("path-views").hidden = !rows.length;
   }
 
   #play() {
@@ -118,6 +165,10 @@ export class PathPanel {
     if (this.film && this.progressText) text = this.progressText;
     byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
+    const listed = JSON.stringify([recordingSince >= 0, points]);
+    if (listed === this.listed || this.recording) return;
+    this.listed = listed;
+    this.#list();
   }
 
   /** What is posted: cameras and times of the film's frames. @param {boolean} stereo whether two eyes share its width */

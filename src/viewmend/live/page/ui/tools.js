@@ -2,12 +2,18 @@
 
 import { byId, download } from "./dom.js";
 
+/** @param {() => string} link @param {import("./notices.js").Notices} notices */
+function copyLink(link, notices) {
+  const copied = navigator.clipboard?.writeText(link()) ?? Promise.reject(new Error("no clipboard"));
+  copied.then(() => notices.toast("Link copied"), () => notices.toast(link())); // browsers offer a clipboard over HTTPS and on localhost
+}
+
 /**
- * @param {{settings: import("../settings.js").Settings, reset: () => void, shot: () => void, headset: () => Promise<void>,
+ * @param {{settings: import("../settings.js").Settings, reset: () => void, shot: () => void, link: () => string, headset: () => Promise<void>,
  *   notices: import("./notices.js").Notices}} page
  * @returns {{shot: () => void, help: () => void}}
  */
-export function buildTools({ settings, reset, shot, headset, notices }) {
+export function buildTools({ settings, reset, shot, link, headset, notices }) {
   const dialog = byId("help");
   const help = () => (dialog.open ? dialog.close() : dialog.showModal());
   byId("tool-help").addEventListener("click", help);
@@ -17,6 +23,7 @@ export function buildTools({ settings, reset, shot, headset, notices }) {
   });
   byId("tool-reset").addEventListener("click", reset);
   byId("tool-shot").addEventListener("click", shot);
+  byId("tool-link").addEventListener("click", () => copyLink(link, notices));
   byId("tool-panel").addEventListener("click", () => settings.set("panel", !settings.get("panel")));
   byId("tool-headset").addEventListener("click", () => {
     headset().catch((error) => notices.toast(`Cannot start VR: ${error.message}`, "error"));

@@ -8,6 +8,7 @@ import { MOST_ELEVATION } from "./pose.js";
 
 /** Between two views that were added one by one. */
 const SECONDS_BETWEEN = 2;
+const LEAST_SECONDS = 0.1;
 export const FPS = 30;
 export const MOST_POSES = 900;
 
@@ -48,6 +49,41 @@ export class Track {
   /** @param {Pose} pose @param {number} time */
   add(pose, time) {
     if (this.room) this.points.push({ pose: { ...pose }, seconds: this.#next, time });
+  }
+
+  /**
+   * Around the target: a whole turn, or a swing there and back about where the view is.
+   * @param {Pose} pose @param {number} arc degrees @param {number} seconds @param {number} time
+   */
+  turntable(pose, arc, seconds, time) {
+    this.clear();
+    const whole = arc >= 360;
+    const steps = whole ? 8 : 16;
+    this.points = Array.from({ length: steps + 1 }, (_, step) => {
+      const turn = whole ? (360 * step) / steps : (arc / 2) * Math.sin((2 * Math.PI * step) / steps);
+      return { pose: { ...pose, azimuth: pose.azimuth + turn }, seconds: (seconds * step) / steps, time };
+    });
+  }
+
+  /** Swap a view with the next or the one before; the moments stay. @param {number} index @param {number} steps */
+  move(index, steps) {
+    const [one, other] = [this.points[index], this.points[index + steps]];
+    if (one && other) [one.pose, other.pose] = [other.pose, one.pose];
+  }
+
+  /** Set when a view is passed, after the one before; the later ones keep their distance. @param {number} index @param {number} seconds */
+  retime(index, seconds) {
+    if (index <= 0 || !Number.isFinite(seconds)) return;
+    const last = (MOST_POSES - 1) / FPS - (this.seconds - this.points[index].seconds);
+    const moved = clamp(seconds, this.points[index - 1].seconds + LEAST_SECONDS, last) - this.points[index].seconds;
+    for (const point of this.points.slice(index)) point.seconds += moved;
+  }
+
+  /** @param {number} index */
+  remove(index) {
+    this.points.splice(index, 1);
+    const first = this.points[0]?.seconds ?? 0;
+    for (const point of this.points) point.seconds -= first;
   }
 
   /** @param {number} now ms */

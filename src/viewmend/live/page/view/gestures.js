@@ -11,8 +11,9 @@ const wheelPixels = (delta, mode) => delta * (mode === 1 ? 16 : mode === 2 ? 400
  * @param {import("./motion.js").Motion} motion
  * @param {() => number} focal of the lens, CSS pixels
  * @param {() => void} wake call it when something moved
+ * @param {(x: number, y: number) => void} focus turn about what is there, CSS pixels
  */
-export function listenToGestures(surface, motion, focal, wake) {
+export function listenToGestures(surface, motion, focal, wake, focus) {
   /** @type {Map<number, {x: number, y: number}>} */
   const pointers = new Map();
   let button = 0;
@@ -61,6 +62,7 @@ export function listenToGestures(surface, motion, focal, wake) {
       if (!pointers.size) delete surface.dataset.held;
     });
   }
+  surface.addEventListener("dblclick", (event) => focus(event.clientX, event.clientY));
   surface.addEventListener("contextmenu", (event) => event.preventDefault());
   surface.addEventListener(
     "wheel",

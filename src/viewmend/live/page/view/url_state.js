@@ -38,7 +38,14 @@ export class Place {
     this.timer ||= window.setTimeout(() => this.#write(), GAP_MS);
   }
 
+  /** The address of what is shown. */
+  link() {
+    this.#write();
+    return location.href;
+  }
+
   #write() {
+    clearTimeout(this.timer);
     this.timer = 0;
     const url = new URL(location.href);
     for (const [name, value] of Object.entries(this.query)) {
