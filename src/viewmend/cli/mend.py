@@ -122,13 +122,11 @@ def run(options: Options) -> int:
     config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
     mender = Mender(inpainter, config, capture.bounds, held, quality, error_model, options.protocol)
     summary = MendSummary(options.protocol)
-    if turntable is not None:
-        mender.background = turntable.background or mender.background
+    mender.background = (turntable and turntable.background) or mender.background
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
     frames, frame = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)]), None
-    with MendOutput(
-        options.out, (turntable and turntable.fps) or capture.fps or STATIC_FPS, options.alpha, options.depth
-    ) as output:
+    fps = (turntable and turntable.fps) or capture.fps or STATIC_FPS
+    with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
             say(f"{options.out}: the results of an earlier run will be replaced")
         for time, target in track(plan, "inpainting"):
