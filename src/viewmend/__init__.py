@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from viewmend.geometry.hull import HullConfig
     from viewmend.geometry.rigid import look_at
     from viewmend.live.client import Client, Publisher
+    from viewmend.live.viewer import Viewer, serve
     from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
     from viewmend.models.checkpoint import load_inpainter
     from viewmend.models.registry import make_method
@@ -53,6 +54,7 @@ __all__ = [
     "Stream",
     "StreamConfig",
     "StreamView",
+    "Viewer",
     "__version__",
     "error_rule",
     "load_inpainter",
@@ -61,6 +63,7 @@ __all__ = [
     "open_capture",
     "pinhole",
     "prepare",
+    "serve",
 ]
 
 _MODULES = {
@@ -95,6 +98,8 @@ _MODULES = {
     "open_capture": "data.native_capture",
     "pinhole": "geometry.cameras",
     "prepare": "data.prepare",
+    "Viewer": "live.viewer",
+    "serve": "live.viewer",
 }
 
 

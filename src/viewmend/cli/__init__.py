@@ -31,7 +31,8 @@ class Command(NamedTuple):
 
 COMMANDS = (
     Command("demo", "viewmend.cli.demo", "Render and inpaint a synthetic scene. Needs no data."),
-    Command("serve", "viewmend.cli.serve", "View a capture or a live rig in the browser."),
+    Command("view", "viewmend.cli.view", "Open a capture in the browser."),
+    Command("serve", "viewmend.cli.serve", "Serve a capture or a live rig to browsers."),
     Command("mend", "viewmend.cli.mend", "Render and inpaint novel views of a capture."),
     Command("studio", "viewmend.cli.studio", "Generate synthetic captures with ground truth."),
     Command("train", "viewmend.cli.train", "Train a model, or fine-tune one on your own capture."),

@@ -87,6 +87,12 @@ class SessionRegistry:
     extensions: Sequence[Extension] = ()
     sessions: list[ViewerSession] = field(default_factory=list)
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
+    shown: dict[str, Any] | None = None
+    """The message `show` that moved all pages last."""
+
+    def show(self, message: dict[str, Any]) -> None:
+        """Move all pages, and those that will be opened; from any thread."""
+        self.shown = message
 
     def source_json(self) -> dict[str, Any]:
         """The part of the message `state` that is the same for all viewers."""
@@ -129,6 +135,7 @@ class ViewerConnection:
         rate = registry.limits.messages_per_s
         self._rate, self._faults = RateLimit(rate, 2 * rate, self._now), RateLimit(*FAULTS, self._now)
         self._rig: dict[str, Any] | None = None
+        self._shown: dict[str, Any] | None = None
         ladder = registry.service.renderer.ladder
         self._session = ViewerSession(self._send_frame, self._report_error, registry.budget_ms, ladder, self._now)
 
@@ -275,6 +282,9 @@ class ViewerConnection:
             if state != last or now - state_at >= 0.5:
                 last, state_at = state, now
                 self._send_soon({"type": "state"} | shared | own)
+            if self._rig is not None and (shown := self._registry.shown) is not self._shown and shown:
+                self._shown = shown
+                self._send_soon(shown)
             if now - stats_at >= 1:
                 stats_at = now
                 self._send_soon(self._session.stats_json(len(self._registry.sessions)))

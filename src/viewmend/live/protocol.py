@@ -192,6 +192,21 @@ class Ping(Struct, frozen=True, tag="ping"):
 Message = Hello | Look | Cancel | Ack | ClockChange | OnAir | Ping
 
 
+class ShowView(Struct, frozen=True):
+    """The server's message `show`, which moves the page."""
+
+    pose: Camera | None = None
+    time: Count | None = None
+    mode: Mode | None = None
+
+
+def show_json(**given: Any) -> dict[str, Any]:
+    """The message `show` with those values that are not None; ProtocolError if one is out of range."""
+    given = {key: value for key, value in given.items() if value is not None}
+    read_message(given, ShowView)
+    return {"type": "show"} | given
+
+
 def parse(text: str, limits: Limits) -> Message:
     """Parse a client's message; ProtocolError if it is malformed or exceeds the limits."""
     if len(text) > limits.max_message_bytes:

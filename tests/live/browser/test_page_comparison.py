@@ -6,7 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from live.browser.test_page_drawing import SCREENSHOT_S, opened
-from live.live_servers import CAMERAS, Running, get, running
+from live.live_servers import CAMERAS, PIPELINE, Running, get, running
+from reference.ball import BallCapture
+
+from viewmend import serve
+from viewmend.models.smooth_fill import SmoothFill
 
 NAME = CAMERAS.names[0]
 
@@ -89,3 +93,17 @@ def test_depth_and_errors_have_a_scale(browser, ball):
         view.until(lambda: view.page.locator("#scale").is_visible(), SCREENSHOT_S)
         far, near = (float(text.split()[0]) for text in texts(view, "scale-low", "scale-high"))
         assert far > near > 0
+
+
+def test_a_program_moves_the_page(browser):
+    with serve(BallCapture(CAMERAS, 3), SmoothFill(), config=PIPELINE) as viewer:
+        page = browser.new_page()
+        page.goto(viewer.address)
+        canvas = page.locator("#picture")
+        canvas.and_(page.locator("[data-drawn]")).wait_for(timeout=1000 * SCREENSHOT_S)
+        viewer.show(azimuth=123.0, time=2, mode="rendered")
+        checked = page.locator("#modes [aria-checked=true]")
+        page.wait_for_url("**/*pose=123*", timeout=1000 * SCREENSHOT_S)
+        page.locator("#picture[data-drawn='2']").wait_for(timeout=1000 * SCREENSHOT_S)
+        assert checked.inner_text() == "Rendered" and "time=2" in page.url
+        page.close()

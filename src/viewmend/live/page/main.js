@@ -29,7 +29,7 @@ import { contained, lensOf, resize, sharpSide, sizeFor } from "./view/lens.js";
 import { degrees } from "./view/matrix.js";
 import { Motion } from "./view/motion.js";
 import { Place, poseOf, poseText, timeOf } from "./view/url_state.js";
-import { extrinsicsOf, eyeOf } from "./view/pose.js";
+import { extrinsicsOf, eyeOf, poseOfCamera } from "./view/pose.js";
 import { Pace, Resolution } from "./draw/resolution.js";
 
 const query = new URLSearchParams(location.search);
@@ -118,6 +118,18 @@ class Page {
     this.wake();
   }
 
+  /** What the server's program wants to be seen. @param {{pose?: any, time?: number, mode?: string}} view */
+  show({ pose, time, mode }) {
+    const { motion, transport, settings } = this;
+    if (pose && motion.rig) {
+      const { fov } = motion.goal ?? motion.home();
+      motion.jump(pose.R ? poseOfCamera(motion.rig, pose, motion.rig.center, fov) : { ...motion.home(), ...motion.goal, roll: 0, ...pose });
+    }
+    if (time !== undefined) transport.pauseAt(time);
+    if (mode) settings.set("mode", mode, false);
+    this.wake();
+  }
+
   /** Turn about the surface that is seen there. @param {number} x CSS pixels @param {number} y */
   focus(x, y) {
     const [viewer, { goal }] = [this.viewer(), this.motion];
@@ -163,6 +175,7 @@ class Page {
       this.notices.source(state);
       this.wake();
     });
+    on(this.link, "show", (view) => this.show(view));
     on(this.assets, "change", () => this.wake());
     on(this.assets, "dropped", (frame) => {
       if (this.drawn === frame) this.drawn = null;

@@ -100,13 +100,17 @@ export class Transport {
     this.#tell({ seek: time });
   }
 
+  /** @param {number} time */
+  pauseAt(time) {
+    this.sought = time;
+    this.#tell({ playing: false, seek: time });
+  }
+
   /** @param {number} frames */
   step(frames) {
     if (!this.state) return;
     const time = this.state.playing || this.sought < 0 ? this.shown : this.sought;
-    const next = Math.min(this.state.end - 1, Math.max(this.state.first, time + frames));
-    this.sought = next;
-    this.#tell({ playing: false, seek: next });
+    this.pauseAt(this.#within(time + frames));
   }
 
   live() {

@@ -1,0 +1,57 @@
+"""The server from Python: an address, what pages show, and an end; and the command that opens a browser."""
+
+import json
+import urllib.error
+import urllib.request
+
+import pytest
+from live.live_servers import CAMERAS, PIPELINE, get, say_hello
+from reference.ball import BallCapture
+from websockets.sync.client import connect
+
+from viewmend import serve
+from viewmend.cli import main, view
+from viewmend.data.native_writer import write_capture
+from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.live.viewer import Viewer
+from viewmend.models.smooth_fill import SmoothFill
+
+TOKEN = "a token of a test, long enough"
+
+
+def messages(socket, kind):
+    """The messages of a kind, as they come."""
+    while True:
+        message = socket.recv(timeout=60)
+        if isinstance(message, str) and json.loads(message)["type"] == kind:
+            yield json.loads(message)
+
+
+def test_pages_show_what_the_program_wants():
+    with serve(BallCapture(CAMERAS, 3), SmoothFill(), token=TOKEN, config=PIPELINE) as viewer:
+        address, _, query = viewer.address.partition("/?")
+        assert query == "token=" + TOKEN.replace(" ", "%20").replace(",", "%2C")
+        assert get(address + "/health")[0] == 401 and get(f"{address}/health?{query}")[0] in (200, 503)
+        viewer.show(azimuth=30.0, mode="rendered")
+        with connect(f"{address.replace('http', 'ws')}/ws?{query}", max_size=None) as socket:
+            assert say_hello(socket)["model"] == "SmoothFill"
+            shown = messages(socket, "show")
+            assert next(shown) == {"type": "show", "pose": {"azimuth": 30.0}, "mode": "rendered"}, "it was shown before"
+            viewer.show(camera=CAMERAS[2], time=1)
+            later = next(shown)
+            assert later["time"] == 1 and len(later["pose"]["R"]) == 9 and len(later["pose"]["T"]) == 3
+        for wrong in ({"mode": "nice"}, {"elevation": 100.0}, {"azimuth": 1.0, "camera": CAMERAS}, {"time": -1}):
+            with pytest.raises(ValueError, match="expected"):
+                viewer.show(**wrong)
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(address, timeout=5)
+
+
+def test_the_command_opens_a_browser(monkeypatch, tmp_path, capsys):
+    seen = {}
+    monkeypatch.setattr(view.webbrowser, "open", lambda address: seen.update(address=address) is None)
+    monkeypatch.setattr(Viewer, "wait", lambda self: seen.update(page=get(self.address)[2]))
+    write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), tmp_path / "capture")
+    assert main(["view", str(tmp_path / "capture"), "--model", "telea"]) == 0
+    assert b"viewmend live" in seen["page"] and seen["address"] in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "none")]) == 2
