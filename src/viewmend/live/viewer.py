@@ -1,19 +1,18 @@
 """The live server from Python: a script or a notebook starts it, and says what its pages show."""
 
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.data.source import CaptureSource
 from viewmend.geometry.cameras import Cameras
 from viewmend.live.frame_source import RecordedSource
-from viewmend.live.listener import Server
 from viewmend.live.poses import cameras_json
 from viewmend.live.protocol import show_json, token_query
 from viewmend.live.renderer import Renderer
-from viewmend.live.server import LiveServer, ServerConfig
-from viewmend.live.service import RenderService
 from viewmend.models.base import Inpainter
 from viewmend.models.registry import default_method, error_model_for, make_method
 from viewmend.stream import StreamConfig
@@ -32,13 +31,14 @@ class Viewer:
         'Viewer'
     """
 
-    def __init__(self, live: LiveServer, config: ServerConfig) -> None:
-        """Start; OSError if the port is in use."""
-        self._live, self._server, self._stack = live, Server(live, config), ExitStack()
-        address = self._stack.enter_context(self._server.bind())
-        self.address = f"{address}/{token_query(config.token)}"
+    def __init__(
+        self, address: str, show: Callable[[dict[str, Any]], None], run: Callable[[], None], stop: Callable[[], None]
+    ) -> None:
+        """Start `run`, which returns after `stop`; `show` sends a message to all pages."""
+        self.address = address
         """What a browser opens, with the token if there is one."""
-        self._thread = threading.Thread(target=self._server.run, name="server", daemon=True)
+        self._show, self._stop = show, stop
+        self._thread = threading.Thread(target=run, name="server", daemon=True)
         self._thread.start()
 
     def show(
@@ -72,7 +72,7 @@ class Viewer:
             raise ValueError(f"expected a camera or {', '.join(given)}, got both; give one of them")
         if camera is not None:
             given = {name: cameras_json(camera)[0][name] for name in ("R", "T")}
-        self._live.registry.show(show_json(pose=given or None, time=time, mode=mode))
+        self._show(show_json(pose=given or None, time=time, mode=mode))
 
     def wait(self) -> None:
         """Return once the server has stopped: by `close`, on another thread."""
@@ -81,9 +81,8 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the server."""
-        self._server.stop()
+        self._stop()
         self._thread.join(STOP_S)
-        self._stack.close()
 
     def __enter__(self) -> "Viewer":
         return self
@@ -102,7 +101,6 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 0,
     token: str | None = None,
-    fps: float | None = None,
     budget_ms: float | None = 100.0,
     config: StreamConfig | None = None,
     device: str = "cpu",
@@ -115,7 +113,6 @@ def serve(
         host: address to bind to; one that other machines can reach needs a token.
         port: 0 takes a free one.
         token: at least 16 characters, if there is one.
-        fps: frames per second; by default those of the capture.
         budget_ms: time that a view may take; None: always full quality.
         config: parameters of geometry, rendering and memory.
         device: cpu or cuda.
@@ -136,7 +133,24 @@ def serve(
     opened = prepare(open_masked(capture)) if isinstance(capture, Path | str) else capture
     name = model if isinstance(model, str) else default_method() if model is None else type(model).__name__
     inpainter = model if isinstance(model, Inpainter) else make_method(name, device)
-    source = RecordedSource(lambda: opened, fps)
+    source = RecordedSource(lambda: opened)
     renderer = Renderer(source, inpainter, config, device, error_model_for(inpainter, device))
-    settings = ServerConfig(host=host, port=port, token=token, budget_ms=budget_ms, model=name)
-    return Viewer(LiveServer(RenderService(renderer, source), settings), settings)
+    return _start(renderer, source, host=host, port=port, token=token, budget_ms=budget_ms, model=name)
+
+
+def _start(renderer: Renderer, source: RecordedSource, **address: Any) -> Viewer:
+    """Serve on a thread; the other arguments are those of `ServerConfig`."""
+    from viewmend.live.listener import Server
+    from viewmend.live.server import LiveServer, ServerConfig
+    from viewmend.live.service import RenderService
+
+    settings = ServerConfig(**address)
+    live, stack = LiveServer(RenderService(renderer, source), settings), ExitStack()
+    server = Server(live, settings)
+    bound = stack.enter_context(server.bind())
+
+    def run() -> None:
+        with stack:
+            server.run()
+
+    return Viewer(f"{bound}/{token_query(settings.token)}", live.registry.show, run, server.stop)
