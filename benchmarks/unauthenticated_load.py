@@ -16,6 +16,7 @@ UPGRADE = "GET {} HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnectio
 KEYS = "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n"
 WRONG = UPGRADE.format("/ws?token=wrong", KEYS).encode()
 POST = "POST /path.mp4{} HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+ASSET = "GET /assets/0?without=cam{:02}{} HTTP/1.1\r\nHost: localhost\r\n\r\n"
 PAGE = b"GET /page/main.js HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
@@ -42,6 +43,8 @@ KINDS = {
     "trailers": Kind(POST.format("").encode() + b"0\r\n", b"a: b\r\n" * 10_000),
     "a head without end": Kind(b"GET / HTTP/1.1\r\n", b"a: b\r\n" * 10_000),
     "blank lines": Kind(b"\r\n", b"\r\n" * 40_000),
+    "assets without a token": Kind(*["".join(ASSET.format(n, "") for n in range(8)).encode()] * 2),
+    "assets, a wrong token": Kind(*["".join(ASSET.format(n, "&token=wrong") for n in range(8)).encode()] * 2),
     "requests one after the other": Kind(PAGE, PAGE * 100),
     "a slow body": Kind(
         POST.format("").replace("Transfer-Encoding: chunked", "Content-Length: 900000").encode() + b"{"

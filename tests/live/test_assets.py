@@ -157,6 +157,8 @@ def test_memory_is_bounded_and_the_last_used_is_kept():
         for index in range(1, 30):
             await store.get(index, "a")
             assert await store.get(0, "a") is first
+            assert await store.get(0, "a", (f"cam{index}",)) is not first, "without a camera"
+            assert await store.get(0, "a") is first
             assert store.size_bytes == sum(made.size_bytes for made in store._kept.values()) <= 1_000_000
         assert await store.get(0, "b") is not first, "another rig has other frames"
         assert store.size_bytes == 400_000 and not store._making
