@@ -45,7 +45,7 @@ def view(browser, served, request) -> Iterator[View]:
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-    page.goto(f"{served.url}?side=256&sharp=0")
+    page.goto(f"{served.url}?side=256&sharp=0&render=server")  # its pictures are what these tests are about
     page.wait_for_selector("#picture[data-frame]", timeout=120_000)
     page.locator("#play").click()
     one = View(page, served, errors)
