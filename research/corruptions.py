@@ -10,12 +10,14 @@ of the camera nearest to the corrupted one is rendered from the others and compa
 import argparse
 import logging
 import math
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 from corruptions_lib import MIDDLE, corrupt
 from measure import write
 
@@ -48,7 +50,7 @@ class Outcome:
     what: str
     camera: str
     kind: str
-    """'refused', 'named', 'misnamed' (a warning about another camera), 'harmless' or 'silent'."""
+    """'refused', 'named', 'misnamed' (about another camera or cause; also refusals), 'harmless' or 'silent'."""
     said: str
     loss_db: float | None
 
@@ -67,7 +69,7 @@ class Judge:
 
     def outcome(self, seed: int) -> Outcome:
         with tempfile.TemporaryDirectory() as place:
-            what, camera = corrupt(self.good, Path(place) / self.good.name, seed)
+            what, camera, cause = corrupt(self.good, Path(place) / self.good.name, seed)
             held = self._neighbour(camera)
             if held not in self._scores:
                 self._scores[held] = self._score(self.good, held, [])
@@ -75,12 +77,14 @@ class Judge:
             try:
                 score = self._score(Path(place) / self.good.name, held, said)
             except ValueError as error:
-                return Outcome(seed, what, camera, "refused", str(error), None)
+                kind = "refused" if re.search(cause, str(error)) else "misnamed"
+                return Outcome(seed, what, camera, kind, str(error), None)
         loss = self._scores[held] - score
         kind = "harmless" if loss < LEAST_LOSS_DB else "silent"
         if said:
             whole = any(word in what for word in ("all", "two cameras", "metres_per_unit", "convention"))
-            kind = "named" if whole or camera in " ".join(said) else "misnamed"
+            place = any((whole or camera in text) and re.search(cause, text) for text in said)
+            kind = "named" if place else "misnamed"
         return Outcome(seed, what, camera, kind, "; ".join(said), loss)
 
     def _neighbour(self, camera: str) -> str:
@@ -120,7 +124,7 @@ class Judge:
 def good_capture(name: str, folder: Path) -> Path:
     """A studio capture, or a small part of a real one."""
     if name == "studio":
-        source = Studio(StudioConfig(seed=10002, cameras=8, frames=10, fps=15, size_px=256, background="stage"))
+        source = Studio(StudioConfig(seed=10002, cameras=8, frames=10, fps=15, size_px=192, background="stage"))
     else:
         opened = open_capture(name)
         opened = open_capture(name, opened.cameras.names[:: -(-len(opened.cameras) // MOST_CAMERAS)])
@@ -128,6 +132,8 @@ def good_capture(name: str, folder: Path) -> Path:
             opened, times=range(min(len(opened.frame_ids), 10)), scale=LONGEST_PX / max(opened.cameras.max_size_px)
         )
     write_capture(source, folder / "good", images="png")
+    for file in (folder / "good/mask").glob("*/*.png"):  # two levels, as in masks of other tools
+        cv2.imwrite(str(file), 255 * (cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) > 127).astype("uint8"))
     return folder / "good"
 
 

@@ -4,6 +4,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -259,22 +260,128 @@ def late(s: Corruption) -> str:
     return f"{which} of one camera late by {frames} frames"
 
 
+def film(path: Path, files: list[Path], fps: int, times: list[int]) -> None:
+    """Write images as a film; `times` are their times in frames."""
+    import av
+
+    path.parent.mkdir(exist_ok=True)
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("libx264", rate=fps)
+        stream.height, stream.width = cv2.imread(str(files[0])).shape[:2]
+        stream.pix_fmt, stream.options = "yuv444p", {"crf": "4", "preset": "veryfast"}
+        stream.codec_context.time_base = Fraction(1, fps)
+        for time, file in zip(times, files, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(cv2.imread(str(file))[..., ::-1]), "rgb24")
+            frame.pts, frame.time_base = time, Fraction(1, fps)
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+
+
+def films(s: Corruption) -> str:
+    """Store all images and masks as films, some of them with a fault."""
+    fps, count = round(s.description.get("fps") or 15), len(s.description["frames"])
+    lost = int(s.rng.integers(1, count - 4))
+    kept = [time for time in range(count) if time not in (lost, lost + 1)]
+    one, half = [s.one["name"]], [camera["name"] for camera in s.cameras[::2]]
+    faults = {
+        "pictures lost": (one, ("image", "mask"), kept, kept),
+        "pictures lost, without a trace in the times": (one, ("image", "mask"), kept, list(range(len(kept)))),
+        "half the rate": (one, ("image", "mask"), list(range(0, count, 2)), list(range(0, count, 2))),
+        "half the rate, half of all cameras": (half, ("image", "mask"), list(range(0, count, 2)), None),
+        "masks at half the rate": (one, ("mask",), list(range(0, count, 2)), list(range(0, count, 2))),
+        "masks end early": (one, ("mask",), list(range(count - 3)), list(range(count - 3))),
+        "starts two frames later": (one, ("image", "mask"), list(range(2, count)), list(range(2, count))),
+        "masks lost, without a trace in the times": (one, ("mask",), kept, list(range(len(kept)))),
+    }
+    name = str(s.rng.choice(list(faults)))
+    cameras, streams, frames, times = faults[name]
+    for camera in s.cameras:
+        camera.pop("depth", None)
+        for stream in ("image", "mask"):
+            bad = camera["name"] in cameras and stream in streams
+            own, rate = (frames, fps if times else fps // 2) if bad else (list(range(count)), fps)
+            files = s.files(stream, camera)
+            place = f"films/{stream}_{camera['name']}.mp4"
+            film(s.folder / place, [files[n] for n in own], rate, (times or list(range(len(own)))) if bad else own)
+            camera["video" if stream == "image" else "mask"] = place
+        del camera["image"]
+    return f"film: {name}{' (all)' if cameras == half else ''}"
+
+
+def mask_files(s: Corruption) -> str:
+    """Write masks as other tools do; all of these mean the same."""
+    from PIL import Image
+
+    def palette(inside: np.ndarray) -> Image.Image:
+        image = Image.fromarray(inside.astype(np.uint8) * 3, "P")
+        image.putpalette([*(0, 0, 0), *(90, 0, 0), *(0, 90, 0), *(int(n) for n in s.rng.integers(0, 256, 3))])
+        return image
+
+    changes: dict[str, Callable[[np.ndarray], Any]] = {
+        "a palette": palette,
+        "1 bit": lambda inside: Image.fromarray(inside),
+        "16 bit": lambda inside: Image.fromarray((inside * 65535).astype(np.uint16)),
+        "labels of 16 bit": lambda inside: Image.fromarray((inside * 7).astype(np.uint16)),
+        "0 and 1": lambda inside: Image.fromarray(inside.astype(np.uint8)),
+        "dark red": lambda inside: Image.fromarray((inside[..., None] * [128, 0, 0]).astype(np.uint8)),
+        "grey and alpha": lambda inside: Image.fromarray(
+            np.dstack([0 * inside + 255, inside * 255]).astype(np.uint8), "LA"
+        ),
+    }
+    name = str(s.rng.choice(list(changes)))
+    every = bool(s.rng.random() < 0.7)
+    for camera in s.cameras if every else [s.one]:
+        for file in s.files("mask", camera):
+            changes[name](cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) > 127).save(file)
+    return f"mask files: {name}, {'all' if every else 'one camera'}"
+
+
+def file_names(s: Corruption) -> str:
+    """Files of file managers, or paths of Windows: no fault."""
+    if s.rng.random() < 0.5:
+        for camera in s.cameras:
+            camera["image"] = camera["image"].replace("/", "\\")
+        return "paths with backslashes (all)"
+    for place in {file.parent for camera in s.cameras for file in s.files("image", camera)} | {s.folder}:
+        for junk in ("._000.png", ".DS_Store", "Thumbs.db"):
+            (place / junk).write_bytes(b"\0\5\26\7")
+    return "files of file managers (all)"
+
+
+CALIBRATION = (
+    r"calibration|camera_from_world|camera-to-world|OpenGL|axes|rotation|principal|\bK\b|focal|unit|distortion"
+)
+CAUSES: dict[Callable[[Corruption], str], str] = {
+    poses: CALIBRATION, unit: rf"metres|{CALIBRATION}", turned: CALIBRATION, displaced: CALIBRATION,
+    focal: CALIBRATION, centre: rf"first_pixel|{CALIBRATION}", pixel_centre: "first_pixel|principal",
+    distortion: CALIBRATION, exchanged: r"exchang|swap|match|its mask|calibration", damaged_json: ".",
+    damaged_file: "file|image|mask|pixels", exif: "EXIF|rotat|upright|upside|turned|pixels",
+    picture: "images|exposure|colour", mask: "mask", late: "late|early|synchronis|out of step|lost",
+    films: "frames per second|lack|start|end |late|early|lost|synchronis|other times|common times|absent",
+    mask_files: "mask|label", file_names: "path|file",
+}  # fmt: skip
+"""What messages about each kind say if they name the true cause."""
+
 KINDS = (
     poses, poses, unit, turned, displaced, focal, centre, pixel_centre, distortion, exchanged, exchanged,
-    damaged_json, damaged_file, exif, exif, picture, picture, mask, mask, mask, late, late,
+    damaged_json, damaged_file, exif, picture, picture, mask, mask, mask, late, late,
+    films, films, films, films, mask_files, mask_files, file_names,
 )  # fmt: skip
+ONE_FRAME = (late, films)
+"""Kinds that need several frames."""
 
 
 def _time(s: Corruption) -> int:
     return int(MIDDLE * len(s.description["frames"]))
 
 
-def corrupt(good: Path, folder: Path, seed: int) -> tuple[str, str]:
-    """Copy a capture with one random mistake; a description of it, and the name of the affected camera."""
+def corrupt(good: Path, folder: Path, seed: int) -> tuple[str, str, str]:
+    """Copy a capture with one random mistake; its description, the camera's name, and the pattern of its cause."""
     shutil.copytree(good, folder)
     copy = Corruption(folder, np.random.default_rng(seed))
-    kinds = [kind for kind in KINDS if len(copy.description["frames"]) > 1 or kind is not late]
-    what = kinds[int(copy.rng.integers(len(kinds)))](copy)
+    kinds = [kind for kind in KINDS if len(copy.description["frames"]) > 1 or kind not in ONE_FRAME]
+    kind = kinds[int(copy.rng.integers(len(kinds)))]
     name = copy.one.get("name", "")
+    what = kind(copy)
     copy.save()
-    return what, name
+    return what, name, CAUSES[kind]

@@ -10,6 +10,8 @@ import torch
 
 from viewmend.cli import main
 from viewmend.cli.checks import chosen_times
+from viewmend.data.native_capture import open_capture
+from viewmend.data.prepare import adjustments
 
 
 @pytest.mark.parametrize(
@@ -140,6 +142,15 @@ def test_one_wrong_mask_does_not_shift_the_rig(folder, tmp_path, mend, caplog):
     cv2.imwrite(str(mask), np.zeros_like(cv2.imread(str(mask), 0)))
     _, _, said = mend(spoiled, tmp_path / "out", "--leave-out", "held", "--frames", "0:1")
     assert "principal points" not in said and "camera 'c5': its mask is empty" in caplog.text
+
+
+def test_check_says_what_mend_would_change(folder, shifted, capsys):
+    (change,) = adjustments(open_capture(shifted), open_capture(shifted).read(0))
+    assert "principal points moved by (-" in change
+    for capture, said in ((shifted, True), (folder, False)):
+        assert main(["check", str(capture)]) == 0
+        words = capsys.readouterr().out
+        assert (change in words) == ("mend, serve and evaluate change:" in words) == said
 
 
 def test_a_shift_of_all_images_is_said_and_undone(folder, shifted, tmp_path, mend):

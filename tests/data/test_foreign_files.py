@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from reference.films import write_film
 from reference.foreign_formats import write_colmap, write_easymocap, write_transforms
+from reference.foreign_rigs import write_toml
 from reference.random_rigs import opencv, random_rig, write_images
 
 from viewmend.data.errors import CaptureError
@@ -42,13 +44,16 @@ def as_written(kind, inside):
         "0 and 1 in 16 bit": inside.astype(np.uint16),
         "indices in 16 bit": np.array([0, 1001, 1002], np.uint16)[label],
         "two levels": Image.fromarray(inside),
+        "colours of 16 bit": np.repeat(65535 * inside.astype(np.uint16)[..., None], 3, 2),
+        "a palette of 1 bit": palette((label > 0).astype(np.uint8), [[40, 40, 90], [10, 200, 10]]),
+        "grey and alpha": Image.fromarray(np.dstack([0 * label + 255, 255 * inside]).astype(np.uint8), "LA"),
     }[kind]
 
 
 KINDS = [
     *("0 and 1", "0 and 128", "indices", "a palette", "a palette with white as background", "a palette of greys"),
     *("a palette with the object in black", "dark red", "several colours", "16 bit", "0 and 1 in 16 bit"),
-    *("indices in 16 bit", "two levels"),
+    *("indices in 16 bit", "two levels", "colours of 16 bit", "a palette of 1 bit", "grey and alpha"),
 ]
 
 
@@ -57,7 +62,8 @@ def test_masks_mean_the_same(plain, kind):
     expected = open_capture(plain.path).read(0).mask
     for view, name in enumerate("abcd"):
         file, image = plain.path / f"masks/{name}_000.png", as_written(kind, (expected[view] > 0).numpy())
-        image.save(file) if isinstance(image, Image.Image) else cv2.imwrite(str(file), image)
+        bits = {"bits": 1} if kind == "a palette of 1 bit" else {}
+        image.save(file, **bits) if isinstance(image, Image.Image) else cv2.imwrite(str(file), image)
     assert torch.equal(open_capture(plain.path).read(0).mask, expected)
 
 
@@ -70,8 +76,12 @@ def test_labels_are_mentioned_once_and_faint_masks_are_no_labels(plain, caplog):
     assert [record.message for record in caplog.records] == [
         "ball: masks have no values above 1: they are read as labels, with 0 as background"
     ]
-    plain.put("masks/b_000.png", np.full((32, 40), 255, np.uint8))  # so that 1 is nearly transparent
-    assert set(open_capture(plain.path).read(0).mask[0].unique().tolist()) == {0, 1}
+    plain.put("masks/b_000.png", np.full((32, 40), 255, np.uint8))
+    caplog.clear()
+    assert set(open_capture(plain.path).read(0).mask[0].unique().tolist()) == {0, 255}
+    assert "masks of a, c, d have no values above 1" in caplog.text
+    plain.put("masks/a_000.png", np.eye(32, 40, dtype=np.uint8) // np.arange(1, 41, dtype=np.uint8))  # one faint pixel
+    assert open_capture(plain.path).read(0).mask[0].max() == 1
 
 
 def blender(folder, pictures):
@@ -271,6 +281,56 @@ def test_numbers_that_begin_elsewhere_are_mentioned(tmp_path, caplog):
     mocap(tmp_path / "b", [["0", "1", "2", "3"], ["1", "2", "3"], ["0", "1", "2", "3"]])  # the first image is missing
     open_capture(tmp_path / "b")
     assert not caplog.records
+
+
+def test_images_with_other_names_are_mentioned(tmp_path, caplog):
+    """Such as times in seconds, whose fractions alone differ."""
+    mocap(tmp_path, [["1700000000.033", "1700000000.066", "1700000001.000"]] * 3)
+    assert open_capture(tmp_path).frame_ids == ("033", "066")
+    (said,) = [record.message for record in caplog.records]
+    assert ": 1 of 3, such as 1700000001.000.png, are ignored, as their names differ from the others' in more" in said
+
+
+def test_names_with_a_number_and_a_time_are_refused(tmp_path):
+    mocap(
+        tmp_path, [[f"frame_{time:06d}_{1700000000000 + 33 * time + camera}" for time in range(4)] for camera in (0, 1)]
+    )
+    with pytest.raises(CaptureError, match="whose names differ in one number, got frame_000001_1700000000033"):
+        open_capture(tmp_path)
+
+
+# Folders of tools.
+
+
+def rig_with_films(folder, name):
+    """A rig of three cameras with a film of each in a folder."""
+    rig = [camera | {"width": 64, "height": 48, "name": f"cam{n}"} for n, camera in enumerate(random_rig(7, 3))]
+    for number in range(3):
+        write_film(folder / f"{name.format(number)}.mp4", [np.full((48, 64, 3), 9, np.uint8)] * 3)
+    return opencv(rig)
+
+
+@pytest.mark.parametrize("calibration", ["Calibration", "../calibration"])
+def test_a_trial_of_pose2sim_is_opened_and_its_session_refused(tmp_path, calibration):
+    session = tmp_path / "participant/S01"
+    rig_with_films(session / "Trial_2/videos", "cam{}")
+    rig = rig_with_films(session / "Trial_1/videos", "cam{}")
+    write_toml(session / calibration / "Calib_scene.toml", rig)
+    (session / "Config.toml").write_text("[project]\nframe_rate = 60\n")
+    capture = open_capture(session / "Trial_1")
+    assert len(capture.cameras) == len(capture.frame_ids) == 3 and capture.metres_per_unit == 1
+    if calibration == "Calibration":
+        with pytest.raises(CaptureError, match="got a folder with Trial_1, Trial_2; open one of these"):
+            open_capture(session)
+
+
+def test_a_recording_of_freemocap_is_opened(tmp_path):
+    rig = rig_with_films(tmp_path / "synchronized_videos", "Camera_{:03d}_synchronized")
+    rig_with_films(tmp_path / "annotated_videos", "Camera_{:03d}_synchronized_mediapipe")
+    (tmp_path / "output_data").mkdir()
+    write_toml(tmp_path / "recording_camera_calibration.toml", rig, "aniposelib")
+    capture = open_capture(tmp_path)
+    assert capture.metres_per_unit == 0.001 and len(capture.cameras) == len(capture.frame_ids) == 3
 
 
 def test_a_pattern_has_all_digits_of_the_frame():

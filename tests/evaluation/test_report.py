@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from viewmend.evaluation.report import main_grid, make_report, markdown, report_csv, report_json
+from viewmend.evaluation.report import main_grid, make_report, markdown, report_csv, report_json, summary
 from viewmend.evaluation.report_page import Point, largest_hole, page, scene_video, trade_off, write_sheets
 from viewmend.evaluation.result_cache import CellStore
 from viewmend.evaluation.runner import run_evaluation
@@ -51,6 +51,14 @@ def test_every_format_has_the_same_figures(evaluated):
     rows = {row["method"]: row["scores"]["psnr_holes"] for row in value["tables"][1]["rows"][:2]}
     assert rows == {c["method"]: c["psnr_holes"] for c in value["cells"][:2]}, "a set of one scene"
     assert "2 frames of 96 x 96" in text and value["missing"] == {"dstt-o-def": "no weights & none"}
+
+
+def test_a_model_made_for_another_background_is_named(evaluated):
+    _, cells, _ = evaluated
+    for background, said in (("black", True), ("white", False)):
+        report = make_report(cells, ("telea", "paper-small"), RunSettings(background=background))
+        for text in (summary(report), markdown(report)):
+            assert ("another background than black, on which they score lower: paper-small (white)" in text) == said
 
 
 def test_failures_and_missing_methods_are_in_every_format(evaluated):

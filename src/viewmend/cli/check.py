@@ -49,8 +49,8 @@ def run(options: Options) -> int:
         _try_model(options.target)
         lines = _model_as_text(description)
     else:
-        capture, check = _check_capture(options)
-        description = describe_capture(capture, check)
+        capture, check, changes = _check_capture(options)
+        description = describe_capture(capture, check) | {"adjustments": list(changes)}
         lines = _capture_as_text(description)
     if options.json:
         print_json(description)
@@ -105,12 +105,14 @@ FEW_CAMERAS, WIDE_DEG = 6, 60.0
 """With fewer cameras, or larger angles between neighbours, artefacts are expected."""
 
 
-def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck]":
+def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, tuple[str, ...]]":
+    """The capture, what is wrong with it, and what `mend` would change."""
     from viewmend.cli.console import busy, say
     from viewmend.data.checks.calibration import check_calibration, draw_check
     from viewmend.data.checks.synchronisation import find_desynchronised_cameras
     from viewmend.data.images import write_image
     from viewmend.data.native_capture import NativeCapture
+    from viewmend.data.prepare import adjustments
     from viewmend.utils.atomic_writes import remove_partial_file
 
     capture = NativeCapture(Path(options.target), format=options.format)
@@ -123,12 +125,13 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck]"
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
         check = replace(check, issues=(*capture.issues, *check.issues, *late))
+        changes = () if fatal or len(good.cameras) < 2 else adjustments(capture, good)
     if options.out is not None:
         remove_partial_file(options.out)
         with busy("drawing the picture"):
             write_image(options.out, draw_check(check, capture.up))
         say(f"wrote {options.out}")
-    return capture, check
+    return capture, check, changes
 
 
 def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dict[str, Any]:
@@ -227,6 +230,8 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         lines += [f"  {camera['name']:<{width}}  {_film_as_text(film)}" for film in camera["films"]]
     if capture["findings"]:
         lines += ["", "  issues:", *(f"  - {text}" for text in capture["findings"])]
+    if capture["adjustments"]:
+        lines += ["", "  mend, serve and evaluate change:", *(f"  - {text}" for text in capture["adjustments"])]
     return lines
 
 

@@ -117,7 +117,7 @@ def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
 
     data = _read_file(path, where)
     mask = _decode(data, where, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if mask.dtype == np.uint16 and mask.ndim == 2:
+    if mask.dtype == np.uint16:
         mask = _from_16_bit(mask)
     if mask.dtype != np.uint8:
         raise CaptureError(f"{where}: expected an 8-bit mask, got {mask.dtype}; write it as 8-bit PNG")
@@ -128,11 +128,11 @@ def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
     return to_mask(mask)
 
 
-def _from_16_bit(mask: UInt16[np.ndarray, "height width"]) -> np.ndarray:
+def _from_16_bit(mask: UInt16[np.ndarray, "height width *channel"]) -> np.ndarray:
     """The mask in 8 bit, if its meaning is clear: 8 bits stored as 16, labels, or the full range."""
     if mask.max() <= 255:
         return mask.astype(np.uint8)
-    if len(np.unique(mask)) <= MAX_LABELS:
+    if mask.ndim == 2 and len(np.unique(mask)) <= MAX_LABELS:
         return 255 * (mask > 0).astype(np.uint8)
     return (mask >> 8).astype(np.uint8) if mask.max() >= FULL_16_BIT else mask
 

@@ -39,6 +39,8 @@ from viewmend.types import MultiViewFrame
 
 OPAQUE = 250
 """Masks of which none reaches this value hold labels if their values are few."""
+LEAST_LABELLED = 0.005
+"""A single mask holds labels if at least this share of it is 1, and nothing is above."""
 
 
 def open_capture(
@@ -120,7 +122,8 @@ class NativeCapture:
         self._readers = tuple(CameraReader(folder, camera, self.frame_ids, self.clock) for camera in self._entries)
         self.present = self._find_files()
         """Whether each camera has its files in each frame."""
-        self._masks_are_opaque = self._warned_of_labels = False
+        self._masks_are_opaque = False
+        self._warned_of_labels: set[str] = set()
 
     @property
     def gaps(self) -> tuple[tuple[str, str], ...]:
@@ -158,7 +161,7 @@ class NativeCapture:
         if not views:
             raise CaptureError(f"{self.folder}: frame '{frame_id}': expected a frame in one film or more, got none")
         frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
-        if frame.mask is not None and not self._masks_are_opaque:
+        if frame.mask is not None:
             frame = self._from_labels(frame)
         if frame.mask is not None and (highest := int(frame.mask.max())) <= FOREGROUND:
             camera = self._entries[views[0]]
@@ -179,18 +182,32 @@ class NativeCapture:
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
 
     def _from_labels(self, frame: MultiViewFrame) -> MultiViewFrame:
-        """The frame with labels in its masks as 255, if no mask so far had an opaque pixel and values are few."""
+        """The frame with labels in its masks as 255.
+
+        Masks hold labels if no mask so far had an opaque pixel and values are few. So does one of 0 and 1 alone, unless
+        its ones are few: they may be nearly transparent.
+        """
         assert frame.mask is not None
-        values = torch.bincount(frame.mask.flatten(), minlength=256).nonzero().flatten().tolist()
-        self._masks_are_opaque = values[-1] >= OPAQUE
-        if self._masks_are_opaque or values == [0] or len(values) > MAX_LABELS:
+        highest = frame.mask.flatten(1).amax(1)
+        self._masks_are_opaque = self._masks_are_opaque or int(highest.max()) >= OPAQUE
+        if self._masks_are_opaque:
+            least = LEAST_LABELLED * frame.mask[0].numel()
+            views = [v for v, top in enumerate(highest.tolist()) if top == 1 and frame.mask[v].count_nonzero() > least]
+            whose = f"masks of {', '.join(frame.cameras.names[view] for view in views)}"
+        else:
+            few = len(torch.bincount(frame.mask.flatten(), minlength=256).nonzero()) <= MAX_LABELS
+            views, whose = (list(range(len(highest))) if few and bool(highest.any()) else []), "masks"
+        if not views:
             return frame
-        if not self._warned_of_labels:
-            self._warned_of_labels = True
+        if whose not in self._warned_of_labels:
+            self._warned_of_labels.add(whose)
+            above = int(highest[views].max())
             logging.getLogger("viewmend").warning(
-                f"{self.name}: masks have no values above {values[-1]}: they are read as labels, with 0 as background"
+                f"{self.name}: {whose} have no values above {above}: they are read as labels, with 0 as background"
             )
-        return replace(frame, mask=255 * (frame.mask > 0).to(torch.uint8))
+        mask = frame.mask.clone()
+        mask[views] = 255 * (mask[views] > 0).to(torch.uint8)
+        return replace(frame, mask=mask)
 
     def _warn_of_rotation(self) -> None:
         rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]

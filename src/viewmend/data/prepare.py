@@ -127,19 +127,28 @@ def prepare(
     _raise_or_warn(f"{_describe(source, names)}: frame '{source.frame_ids[frame.time]}'", issues, reported)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
     frame = frame.without([issue.camera for issue in issues if issue.camera])
-    alignment = None
     if align:
         _raise_or_warn(_describe(source, names), find_desynchronised_cameras(source, frame, last), reported)
+    prepared = PreparedCapture(source, None, longest_px, names, left_out, None, reported)
+    return _adjusted(prepared, frame, align, match_colours)
+
+
+def adjustments(source: CaptureSource, frame: MultiViewFrame) -> tuple[str, ...]:
+    """What `prepare` would change, by a frame of good cameras, in the same words."""
+    if frame.mask is None or not bool((frame.mask > 0).any()):
+        return ()
+    return _adjusted(PreparedCapture(source), frame, align=True, colours=True).changes
+
+
+def _adjusted(prepared: PreparedCapture, frame: MultiViewFrame, align: bool, colours: bool) -> PreparedCapture:
+    """The capture with the shift of all images undone, and with matched colours, as found in a frame."""
     if align and frame.mask is not None and len(frame.cameras) >= 2:
-        alignment = shared_offset(frame.mask, frame.cameras, source.bounds)
-    prepared = PreparedCapture(source, alignment, longest_px, names, left_out, None, reported)
-    return _with_matched_colours(prepared, frame) if match_colours else prepared
-
-
-def _with_matched_colours(prepared: PreparedCapture, frame: MultiViewFrame) -> PreparedCapture:
-    cameras = replace(prepared, longest_px=None).cameras.select(frame.cameras.names)
-    colours = match_colours(replace(frame, cameras=cameras), prepared.bounds)
-    return replace(prepared, colours=colours) if colours is not None and colours.helps else prepared
+        prepared = replace(prepared, alignment=shared_offset(frame.mask, frame.cameras, prepared.bounds))
+    if colours:
+        cameras = replace(prepared, longest_px=None).cameras.select(frame.cameras.names)
+        found = match_colours(replace(frame, cameras=cameras), prepared.bounds)
+        prepared = replace(prepared, colours=found if found is not None and found.helps else None)
+    return prepared
 
 
 def _describe(source: CaptureSource, inputs: Sequence[str] | None) -> str:

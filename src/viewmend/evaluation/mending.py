@@ -30,7 +30,7 @@ SLOW_MS = 10_000.0
 class Mender:
     """Completes the views of one viewer, frame by frame.
 
-    The first view is computed twice, and the second is timed, so that nothing is compiled in it.
+    The first view is computed twice (`first_twice`), and the second is timed.
     """
 
     def __init__(
@@ -59,6 +59,8 @@ class Mender:
         """Background of the output, on which it is shown and scored."""
         self.state: State | None = None
         """The viewer's state; None before the first view."""
+        self.first_twice = True
+        """Whether the first view is computed twice, so that its time has no compilation in it."""
         self._exclude, self._quality = exclude, quality
         self._protocol: Protocol = protocol
         self._scorers: Scorers | None = None
@@ -68,7 +70,7 @@ class Mender:
     def add_frame(self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None) -> CachedFrame:
         """Add a frame, with its proxy and depths if another stream computed them; `carving` as for `Stream`."""
         given = frame.frame if isinstance(frame, CachedFrame) else frame
-        if not self.stream.times:
+        if self.first_twice and not self.stream.times:
             self._warm_up = Stream(
                 self.stream.inpainter, self.stream.config, self.stream.bounds, self.stream.error_model
             )

@@ -22,7 +22,7 @@ from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import PROTOCOL, Cell
 from viewmend.evaluation.scene_run import SLOW_MS, RunSettings
 from viewmend.evaluation.scores import MIN_HOLE_PX
-from viewmend.models.registry import PRIVILEGED, REFERENCE
+from viewmend.models.registry import PRIVILEGED, REFERENCE, own_background
 from viewmend.utils.logging import printable
 
 RULES = (
@@ -59,7 +59,7 @@ RULES = (
     '"Warp" is the mean absolute difference from the previous frame warped in the same way, over the holes, in 255ths; '
     '"change" is the difference in place, over the holes of both frames. The truth is not 0 in either: see its row.',
     "Milliseconds are the inpainter's step without hull and rendering, with its caches as in production, over the "
-    "frames with holes: median and 95th percentile. The first step is run twice and the second is timed, "
+    "frames with holes: median and 95th percentile. A method's first step is run twice and the second is timed, "
     f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
 )
 """Definitions of the figures, printed with every report."""
@@ -162,11 +162,22 @@ def setting_lines(report: Report) -> list[str]:
         f"error rule {rule}; "
         f"SSIM {settings.ssim}; scored on {settings.background}."
     ]
-    return lines + [
+    return [*lines, *background_lines(report)] + [
         f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "
         f"{o.jobs} process{'es' if o.jobs > 1 else ''} of {o.threads} threads, load {o.load}."
         for o in report.origins
     ]
+
+
+def background_lines(report: Report) -> list[str]:
+    """Which models were made for another background than that of the scores."""
+    scored = report.settings.background
+    made = {name: own_background(name) for name in report.methods if name not in report.missing}
+    others = ", ".join(f"{name} ({own})" for name, own in made.items() if own not in (None, scored))
+    if not others:
+        return []
+    text = f"Made for another background than {scored}, on which they score lower: {others}"
+    return [f"{text}; see --score-background."]
 
 
 def holes_line(table: Table) -> str:
@@ -289,7 +300,7 @@ def markdown(report: Report) -> str:
 
 def summary(report: Report) -> str:
     """The main tables only, as Markdown."""
-    return "\n\n".join(_main(table) for table in report.tables) + "\n"
+    return "\n\n".join([*(_main(table) for table in report.tables), *background_lines(report)]) + "\n"
 
 
 def markdown_table(grid: Grid) -> str:

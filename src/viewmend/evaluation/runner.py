@@ -15,6 +15,7 @@ from viewmend.data.holdout.scenes import LeaveOneOutScene
 from viewmend.evaluation.provenance import provenance
 from viewmend.evaluation.result_cache import Cell, CellStore, cell_keys, method_identities, to_cells
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun, evaluate_scene
+from viewmend.models.base import Inpainter
 from viewmend.utils.logging import log_to_terminal
 from viewmend.utils.plugins import import_object
 
@@ -105,8 +106,9 @@ def _check(names: list[str], jobs: int) -> None:
 
 def _run(tasks: Sequence[Task], settings: RunSettings, jobs: int, threads: int) -> Runs:
     if jobs == 1:
+        loaded: dict[str, Inpainter] = {}
         for task in tasks:
-            yield task, evaluate_scene(task.scene, task.methods, settings)
+            yield task, evaluate_scene(task.scene, task.methods, settings, loaded)
         return
     left = list(tasks)
     try:

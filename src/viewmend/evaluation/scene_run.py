@@ -23,6 +23,7 @@ from viewmend.evaluation.video_strip import STRIP_FRAMES, Box, Picture, make_str
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.metrics.image_quality import SsimWindow
+from viewmend.models.base import Inpainter
 from viewmend.models.classical import Unfilled
 from viewmend.models.compositing import Background, composite
 from viewmend.models.registry import error_model_for, make_method
@@ -100,15 +101,22 @@ class _Frame:
     """Whether no earlier hole was as large."""
 
 
-def evaluate_scene(scene: LeaveOneOutScene, methods: Sequence[str], settings: RunSettings) -> SceneRun:
+def evaluate_scene(
+    scene: LeaveOneOutScene,
+    methods: Sequence[str],
+    settings: RunSettings,
+    loaded: dict[str, Inpainter] | None = None,
+) -> SceneRun:
     """Stream the held-out camera's view through the methods, one frame at a time, using past frames only.
 
     The result depends on the arguments only, and everything can be pickled: processes and clusters call it. An
     exception becomes the `error` of the method that raised it, or of all methods if the scene cannot be read.
+    Methods in `loaded`, which have run in this process, are neither loaded nor warmed up again; others are added.
     """
+    loaded = {} if loaded is None else loaded
     scorers = load_scorers(settings.background, settings.ssim, settings.networks, settings.device)
     shared = _SharedImages(scorers)
-    streams = [_MethodStream(name, settings, scorers) for name in methods]
+    streams = [_MethodStream(name, settings, scorers, loaded) for name in methods]
     try:
         with torch.no_grad():
             for frame in _frames(scene, settings):
@@ -171,8 +179,8 @@ class _SharedImages:
 class _MethodStream:
     """One method's stream through the scene."""
 
-    def __init__(self, method: str, settings: RunSettings, scorers: Scorers) -> None:
-        self.method = method
+    def __init__(self, method: str, settings: RunSettings, scorers: Scorers, loaded: dict[str, Inpainter]) -> None:
+        self.method, self._loaded = method, loaded
         self._settings, self._scorers = settings, scorers
         self._mender: Mender | None = None
         self._error: str | None = None
@@ -201,11 +209,16 @@ class _MethodStream:
 
     def _make(self, bounds: Bounds | None) -> Mender:
         settings = self._settings
-        inpainter = make_method(self.method, settings.device, settings.precision)
+        new = self.method not in self._loaded
+        if new:
+            self._loaded[self.method] = make_method(self.method, settings.device, settings.precision)
+        inpainter = self._loaded[self.method]
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
         error_model = error_model_for(inpainter, settings.device) if predicted else None
         config = replace(settings.stream, background=settings.background)
-        return Mender(inpainter, config, bounds, error_model=error_model)
+        mender = Mender(inpainter, config, bounds, error_model=error_model)
+        mender.first_twice = new
+        return mender
 
     def _score(self, mender: Mender, frame: _Frame) -> None:
         made = mender.view(frame.view.camera, frame.view.time, frame.view, frame.view.target_mask)

@@ -1,6 +1,7 @@
 """Inpainters by name, for all commands: `METHODS`, baselines, classes in files, and models' folders."""
 
 import hashlib
+import json
 import re
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from viewmend.models.base import Inpainter
-from viewmend.models.checkpoint import load_inpainter, shipped_models
+from viewmend.models.checkpoint import CONFIG, load_inpainter, model_folder, shipped_models
 from viewmend.utils.plugins import import_object, load_from_file
 from viewmend.utils.weight_files import MissingWeightsError
 
@@ -94,6 +95,15 @@ def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpa
 def error_model_for(inpainter: Inpainter, device: str = "cpu") -> Inpainter | None:
     """The model that predicts errors for `inpainter`: the shipped `views`; None if it predicts them itself."""
     return None if inpainter.predicts_errors else load_inpainter(ERROR_MODEL, device)
+
+
+def own_background(name: str) -> str | None:
+    """The background that a model was made for, by its config; None for one without, and for other methods."""
+    try:
+        found = json.loads((model_folder(name) / CONFIG).read_bytes())
+    except (ValueError, OSError):
+        return None
+    return found.get("background") if isinstance(found, dict) else None
 
 
 def _make(name: str, device: str, precision: str) -> object:

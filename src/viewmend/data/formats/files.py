@@ -214,6 +214,8 @@ class ImageList:
     pattern: str
     """A path with `{frame}` for the frame id."""
     frames: frozenset[str]
+    ignored: str = ""
+    """How many images have other names, and an example; empty if none has."""
 
     def first(self) -> str:
         """The path of the first image."""
@@ -251,7 +253,7 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
-    entries, frames, fps, ids = {}, set(), None, {}
+    entries, frames, fps, ids, ignored = {}, set(), None, {}, ""
     paths = {name: _only_video(folder, path) or path for name, path in paths.items()}
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
@@ -266,6 +268,10 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         entries[name] = {"width": width, "height": height, "image": images.pattern}
         frames |= images.frames
         ids[name] = images.frames
+        if images.ignored and not ignored:
+            ignored = f"{name}: {images.ignored}"
+    if ignored:
+        warn(f"images of {ignored}, are ignored, as their names differ from the others' in more than one number")
     masks = _find_masks(folder, tuple(paths))
     _compare_ids(ids | {f"{name} (masks)": found for name, (_, found) in masks.items() if found and name in ids})
     for name, (mask, _) in masks.items():
@@ -286,9 +292,18 @@ def list_images(folder: Path, place: str) -> ImageList | None:
     parts = [m.groups()[:4] if m[2] else ("", m[5], "", m[8]) for m in images]
     if not parts:
         return None
-    (before, after, suffix), _ = Counter(sorted((p[0], p[2], p[3]) for p in parts)).most_common(1)[0]
+    alike = Counter(sorted((p[0], p[2], p[3]) for p in parts))
+    (before, after, suffix), count = alike.most_common(1)[0]
+    others = ["".join(p) for p in parts if (p[0], p[2], p[3]) != (before, after, suffix)]
+    if count == 1 and len(others) > 1:
+        raise ValueError(
+            f"expected images in {place} whose names differ in one number, got {', '.join(sorted(others)[:2])}; "
+            "rename them by their frame alone"
+        )
+    ignored = f"{len(others)} of {len(parts)}, such as {others[0]}" if others else ""
     frames = frozenset(p[1] for p in parts if (p[0], p[2], p[3]) == (before, after, suffix))
-    return ImageList(f"{place}/{before}{{frame}}{after}{suffix}".removeprefix("/"), frames)
+    pattern = f"{place}/{before}{{frame}}{after}{suffix}".removeprefix("/")
+    return ImageList(pattern, frames, ignored)
 
 
 def _compare_ids(ids: dict[str, frozenset[str]]) -> None:

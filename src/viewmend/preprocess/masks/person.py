@@ -28,6 +28,8 @@ MAX_OVERLAP = 0.3
 """Detections with a larger IoU are the same person."""
 ROI_SCALE = 1.25
 """Side of the square around a person over the diameter of the circle that the landmarks span."""
+OUTWARD = 0.6
+"""Added to the segmenter's logits, whose outlines lie inside those of people: IoU 0.01 higher on two captures."""
 DETECT_EVERY = 15
 """Images after which the detector looks for further people while some are tracked."""
 
@@ -180,7 +182,7 @@ def _segment(rgb: Rgb, roi: Roi) -> tuple[Float32[np.ndarray, "height width"], R
     landmarks, presence, logits, *_ = _run("segmenter", np.asarray(crop, np.float32) / 255)
     if float(presence[0, 0]) < MIN_SCORE:
         return None
-    opacity = 1 / (1 + np.exp(-np.clip(logits[0, :, :, 0], -30, 30)))
+    opacity = 1 / (1 + np.exp(-np.clip(logits[0, :, :, 0] + OUTWARD, -30, 30)))
     # Landmarks 33 and 34 are the centre of the body and a point on the circle around it.
     points = landmarks[0].reshape(39, 5)[33:35, :2] @ image_from_roi[:, :2].T + image_from_roi[:, 2]
     return cv2.warpAffine(opacity, image_from_roi, (width, height), flags=cv2.INTER_LINEAR), Roi.around(
