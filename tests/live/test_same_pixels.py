@@ -10,6 +10,7 @@ import torch
 from live.live_servers import wait_until
 
 from viewmend.cli import main, serve
+from viewmend.cli.checks import PreparationOptions
 from viewmend.live.encoding import draw_mode
 from viewmend.live.poses import view_camera
 from viewmend.live.protocol import Camera
@@ -20,9 +21,9 @@ from viewmend.models.registry import make_method
 SIZE_PX = (480, 360)
 
 
-def served(capture, model, **options):
+def served(capture, model, align=True):
     """A view of the first frame as `viewmend serve` renders it, and its camera."""
-    source = serve.open_source(serve.Options(source=str(capture), **options))
+    source = serve.open_source(serve.Options(source=str(capture), preparation=PreparationOptions(align=align)))
     source.start()
     try:
         renderer = Renderer(source, make_method(model))

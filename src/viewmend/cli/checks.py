@@ -1,14 +1,59 @@
-"""Checks of options, and messages, that several commands share."""
+"""Options, checks of options, and messages that several commands share."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from viewmend.cli.console import say
 
 if TYPE_CHECKING:
     from viewmend.data.prepare import PreparedCapture
     from viewmend.models.base import Inpainter
+    from viewmend.rendering.view import RenderConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions:
+    """How views are rendered, and which of their pixels are inpainted."""
+
+    num_source_views: int = 3
+    """Number of source cameras, which colour a view and are the inpainter's context: the closest to it."""
+    view_selection: Literal["angle", "direction"] = "angle"
+    """Which source cameras are closest: 'angle' at the subject, or 'direction' of view, an alternative of RIFTCast."""
+    error_rule: str | None = None
+    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
+    themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
+    that each method is made for."""
+    refine_fraction: float = 0.15
+    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
+
+    def config(self) -> "RenderConfig":
+        """The renderer's configuration; ValueError for options that are out of range."""
+        from viewmend.rendering.view import RenderConfig
+
+        if self.num_source_views < 1:
+            raise ValueError(
+                f"expected --num-source-views of at least 1, got {self.num_source_views}; the paper uses 3"
+            )
+        return RenderConfig(
+            cameras=self.num_source_views,
+            selection=self.view_selection,
+            error_rule=self.error_rule,
+            refine_fraction=self.refine_fraction,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreparationOptions:
+    """What is corrected in a capture."""
+
+    align: bool = True
+    """Use the calibration as it is. By default, a common shift of all images (for example a different convention for
+    pixel centres) is estimated from the masks of one frame, and undone if the masks then agree better."""
+    match_colours: bool = True
+    """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one frame, if they then
+    agree better on surface points that were not used for matching."""
 
 
 def check_device(name: str) -> None:

@@ -2,9 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from viewmend.cli.checks import ViewOptions
+from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
     from viewmend.evaluation.mending import Fill, MendStep, MendSummary
@@ -37,12 +40,7 @@ class Options:
     """Width and height of all images."""
     cameras: int = 6
     """Cameras of the ring."""
-    error_rule: str | None = None
-    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
-    themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
-    that the model is made for."""
-    refine_fraction: float = 0.15
-    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
+    view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """Name of a shipped model, or a model's folder; 'telea' and 'nearest' are classical fills."""
     json: bool = False
@@ -60,11 +58,10 @@ def run(options: Options) -> int:
     from viewmend.data.synthetic.stage import Studio, StudioConfig
     from viewmend.evaluation.mending import Mender, MendSummary
     from viewmend.models.registry import error_model_for
-    from viewmend.rendering.view import RenderConfig
     from viewmend.stream import StreamConfig
     from viewmend.utils.output_folder import OutputFolder
 
-    render = RenderConfig(error_rule=options.error_rule, refine_fraction=options.refine_fraction)
+    render = options.view.config()
     inpainter = load_named(options.model, "cpu")
     config = StudioConfig(
         seed=options.seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=FPS

@@ -1,13 +1,14 @@
 """`viewmend evaluate`: compare methods on synthetic scenes and captures, in tables and images."""
 
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import check_device
+from viewmend.cli.checks import PreparationOptions, ViewOptions, check_device
+from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
 """Files in OUT besides cells, models and samples."""
 LONG_SETS = ("P-long", "Q-long", "P-turn")
-POSITIVE = ("frames", "every", "scenes", "size", "jobs", "num_source_views", "shown")
+POSITIVE = ("frames", "every", "scenes", "size", "jobs", "shown")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,23 +41,11 @@ class RunOptions:
     """Format of the captures (docs/formats.md); recognised by default."""
     inputs: str = "all"
     """Cameras of a capture to use: all, or a number, spread evenly around; several numbers separated by commas."""
-    num_source_views: int = 3
-    """Cameras that colour a view: the closest to it."""
     protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
     """What is known of the held-out camera: nothing ('strict'); its mask, by which the view is cut and composited
     ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
-    view_selection: Literal["angle", "direction"] = "angle"
-    """Which source cameras are closest: 'angle' at the subject, or 'direction' of view, an alternative of RIFTCast."""
-    error_rule: str | None = None
-    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
-    themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
-    that each method is made for. Scores in the holes cover the same pixels with every rule."""
-    refine_fraction: float = 0.15
-    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
-    align: bool = True
-    """Use the calibration of captures as it is, as in viewmend mend."""
-    match_colours: bool = True
-    """Use the cameras' colours of captures as they are, as in viewmend mend."""
+    view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
+    preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     frames: int | None = None
     """Frames of each scene, from the first. By default 10 of P and Q, all of a capture. Long sets have 41, of which the
     last 10 are scored."""
@@ -227,7 +216,7 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         else:
             scenes = studio.performer_set(options.performers, options.motions, frames, options.size)
         return list((studio.lengthened(scenes) if name in LONG_SETS else scenes)[part])
-    prepared = {"align": options.align, "match_colours": options.match_colours}
+    prepared = asdict(options.preparation)
     if is_splits(Path(name)):
         return [replace(s, **prepared) for s in split_scenes(Path(name), options.frames)[part]]
     inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
@@ -239,19 +228,12 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
 
 def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
     from viewmend.evaluation.scene_run import RunSettings
-    from viewmend.rendering.view import RenderConfig
     from viewmend.stream import StreamConfig
 
-    render = RenderConfig(
-        cameras=options.num_source_views,
-        selection=options.view_selection,
-        error_rule=options.error_rule,
-        refine_fraction=options.refine_fraction,
-    )
     return RunSettings(
         device=options.device,
         precision=options.precision,
-        stream=StreamConfig(render=render, memory_mb=None),
+        stream=StreamConfig(render=options.view.config(), memory_mb=None),
         ssim=options.ssim,
         background=options.score_background,
         networks=networks,

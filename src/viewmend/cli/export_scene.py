@@ -1,10 +1,13 @@
 """`viewmend export-scene`: exports a capture as a scene for Blender, Unreal, Unity, Houdini and similar programs."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from viewmend.cli.checks import PreparationOptions
+from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,10 +46,7 @@ class Options:
     """Name of a shipped model, a model's folder, or any method of `viewmend evaluate`."""
     least_confidence: float = 0.5
     """Pixels below this confidence, 0 to 1, make no points, if the model predicts a confidence."""
-    align: bool = True
-    """Use the calibration as it is; by default, a shift that all images share is corrected."""
-    match_colours: bool = True
-    """Keep the cameras' colours as they are; by default they are matched, as in `viewmend mend`."""
+    preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     device: str = "cpu"
     """Device to compute on: cpu, or cuda."""
 
@@ -99,13 +99,7 @@ def _prepared(options: Options, opened: "CaptureSource", first: int) -> "Prepare
     from viewmend.cli.checks import log_preparation
     from viewmend.data.prepare import prepare
 
-    capture = prepare(
-        opened,
-        longest_px=options.longest_px,
-        align=options.align,
-        match_colours=options.match_colours,
-        first=first,
-    )
+    capture = prepare(opened, longest_px=options.longest_px, **asdict(options.preparation), first=first)
     log_preparation(capture)
     return capture
 

@@ -1,11 +1,14 @@
 """`viewmend mend`: render and inpaint novel views of a capture, and score them against a held-out camera."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+from viewmend.cli.checks import PreparationOptions, ViewOptions
+from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
     from viewmend.data.camera_path import Turntable
@@ -13,7 +16,6 @@ if TYPE_CHECKING:
     from viewmend.data.source import CaptureSource
     from viewmend.evaluation.mending import MendSummary
     from viewmend.geometry.cameras import Cameras
-    from viewmend.rendering.view import RenderConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,19 +52,10 @@ class Options:
     """Comma-separated names of the input cameras; all by default."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
-    num_source_views: int = 3
-    """Number of source cameras, which colour a view and are the inpainter's context."""
     protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
     """What is known of the camera of --leave-out: nothing ('strict'); its mask, by which the view is cut and composited
     ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
-    view_selection: Literal["angle", "direction"] = "angle"
-    """Which source cameras are closest: 'angle' at the subject, or 'direction' of view, an alternative of RIFTCast."""
-    error_rule: str | None = None
-    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
-    themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
-    that the model is made for."""
-    refine_fraction: float = 0.15
-    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
+    view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea', 'reprojection',
     'dstt-o-mul', FILE.py:NAME)."""
@@ -70,12 +63,7 @@ class Options:
     """Number of context tokens kept by pruning: fewer is faster. All by default."""
     frames: str | None = None
     """Frames to use, first:end, counted from 0; all by default."""
-    align: bool = True
-    """Use the calibration as it is. By default, a common shift of all images (for example a different convention for
-    pixel centres) is estimated from the masks of the first frame, and undone if the masks then agree better."""
-    match_colours: bool = True
-    """Use the cameras' colours as they are. By default, the input cameras are colour-matched in the first frame, if
-    they then agree better on surface points that were not used for matching."""
+    preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     alpha: bool = False
     """Also write the subject as a cut-out: cutout/*.png with straight alpha, and cutout.webm (VP9 with alpha) if videos
     are written. Alpha is the proxy's mask if the model predicts none."""
@@ -106,7 +94,7 @@ def run(options: Options) -> int:
     from viewmend.models.registry import error_model_for
     from viewmend.stream import StreamConfig
 
-    render = _render_config(options)
+    render = options.view.config()
     turntable = parse_turntable(options.path or "")
     held = () if options.leave_out is None else (options.leave_out,)
     opened = _open(options, held)
@@ -114,9 +102,7 @@ def run(options: Options) -> int:
     usable = _usable(opened, times, held)
     inpainter = load_named(options.model, options.device)
     inputs = [name for name in opened.cameras.names if name not in held]
-    capture = prepare(
-        opened, inputs, align=options.align, match_colours=options.match_colours, first=usable[0], last=usable[-1]
-    )
+    capture = prepare(opened, inputs, **asdict(options.preparation), first=usable[0], last=usable[-1])
     log_preparation(capture)
     error_model = error_model_for(inpainter, options.device) if render.error_rule == "predicted" else None
     config, quality = StreamConfig(render=render, memory_mb=None), RenderQuality(top_k=options.top_k)
@@ -150,23 +136,10 @@ def _check(options: Options) -> None:
         raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
     if options.leave_out is None and options.protocol != "strict":
         raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path: no camera has its mask")
-    if options.num_source_views < 1:
-        raise ValueError(f"expected --num-source-views of at least 1, got {options.num_source_views}; the paper uses 3")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     if options.top_k is not None and options.top_k < 1:
         raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; omit it to keep all")
-
-
-def _render_config(options: Options) -> "RenderConfig":
-    from viewmend.rendering.view import RenderConfig
-
-    return RenderConfig(
-        cameras=options.num_source_views,
-        selection=options.view_selection,
-        error_rule=options.error_rule,
-        refine_fraction=options.refine_fraction,
-    )
 
 
 def _in_words(summary: "MendSummary") -> list[str]:

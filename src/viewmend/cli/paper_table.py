@@ -55,7 +55,7 @@ def run(options: Options) -> int:
     from viewmend.models.registry import method_names
     from viewmend.utils.atomic_writes import write_text
 
-    options = replace(options, error_rule=options.error_rule or "holes")
+    options = replace(options, view=replace(options.view, error_rule=options.view.error_rule or "holes"))
     sets = options.sets or (("P", "Q") if options.performers else ("P",))
     rows = paper_rows(options.table)
     if options.table == 3:

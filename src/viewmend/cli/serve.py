@@ -3,13 +3,15 @@
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
+from viewmend.cli.checks import PreparationOptions, ViewOptions
+from viewmend.training.config import FLAT
 from viewmend.utils.plugins import import_object
 
 if TYPE_CHECKING:
@@ -60,17 +62,8 @@ class Options:
     """Milliseconds that a view may take; quality is reduced to hold this time. 0: always full quality."""
     max_image_size: int = 1024
     """Longest side of the cameras' images, in pixels; larger images are reduced when they are read."""
-    align: bool = True
-    """Use the calibration as it is. By default it is aligned as in `viewmend mend`."""
-    match_colours: bool = True
-    """Use the cameras' colours as they are. By default they are matched as in `viewmend mend`."""
-    num_source_views: int = 3
-    """Number of source cameras, which colour a view and are the inpainter's context."""
-    error_rule: str | None = None
-    """Pixels to inpaint, as in `viewmend mend`: 'holes', 'all', 'predicted', or FILE.py:NAME. By default the rule that
-    the model is made for."""
-    refine_fraction: float = 0.15
-    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
+    preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
+    view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     viewers: int = 8
     """Maximum number of viewers; with --ray, per replica."""
     riftcast_port: int | None = None
@@ -135,7 +128,7 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     """Raise a ValueError for an option that is out of range, before anything heavy is imported."""
-    positive = ("max_image_size", "num_source_views", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
+    positive = ("max_image_size", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
     checks = [(name, getattr(options, name) > 0, "positive") for name in positive]
     checks += [
         ("cameras", options.source != "studio" or options.cameras >= 4, "at least 4"),
@@ -183,12 +176,9 @@ def server_config(options: Options) -> "ServerConfig":
 
 def stream_config(options: Options) -> "StreamConfig":
     """How frames become views."""
-    from viewmend.rendering.view import RenderConfig
     from viewmend.stream import StreamConfig
 
-    rule, fraction = options.error_rule, options.refine_fraction
-    render = RenderConfig(cameras=options.num_source_views, error_rule=rule, refine_fraction=fraction)
-    return StreamConfig(render=render, memory_mb=options.memory_mb / 2)
+    return StreamConfig(render=options.view.config(), memory_mb=options.memory_mb / 2)
 
 
 def load_inpainter(options: Options) -> "Inpainter":
@@ -217,12 +207,12 @@ def open_source(options: Options) -> "FrameSource":
     from viewmend.live.push import PushSource
 
     memory_mb, size_px = options.memory_mb / 2, options.max_image_size
-    align, match = options.align, options.match_colours
+    prepared = asdict(options.preparation)
     if options.source == "live":
         return PushSource(options.fps, memory_mb)
     if options.source.endswith(".toml"):
         rig_source: Callable[..., FrameSource] = import_object(RIG_SOURCE)
-        return rig_source(Path(options.source), options.fps, memory_mb, size_px, align, match)
+        return rig_source(Path(options.source), options.fps, memory_mb, size_px, **prepared)
     if options.source == "studio":
         return RecordedSource(partial(_make_studio, options), options.fps, generated=True, memory_mb=memory_mb)
     from viewmend.cli.checks import log_preparation
@@ -230,9 +220,9 @@ def open_source(options: Options) -> "FrameSource":
 
     # Prepared before the address is printed, so that an unusable capture is an error of the command.
     capture = open_masked(options.source, format=options.format)
-    prepared = prepare(capture, longest_px=size_px, align=align, match_colours=match)
-    log_preparation(prepared)
-    return RecordedSource(lambda: prepared, options.fps, memory_mb=memory_mb)
+    source = prepare(capture, longest_px=size_px, **prepared)
+    log_preparation(source)
+    return RecordedSource(lambda: source, options.fps, memory_mb=memory_mb)
 
 
 def _make_studio(options: Options) -> "CaptureSource":
@@ -256,7 +246,8 @@ def _serve_on_ray(options: Options, address: str) -> NoReturn:
     config = server_config(options)
     if not is_loopback(config.host):
         say("Ray's proxy does not limit unauthenticated connections; use another proxy that does (docs/live.md)")
-    elsewhere = {name: _absolute(getattr(options, name)) for name in ("source", "error_rule")}
+    elsewhere: dict[str, Any] = {"source": _absolute(options.source)}
+    elsewhere["view"] = replace(options.view, error_rule=_absolute(options.view.error_rule))
     if options.model not in (*shipped_models(), *METHODS):  # which a folder of the same name does not replace
         elsewhere["model"] = _absolute(options.model)
     remote = replace(options, **elsewhere)
