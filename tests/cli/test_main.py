@@ -87,24 +87,16 @@ def test_json_has_no_nan(capsys):
 @pytest.mark.parametrize("terminal", [False, True])
 def test_tracking_passes_everything_on(monkeypatch, capsys, terminal):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
-    monkeypatch.setattr(console, "QUIET_S", -1.0)
     assert list(console.track(iter([3, 1, 2]), "counting", total=3)) == [3, 1, 2]
     out, message = capsys.readouterr()
     assert out == ""
     assert ("counting" in message) == terminal
 
 
-def test_what_is_quick_shows_no_bar(monkeypatch, capsys):
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    assert list(console.track(range(5), "counting")) == [0, 1, 2, 3, 4]
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(("terminal", "quiet_s", "shown"), [(True, 0.0, True), (True, 9.0, False), (False, 0.0, False)])
-def test_busy_speaks_up_when_it_takes_long(monkeypatch, capsys, terminal, quiet_s, shown):
+@pytest.mark.parametrize("terminal", [False, True])
+def test_busy_is_shown_on_a_terminal(monkeypatch, capsys, terminal):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
-    monkeypatch.setattr(console, "QUIET_S", quiet_s)
     with console.busy("thinking"):
-        time.sleep(0.3)
+        pass
     out, message = capsys.readouterr()
-    assert out == "" and ("thinking" in message) == shown
+    assert out == "" and ("thinking" in message) == terminal

@@ -14,8 +14,6 @@ from typing import TypeVar
 from viewmend.utils.logging import printable
 
 _Item = TypeVar("_Item")
-QUIET_S = 2.0
-"""Progress is shown only for work that takes longer."""
 INTERVAL_S = 30.0
 """Seconds between progress lines if standard error is not a terminal."""
 
@@ -40,19 +38,12 @@ def track(items: Iterable[_Item], description: str, total: int | None = None) ->
             for done, item in enumerate(items):  # noqa: B007 (read by `text`)
                 yield item
         return
-    start, bar, task = time.monotonic(), None, None
-    try:
-        for done, item in enumerate(items):
-            if bar is None and time.monotonic() - start > QUIET_S:
-                bar = _progress_bar()
-                bar.start()
-                task = bar.add_task(description, total=total)
-            if bar is not None and task is not None:
-                bar.update(task, completed=done)
-            yield item
-    finally:
-        if bar is not None:
-            bar.stop()
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield from bar.track(items, total, description=description)
 
 
 def _duration(seconds: float) -> str:
@@ -60,14 +51,6 @@ def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _progress_bar():
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True), transient=True)
 
 
 @contextlib.contextmanager
@@ -79,15 +62,8 @@ def busy(description: str) -> Iterator[None]:
         return
     from rich.console import Console
 
-    status = Console(stderr=True).status(description)
-    timer = threading.Timer(QUIET_S, status.start)
-    timer.start()
-    try:
+    with Console(stderr=True).status(description):
         yield
-    finally:
-        timer.cancel()
-        timer.join()
-        status.stop()
 
 
 class Heartbeat:

@@ -74,25 +74,28 @@ def check_scenes(scenes: SceneConfig) -> None:
 
 
 def run(options: Options) -> int:
-    """Train, with a progress bar on a terminal and a line every half minute elsewhere.
-
-    Ctrl-C and SIGTERM end the run with a checkpoint.
-    """
+    """Train, with a line of progress every half minute; Ctrl-C and SIGTERM end the run with a checkpoint."""
     import os
 
-    from viewmend.cli.console import say, stop_requests
+    from viewmend.cli.console import Heartbeat, say, stop_requests
     from viewmend.training.loop import train
 
-    with _Reporter() as reporter, stop_requests() as stopped:
+    steps: list[Progress] = []
+
+    def report(step: "Progress") -> None:
+        steps[:] = [step]
+
+    heartbeat = Heartbeat(lambda: _line(steps[0]) if steps else "making the first samples")
+    with heartbeat, stop_requests() as stopped:
         try:
-            train(options.config, options.out, report=reporter.report, stopped=lambda: stopped() > 0)
+            train(options.config, options.out, report=report, stopped=lambda: stopped() > 0)
         except FloatingPointError as error:
             raise ValueError(str(error)) from error
     if number := stopped():
-        say(f"{options.out}: stopped after step {reporter.last}; run the same command to resume")
+        say(f"{options.out}: stopped after step {steps[0].step if steps else 0}; run the same command to resume")
         return 128 + number
     if os.environ.get("RANK", "0") == "0":  # torchrun's other processes report no steps
-        say(f"wrote {options.out}" if reporter.last else f"{options.out}: this run is complete; nothing to do")
+        say(f"wrote {options.out}" if steps else f"{options.out}: this run is complete; nothing to do")
         _show_gain(options)
     return 0
 
@@ -110,47 +113,6 @@ def _show_gain(options: Options) -> None:
     say("comparing both models by camera")
     print(compare(scenes.captures[0], scenes.hold_out, load_inpainter(start), load_inpainter(options.out), sheet))
     print(f"views before and after: {sheet}")
-
-
-class _Reporter:
-    """Shows the progress of a run."""
-
-    def __init__(self) -> None:
-        import sys
-
-        from viewmend.cli.console import Heartbeat
-
-        self.last = 0
-        """Steps done; 0 until this command has made one."""
-        self._live = sys.stderr.isatty()
-        self._text = "making the first samples"
-        self._heartbeat = Heartbeat(lambda: self._text)
-
-    def __enter__(self) -> "_Reporter":
-        if self._live:
-            from rich.console import Console
-            from rich.progress import BarColumn, Progress, TextColumn
-
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
-            self._bar = Progress(*columns, console=Console(stderr=True))
-            self._bar.start()
-            self._task = self._bar.add_task("training", total=1.0, text="making the first samples")
-        else:
-            self._heartbeat.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live:
-            self._bar.stop()
-        else:
-            self._heartbeat.__exit__()
-
-    def report(self, progress: "Progress") -> None:
-        """Show a step."""
-        self.last = progress.step
-        self._text = _line(progress)
-        if self._live:
-            self._bar.update(self._task, completed=progress.progress, text=_line(progress))
 
 
 def _line(progress: "Progress") -> str:
