@@ -8,7 +8,7 @@ import torch
 
 from viewmend import cli
 from viewmend.cli.evaluate import RunOptions, scenes_of
-from viewmend.contrib.baselines.dstt import DSTT
+from viewmend.contrib.baselines.token_transformers import DSTT
 from viewmend.metrics.weights import FOLDERS_VARIABLE
 
 QUICK = ("--frames", "1", "--scenes", "1", "--size", "128", "--methods", "nearest,unfilled")

@@ -8,7 +8,7 @@ from reference.ball import BallCapture, camera_at, photograph, ring
 
 from viewmend.data import prepare as preparing
 from viewmend.data.prepare import prepare
-from viewmend.data.resize import limit_size
+from viewmend.data.source import limit_size
 from viewmend.geometry.cameras import concatenate_cameras
 
 SHIFT_PX = 0.8

@@ -15,7 +15,7 @@ from viewmend.data.holdout.scenes import LeaveOneOut
 from viewmend.data.holdout.studio_scenes import P_SEEDS, Q_SEEDS, StudioScene
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare
-from viewmend.data.resize import limit_size
+from viewmend.data.source import limit_size
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.evaluation.scores import true_view
 from viewmend.geometry.hull import HullConfig

@@ -13,7 +13,7 @@ from einops import rearrange
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
-from viewmend.data.resize import limit_size
+from viewmend.data.source import limit_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import project
 from viewmend.geometry.hull import HullConfig

@@ -14,8 +14,7 @@ from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
 from viewmend.data.errors import CaptureError, Issue
 from viewmend.data.native_capture import NativeCapture, open_capture
-from viewmend.data.resize import limit_camera_size, limit_size
-from viewmend.data.source import CaptureSource, CaptureWrapper
+from viewmend.data.source import CaptureSource, CaptureWrapper, limit_camera_size, limit_size
 from viewmend.geometry.alignment import Alignment, shared_offset
 from viewmend.geometry.cameras import Cameras
 from viewmend.types import MultiViewFrame

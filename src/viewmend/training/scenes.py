@@ -10,8 +10,7 @@ from viewmend.data.holdout.capture_scenes import is_splits, training_captures
 from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS, LeaveOneOut, Split, recordings
 from viewmend.data.native_capture import NativeCapture
 from viewmend.data.prepare import PreparedCapture, open_masked, prepare
-from viewmend.data.resize import limit_size
-from viewmend.data.source import CaptureSource
+from viewmend.data.source import CaptureSource, limit_size
 from viewmend.data.synthetic.imperfections import Imperfections
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras

@@ -11,10 +11,9 @@ from models.plates import view as plate
 from safetensors.torch import load_file
 from training.conftest import RUN, SAMPLING, SCENES, studio_samples
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, E2FGVIHQ, LocalFlows
-from viewmend.contrib.baselines.fuseformer import TOKENS, FuseFormer
 from viewmend.contrib.baselines.published import load_baseline
+from viewmend.contrib.baselines.token_transformers import DSTT, TOKENS, FuseFormer
 from viewmend.contrib.baselines.training import (
     BaselineObjective,
     BaselineObjectiveConfig,

@@ -7,9 +7,9 @@ import torch
 from models.plates import HEIGHT, WIDTH, Rig, camera, context, look
 from models.plates import view as plate
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.framing import Window, aim, camera_windows, foreground
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter, Sampling
+from viewmend.contrib.baselines.token_transformers import DSTT
 from viewmend.models.base import Inpainter
 from viewmend.types import ContextViews, MultiViewFrame
 

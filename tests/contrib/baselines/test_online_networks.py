@@ -5,10 +5,9 @@ from copy import deepcopy
 import pytest
 import torch
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, E2FGVIHQ
-from viewmend.contrib.baselines.fuseformer import FuseFormer
 from viewmend.contrib.baselines.online import Clip
+from viewmend.contrib.baselines.token_transformers import DSTT, FuseFormer
 
 SIZES = {DSTT: (48, 72), FuseFormer: (240, 432), E2FGVI: (240, 432), E2FGVIHQ: (60, 108)}
 """The smallest that each takes."""

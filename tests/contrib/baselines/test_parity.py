@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, E2FGVIHQ
-from viewmend.contrib.baselines.fuseformer import FuseFormer
+from viewmend.contrib.baselines.token_transformers import DSTT, FuseFormer
 
 FILES = ("dstt_t5", "dstt_om_4", "fuseformer_t5", "fuseformer_om_4", "e2fgvi_t5_local3", "e2fgvi_hq_t5_local3")
 NETWORKS = {"DSTT": DSTT, "FuseFormer": FuseFormer, "E2FGVI": E2FGVI, "E2FGVI_HQ": E2FGVIHQ}

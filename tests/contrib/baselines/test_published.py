@@ -6,10 +6,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.e2fgvi import E2FGVIHQ
 from viewmend.contrib.baselines.online import OnlineInpainter
 from viewmend.contrib.baselines.published import NETWORKS, RiftCast, make_baseline
+from viewmend.contrib.baselines.token_transformers import DSTT
 from viewmend.metrics.weights import FOLDERS_VARIABLE
 from viewmend.models.registry import MethodMissing, make_method
 from viewmend.utils.weight_files import MissingWeightsError, WeightsError

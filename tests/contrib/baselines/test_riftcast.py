@@ -8,8 +8,8 @@ from models.plates import Rig
 from models.plates import view as plate
 from torch import nn
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.published import RiftCast
+from viewmend.contrib.baselines.token_transformers import DSTT
 
 
 class Counter(DSTT):

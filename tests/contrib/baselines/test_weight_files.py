@@ -7,9 +7,8 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, E2FGVIHQ
-from viewmend.contrib.baselines.fuseformer import FuseFormer
+from viewmend.contrib.baselines.token_transformers import DSTT, FuseFormer
 from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, load_weights
 
 NETWORKS = {"DSTT": DSTT, "FuseFormer": FuseFormer, "E2FGVI": E2FGVI, "E2FGVI_HQ": E2FGVIHQ}

@@ -21,7 +21,7 @@ from viewmend.contrib.baselines.layers import (
     SoftSplit,
 )
 from viewmend.contrib.baselines.online import Clip, Frames
-from viewmend.contrib.baselines.token_transformer import BLOCKS, HEADS, NATIVE_PX, initialise
+from viewmend.contrib.baselines.token_transformers import BLOCKS, CELLS, HEADS, NATIVE_PX, initialise
 
 WINDOW = (5, 9)
 """Rows and columns of tokens in a window."""
@@ -124,8 +124,6 @@ def _outside_of_window() -> Int[Tensor, "120"]:
     return torch.nonzero(~torch.isin(rolled[4], own[4]))[:, 0]
 
 
-CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
-"""Rows and columns of the feature map that E2FGVI's learned bias map fixes."""
 MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)
 """Height and width of one attention window: 60 x 108."""
 

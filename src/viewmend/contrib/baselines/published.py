@@ -16,11 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from viewmend.contrib.baselines.dstt import DSTT
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, E2FGVIHQ
-from viewmend.contrib.baselines.fuseformer import FuseFormer
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter, Sampling
-from viewmend.contrib.baselines.token_transformer import NATIVE_PX, MemorySlot
+from viewmend.contrib.baselines.token_transformers import DSTT, NATIVE_PX, FuseFormer, MemorySlot
 from viewmend.metrics.weights import KnownWeights, checked_weights, known_weights
 from viewmend.models.base import ContextProvider, Inpainter, State
 from viewmend.models.compositing import blend

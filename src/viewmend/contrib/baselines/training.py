@@ -29,7 +29,7 @@ from viewmend.contrib.baselines.framing import (
 from viewmend.contrib.baselines.layers import SLOPE
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter
 from viewmend.contrib.baselines.published import NETWORKS, TRAINED, load_baseline
-from viewmend.contrib.baselines.token_transformer import NATIVE_PX, TokenTransformer
+from viewmend.contrib.baselines.token_transformers import NATIVE_PX, TokenTransformer
 from viewmend.models.base import ContextProvider
 from viewmend.models.compositing import Background, composite, to_background
 from viewmend.training.adversarial import BETAS, HINGE, Adversary, Discriminator, Judged

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from viewmend.data.colour_matching import SurfaceColours, SurfacePoints, agreement, best_agreement
 from viewmend.data.errors import Issue
-from viewmend.data.resize import limit_size
+from viewmend.data.source import limit_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.proxy import reconstruct

@@ -14,7 +14,7 @@ from torch import Tensor
 from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.leave_one_out import find_outlier_by_hull, find_outlier_by_outlines
 from viewmend.data.errors import Issue
-from viewmend.data.resize import limit_size
+from viewmend.data.source import limit_size
 from viewmend.geometry.alignment import LEAST_IOU, silhouette_iou
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras

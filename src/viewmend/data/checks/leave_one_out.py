@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.data.errors import Issue
-from viewmend.data.resize import limit_size
+from viewmend.data.source import limit_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND, HullConfig
 from viewmend.geometry.line_of_sight import LinesOfSight, Rig

@@ -10,8 +10,7 @@ from torch.nn import functional as F
 
 from viewmend.data.checks.leave_one_out import HULL, LONGEST_PX, MIN_CAMERAS, leave_one_out, missed_share, pad_like
 from viewmend.data.errors import Issue
-from viewmend.data.resize import limit_size
-from viewmend.data.source import CaptureSource
+from viewmend.data.source import CaptureSource, limit_size
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import reconstruct

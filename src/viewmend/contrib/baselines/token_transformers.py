@@ -1,0 +1,342 @@
+"""DSTT and FuseFormer: frames to tokens, blocks of attention, tokens to frames; all at once or online.
+
+DSTT: Liu et al. 2021, "Decoupled Spatial-Temporal Transformer for Video Inpainting". FuseFormer: Liu et al. 2021,
+"Fusing Fine-Grained Information in Transformers for Video Inpainting".
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import scaled_dot_product_attention
+
+from viewmend.contrib.baselines.layers import (
+    DIM,
+    FEATURES,
+    MARGIN_CELLS,
+    PATCH_CELLS,
+    STEP_CELLS,
+    STEP_PX,
+    STRIDE_PX,
+    DeepLayers,
+    FrameDecoder,
+    FusionFeedForward,
+    HierarchicalEncoder,
+    SoftComposition,
+    SoftSplit,
+    part_of,
+    shallow_layers,
+    token_grid,
+)
+from viewmend.contrib.baselines.online import Clip, Frames
+
+HEADS = 4
+BLOCKS = 8
+NATIVE_PX = (240, 432)
+"""Height and width that the official weights were trained at."""
+CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
+"""Rows and columns of the feature map, fixed by the learned maps of FuseFormer and E2FGVI."""
+
+TokenClips = Float[Tensor, "sample frame rows cols 512"]
+"""Tokens of clips in the grid of their patches."""
+MemorySlot = Float[Tensor, "block frame rows cols 512"]
+"""The memory of one time: its frames' tokens as input to each block's attention, after the first norm."""
+
+
+class MultiHeadAttention(nn.Module):
+    """Attention with 4 heads; keys `query_embedding`, `key_embedding`, `value_embedding`, `output_linear`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.query_embedding = nn.Linear(DIM, DIM)
+        self.value_embedding = nn.Linear(DIM, DIM)
+        self.key_embedding = nn.Linear(DIM, DIM)
+        self.output_linear = nn.Linear(DIM, DIM)
+
+    def forward(
+        self, queries: Float[Tensor, "group query 512"], sources: Float[Tensor, "group key 512"]
+    ) -> Float[Tensor, "group query 512"]:
+        """Each query's mixture of the sources of its group."""
+        projected = self.query_embedding(queries), self.key_embedding(sources), self.value_embedding(sources)
+        Q, K, V = (rearrange(x, "g n (h c) -> g h n c", h=HEADS) for x in projected)
+        return self.output_linear(rearrange(scaled_dot_product_attention(Q, K, V), "g h n c -> g n (h c)"))
+
+
+class TokenBlock(nn.Module, ABC):
+    """One block: attention, then a feed-forward. Keys `attention`, `ffn`, `norm1`, `norm2`."""
+
+    def __init__(self, ffn: nn.Module) -> None:
+        super().__init__()
+        self.attention = MultiHeadAttention()
+        self.ffn = ffn
+        self.norm1, self.norm2 = nn.LayerNorm(DIM), nn.LayerNorm(DIM)
+
+    @abstractmethod
+    def forward(
+        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
+    ) -> tuple[TokenClips, TokenClips]:
+        """The tokens after the block, and what it remembers of them.
+
+        `memory` is what it remembered of earlier frames: keys and values, never queries.
+        """
+
+
+class TokenTransformer(nn.Module, ABC):
+    """From frames with holes to whole frames; subclasses name the parts as the official checkpoints do."""
+
+    encoder: nn.Module
+    transformer: nn.ModuleList
+    name: str
+    """The network's name in messages."""
+
+    @abstractmethod
+    def check_size(self, height: int, width: int) -> None:
+        """ValueError for frames of a size that this network does not support."""
+
+    def encode(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
+        """Features at a quarter of the size."""
+        return self.encoder(frames)
+
+    @abstractmethod
+    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+        """Tokens of overlapping patches."""
+
+    @abstractmethod
+    def decode(
+        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
+    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
+        """Frames from the encoder's features and what the tokens add to them."""
+
+    def forward(
+        self, clips: Float[Tensor, "sample frame 3 height width"]
+    ) -> Float[Tensor, "sample frame 3 height width"]:
+        """All frames of each clip, filled, in [-1, 1].
+
+        Args:
+            clips: frames in [-1, 1], 0 in the holes. Frames of a clip have no order.
+
+        Raises:
+            ValueError: an unsupported size.
+        """
+        self.check_size(*clips.shape[-2:])
+        features = self.encode(clips.flatten(0, 1))
+        tokens = self.split(features).unflatten(0, clips.shape[:2])
+        for block in self.transformer:
+            tokens, _ = block(tokens)
+        return self.decode(features, tokens.flatten(0, 1)).unflatten(0, clips.shape[:2])
+
+    def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
+        """See `OnlineNetwork`."""
+        return self(torch.cat([clip.now, *clip.neighbours, *clip.references])[None])[0, 0]
+
+    def complete_remembering(
+        self, now: Frames, memory: Sequence[MemorySlot]
+    ) -> tuple[Float[Tensor, "3 height width"], MemorySlot]:
+        """See `OnlineNetwork`: only the frames of one time go through the network (Thiry et al., OM).
+
+        The order of `memory` does not matter.
+
+        Raises:
+            ValueError: an unsupported size, or slots of another size.
+        """
+        self.check_size(*now.shape[-2:])
+        features = self.encode(now)
+        tokens = self.split(features)[None]
+        if any(slot.shape[2:] != tokens.shape[2:] for slot in memory):
+            raise ValueError(
+                f"{self.name}: expected memory of {tuple(tokens.shape[2:4])} tokens a frame as this frame has, got "
+                f"{[tuple(slot.shape[2:4]) for slot in memory]}; start a new stream for another size"
+            )
+        remembered = []
+        for number, block in enumerate(self.transformer):
+            past = torch.cat([slot[number] for slot in memory])[None] if memory else None
+            tokens, own = block(tokens, past)
+            remembered.append(own[0])
+        return self.decode(features[:1], tokens[0, :1])[0], torch.stack(remembered)
+
+
+def initialise(network: nn.Module) -> None:
+    """Fresh weights as the authors draw them: N(0, 0.02), biases 0."""
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv2d | nn.Linear):
+            nn.init.normal_(layer.weight, 0, 0.02)
+            if layer.bias is not None:
+                nn.init.zeros_(layer.bias)
+
+
+ZONES = 2
+"""Temporal attention stays within a zone; a frame has ZONES x ZONES."""
+HIDDEN = 2048
+SIZE_STEP_PX = STEP_PX * ZONES
+"""Heights and widths are multiples of this, so that zones are equal."""
+
+
+class FeedForward(nn.Module):
+    """Linear, ReLU, linear; keys `conv.0` and `conv.3` (the official dropout between them is inactive)."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv = nn.Sequential(nn.Linear(DIM, HIDDEN), nn.ReLU(inplace=True), nn.Identity(), nn.Linear(HIDDEN, DIM))
+
+    def forward(self, tokens: TokenClips) -> TokenClips:
+        """The same grid of tokens."""
+        return self.conv(tokens)
+
+
+class DecoupledBlock(TokenBlock):
+    """Attention over all frames within each zone (`temporal`), or over all tokens of each frame.
+
+    The residual starts from the normalised tokens, not from those that came in.
+    """
+
+    def __init__(self, temporal: bool) -> None:
+        super().__init__(FeedForward())
+        self.temporal = temporal
+
+    def forward(
+        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
+    ) -> tuple[TokenClips, TokenClips]:
+        """See `TokenBlock`; a spatial block does not use the memory."""
+        own = self.norm1(tokens)
+        x = own + (self._over_time(own, memory) if self.temporal else self._over_frames(own))
+        return x + self.ffn(self.norm2(x)), own
+
+    def _over_time(self, own: TokenClips, memory: Tensor | None) -> TokenClips:
+        samples, frames, rows, cols, _ = own.shape
+        sources = own if memory is None else torch.cat([own, memory], 1)
+        mixed = self.attention(_zones(own), _zones(sources))
+        return rearrange(
+            mixed,
+            "(b i j) (f r c) d -> b f (i r) (j c) d",
+            b=samples,
+            f=frames,
+            i=ZONES,
+            j=ZONES,
+            r=rows // ZONES,
+            c=cols // ZONES,
+        )
+
+    def _over_frames(self, own: TokenClips) -> TokenClips:
+        flat = rearrange(own, "b f r c d -> (b f) (r c) d")
+        return self.attention(flat, flat).reshape(own.shape)
+
+
+def _zones(tokens: TokenClips) -> Float[Tensor, "zone token 512"]:
+    return rearrange(tokens, "b f (i r) (j c) d -> (b i j) (f r c) d", i=ZONES, j=ZONES)
+
+
+class DSTT(TokenTransformer):
+    """34.5 M parameters; 158 tensors, named as in the official checkpoint's `netG`. Takes multiples of 24 x 24 px."""
+
+    name = "DSTT"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = shallow_layers()
+        self.hier_enc = DeepLayers()
+        self.patch2vec = nn.Conv2d(FEATURES, DIM, PATCH_CELLS, STEP_CELLS, MARGIN_CELLS)
+        self.transformer = nn.ModuleList(DecoupledBlock(temporal=i % 2 == 0) for i in range(BLOCKS))
+        self.vec2patch = SoftComposition()
+        self.decoder = FrameDecoder()
+        initialise(self)
+
+    def check_size(self, height: int, width: int) -> None:
+        """ValueError unless both are multiples of 24: zones of equal size."""
+        if height % SIZE_STEP_PX or width % SIZE_STEP_PX or not height or not width:
+            raise ValueError(
+                f"DSTT: expected frames of a height and width that are multiples of {SIZE_STEP_PX}, got "
+                f"{width}x{height}; resize them, to 432x240 for the official weights"
+            )
+
+    def encode(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
+        """Features at a quarter of the size."""
+        return self.hier_enc(self.encoder(frames))
+
+    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+        """Tokens of overlapping patches; the convolution is soft split's linear layer."""
+        return self.patch2vec(features).movedim(1, -1)
+
+    def decode(
+        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
+    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
+        """Frames in [-1, 1]."""
+        rows, cols = features.shape[-2:]
+        return self.decoder(features + self.vec2patch(tokens, (rows, cols)))
+
+
+TOKENS = token_grid(*CELLS)
+
+
+class JointBlock(TokenBlock):
+    """Attention over all tokens of all frames, then the fusion feed-forward; both with the usual residual."""
+
+    def __init__(self) -> None:
+        super().__init__(FusionFeedForward(nn.ReLU(inplace=True), nn.Identity()))
+
+    def forward(
+        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
+    ) -> tuple[TokenClips, TokenClips]:
+        """See `TokenBlock`."""
+        own = self.norm1(tokens)
+        sources = own if memory is None else torch.cat([own, memory], 1)
+        queries, keys = (rearrange(x, "b f r c d -> b (f r c) d") for x in (own, sources))
+        x = tokens + self.attention(queries, keys).reshape(tokens.shape)
+        size = (STEP_CELLS * x.shape[2], STEP_CELLS * x.shape[3])
+        fused = self.ffn(self.norm2(x).flatten(0, 1), size)
+        return x + fused.reshape(x.shape), own
+
+
+class PositionalEmbedding(nn.Module):
+    """A learned vector for each place of a frame, the same in all frames; key `pos_emb`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        rows, cols = TOKENS
+        self.pos_emb = nn.Parameter(torch.empty(1, 1, rows * cols, DIM))
+        nn.init.normal_(self.pos_emb, 0, 0.02)
+
+    def forward(self, tokens: Float[Tensor, "frame rows cols 512"]) -> Float[Tensor, "frame rows cols 512"]:
+        """Tokens with their positional embedding."""
+        everywhere = self.pos_emb.reshape(*TOKENS, DIM).movedim(-1, 0)
+        return tokens + part_of(everywhere, (tokens.shape[1], tokens.shape[2])).movedim(0, -1)
+
+
+class FuseFormer(TokenTransformer):
+    """36.6 M parameters; 160 tensors, named as in the official checkpoint. Takes 432x240; in training, also less."""
+
+    name = "FuseFormer"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = HierarchicalEncoder()
+        self.ss = SoftSplit()
+        self.add_pos_emb = PositionalEmbedding()
+        self.transformer = nn.ModuleList(JointBlock() for _ in range(BLOCKS))
+        self.sc = SoftComposition(bias_size=CELLS)
+        self.decoder = FrameDecoder()
+        initialise(self)
+
+    def check_size(self, height: int, width: int) -> None:
+        """ValueError unless the frame is 432x240: positional embedding and bias map are learned for this size.
+
+        In training, smaller frames of multiples of 12 px are allowed; each uses a part of these maps.
+        """
+        part = 0 < height <= NATIVE_PX[0] and 0 < width <= NATIVE_PX[1] and not (height % STEP_PX or width % STEP_PX)
+        if (height, width) != NATIVE_PX and not (self.training and part):
+            raise ValueError(
+                f"FuseFormer: expected frames of {NATIVE_PX[1]}x{NATIVE_PX[0]}, the size of its learned positions, got "
+                f"{width}x{height}; resize them or run windows of that size"
+            )
+
+    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+        """Tokens of overlapping patches with their positional embedding."""
+        return self.add_pos_emb(self.ss(features))
+
+    def decode(
+        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
+    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
+        """Frames in [-1, 1]."""
+        return self.decoder(features + self.sc(tokens, (features.shape[-2], features.shape[-1])))
