@@ -31,14 +31,6 @@ class MendOutput:
     """Context manager that collects views in a hidden draft folder, and publishes the files if there was no error."""
 
     def __init__(self, out: Path, fps: float, alpha: bool = False, depth: bool = False):
-        """Create the output.
-
-        Args:
-            out: folder for the files.
-            fps: frame rate of the videos.
-            alpha: write cutout/*.png, RGB and straight alpha, and cutout.webm.
-            depth: write depth/*.png, see `depth_image_m`.
-        """
         self._folder, self._fps, self._alpha, self._depth = OutputFolder(out), fps, alpha, depth
         self._draft = self._folder.draft
         self._count = 0

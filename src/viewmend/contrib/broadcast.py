@@ -70,12 +70,6 @@ class FilmSegments:
     """
 
     def __init__(self, size_px: tuple[int, int], fps: int) -> None:
-        """Set up.
-
-        Args:
-            size_px: width and height, even.
-            fps: maximum frame rate.
-        """
         self._size_px, self._fps = size_px, fps
         self._files: dict[str, bytes] = {}
         self._segments: deque[str] = deque()
@@ -248,13 +242,6 @@ class Broadcast(Extension):
     notice = "watch {address}/watch{query}   (the view of the viewer who is on air)"
 
     def __init__(self, service: RenderService, config: ServerConfig, size_px: tuple[int, int]) -> None:
-        """Set up.
-
-        Args:
-            service: renders the view.
-            config: the server's; its budget applies.
-            size_px: width and height of the video, even.
-        """
         self._service, self._size_px, self._now = service, size_px, service.now
         self.session = BroadcastSession(service, size_px, config.budget_ms)
         self._director: ViewerSession | None = None

@@ -109,13 +109,7 @@ def _inverse(matrix: Float[np.ndarray, "4 4"]) -> bytes:
 
 
 def update(request: ImageRequest, jpeg: bytes, depth: Float[Tensor, "height width"]) -> bytes:
-    """A requested image, top row first, and its depth, bottom row first and compressed by Zstandard.
-
-    Args:
-        request: the request.
-        jpeg: the image.
-        depth: z-depth, metres; 0 without subject.
-    """
+    """A requested image, top row first, and its depth (metres, 0 without subject), bottom row first, as Zstandard."""
     import zstandard
 
     packed = zstandard.ZstdCompressor(level=1).compress(depth_steps(depth).tobytes())

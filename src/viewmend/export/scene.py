@@ -46,14 +46,7 @@ def engine_from_cameras(cameras: Cameras, rotation: Float[Tensor, "3 3"]) -> Flo
 
 
 def usd_scene(groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int) -> str:
-    """Cameras as ASCII USD (.usda), metres, y up; skew is left out.
-
-    Args:
-        groups: cameras by the name of their scope.
-        rotation: `engine_from_world`.
-        fps: frames per second.
-        frames: number of frames; they are counted from 0.
-    """
+    """Cameras as ASCII USD (.usda), metres, y up; skew is left out."""
     lines = ["#usda 1.0", "(", '    defaultPrim = "scene"', "    metersPerUnit = 1", '    upAxis = "Y"']
     lines += [f"    timeCodesPerSecond = {fps:g}", "    startTimeCode = 0", f"    endTimeCode = {frames - 1}", ")", ""]
     lines += ['def Xform "scene"', "{"]
@@ -103,15 +96,7 @@ def _prim_names(names: tuple[str, ...]) -> list[str]:
 def blender_script(
     groups: Mapping[str, Cameras], rotation: Float[Tensor, "3 3"], fps: float, frames: int, images: Mapping[str, str]
 ) -> str:
-    """A script that opens the exported scene in Blender: cameras with background images, and the animated hull.
-
-    Args:
-        groups: cameras by the name of their collection.
-        rotation: `engine_from_world`; the script converts to Blender's world, z up.
-        fps: frames per second.
-        frames: number of frames.
-        images: path of the first image of a camera, by the camera's name, relative to the script.
-    """
+    """A script that opens the exported scene in Blender: cameras with background images, and the animated hull."""
     cameras = [
         _blender_camera(own[view]) | {"group": group, "image": images.get(own.names[view]), "engine_from_camera": pose}
         for group, own in groups.items()

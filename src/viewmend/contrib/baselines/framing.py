@@ -150,12 +150,6 @@ def camera_windows(
     """The cameras' images around the aim, in [-1, 1]; black beyond the image.
 
     Without an aim, or with one behind a camera, its whole image is resized instead.
-
-    Args:
-        images: `foreground(views)`.
-        views: whose cameras they are.
-        at: the window's aim.
-        size: height and width of a window.
     """
     height, width = size
     cameras = views.frame.cameras

@@ -88,14 +88,6 @@ class Aligner:
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:
-        """Set up.
-
-        Args:
-            names: of the cameras.
-            interval_s: between two ticks.
-            tolerance_s: largest offset of an image from its tick.
-            wait_s: how long a tick waits after its first image.
-        """
         self._line = TimeLine(interval_s)
         self._tolerance_s, self._wait_s = tolerance_s, wait_s
         self._most = SPARE + math.ceil(wait_s / interval_s)

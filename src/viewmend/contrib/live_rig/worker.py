@@ -154,12 +154,6 @@ class CameraWorker:
     ) -> None:
         """Set up.
 
-        Args:
-            camera: its settings.
-            connect: returns a generator of images (`pictures_of`).
-            deliver: receives the camera's name, the time and the images.
-            wants: whether an image with this timestamp and interval is needed.
-
         Raises:
             CaptureError: the camera's clean plate is missing, or of another size.
         """

@@ -45,11 +45,6 @@ def find_ray(address: str) -> Any:
 def connect(ray: Any, address: str, **own: object) -> None:
     """Connect to a running cluster, or start one of this machine alone.
 
-    Args:
-        ray: the module, from `find_ray`.
-        address: of a running cluster (HOST:PORT, ray://HOST:PORT, auto), or `LOCAL`.
-        own: options of `ray.init` for a cluster that is started.
-
     Raises:
         ValueError: there is no cluster at the address.
     """
@@ -77,11 +72,6 @@ def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Ru
 
     Machines of the cluster need this package, and captures, people and models at the same paths. A task whose process
     dies fails alone.
-
-    Args:
-        tasks: scenes and methods.
-        settings: how scenes are run.
-        address: of a running cluster (HOST:PORT, ray://HOST:PORT, auto), or `cluster.LOCAL`.
 
     Raises:
         ValueError: Ray is not installed, or there is no cluster at the address.

@@ -117,10 +117,6 @@ class RayIngest:
 def serving(served: ManyViewers, address: str) -> Iterator[str]:
     """Serve on a cluster within the context; yields the viewers' address once replicas are ready.
 
-    Args:
-        served: what is served.
-        address: of a running cluster, or `cluster.LOCAL`.
-
     Raises:
         ValueError: Ray is not installed, there is no cluster, Serve runs on it, or the source cannot be read.
         OSError: the port is in use.

@@ -172,16 +172,7 @@ class Ingest:
         put: Callable[[SharedFrame], Any] = lambda shared: shared,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start reading.
-
-        Args:
-            source: the frames.
-            inpainter: encodes the cameras.
-            hull: how the hull is carved.
-            memory_mb: memory for prepared frames; the least recently used are dropped.
-            put: stores a frame where other processes can read it, and returns a reference to it.
-            now: the clock, in seconds.
-        """
+        """Start reading."""
         self._source, self._inpainter, self._hull, self._put, self._now = source, inpainter, hull, put, now
         self._max_bytes = 1e6 * memory_mb
         self._process = secrets.token_hex(8)

@@ -173,15 +173,6 @@ def make_splits(
     The order of subjects and the cameras follow from hashes of their names and the seed alone: the same on every
     machine, and adding a capture does not change the cameras of the others.
 
-    Args:
-        captures: folders, or files that stand for them.
-        base: the folder that paths are relative to.
-        seed: chooses subjects and cameras.
-        test_fraction: at least this part of the scenes is for tests; at least one subject.
-        scenes: use only this many captures, drawn by the seed; None uses all.
-        subject: a regular expression, whose first group in a capture's name is its subject.
-        kind: the captures' format, None to recognise it.
-
     Raises:
         ValueError: fewer than two subjects, a name without a subject, two scenes of one name, or fewer than 4 cameras.
     """

@@ -159,12 +159,6 @@ def performer_set(
 ) -> tuple[StudioScene, ...]:
     """Q: every character with every motion, each with both rigs.
 
-    Args:
-        folder: characters (.glb, .gltf) in it or in its `test`.
-        motions: BVH files in it; by default `motions/test`, `motions`, or the folder itself.
-        frames: of each scene.
-        size_px: width and height.
-
     Raises:
         CaptureError: there are no characters or no motions.
     """

@@ -269,12 +269,6 @@ def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], va
     Each garment is found by its colour (see `garments`), and with a chance of `variety` either dyed (its own pattern in
     other hues) or replaced by a seeded cloth: plain, striped, checked, printed or lettered, under the garment's folds.
 
-    Args:
-        character: with photographs of clothes as textures.
-        upright_from_file: brings its rest pose upright (`Retarget.upright_from_file`).
-        variety: 0 leaves it as it is, 1 changes every garment.
-        seed: of the clothes.
-
     Raises:
         ValueError: `variety` is not in [0, 1], or the skeleton is not human.
     """

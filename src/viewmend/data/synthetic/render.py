@@ -177,13 +177,7 @@ class Surface:
 
 
 def light(scene: TexturedMesh, lights: Lights, pyramid: TexturePyramid) -> Surface:
-    """Light a scene once, for any number of cameras; all arguments on one device.
-
-    Args:
-        scene: the performers at one time.
-        lights: of the stage.
-        pyramid: `texture_pyramid(scene.textures)`.
-    """
+    """Light a scene once, for any number of cameras; all arguments on one device."""
     return Surface(scene, irradiance(scene.mesh, scene.normals, lights), lights, pyramid)
 
 

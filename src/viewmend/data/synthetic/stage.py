@@ -69,10 +69,6 @@ class Studio:
     def __init__(self, config: StudioConfig | None = None, performer: Performer | None = None) -> None:
         """Set up the stage.
 
-        Args:
-            config: all defaults if None.
-            performer: replaces the one of the config.
-
         Raises:
             CaptureError: performers or motions that are missing, none in their folder, or unreadable.
             ValueError: sizes or counts that are not positive, a variety of cloth beyond [0, 1].
