@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Options:
     """Render novel views of a capture and inpaint them.
 
-    OUT receives the inpainted views (mended.mp4, or mended/*.png for a single view or without PyAV), the views as
+    OUT receives the inpainted views (mended.mp4, or mended/*.png for a single view), the views as
     rendered (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be inpainted), the ground truth
     of a held-out camera (truth/*.png), all of them side by side (compared.mp4), and contact_sheet.png.
 

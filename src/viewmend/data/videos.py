@@ -10,7 +10,6 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
-from importlib.util import find_spec
 from io import BytesIO
 from itertools import chain, islice
 from pathlib import Path
@@ -375,8 +374,3 @@ def _open_output(file: Path | BytesIO, format: str, codec: str, fps: float) -> t
         file.parent.mkdir(parents=True, exist_ok=True)
     container = av.open(file, "w", format=format)
     return container, container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
-
-
-def can_write_mp4() -> bool:
-    """Whether PyAV is installed."""
-    return find_spec("av") is not None

@@ -16,7 +16,6 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
-from viewmend.data.videos import can_write_mp4
 from viewmend.live.assets import AssetQuery, AssetStore, BusyError
 from viewmend.live.auth import AccessControl
 from viewmend.live.connection import Extension, SessionRegistry, ViewerConnection
@@ -112,7 +111,6 @@ class LiveServer:
             "limits": asdict(config.limits),
             "codecs": ["jpeg", *video_codecs()],
             "models": [name for name in shipped_models() if name != config.model],
-            "export": can_write_mp4(),
             "token_needed": bool(config.token),
             "broadcast": False,
         }
@@ -283,8 +281,6 @@ class LiveServer:
         return JSONResponse({"done": done, "of": of}, headers={"Cache-Control": "no-store"})
 
     async def _export(self, request: Request) -> Response:
-        if not can_write_mp4():
-            return error_response(501, "videos need PyAV; install viewmend's extra 'video'")
         if self._is_exporting:
             return error_response(409, "another path is being rendered; try again later")
         self._is_exporting = True

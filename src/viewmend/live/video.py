@@ -27,10 +27,8 @@ MAX_KEY_INTERVAL = 240
 @cache
 def video_codecs() -> tuple[str, ...]:
     """The codecs that can be encoded here."""
-    try:
-        import av
-    except ImportError:
-        return ()
+    import av
+
     return tuple(codec for codec, encoder in ENCODERS.items() if encoder in av.codecs_available)
 
 

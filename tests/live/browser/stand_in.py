@@ -152,7 +152,7 @@ class StandIn:
             codecs = [c for c in message["codecs"] if c == "jpeg" or self.video]
             about = {"version": 1, "viewer": 1, "server": "stand-in", "model": "none", "modes": MODES, "codecs": codecs}
             about |= {"error_rules": ["holes", "all", "yours"], "error_rule": "all", "background": self.ground}
-            more = {"export": True, "budget_ms": None, "limits": LIMITS, "token_needed": False}
+            more = {"budget_ms": None, "limits": LIMITS, "token_needed": False}
             await viewer.socket.send_json({"type": "welcome", **about, **more})
             await viewer.socket.send_json(scene.rig())
             viewer.greeted = True

@@ -159,7 +159,6 @@ class Page {
       offerModels(this.settings, welcome.model, welcome.models ?? []);
       this.controls.rules(welcome.error_rules, welcome.error_rule);
       this.settings.set("modelGround", welcome.background ?? "000000", false);
-      this.paths.offer(welcome.export);
       this.wake();
     });
     on(this.link, "rig", (rig) => {

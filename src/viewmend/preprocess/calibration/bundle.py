@@ -59,7 +59,6 @@ def calibrate(
 
     Raises:
         ValueError: a camera saw the board too seldom, or never together with the others.
-        ImportError: scipy is not installed.
     """
     from scipy.optimize import least_squares
 

@@ -33,7 +33,6 @@ export class PathPanel {
     this.film = null;
     this.progressText = "";
     this.listed = "";
-    this.canExport = true;
     byId("path-record").addEventListener("click", () => this.toggleRecording());
     byId("path-add").addEventListener("click", () => this.#add());
     byId("path-play").addEventListener("click", () => this.#play());
@@ -48,12 +47,6 @@ export class PathPanel {
     byId("path-save").addEventListener("click", () => this.#save());
     byId("path-open").addEventListener("click", () => byId("path-file").click());
     byId("path-file").addEventListener("change", () => void this.#open());
-    this.#show();
-  }
-
-  /** @param {boolean} can whether the server writes MP4 */
-  offer(can) {
-    this.canExport = can;
     this.#show();
   }
 
@@ -154,14 +147,13 @@ export class PathPanel {
     byId("path-play").textContent = this.playing ? "Stop" : "Preview";
     byId("path-clear").disabled = !points.length || this.recording;
     const button = byId("path-export");
-    button.disabled = !ready || !this.canExport || this.film !== null;
+    button.disabled = !ready || this.film !== null;
     button.classList.toggle("busy", this.film !== null);
     button.textContent = this.film ? "Rendering" : "Export MP4";
     byId("path-save").disabled = !ready;
     byId("path-film").hidden = this.film === null;
     let text = "Record a movement, or add views to fly through.";
     if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s${room ? "" : ", the maximum length"}`;
-    if (!this.canExport) text = "The server cannot write MP4; install PyAV there: pip install av";
     if (this.film && this.progressText) text = this.progressText;
     byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;
