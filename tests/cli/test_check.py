@@ -2,8 +2,14 @@ import json
 
 import cv2
 import pytest
+import torch
+from models.plates import tiny
+from reference.ball import BallCapture, ring
+from safetensors.torch import load_file, save_file
 
 from viewmend.cli import main
+from viewmend.data.native_writer import write_capture
+from viewmend.models.checkpoint import save_inpainter
 
 
 def described(capsys, *arguments):
@@ -76,3 +82,67 @@ def test_a_picture_needs_a_picture_s_name(shared, capsys, tmp_path):
     assert main(["check", str(shared / "captures" / "utrecht"), "--out", str(tmp_path / "check.txt")]) == 2
     assert "the file name of an image" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+# A model whose weights make no finite numbers is refused by every command that takes one, in one line.
+
+
+SMALL = ("--frames", "1", "--size", "64")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture") / "ball"
+    write_capture(BallCapture(ring(4)), folder, images="png")
+    return folder
+
+
+def model_with(folder, spoilt):
+    save_inpainter(tiny(), folder, "# A card")
+    weights = load_file(folder / "model.safetensors")
+    save_file({name: spoilt(value) for name, value in weights.items()}, folder / "model.safetensors")
+    return str(folder)
+
+
+COMMANDS = {
+    "info": lambda model, capture, out: ["info", model],
+    "demo": lambda model, capture, out: ["demo", "--out", out, "--model", model, *SMALL],
+    "mend": lambda model, capture, out: ["mend", capture, "--out", out, "--path", "orbit", "--model", model],
+    "evaluate": lambda model, capture, out: [
+        "evaluate",
+        "P",
+        "--scenes",
+        "1",
+        "--out",
+        out,
+        "--methods",
+        model,
+        "--error-rule",
+        "all",
+        *SMALL,
+    ],
+    "export-scene": lambda model, capture, out: ["export-scene", capture, out, "--model", model, "--views", "8"],
+    "serve": lambda model, capture, out: ["serve", "--port", "0", "--model", model],
+    "train": lambda model, capture, out: ["train", "finetune", "--captures", capture, "--from", model, "--out", out],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused(command, value, capture, tmp_path, capsys):
+    model = model_with(tmp_path / "model", lambda weights: torch.full_like(weights, value))
+    assert main(COMMANDS[command](model, str(capture), str(tmp_path / "out"))) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "not finite" in line and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["info", "demo", "mend", "evaluate", "export-scene"])
+def test_weights_that_make_no_finite_colours_are_refused(command, capture, tmp_path, capsys):
+    model = model_with(tmp_path / "model", lambda weights: weights * 1e30)
+    code = main(COMMANDS[command](model, str(capture), str(tmp_path / "out")))
+    said = capsys.readouterr()
+    (line,) = [line for line in said.err.splitlines() if "expected finite colours" in line]
+    if command == "evaluate":
+        assert code == 1 and "failed: ValueError" in line, "its row says so, the other rows stand"
+    else:
+        assert code == 2 and line.startswith("viewmend: error: ") and not (tmp_path / "out").exists()

@@ -1,13 +1,17 @@
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
+from time import sleep
 from types import SimpleNamespace
 
 import pytest
 
 from viewmend import cli
-from viewmend.cli import console
+from viewmend.cli import console, main
+from viewmend.cli.console import busy, printable, say, show, track
 
 
 def run_command(monkeypatch, run, arguments=()):
@@ -100,3 +104,71 @@ def test_busy_is_shown_on_a_terminal(monkeypatch, capsys, terminal):
         pass
     out, message = capsys.readouterr()
     assert out == "" and ("thinking" in message) == terminal
+
+
+# What people are told: progress without a terminal, names that others chose, signals.
+
+
+def test_names_of_others_move_no_cursor(capsys):
+    name = "a\x1b[2Jb\rc\u202ed\x00e\ud800f\ng"
+    say(name)
+    show(name, "über 日本")
+    said = capsys.readouterr()
+    assert said.err == "a\\x1b[2Jb\\rc\\u202ed\\x00e\\ud800f\\ng\n"
+    assert said.out == f"{said.err}über 日本\n", "no name begins a line"
+    assert printable("plain text") == "plain text"
+
+
+def test_an_error_is_one_line_whatever_it_names(capsys):
+    assert main(["check", "no\x1b]0;such\x07\u202efolder"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said[:-1].isprintable() and "\\x1b]0;such\\x07\\u202efolder" in said
+
+
+def test_progress_is_said_without_a_terminal(monkeypatch, capsys):
+    monkeypatch.setattr(console, "INTERVAL_S", 0.05)
+    for _ in track(range(2), "counting"):
+        sleep(0.12)
+    with busy("thinking"):
+        sleep(0.12)
+    said = capsys.readouterr().err.splitlines()
+    assert {"counting: 0 of 2", "counting: 1 of 2, 0 s left", "thinking"} <= set(said)
+    assert [console._duration(s) for s in (80.0, 1200.0, 9000.0)] == ["80 s", "20 min", "2.5 h"]
+    sleep(0.12)
+    assert capsys.readouterr().err == "", "an end is an end"
+
+
+@pytest.mark.parametrize("arguments", [["mend", "x", "--out", ""], ["mend", "x", "--out="], ["check", " "]])
+def test_an_empty_value_is_refused(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert "got an empty one; is a variable unset?" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys):
+    before = signal.getsignal(number)
+    with console.stop_requests() as stopped:
+        assert not stopped()
+        os.kill(os.getpid(), number)
+        assert stopped() == number and "saving a checkpoint" in capsys.readouterr().err
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+            sleep(1)
+    assert signal.getsignal(number) == before
+
+
+def test_sigterm_lets_a_command_clean_up(tmp_path):
+    program = (
+        "import pathlib, sys, time\n"
+        "from viewmend.cli import console\n"
+        "with console.exit_on_sigterm():\n"
+        "    try:\n        print('begun', flush=True)\n        time.sleep(20)\n"
+        "    finally:\n        pathlib.Path(sys.argv[1]).write_text('cleaned')\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program, str(tmp_path / "a")], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"begun\n"
+        process.terminate()
+        assert process.wait(20) == 143
+    assert (tmp_path / "a").read_text() == "cleaned"

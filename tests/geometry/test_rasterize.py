@@ -3,6 +3,7 @@
 import pytest
 import torch
 from geometry.solids import ball_mesh, camera_at, dome
+from reference.ball import proxy, ring
 from reference.raster_twin import raster_twin
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers, unproject
@@ -130,3 +131,25 @@ def test_cuda_equals_cpu():
     there = rasterize(mesh.to("cuda"), cameras.to("cuda"))
     here = rasterize(mesh, cameras)
     assert (there.triangle.cpu() != here.triangle).float().mean() < 1e-4
+
+
+# The CPU's fast path of `interpolate` against the path for any device, which gradients take.
+
+
+def test_the_fast_path_equals_the_other():
+    ball, cameras = proxy(16), ring(3, 40).cropped(-4, 6, 50, 40)
+    raster = rasterize(ball.mesh, cameras)
+    attributes = torch.randn(len(ball.mesh.vertices), 5, generator=torch.Generator().manual_seed(0))
+    fast = interpolate(attributes, ball.mesh, cameras, raster)
+    slow = interpolate(attributes.clone().requires_grad_(), ball.mesh, cameras, raster)
+    assert slow.requires_grad and (raster.triangle >= 0).float().mean() > 0.2
+    torch.testing.assert_close(fast, slow.detach(), atol=1e-4, rtol=1e-4)
+
+
+def test_gradients_reach_the_attributes():
+    ball, cameras = proxy(8), ring(1, 20)
+    attributes = torch.ones(len(ball.mesh.vertices), 1, requires_grad=True)
+    raster = rasterize(ball.mesh, cameras)
+    interpolate(attributes, ball.mesh, cameras, raster).sum().backward()
+    assert attributes.grad is not None
+    torch.testing.assert_close(attributes.grad.sum(), (raster.triangle >= 0).sum().float())
