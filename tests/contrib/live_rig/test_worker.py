@@ -12,7 +12,7 @@ from reference.ball_rig import CAMERAS
 from viewmend.contrib.live_rig import worker as workers
 from viewmend.contrib.live_rig.frame_readers import Picture
 from viewmend.contrib.live_rig.rig_file import read_rig
-from viewmend.contrib.live_rig.worker import CameraWorker, Slot, pauses
+from viewmend.contrib.live_rig.worker import CameraWorker, pauses
 
 SIZE = CAMERAS.max_size_px
 
@@ -31,11 +31,11 @@ def test_pauses_grow_and_stay_short():
     assert list(itertools.islice(pauses(), 6)) == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
 
 
-def test_the_newest_wins():
-    slot: Slot[int] = Slot()
-    assert slot.take(0.0) is None
-    assert [slot.put(n) for n in range(3)] == [False, True, True]
-    assert slot.take(0.0) == 2 and slot.take(0.0) is None
+def test_the_newest_wins(camera):
+    worker = CameraWorker(camera, lambda _: None, lambda *_: None, lambda *_: True)
+    for n in range(3):
+        worker._offer(Picture(frame(), 10.0 + n))
+    assert worker.counts["replaced"] == 2 and worker._newest.get_nowait().taken_s == 12.0
 
 
 def test_a_camera_that_fails_is_reached_again(camera, monkeypatch):

@@ -1,12 +1,13 @@
 """One worker per camera: it reads images, reconnects after failures, makes masks, and delivers the result."""
 
+import contextlib
 import logging
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing
-from typing import Any, Generic, TypeVar
+from queue import Empty, Queue
+from typing import Any
 
 import numpy as np
 
@@ -66,32 +67,6 @@ def mask_maker(camera: LiveCamera) -> MaskMaker:
             raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
         maker = PlateMasks(reduced(plate, small_px))
     return maker if small_px == size_px else ReducedMasks(maker, small_px)
-
-
-T = TypeVar("T")
-
-
-class Slot(Generic[T]):
-    """Holds the latest value for another thread; a newer one replaces one that was not taken."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Condition()
-        self._value: T | None = None
-
-    def put(self, value: T) -> bool:
-        """Store a value; returns whether it replaced another."""
-        with self._lock:
-            replaced = self._value is not None
-            self._value = value
-            self._lock.notify()
-        return replaced
-
-    def take(self, timeout_s: float) -> T | None:
-        """Take the value; None if there is none in time."""
-        with self._lock:
-            self._lock.wait_for(lambda: self._value is not None, timeout_s)
-            value, self._value = self._value, None
-        return value
 
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
@@ -169,7 +144,8 @@ class CameraWorker:
         """When `up` changed last."""
         self._last_s: float | None = None
         self._period_s = 0.0
-        self._slot: Slot[Picture] = Slot()
+        self._newest: Queue[Picture] = Queue(1)
+        """The newest image, until it is taken."""
         self._stopped = threading.Event()
         self._threads = [
             threading.Thread(target=work, name=f"{camera.name} {work.__name__}", daemon=True)
@@ -202,7 +178,7 @@ class CameraWorker:
         while not self._stopped.is_set():
             began_s = time.monotonic()
             try:
-                with closing(self._connect(self)) as pictures:
+                with contextlib.closing(self._connect(self)) as pictures:
                     for picture in pictures:
                         if not self.up:
                             self._is_up()
@@ -220,11 +196,11 @@ class CameraWorker:
     def work(self) -> None:
         """Process the newest image, again and again, until stopped."""
         while not self._stopped.is_set():
-            picture = self._slot.take(TAKE_S)
-            if picture is None:
-                continue
             try:
+                picture = self._newest.get(timeout=TAKE_S)
                 images = self._input.images(picture)
+            except Empty:
+                continue
             except ValueError as error:
                 self.counts["refused"] += 1
                 self._say(str(error))
@@ -240,8 +216,11 @@ class CameraWorker:
         self.counts["read"] += 1
         if not self._wants(picture.taken_s, self._period_s):
             self.counts["thinned"] += 1
-        elif self._slot.put(picture):
+            return
+        with contextlib.suppress(Empty):  # one that was not taken is replaced
+            self._newest.get_nowait()
             self.counts["replaced"] += 1
+        self._newest.put(picture)
 
     def _is_up(self) -> None:
         gone_s = time.monotonic() - self._since_s

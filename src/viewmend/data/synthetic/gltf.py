@@ -36,13 +36,15 @@ class Document:
     json: Mapping[str, Any]
     buffers: tuple[bytes, ...] = field(repr=False)
 
+    def fault(self, text: str) -> CaptureError:
+        """The error for a file that has to be exported in another way."""
+        return CaptureError(f"{self.path}: {text}; export it again")
+
     def entry(self, kind: str, index: int) -> Mapping[str, Any]:
         """`json[kind][index]`, or a CaptureError that names what is missing."""
         entries = self.json.get(kind, [])
         if type(index) is not int or not 0 <= index < len(entries):
-            raise CaptureError(
-                f"{self.path}: expected {kind} number {index}, the file has {len(entries)}; export it again"
-            )
+            raise self.fault(f"expected {kind} number {index}, the file has {len(entries)}")
         return entries[index]
 
     def view(self, index: int) -> bytes:
@@ -51,9 +53,8 @@ class Document:
         start, length = _count(entry.get("byteOffset", 0)), _count(entry["byteLength"])
         data = self.buffers[_count(entry["buffer"])]
         if start + length > len(data):
-            raise CaptureError(
-                f"{self.path}: expected at least {start + length} bytes of binary data, found {len(data)}: "
-                "the file is cut short; copy or export it again"
+            raise self.fault(
+                f"expected {start + length} bytes of binary data or more, got {len(data)}: it is cut short"
             )
         return data[start : start + length]
 
@@ -67,20 +68,14 @@ class Document:
         stride = _count(self.entry("bufferViews", entry["bufferView"]).get("byteStride", dtype.itemsize * width))
         offset, count = _count(entry.get("byteOffset", 0)), _count(entry["count"])
         if stride < dtype.itemsize * width:
-            raise CaptureError(
-                f"{self.path}: expected a byteStride of at least {dtype.itemsize * width} for accessor {index}, got "
-                f"{stride}; export it again"
+            raise self.fault(
+                f"accessor {index}: expected a byteStride of {dtype.itemsize * width} or more, got {stride}"
             )
         if count and offset + stride * (count - 1) + dtype.itemsize * width > len(data):
-            raise CaptureError(
-                f"{self.path}: accessor {index} wants {count} elements, its view has only {len(data)} bytes: "
-                "the file is damaged; export it again"
-            )
+            raise self.fault(f"accessor {index} wants {count} elements, its view has only {len(data)} bytes")
         values = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize)).copy()
         if dtype.kind == "f" and not np.isfinite(values).all():
-            raise CaptureError(
-                f"{self.path}: accessor {index} holds NaN or infinity; repair the mesh and export it again"
-            )
+            raise self.fault(f"accessor {index} holds NaN or infinity; repair the mesh")
         if entry.get("normalized") and dtype.kind != "f":
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1)
         return values
@@ -109,9 +104,7 @@ class Document:
             )
         image = decode_image(data, cv2.IMREAD_COLOR)
         if image is None:
-            raise CaptureError(
-                f"{self.path}: image {entry.get('name', index)} is no readable JPEG or PNG; export it again"
-            )
+            raise self.fault(f"image {entry.get('name', index)} is no readable JPEG or PNG")
         return np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)).astype(np.float32) / 255
 
 
@@ -283,7 +276,7 @@ def _tree(document: Document) -> tuple[list[int], dict[int, int]]:
         order.append(n)
         waiting.extend(entries[n].get("children", ()))
         if len(order) > len(entries):
-            raise CaptureError(f"{document.path}: expected a tree of nodes, found a loop; export the file again")
+            raise document.fault("expected a tree of nodes, got a loop")
     return order, parent_of
 
 
@@ -339,10 +332,8 @@ class _Parts:
             raise CaptureError(f"{self.document.path}: expected at most {MAX_VERTICES} vertices, got more; simplify it")
         faces = (read(primitive["indices"]).reshape(-1) if "indices" in primitive else np.arange(n)).astype(np.int64)
         if len(faces) % 3 or (len(faces) and faces.max() >= n):
-            raise CaptureError(
-                f"{self.document.path}: expected triangles whose corners are below {n}, found an index list "
-                f"of {len(faces)} up to {faces.max(initial=0)}; export the file again"
-            )
+            got = f"an index list of {len(faces)} up to {faces.max(initial=0)}"
+            raise self.document.fault(f"expected triangles whose corners are below {n}, got {got}")
         faces = faces.reshape(-1, 3)
         shape = Mesh(torch.from_numpy(vertices), torch.from_numpy(faces))
         normals = read(attributes["NORMAL"]) if "NORMAL" in attributes else vertex_normals(shape).numpy()
@@ -379,19 +370,17 @@ class _Parts:
         joints = self.document.accessor(attributes["JOINTS_0"]).astype(np.int64)
         weights = self.document.accessor(attributes["WEIGHTS_0"]).astype(np.float32)
         if len(joints) != n or len(weights) != n or joints.max(initial=0) >= len(entry["joints"]):
-            raise CaptureError(
-                f"{self.document.path}: expected joints and weights for {n} vertices with joints below "
-                f"{len(entry['joints'])}, found {len(joints)} and {len(weights)} up to joint "
-                f"{joints.max(initial=0)}; export the file again"
-            )
+            expected = f"joints and weights for {n} vertices with joints below {len(entry['joints'])}"
+            got = f"{len(joints)} and {len(weights)} up to joint {joints.max(initial=0)}"
+            raise self.document.fault(f"expected {expected}, got {got}")
         if not bool(((weights >= 0) & (weights <= HEAVIEST)).all()):
-            raise CaptureError(f"{self.document.path}: expected weights of joints in [0, 1]; export the file again")
+            raise self.document.fault("expected weights of joints in [0, 1], got others")
         return joints + self.first_joint[key], weights / np.maximum(weights.sum(1, keepdims=True), 1e-8)
 
     def _add_joints(self, key: tuple[str, int], nodes: list[int], binds: np.ndarray) -> None:
         missing = [n for n in nodes if n not in self.position]
         if missing:
-            raise CaptureError(f"{self.document.path}: joints {missing} are not in the scene; export the file again")
+            raise self.document.fault(f"joints {missing} are not in the scene")
         self.first_joint[key] = len(self.joint_nodes)
         self.joint_nodes += [self.position[n] for n in nodes]
         self.inverse_binds.append(binds.astype(np.float32))
@@ -412,7 +401,7 @@ class _Parts:
 
         for node in nodes:
             if not all(bool(part.isfinite().all()) for part in (node.translation, node.rotation, node.scale)):
-                raise CaptureError(f"{self.document.path}: node {node.name} is no finite transform; export it again")
+                raise self.document.fault(f"node {node.name} is no finite transform")
         return Character(
             nodes=nodes,
             vertices=floats(joined["vertices"]),
