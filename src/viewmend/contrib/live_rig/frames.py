@@ -122,42 +122,28 @@ class Aligner:
                 counts["surplus"] += 1
             if other is None or abs(offset_s) < abs(self._line.nearest(other.taken_s)[1]):
                 together.taken[name] = taken
-            self._drop_oldest()
+            while len(self._waiting) > self._most:
+                self._done = min(self._waiting)
+                for name in self._waiting.pop(self._done).taken:
+                    self.counts[name]["replaced"] += 1
 
     def take(self, now_s: float) -> list[Together]:
         """Ticks that are complete or waited long enough, the oldest first."""
         out = []
+        present = {name for name, heard_s in self._heard_s.items() if heard_s > now_s - AWAY_S}
         for tick in sorted(self._waiting):
             together = self._waiting[tick]
-            if not self._complete(together, now_s):
+            if now_s < together.since_s + self._wait_s and any(self._newest[name] < tick for name in present):
                 break
             del self._waiting[tick]
             self._done = tick
-            self._count(together, now_s)
+            for name in together.taken:
+                self.counts[name]["used"] += 1
+            for name in present - together.taken.keys():
+                self.counts[name]["missing"] += 1
             self._line.follow([self._line.nearest(taken.taken_s)[1] for taken in together.taken.values()])
             out.append(together)
         return out
-
-    def _drop_oldest(self) -> None:
-        """Drop the oldest ticks if too many wait."""
-        while len(self._waiting) > self._most:
-            self._done = min(self._waiting)
-            for name in self._waiting.pop(self._done).taken:
-                self.counts[name]["replaced"] += 1
-
-    def _complete(self, together: Together, now_s: float) -> bool:
-        if now_s >= together.since_s + self._wait_s:
-            return True
-        return not any(self._newest[name] < together.tick for name in self._present(now_s))
-
-    def _present(self, now_s: float) -> list[str]:
-        return [name for name, heard_s in self._heard_s.items() if heard_s > now_s - AWAY_S]
-
-    def _count(self, together: Together, now_s: float) -> None:
-        for name in together.taken:
-            self.counts[name]["used"] += 1
-        for name in set(self._present(now_s)) - set(together.taken):
-            self.counts[name]["missing"] += 1
 
 
 WATCH_S = 1.0
@@ -290,7 +276,10 @@ class RigSource(LiveSource):
         watch_s = report_s = time.monotonic()
         while not self._stopped:
             try:
-                for together in self._next(0.1):
+                with self._lock_cameras:
+                    self._lock_cameras.wait(0.1)
+                    complete = self._aligner.take(time.monotonic())
+                for together in complete:
                     self._show(together)
             except Exception as error:  # nothing may end the thread
                 self._is_wrong(f"{type(error).__name__}: {error}"[:400])
@@ -302,12 +291,6 @@ class RigSource(LiveSource):
             if now_s > report_s + REPORT_S:
                 report_s = now_s
                 self._report()
-
-    def _next(self, timeout_s: float) -> list[Together]:
-        """The ticks that are complete."""
-        with self._lock_cameras:
-            self._lock_cameras.wait(timeout_s)
-            return self._aligner.take(time.monotonic())
 
     def _show(self, together: Together) -> None:
         """Add one frame, prepared as in `viewmend mend`."""

@@ -16,28 +16,9 @@ from viewmend.contrib.live_rig.rig_file import LiveCamera
 from viewmend.data.errors import CaptureError
 from viewmend.data.native_capture import CameraImages, Undistortion
 from viewmend.data.videos import is_turned, to_rgb
-from viewmend.preprocess.masks.maker import Mask, MaskMaker, Rgb
+from viewmend.preprocess.masks.maker import MaskMaker, Rgb
 from viewmend.preprocess.masks.person import PersonMasks
 from viewmend.preprocess.masks.plate import PlateMasks, read_plate
-
-
-class ReducedMasks:
-    """Makes masks of reduced images, and enlarges them."""
-
-    def __init__(self, maker: MaskMaker, size_px: tuple[int, int]) -> None:
-        self._maker = maker
-        self._size_px = size_px
-
-    def mask(self, rgb: Rgb) -> Mask:
-        """Foreground of the next image, of its size.
-
-        Raises:
-            ValueError: the image is not of the size that the maker was made for.
-        """
-        import cv2
-
-        small = self._maker.mask(reduced(rgb, self._size_px))
-        return np.asarray(cv2.resize(small, rgb.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def reduced(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
@@ -49,24 +30,26 @@ def reduced(rgb: Rgb, size_px: tuple[int, int]) -> Rgb:
     return np.asarray(cv2.resize(rgb, size_px, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def mask_size_px(camera: LiveCamera) -> tuple[int, int]:
+    """Width and height at which a camera's masks are made."""
+    size_px = camera.calibration.width, camera.calibration.height
+    return max(1, round(size_px[0] * camera.mask.scale)), max(1, round(size_px[1] * camera.mask.scale))
+
+
 def mask_maker(camera: LiveCamera) -> MaskMaker:
-    """The mask maker of a camera, by its rig's settings.
+    """The mask maker of a camera, by its rig's settings, for images of `mask_size_px`.
 
     Raises:
         CaptureError: its clean plate is missing, unreadable or of another size.
     """
-    size_px = camera.calibration.width, camera.calibration.height
-    small_px = max(1, round(size_px[0] * camera.mask.scale)), max(1, round(size_px[1] * camera.mask.scale))
     if camera.mask.method == "person":
-        maker = PersonMasks()
-    else:
-        where = f"{camera.plate}: the clean plate of camera '{camera.name}'"
-        plate = read_plate(camera.plate, where)
-        if plate.shape[1::-1] != camera.taken_px:
-            expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
-            raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
-        maker = PlateMasks(reduced(plate, small_px))
-    return maker if small_px == size_px else ReducedMasks(maker, small_px)
+        return PersonMasks()
+    where = f"{camera.plate}: the clean plate of camera '{camera.name}'"
+    plate = read_plate(camera.plate, where)
+    if plate.shape[1::-1] != camera.taken_px:
+        expected, got = ("{} x {}".format(*size) for size in (camera.taken_px, plate.shape[1::-1]))
+        raise CaptureError(f"{where}: expected {expected} pixels as the calibration says, got {got}; take it again")
+    return PlateMasks(reduced(plate, mask_size_px(camera)))
 
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 1.0
@@ -76,37 +59,6 @@ PERIOD_FOLLOWS = 0.05
 """Weight of the newest interval in the estimate of the interval between images."""
 
 log = logging.getLogger("viewmend.live")
-
-
-class CameraInput:
-    """Reduces, masks and undistorts the images of one camera."""
-
-    def __init__(self, camera: LiveCamera) -> None:
-        """Set up.
-
-        Raises:
-            CaptureError: the camera's clean plate is missing, or of another size.
-        """
-        self._camera = camera
-        self._masks = mask_maker(camera)
-        self._undistortion = Undistortion(camera.calibration)
-
-    def images(self, picture: Picture) -> CameraImages:
-        """The image and mask of a picture.
-
-        Raises:
-            ValueError: it has another size than the calibration.
-        """
-        frame, camera = picture.frame, self._camera.calibration
-        size = (frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)
-        if size != self._camera.taken_px:
-            expected = "{} x {}".format(*self._camera.taken_px)
-            raise ValueError(
-                f"expected pictures of {expected} as the calibration says, got {size[0]} x {size[1]}; "
-                "set the camera's mode in 'options'"
-            )
-        rgb = to_rgb(frame, (camera.width, camera.height))
-        return self._undistortion.apply(CameraImages(rgb, self._masks.mask(rgb), None))
 
 
 def pauses() -> Iterator[float]:
@@ -138,7 +90,8 @@ class CameraWorker:
         """Whether the camera delivers images."""
         self.error: str | None = None
         """Why not, or what is wrong with its images."""
-        self._input = CameraInput(camera)
+        self._masks = mask_maker(camera)
+        self._undistortion = Undistortion(camera.calibration)
         self._connect, self._deliver, self._wants = connect, deliver, wants
         self._since_s = time.monotonic()
         """When `up` changed last."""
@@ -198,7 +151,7 @@ class CameraWorker:
         while not self._stopped.is_set():
             try:
                 picture = self._newest.get(timeout=TAKE_S)
-                images = self._input.images(picture)
+                images = self._images(picture)
             except Empty:
                 continue
             except ValueError as error:
@@ -206,6 +159,23 @@ class CameraWorker:
                 self._say(str(error))
                 continue
             self._deliver(self.camera.name, picture.taken_s, images)
+
+    def _images(self, picture: Picture) -> CameraImages:
+        """The reduced and undistorted image, and its mask; ValueError for a size that is not the calibration's."""
+        import cv2
+
+        frame, camera = picture.frame, self.camera.calibration
+        size = (frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)
+        if size != self.camera.taken_px:
+            expected = "{} x {}".format(*self.camera.taken_px)
+            raise ValueError(
+                f"expected pictures of {expected} as the calibration says, got {size[0]} x {size[1]}; "
+                "set the camera's mode in 'options'"
+            )
+        size_px = camera.width, camera.height
+        rgb = to_rgb(frame, size_px)
+        mask = cv2.resize(self._masks.mask(reduced(rgb, mask_size_px(self.camera))), size_px)
+        return self._undistortion.apply(CameraImages(rgb, np.asarray(mask, np.uint8), None))
 
     def _offer(self, picture: Picture) -> None:
         """Pass on an image if its time is wanted."""
