@@ -40,8 +40,9 @@ def ball_frame(inpainter=None):
 
 
 def tensors_of(shared):
-    pyramids = [level for made in shared.encoded.values() for level in made.levels]
-    return [shared.frame.rgb, shared.frame.mask, shared.proxy.mesh.vertices, *shared.depths.values(), *pyramids]
+    frame, cached = shared.frame, shared.cached
+    pyramids = [level for made in cached.encoded.values() for level in made.levels]
+    return [frame.rgb, frame.mask, cached.proxy.mesh.vertices, *cached.depths.values(), *pyramids]
 
 
 def test_arrays_are_not_copied():
@@ -57,16 +58,17 @@ def test_arrays_are_not_copied():
 def test_a_repeated_tensor_is_sent_once():
     shared = ball_frame()
     mask = shared.frame.mask
-    twice = SharedFrame(shared.frame, shared.proxy, shared.depths, {"one": (mask,), "two": (mask,)})
-    got, buffers, _ = send(twice)
-    assert got.encoded["one"][0] is got.encoded["two"][0] is got.frame.mask
+    shared.cached.encoded.update(one=(mask,), two=(mask,))
+    got, buffers, _ = send(shared)
+    assert got.cached.encoded["one"][0] is got.cached.encoded["two"][0] is got.frame.mask
+    assert got.cached.frame is got.frame
     assert sum(len(buffer) == mask.numel() for buffer in buffers) == 1
 
 
 def test_a_stream_has_nothing_left_to_compute():
     model = make_method("views")
     own = cache_frame(photograph(CAMERAS, 3), None, PIPELINE.hull)
-    got = send(ball_frame(model))[0].cached_frame()
+    got = send(ball_frame(model))[0].cached
     assert torch.equal(own.proxy.mesh.vertices, got.proxy.mesh.vertices)
     assert torch.equal(own.depth(CAMERAS.names), torch.stack([got.depths[name] for name in CAMERAS.names]))
     model.encode_cameras(own.context(CAMERAS.names), ContextProvider(lambda *_: None, memory=lambda _: own.encoded))
@@ -74,7 +76,7 @@ def test_a_stream_has_nothing_left_to_compute():
 
 
 def test_a_renderer_uses_the_depth_of_another_process(monkeypatch):
-    cached = {3: ball_frame().cached_frame()}
+    cached = {3: ball_frame().cached}
 
     class Source(FrameSource):
         def read(self, index):
@@ -101,8 +103,8 @@ def test_a_renderer_uses_the_depth_of_another_process(monkeypatch):
 def test_tokens_of_the_transformer_are_shared():
     model = make_method("paper-small")
     got, *_ = send(ball_frame(model))
-    assert set(got.encoded) == set(CAMERAS.names)
-    frame = got.encoded["c1"]
+    assert set(got.cached.encoded) == set(CAMERAS.names)
+    frame = got.cached.encoded["c1"]
     assert frame.name == "c1" and frame.keys_values.isfinite().all() and len(frame.tokens) == len(frame.places)
 
 
@@ -112,7 +114,7 @@ def test_a_frame_without_a_hull():
         type(frame)(frame.cameras, frame.rgb, 0 * frame.mask, 0), None, PIPELINE.hull, SmoothFill()
     )
     got, *_ = send(shared)
-    assert got.cached_frame() is None and torch.equal(got.frame.rgb, frame.rgb)
+    assert got.cached is None and torch.equal(got.frame.rgb, frame.rgb)
 
 
 class Link:

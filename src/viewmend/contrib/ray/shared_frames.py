@@ -16,15 +16,13 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.frame_cache import CachedFrame, cache_frame
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.hull import HullConfig
-from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
-from viewmend.models.base import ContextProvider, Inpainter, Memory
+from viewmend.models.base import ContextProvider, Inpainter
 from viewmend.types import MultiViewFrame
 from viewmend.utils.heap import HeapTrimmer
 from viewmend.utils.mmap_tensors import size_bytes
@@ -39,12 +37,9 @@ class SharedFrame:
     """
 
     frame: MultiViewFrame
-    proxy: GeometryProxy | None
-    """The visual hull; None if it cannot be carved, in which case the renderer raises the reason again."""
-    depths: dict[str, Float[Tensor, "_height _width"]]
-    """Depth of the hull in each camera."""
-    encoded: Memory
-    """The inpainter's encodings of each camera: tokens, or pyramids."""
+    cached: CachedFrame | None
+    """The frame with its hull, its depth in each camera, and the inpainter's encodings; None if no hull can be carved,
+    in which case the renderer raises the reason again."""
 
     @classmethod
     def prepare(
@@ -54,24 +49,18 @@ class SharedFrame:
         try:
             cached = cache_frame(frame, bounds, hull)
         except ValueError:
-            return cls(frame, None, {}, {})
-        assert isinstance(cached.proxy, GeometryProxy), "it was carved"
+            return cls(frame, None)
+        cached.pop_geometry_ms()  # it was spent elsewhere
         views = cached.context(frame.cameras.names)
         if views is not None:
             context = ContextProvider(lambda _, names: cached.context(names), memory=lambda _: cached.encoded)
             inpainter.encode_cameras(views, context)
-        return cls(frame, cached.proxy, cached.depths, cached.encoded)
-
-    def cached_frame(self) -> CachedFrame | None:
-        """The frame in the form that a stream keeps; None without a hull."""
-        return None if self.proxy is None else CachedFrame(self.frame, self.proxy, 0.0, self.encoded, self.depths)
+        return cls(frame, cached)
 
     @cached_property
     def size_bytes(self) -> int:
         """Bytes of all arrays."""
-        made = [*self.depths.values(), *self.encoded.values()]
-        hull = () if self.proxy is None else (self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals)
-        return size_bytes([self.frame.rgb, self.frame.mask, *hull, *made])
+        return size_bytes([self.frame.rgb, self.frame.mask]) if self.cached is None else self.cached.size
 
     def __reduce__(self) -> tuple[Any, ...]:
         content = io.BytesIO()
@@ -335,7 +324,7 @@ class SharedSource(FrameSource):
     def read_cached(self, index: int) -> CachedFrame | None:
         """The frame with its hull and encodings, or None while it is being fetched."""
         shared = self._find(index)
-        return None if shared is None else shared.cached_frame()
+        return None if shared is None else shared.cached
 
     def _find(self, index: int) -> SharedFrame | None:
         with self._lock:
