@@ -232,8 +232,6 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
     for scene, path in _scenes_of(file, "test"):
         held = next(one for one in capture_set(path, frames=frames, kind=scene.kind) if one.held == scene.left_out)
         found.append(replace(held, name=f"{scene.name}-{scene.left_out}", set=file.stem))
-    if not found:
-        raise ValueError(f"{file}: expected a scene for tests, got none; make splits of two subjects or more")
     return tuple(found)
 
 
@@ -243,19 +241,16 @@ def training_captures(file: Path) -> tuple[tuple[NativeCapture, str], ...]:
     Raises:
         ValueError: it is none, or a capture is absent, cannot be used, or was recalibrated.
     """
-    found = tuple(
-        (open_masked(path, held=1, format=scene.kind), scene.left_out) for scene, path in _scenes_of(file, "training")
-    )
-    if not found:
-        raise ValueError(f"{file}: expected a scene for training, got none; make splits of two subjects or more")
-    return found
+    scenes = _scenes_of(file, "training")
+    return tuple((open_masked(path, held=1, format=scene.kind), scene.left_out) for scene, path in scenes)
 
 
 def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple[SplitScene, Path]]:
     """One part of a file, and where its captures are; ValueError for one that is absent or was recalibrated."""
-    for scene in read_splits(file).scenes:
-        if scene.split != split:
-            continue
+    scenes = [scene for scene in read_splits(file).scenes if scene.split == split]
+    if not scenes:
+        raise ValueError(f"{file}: expected a scene for {split}, got none; make splits of two subjects or more")
+    for scene in scenes:
         path = file.parent / scene.path
         if not path.exists():
             raise ValueError(f"{file}: expected the capture {path}, got none; put the file where its paths hold")

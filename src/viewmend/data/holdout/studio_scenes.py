@@ -5,7 +5,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -102,18 +102,15 @@ def procedural_set(
     scenes = []
     for n, seed in enumerate(P_SEEDS):
         cameras, tempo = RINGS[n % 2], TEMPOS[n % 3]
-        scenes.append(
-            StudioScene(
-                name=f"{name}-{seed}",
-                set=name,
-                rig=f"ring of {cameras}",
-                style=tempo,
-                config=StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background),
-                held=held_camera(seed, cameras),
-                tempo=tempo,
-            )
-        )
+        config = StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px, background=background)
+        scenes.append(_scene(f"{name}-{seed}", name, cameras, tempo, config, tempo=tempo))
     return tuple(scenes)
+
+
+def _scene(name: str, set: str, cameras: int, style: str, config: StudioConfig, **more: Any) -> StudioScene:
+    """A scene seen by a ring of cameras, of which the seed leaves out one."""
+    held = held_camera(config.seed, cameras)
+    return StudioScene(name=name, set=set, rig=f"ring of {cameras}", style=style, config=config, held=held, **more)
 
 
 def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
@@ -124,19 +121,9 @@ def turning_set(size_px: int = SIZE_PX) -> tuple[StudioScene, ...]:
     scenes = []
     for n, seed in enumerate(TURN_SEEDS):
         cameras, (tempo, motion) = TURN_RINGS[n % 2], TURNS[n // 2 % 2]
-        scenes.append(
-            StudioScene(
-                name=f"P-turn-{seed}",
-                set="P-turn",
-                rig=f"ring of {cameras}",
-                style=motion,
-                config=StudioConfig(seed=seed, cameras=cameras, frames=LONG_FRAMES, size_px=size_px),
-                held=held_camera(seed, cameras),
-                tempo=tempo,
-                motion=motion,
-                scored_from=LONG_FRAMES - FRAMES,
-            )
-        )
+        config = StudioConfig(seed=seed, cameras=cameras, frames=LONG_FRAMES, size_px=size_px)
+        moving = {"tempo": tempo, "motion": motion, "scored_from": LONG_FRAMES - FRAMES}
+        scenes.append(_scene(f"P-turn-{seed}", "P-turn", cameras, motion, config, **moving))
     return tuple(scenes)
 
 
@@ -171,17 +158,10 @@ def performer_set(
     for seed, (person, clip) in zip(Q_SEEDS, itertools.product(people, clips), strict=False):
         for cameras in RINGS:
             config = StudioConfig(seed=seed, cameras=cameras, frames=frames, size_px=size_px)
-            scenes.append(
-                StudioScene(
-                    name=f"Q-{person.stem}-{clip.stem}-{cameras}",
-                    set="Q",
-                    rig=f"ring of {cameras}",
-                    style=clip.stem,
-                    config=replace(config, performers=person, motions=clip),
-                    held=held_camera(seed, cameras),
-                    files_sha256=(sha256[person], sha256[clip]),
-                )
-            )
+            config = replace(config, performers=person, motions=clip)
+            hashes = (sha256[person], sha256[clip])
+            name = f"Q-{person.stem}-{clip.stem}-{cameras}"
+            scenes.append(_scene(name, "Q", cameras, clip.stem, config, files_sha256=hashes))
     return tuple(scenes)
 
 
