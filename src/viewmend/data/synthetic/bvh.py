@@ -68,33 +68,28 @@ def read_bvh(path: Path) -> Motion:
 
 def _hierarchy(path: Path, words: list[str]) -> list[_Joint]:
     joints: list[_Joint] = []
-    open_joints: list[int] = []
-    current = -1
-    place = 0
+    inside = [-1]  # the joints whose braces are open
+    tokens = iter(words)
     try:
-        while place < len(words):
-            word = words[place].upper()
-            if word in ("ROOT", "JOINT"):
-                joints.append(_Joint(words[place + 1], current))
-                place += 1
-            elif word == "END":
-                place += 1
-                joints.append(_Joint("", current))
-            elif word == "{":
-                open_joints.append(current)
-                current = len(joints) - 1
-            elif word == "}":
-                current = open_joints.pop()
-            elif word == "OFFSET":
-                joints[-1].offset = tuple(float(w) for w in words[place + 1 : place + 4])
-                place += 3
-            elif word == "CHANNELS":
-                count = int(words[place + 1])
-                joints[-1].channels = _channels(words[place + 2 : place + 2 + count], count)
-                place += 1 + count
-            place += 1
-    except (IndexError, ValueError) as error:
-        raise CaptureError(f"{path}: its HIERARCHY breaks off near word {place} ({error}); export it again") from error
+        for token in tokens:
+            match token.upper():
+                case "ROOT" | "JOINT":
+                    joints.append(_Joint(next(tokens), inside[-1]))
+                case "END":
+                    next(tokens)
+                    joints.append(_Joint("", inside[-1]))
+                case "{":
+                    inside.append(len(joints) - 1)
+                case "}":
+                    inside.pop()
+                case "OFFSET":
+                    joints[-1].offset = tuple([float(next(tokens)) for _ in range(3)])
+                case "CHANNELS":
+                    count = int(next(tokens))
+                    joints[-1].channels = _channels([next(tokens) for _ in range(count)], count)
+    except (IndexError, ValueError, StopIteration) as error:
+        reason = f"{error}" or "it is cut short"
+        raise CaptureError(f"{path}: its HIERARCHY breaks off ({reason}); export it again") from error
     if not joints or sum(j.parent < 0 for j in joints) != 1:
         raise CaptureError(f"{path}: expected one ROOT, found {sum(j.parent < 0 for j in joints)}; export one skeleton")
     if not all(len(j.offset) == 3 and all(abs(x) < 1e9 for x in j.offset) for j in joints):
