@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -38,6 +36,12 @@ class ServerSocket:
     """A connection to the server's path `ws` or `push`."""
 
     def __init__(self, url: str, token: str | None) -> None:
+        try:  # an optional package: without it, this module can still be imported
+            from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+            from websockets.sync.client import connect
+        except ImportError:
+            raise ImportError("a connection needs websockets: pip install 'viewmend'") from None
+        self._closed = ConnectionClosed
         self._context = contextlib.ExitStack()
         address = f"{url}{token_query(token)}"
         try:
@@ -51,7 +55,7 @@ class ServerSocket:
 
     def send(self, message: str | bytes) -> None:
         """Send a message. If the connection is closed already, `receive` raises the reason."""
-        with contextlib.suppress(ConnectionClosed):
+        with contextlib.suppress(self._closed):
             self._socket.send(message)
 
     def receive(self, timeout_s: float) -> dict[str, Any] | bytes:
@@ -61,7 +65,7 @@ class ServerSocket:
         """
         try:
             message = self._socket.recv(timeout=max(0.0, timeout_s))
-        except ConnectionClosed as closed:
+        except self._closed as closed:
             raise ConnectionLostError(f"the server has closed the connection: {closed}") from None
         if isinstance(message, bytes):
             return message
