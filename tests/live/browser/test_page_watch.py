@@ -7,17 +7,18 @@ from live.browser.conftest import View
 from live.live_servers import running
 
 from viewmend.live.client import Client
+from viewmend.live.server import load_extension
 from viewmend.live.video import video_codecs
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif("h264" not in video_codecs(), reason="PyAV has no x264 here")]
-SIZE = (160, 120)
+SIZE = "160x120"
 NO_SEGMENTS = "delete window.MediaSource"
 MOVES = "document.querySelector('#film').currentTime > {}"
 
 
 @pytest.fixture(scope="module")
 def on_air():
-    with running(broadcast_px=SIZE) as server:
+    with running(extensions=(load_extension("broadcast", SIZE),)) as server:
         yield server
 
 
@@ -74,7 +75,7 @@ def test_a_film_that_stands_still_is_begun_anew(on_air, pages):
 def test_the_tool_puts_this_page_on_air_and_tells_who_took_over(on_air, pages):
     view = pages(f"{on_air.url}/?side=128&sharp=0&background=0000c8")
     tool = view.page.locator("#tool-air")
-    view.page.wait_for_selector("#picture[data-frame]", timeout=60_000)
+    view.page.wait_for_selector("#picture[data-drawn]", timeout=60_000)
     assert tool.is_visible() and tool.get_attribute("aria-pressed") == "false"
     tool.click()
     pressed = "document.querySelector('#tool-air').getAttribute('aria-pressed') === '{}'"
@@ -85,11 +86,13 @@ def test_the_tool_puts_this_page_on_air_and_tells_who_took_over(on_air, pages):
     watching.until(lambda: np.abs(ground(watching)[0] - (0, 0, 200)).max() < 12, 20)
     view.until("document.querySelector('#tool-air').dataset.watched === 'true'")
     sessions = on_air.live.registry.sessions
-    loop, (before,) = on_air.server.servers[0].get_loop(), sessions
-    for connection in list(on_air.server.server_state.connections):
+    loop, (before,) = on_air.server._uvicorn.servers[0].get_loop(), sessions
+    for connection in list(on_air.server._uvicorn.server_state.connections):
         loop.call_soon_threadsafe(connection.transport.abort)
     view.until(lambda: before not in sessions, 20)
-    view.until(lambda: sessions and on_air.live._broadcast.is_on_air(sessions[0]), 20)  # it has come back, and on air
+    view.until(
+        lambda: sessions and on_air.live.extensions[0].state_json(sessions[0])["on_air"], 20
+    )  # it has come back, and on air
     view.until(pressed.format("true"), 20)
     with Client(on_air.ws) as other:
         other.on_air()
@@ -103,18 +106,18 @@ def test_the_tool_puts_this_page_on_air_and_tells_who_took_over(on_air, pages):
 
 def test_without_a_broadcast_there_is_no_tool_and_the_page_says_why(ball, pages):
     view = pages(f"{ball.url}/?side=128")
-    view.page.wait_for_selector("#picture[data-frame]", timeout=60_000)
+    view.page.wait_for_selector("#picture[data-drawn]", timeout=60_000)
     assert view.page.locator("#tool-air").is_hidden()
     assert "without --broadcast" in pages(f"{ball.url}/watch").page.wait_for_selector(
-        "#said:has-text('Nothing')"
+        "#said:has-text('No broadcast')"
     ).inner_text()  # fmt: skip
 
 
 def test_the_token_is_passed_on(pages):
-    with running(broadcast_px=SIZE, token="0123456789abcdef") as server:
+    with running(extensions=(load_extension("broadcast", SIZE),), token="0123456789abcdef") as server:
         for script in ("", NO_SEGMENTS):
             view = pages(f"{server.url}/watch?token=0123456789abcdef", script)
             view.until(MOVES.format(1), 40)
-        assert "asks for a token" in pages(f"{server.url}/watch").page.wait_for_selector(
+        assert "needs a token" in pages(f"{server.url}/watch").page.wait_for_selector(
             "#said:has-text('token')"
         ).inner_text()  # fmt: skip
