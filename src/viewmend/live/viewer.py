@@ -34,7 +34,14 @@ class Viewer:
     def __init__(
         self, address: str, show: Callable[[dict[str, Any]], None], run: Callable[[], None], stop: Callable[[], None]
     ) -> None:
-        """Start `run`, which returns after `stop`; `show` sends a message to all pages."""
+        """Start a bound server on a thread; `serve` does it.
+
+        Args:
+            address: what a browser opens.
+            show: sends a message to all pages.
+            run: serves until `stop` is called.
+            stop: ends `run`, from any thread.
+        """
         self.address = address
         """What a browser opens, with the token if there is one."""
         self._show, self._stop = show, stop
