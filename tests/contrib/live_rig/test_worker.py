@@ -96,7 +96,7 @@ def test_a_slow_mask_costs_pictures_and_never_delay(camera, monkeypatch):
         worker.wait(WAIT_S)
 
     worker = CameraWorker(camera, connect, lambda name, taken_s, _: delivered.append(taken_s), lambda *_: True)
-    monkeypatch.setattr(worker._input, "images", lambda picture: go_on.wait(WAIT_S) and None)
+    monkeypatch.setattr(worker, "_images", lambda picture: go_on.wait(WAIT_S) and None)
     worker.start()
     wait_until(lambda: 49.0 in delivered)
     worker.stop()
