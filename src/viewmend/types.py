@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -126,22 +126,6 @@ class MultiViewFrame(_LazyStacks):
 
 
 @dataclass(frozen=True)
-class WindowPart:
-    """Where images are windows of larger ones, as in training: what the model needs to know about the whole images."""
-
-    whole_size_px: tuple[int, int]
-    """Width and height of the whole image, of the first if there are several."""
-    reference_m: Float[Tensor, "view"]
-    """Median depth of each whole image, metres."""
-    inner: Bool[Tensor, "view height width"]
-    """Only patches inside this region count; the pixels around it are there for the encoder."""
-
-    def select(self, index: Int[Tensor, "view"], height: int, width: int) -> "WindowPart":
-        """The parts of some images, cut to this size."""
-        return replace(self, reference_m=self.reference_m[index], inner=self.inner[index, :height, :width])
-
-
-@dataclass(frozen=True)
 class ContextViews(_LazyStacks):
     """Camera images of one frame, with the geometry proxy's depth in each: everything an inpainter knows about a rig.
 
@@ -156,16 +140,12 @@ class ContextViews(_LazyStacks):
     frame: MultiViewFrame
     depth: Float[Tensor, "view height width"]
     """z-depth of G[t] in each camera, metres; 0 where the camera does not see the proxy."""
-    part: WindowPart | None = None
-    """Set if each image is a window of a larger one."""
 
     @classmethod
-    def of_depths(
-        cls, frame: MultiViewFrame, depths: Sequence[Float[Tensor, "_height _width"]], part: WindowPart | None = None
-    ) -> "ContextViews":
+    def of_depths(cls, frame: MultiViewFrame, depths: Sequence[Float[Tensor, "_height _width"]]) -> "ContextViews":
         """A frame with one depth image per camera, at least as large as the frame's images, without copying."""
         height, width = frame.per_camera("rgb")[0].shape[1:]
-        return cls._of_parts({"depth": [depth[:height, :width] for depth in depths]}, frame=frame, part=part)
+        return cls._of_parts({"depth": [depth[:height, :width] for depth in depths]}, frame=frame)
 
     def to(self, device: torch.device | str) -> "ContextViews":
         """The same on `device`."""
@@ -177,9 +157,8 @@ class ContextViews(_LazyStacks):
         frame = self.frame.select([name for name in names if name in own])
         if not len(frame.cameras):
             return ContextViews(frame, self.depth[:0])
-        index, depths = [own.index(name) for name in frame.cameras.names], self.per_camera("depth")
-        part = self.part and self.part.select(torch.tensor(index, device=depths[0].device), *frame.rgb.shape[2:])
-        return ContextViews.of_depths(frame, [depths[i] for i in index], part)
+        depths = self.per_camera("depth")
+        return ContextViews.of_depths(frame, [depths[own.index(name)] for name in frame.cameras.names])
 
 
 @dataclass(frozen=True)
@@ -246,8 +225,6 @@ class IncompleteView:
     fade: Float[Tensor, "height width"] | None = None
     """Predicted background fraction, in [0, 1], of pixels with E > 0 that are only attenuated; 0 where a pixel is to be
     re-synthesised. None: all pixels with E > 0 are."""
-    part: WindowPart | None = None
-    """Set if the view is a window of a larger one."""
     target_mask: Float[Tensor, "height width"] | None = None
     """M_t, the subject's true mask in this view, in [0, 1], where one is known: from a matting of the target camera, a
     better silhouette, or the alpha of another model. It may be smaller than the proxy: the completed view shows nothing

@@ -77,6 +77,8 @@ class SamplingConfig:
     """Earlier frames that a target must have."""
     clip_length: int = 1
     """Consecutive frames in a sample, for discriminators of clips."""
+    window_fraction: float = 1.0
+    """Fraction of the scenes with all `frames`; the others have the last only, in an eighth of the time."""
     with_context: bool = False
     """Whether samples have context: the source views now and at all earlier `frames`."""
     num_source_views: tuple[int, ...] = (2, 3, 4, 5)

@@ -197,16 +197,23 @@ class SampleScenes:
     rigs: RigSource
     config: SceneConfig
     sampling: SamplingConfig
+    single_frames: RigSource | None = None
+    """The rigs at the last frame only, if some samples have no history."""
 
     def scene(self, number: int) -> list[Sample]:
         """The samples of rig `number`, for some held-out cameras at some frames."""
-        scene = self.rigs.rig(number)
-        return rig_samples(scene.rig, self.config, self.sampling, scene.random, scene.held_out)
+        rigs, sampling = self.rigs, self.sampling
+        if self.single_frames is not None and Random(f"window/{number}").random() >= sampling.window_fraction:
+            rigs, sampling = self.single_frames, replace(sampling, min_history=0)
+        scene = rigs.rig(number)
+        return rig_samples(scene.rig, self.config, sampling, scene.random, scene.held_out)
 
 
 def sample_scenes(config: SceneConfig, sampling: SamplingConfig, seed: str) -> SampleScenes:
     """The training samples of `rig_source`; raises as it does."""
-    return SampleScenes(rig_source(config, sampling.frames, seed), config, sampling)
+    rigs = rig_source(config, sampling.frames, seed)
+    single = rig_source(config, sampling.frames[-1:], seed) if sampling.window_fraction < 1 else None
+    return SampleScenes(rigs, config, sampling, single)
 
 
 def validation_scenes(config: SceneConfig, sampling: SamplingConfig) -> SampleScenes:

@@ -20,13 +20,12 @@ from safetensors.torch import load, save
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.training.samples import Sample
-from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes, WindowPart
+from viewmend.types import ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 from viewmend.utils.atomic_writes import TEMPORARY, write_atomically
 from viewmend.utils.untrusted_input import InputError
 
 KINDS: dict[str, type] = {
-    kind.__name__: kind
-    for kind in (Sample, IncompleteView, ContextViews, WindowPart, MultiViewFrame, Silhouettes, Cameras, Bounds)
+    kind.__name__: kind for kind in (Sample, IncompleteView, ContextViews, MultiViewFrame, Silhouettes, Cameras, Bounds)
 }
 """The dataclasses that files may hold, by name; `storable` adds to them."""
 COMPRESSION, MAX_BYTES = 1, 2**31

@@ -99,7 +99,7 @@ def collate(
     """
     queries, query_positions, keys, key_positions = [], [], [], []
     for target, frames, own in zip(targets, contexts, own_keys_values, strict=True):
-        uvs = F.pad(centers_px(target.places) / whole_size_px(target.view), (0, 1))  # s = 0 in the novel view
+        uvs = F.pad(centers_px(target.places) / target.view.camera.size_px[0], (0, 1))  # s = 0 in the novel view
         valid = torch.ones_like(target.incomplete)
         queries.append(target.tokens[target.incomplete])
         query_positions.append((uvs[target.incomplete], valid[target.incomplete]))
@@ -116,12 +116,6 @@ def collate(
     return Batch(padded, _stack(query_positions, num_queries), keys_values, _stack(key_positions, num_keys))
 
 
-def whole_size_px(view: IncompleteView) -> Int[Tensor, "2"]:
-    """Width and height by which (u, v) are normalised: of the view, or of the whole view it was cropped from."""
-    own = view.camera.size_px[0]
-    return own if view.part is None else own.new_tensor(view.part.whole_size_px)
-
-
 def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: IncompleteView, config: PaperConfig) -> Positions:
     """C_G(x) of a frame's patches. Past frames use the current geometry, if their camera has a current frame."""
     points, valid = frame.points_world, frame.valid
@@ -130,7 +124,6 @@ def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: Incomplete
         if current:
             points, valid = frame.lifted_by(current[0])
     uv, valid = reproject(points, valid, view.camera)
-    uv = uv * (view.camera.size_px[0] / whole_size_px(view))
     s = torch.full_like(uv[:, :1], (view.time - frame.time) / config.window)
     return torch.cat([uv, s], 1), valid
 

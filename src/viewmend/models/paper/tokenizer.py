@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from viewmend.models.paper.config import ENCODER_GROUPS, PaperConfig
 from viewmend.models.paper.patches import PATCH_CELLS, STEP_CELLS, STEP_PX, any_in_patch, crop, padded_size, split
-from viewmend.types import ContextViews, IncompleteView, WindowPart
+from viewmend.types import ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
 RECEPTIVE_RADIUS_PX = 29
@@ -48,23 +48,23 @@ def build_context_input(views: ContextViews, config: PaperConfig) -> EncoderInpu
     for image, (width, height) in zip(inside, frame.cameras.size_px.tolist(), strict=True):
         image[height:], image[:, width:] = 0, 0
     if not config.use_mask:  # neither matting nor pruning of patches
-        return _stack_channels(rgb, mask, views.depth, inside > 0, config, views.part)
+        return _stack_channels(rgb, mask, views.depth, inside > 0, config)
     rgb = rgb * mask[:, None]
     if config.background == "white":
         rgb = rgb + (inside * (1 - mask))[:, None]  # a smaller image of the stack is padded with black
-    return _stack_channels(rgb, mask, views.depth, mask > 0, config, views.part)
+    return _stack_channels(rgb, mask, views.depth, mask > 0, config)
 
 
 def build_target_input(view: IncompleteView, config: PaperConfig) -> EncoderInput:
     """Encoder input of a novel view. Missing pixels are black and count as foreground, but not where M_t is 0."""
     if not config.use_mask:  # F as it was rendered, and every patch
         everywhere = torch.ones_like(view.mask[None])
-        return _stack_channels(view.rgb[None], everywhere, view.depth[None], everywhere > 0, config, view.part)
+        return _stack_channels(view.rgb[None], everywhere, view.depth[None], everywhere > 0, config)
     rgb, mask, missing = view.cut_rgb[None], view.silhouette[None], view.missing
     if config.background == "white":
         rgb = (rgb + (1 - mask)) * (1 - missing)
     foreground = (mask > 0) | (missing[None] > 0)
-    return _stack_channels(rgb, mask, view.depth[None], foreground, config, view.part)
+    return _stack_channels(rgb, mask, view.depth[None], foreground, config)
 
 
 def _stack_channels(
@@ -73,17 +73,13 @@ def _stack_channels(
     depth: Float[Tensor, "view height width"],
     foreground: Bool[Tensor, "view height width"],
     config: PaperConfig,
-    part: WindowPart | None,
 ) -> EncoderInput:
     channels = [rgb]
     if config.use_mask:
         channels.append(mask[:, None])
     if config.use_depth:
-        channels.append(relative_depth(depth, None if part is None else part.reference_m)[:, None])
-    kept = any_in_patch(foreground)
-    if part is not None:
-        kept &= ~any_in_patch(~part.inner)
-    return EncoderInput(torch.cat(channels, 1), foreground, kept)
+        channels.append(relative_depth(depth)[:, None])
+    return EncoderInput(torch.cat(channels, 1), foreground, any_in_patch(foreground))
 
 
 def reference_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view"]:
@@ -92,15 +88,12 @@ def reference_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, 
     return torch.stack([z.median() if len(z) else z.new_ones(()) for z in surfaces])
 
 
-def relative_depth(
-    depth: Float[Tensor, "view height width"], reference: Float[Tensor, "view"] | None = None
-) -> Float[Tensor, "view height width"]:
-    """4 (z / z_ref - 1), with z_ref `reference` or each image's `reference_depth`; 0 without a surface (section 3).
+def relative_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view height width"]:
+    """4 (z / z_ref - 1), with z_ref each image's `reference_depth`; 0 without a surface (section 3).
 
     It is independent of the rig's scale and of the target view, so features computed from it can be cached.
     """
-    reference = reference_depth(depth) if reference is None else reference
-    return torch.where(depth > 0, 4 * (depth / reference[:, None, None] - 1), 0.0)
+    return torch.where(depth > 0, 4 * (depth / reference_depth(depth)[:, None, None] - 1), 0.0)
 
 
 class Encoder(nn.Module):
