@@ -6,9 +6,11 @@ In ten minutes and in this order, each step in a process of its own so that a fa
 2. parity: views of a procedural scene by each shipped model, on the CPU and on the device;
 3. timings: geometry and live;
 4. a profile of a view: where the device's time goes, and how often a view waits for it;
-5. the recipe `paper`, trained for the rest of the time; a second run resumes it.
+5. training for the rest of the time: windows by all CPU cores, then an autoencoder and the recipe, first of
+   `paper_small`, then of `paper`. A second run with the same DIR goes on where each of them stopped.
 
-Writes DIR/gpu_first_hour.json after each step (exit codes, seconds, figures, last lines), and DIR/paper.
+Writes DIR/gpu_first_hour.json after each step (exit codes, seconds, figures, last lines), DIR/windows, a folder of each
+run, and DIR/pieces: the weights and checkpoints of all runs in files of at most 16 MiB, to be joined by `cat`.
 `--device cpu --minutes 3` tries the script itself. Exits with 1 if a step failed.
 """
 
@@ -29,6 +31,7 @@ from measure import machine, synchronise
 from viewmend import Stream
 from viewmend.data.synthetic.rigs import orbit
 from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.evaluation.paper_tables import training_of
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.stream import StreamConfig
 from viewmend.utils.atomic_writes import write_text
@@ -41,6 +44,9 @@ LARGEST_DB_BELOW = 50.0
 """Minimum PSNR between the device's image and the CPU's."""
 GRACE_S = 60.0
 """Seconds that a step has to end after its time is over."""
+PIECE_BYTES = 16 * 2**20
+SHARES = {"windows": 0.2, "autoencoder-small": 0.08, "paper_small": 0.27, "autoencoder": 0.1, "paper": 0.35}
+"""Fractions of the time for training."""
 SAID = 3000
 """Characters of a step's output that are kept."""
 
@@ -110,6 +116,38 @@ def commands(device: str) -> dict[str, list[str]]:
     return {"tests": tests, "parity": [*own, "parity"], **timings, "profile": [*own, "profile"]}
 
 
+def training(out: Path, minutes: float) -> dict[str, list[str]]:
+    """The steps of training, which share `minutes`."""
+    viewmend, windows = [sys.executable, "-m", "viewmend"], str(out / "windows")
+    pretrain = [sys.executable, str(HERE / "pretrain_paper.py")]
+
+    def learn(name: str, command: list[str], *options: str) -> list[str]:
+        before = training_of(out / name)
+        total = SHARES[name] * minutes + (before.minutes if before else 0)
+        return [*command, "--shards", windows, "--out", str(out / name), "--minutes", f"{total:.2f}", *options]
+
+    workers = ("--workers", str(os.cpu_count() or 1), "--count", "100000")
+    return {
+        "windows": [*viewmend, "make-dataset", "paper_small", *workers, "--out", windows],
+        "autoencoder-small": learn("autoencoder-small", pretrain),
+        "paper_small": learn(
+            "paper_small", [*viewmend, "train", "paper_small"], "--from", str(out / "autoencoder-small")
+        ),
+        "autoencoder": learn("autoencoder", pretrain, "--size", "paper"),
+        "paper": learn("paper", [*viewmend, "train", "paper"], "--from", str(out / "autoencoder")),
+    }
+
+
+def write_pieces(out: Path) -> None:
+    """The weights and checkpoints of all runs, in pieces."""
+    pieces = out / "pieces"
+    pieces.mkdir(exist_ok=True)
+    for path in sorted(out.glob("*/*.safetensors")):
+        with path.open("rb") as file:
+            for number, data in enumerate(iter(lambda: file.read(PIECE_BYTES), b"")):
+                (pieces / f"{path.parent.name}--{path.name}.{number:03d}").write_bytes(data)
+
+
 def run(command: list[str], limit_s: float) -> dict[str, object]:
     """Run a process; after `limit_s` it receives SIGTERM, so that training writes a checkpoint."""
     began, pipe = time.monotonic(), subprocess.PIPE
@@ -160,9 +198,10 @@ def main() -> None:
         if name not in given.skip:
             step(name, command, (end - time.monotonic()) / 2)
     left = (end - time.monotonic()) / 60
-    if "paper" not in given.skip and left > 0:
-        options = ["--out", str(given.out / "paper"), "--minutes", f"{left:.2f}"]
-        step("paper", [sys.executable, "-m", "viewmend", "train", "paper", *options], 60 * left + 120)
+    for name, command in training(given.out, left).items() if left > 0 else ():
+        if name not in given.skip:
+            step(name, command, 60 * SHARES[name] * left + (0 if name == "windows" else GRACE_S))
+            write_pieces(given.out)
     sys.exit(any(one["code"] not in (0, 5) for one in report["steps"].values()))
 
 

@@ -9,16 +9,16 @@ Small crops instead of whole images make ten times as many steps in the same tim
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 import tyro
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from viewmend.models.paper.config import PaperConfig, paper_small
+from viewmend.models.paper.config import PaperConfig, paper, paper_small
 from viewmend.models.paper.patch_transformer import PatchTransformer
 from viewmend.models.paper.patches import PATCH_CELLS, PATCH_PX, STEP_CELLS, STEP_PX, split
 from viewmend.models.paper.tokenizer import build_context_input
@@ -112,9 +112,16 @@ RECIPE = TrainConfig(
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 
 
-def main(out: Path, config: Config = RECIPE) -> None:
-    """Train the autoencoder; `out` is the folder of the run."""
-    train(config, out)
+def main(out: Path, config: Config = RECIPE, size: Literal["paper_small", "paper"] = "paper_small") -> None:
+    """Train the autoencoder.
+
+    Args:
+        out: folder of the run.
+        config: the run.
+        size: the model whose encoder and decoder are trained.
+    """
+    model = paper() if size == "paper" else paper_small()
+    train(replace(config, objective=AutoencoderConfig(model=model)), out)
 
 
 if __name__ == "__main__":

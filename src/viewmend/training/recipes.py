@@ -90,12 +90,18 @@ def paper_small() -> TrainConfig:
     return TrainConfig(
         name="paper_small",
         objective=PaperObjectiveConfig(model=paper_small_model(), sampling=sampling),
-        scenes=SceneConfig(protocols=PROTOCOLS, captures_fraction=1.0),
+        scenes=SceneConfig(
+            sizes_px=(224, 320, 416),
+            cameras=(6, 24),
+            num_holdout_views=6,
+            imperfect_fraction=0.5,
+            protocols=PROTOCOLS,
+            captures_fraction=1.0,
+        ),
         steps=20_000,
-        batch=4,
         new_per_batch=1,
-        learning_rate=4e-4,
-        warmup=200,
+        learning_rate=6e-4,
+        warmup=100,
         ema=0.998,
     )
 
