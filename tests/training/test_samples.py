@@ -24,7 +24,16 @@ from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream
 from viewmend.training.replay import SampleReplay, samples_in_order
 from viewmend.training.samples import HeldOutCamera, Sample, rig_samples
-from viewmend.training.scenes import CaptureRigs, MixedRigs, SampleScenes, Scene, StudioRigs, random_studio, rig_source
+from viewmend.training.scenes import (
+    CaptureRigs,
+    MixedRigs,
+    SampleScenes,
+    Scene,
+    StudioRigs,
+    random_studio,
+    rig_source,
+    sample_scenes,
+)
 from viewmend.training.shards import (
     ShardError,
     ShardScenes,
@@ -101,6 +110,17 @@ def test_the_truth_is_on_black_and_the_context_is_in_the_past():
         assert times[0] == sample.view.time and times == sorted(times, reverse=True)
         assert float(sample.view.error.sum()) >= SAMPLING.min_hole_px
         assert not sample.truth[:, 0].any(), "the top row is background"
+
+
+def test_some_scenes_have_the_last_frame_only():
+    sampling = replace(SAMPLING, frames=(0, 3), min_history=1, window_fraction=0.5)
+    scenes, whole = (sample_scenes(SCENES, replace(sampling, window_fraction=f), "w") for f in (0.5, 1.0))
+    times = [{v.frame.time for s in scenes.scene(n) for v in s.context} for n in range(6)]
+    assert {3} in times and {0, 3} in times and all(found in ({3}, {0, 3}, set()) for found in times)
+    short = times.index({3})
+    [single, *_], [full, *_] = scenes.scene(short), whole.scene(short)
+    assert len(single.context) == 1 and len(full.context) == 2
+    assert torch.equal(single.context[0].frame.rgb, full.context[0].frame.rgb)
 
 
 def test_a_clip_is_one_camera_at_consecutive_frames():
