@@ -112,7 +112,7 @@ def test_only_a_model_of_the_papers_recipe_has_the_papers_row(tmp_path):
     assert training_of(tmp_path / "0") == Training("paper_small", None, 81)
     labels = {name: row_label(name) for name in ("paper-small", "views", "rays", "telea")}
     assert labels == {
-        "paper-small": "the paper's architecture, trained otherwise", "views": "ours, not the paper's",
+        "paper-small": "the paper's model, pre-trained (a patch autoencoder)", "views": "ours, not the paper's",
         "rays": "ours, not the paper's", "telea": "not in the paper",
     }  # fmt: skip
 
