@@ -35,7 +35,7 @@ TOLERANCE = 1e-4
 @pytest.fixture(scope="module")
 def model() -> PatchTransformer:
     torch.manual_seed(0)
-    return PatchTransformer(replace(paper_small(), widths=(8,) * 9, dim=64, k_w=2, n_w=1, n_c=2)).eval()
+    return PatchTransformer(replace(paper_small(), widths=(8,) * 9, dim=64, heads=4, k_w=2, n_w=1, n_c=2)).eval()
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_every_camera_image_is_encoded_once_for_all_viewers(model, encoded):
 @pytest.mark.parametrize("count", [1, 5])
 def test_context_cameras_of_any_number_are_encoded_once(count, encoded):
     torch.manual_seed(0)
-    config = replace(paper_small(), widths=(8,) * 9, dim=64, k_w=2, n_w=1, n_c=2, num_source_views=count)
+    config = replace(paper_small(), widths=(8,) * 9, dim=64, heads=4, k_w=2, n_w=1, n_c=2, num_source_views=count)
     walk(Stream(PatchTransformer(config).eval(), CONFIG), range(3), A, A)
     assert len(encoded) == len(set(encoded)) == 3 * count
 

@@ -57,9 +57,9 @@ def write_images(folder, rig, frame=None):
 
 def assert_same(calibration, rig):
     """The calibration, or the capture's, is that of the rig."""
-    calibration = getattr(calibration, "_calibration", calibration)
-    assert [camera.name for camera in calibration.cameras] == [camera["name"] for camera in rig]
-    for read, camera in zip(calibration.cameras, rig, strict=True):
+    cameras = getattr(calibration, "_entries", calibration.cameras)
+    assert [camera.name for camera in cameras] == [camera["name"] for camera in rig]
+    for read, camera in zip(cameras, rig, strict=True):
         assert (read.width, read.height) == (camera["width"], camera["height"])
         for key, value in (("K", read.K), ("R", read.R), ("t", read.t_m), ("dist", read.dist)):
             np.testing.assert_allclose(value, camera[key], rtol=1e-9, atol=1e-9, err_msg=key)

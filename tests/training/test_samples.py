@@ -253,9 +253,9 @@ def test_a_capture_is_aligned_without_the_held_out_camera():
     class Shifted(Studio):
         """States wrong principal points."""
 
-        @property
-        def cameras(self):
-            return super().cameras.moved(0.7, 0.0)
+        def __init__(self, config):
+            super().__init__(config)
+            self.cameras = self.cameras.moved(0.7, 0.0)
 
         def read(self, time):
             return replace(super().read(time), cameras=self.cameras)

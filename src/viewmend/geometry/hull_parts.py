@@ -16,7 +16,7 @@ BLOCK = 2
 """Side in voxels of the blocks that are labelled: parts less than a block apart count as one."""
 CELL = 1.25
 """Side of the cells in which images are compared, relative to the nearest voxel's image: no cell inside is missed."""
-COVERED = 0.5
+COVERED = 0.75
 """A part is not needed if the others cover this share of its image in every camera. Masks of real cameras disagree by
 strips at the outline, which a part can cover by chance."""
 MANY = 2000
