@@ -5,7 +5,7 @@
     viewmend train paper_small --from AUTOENCODER --shards SHARDS --out RUN
 
 Encoder and decoder learn to reproduce patches of camera images, each through its own token, without the transformer.
-Small crops instead of whole images make ten times as many steps in the same time.
+Small crops instead of whole images make five times as many steps in the same time.
 """
 
 from collections.abc import Sequence

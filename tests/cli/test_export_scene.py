@@ -185,7 +185,7 @@ def test_without_openexr_it_says_what_to_install(folder, tmp_path, capsys, monke
         ),
         (["views", "--format", "pt2", "--out", "{}/m.onnx"], "expected --out to end in .pt2, got"),
         (["views", "--format", "onnx", "--out", "{}/none/m.onnx"], "expected a folder to write to, found none"),
-        (["nobody", "--format", "onnx", "--out", "{}/m.onnx"], "one of the shipped models"),
+        (["no-such-model", "--format", "onnx", "--out", "{}/m.onnx"], "one of the shipped models"),
     ],
 )
 def test_what_cannot_be_exported_is_said(tmp_path, capsys, arguments, said):

@@ -107,7 +107,7 @@ def test_rendered_views_and_the_truth_lie_beside_the_mended_ones(folder, tmp_pat
     assert (rendered[holes] == 0).all() and (mended[holes] > 0).any() and (rendered == mended)[~holes].all()
     true = prepare(open_masked(folder), [f"c{n}" for n in range(6)]).read(1).select(["held"])
     assert np.abs(truth - picture(true.rgb[0] / 255 * (true.mask[0] / 255)).astype(int)).max() <= 1
-    mend(folder, tmp_path, "--path", "orbit:seconds=0.2")  # nobody knows its truth
+    mend(folder, tmp_path, "--path", "orbit:seconds=0.2")  # without ground truth
     assert not (tmp_path / "truth").exists() and (tmp_path / "compared.mp4").exists()
 
 

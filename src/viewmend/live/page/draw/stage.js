@@ -215,15 +215,15 @@ export class Stage {
     this.lines?.draw(clipFromWorld(viewer), width, height);
   }
 
-  /** A camera's image on a plane. @param {any} camera @param {WebGLTexture} picture @param {any} quad @param {Float32Array} clip */
-  #image(camera, picture, quad, clip) {
+  /** An image on a plane. @param {any} size @param {WebGLTexture} picture @param {any} quad @param {Float32Array} clip */
+  #image(size, picture, quad, clip, opacity = 1) {
     const { gl } = this;
     const { program, at } = /** @type {any} */ (this.painter);
     gl.useProgram(program);
     gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.uniform2f(at.size, camera.width, camera.height);
+    gl.uniform2f(at.size, size.width, size.height);
     gl.uniform1f(at.tone, 1);
-    gl.uniform1f(at.opacity, 1);
+    gl.uniform1f(at.opacity, opacity);
     gl.uniform3fv(at.ground, this.ground);
     gl.uniformMatrix4fv(at.clip, false, clip);
     gl.bindVertexArray(quad.array);
@@ -247,19 +247,10 @@ export class Stage {
   #overlay(kept, picture, opacity) {
     const { gl } = this;
     const header = /** @type {Header} */ (this.header);
-    const { program, at } = /** @type {any} */ (this.painter);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
-    gl.useProgram(program);
-    gl.bindTexture(gl.TEXTURE_2D, picture);
-    gl.uniform2f(at.size, header.width, header.height);
-    gl.uniform1f(at.tone, 1);
-    gl.uniform1f(at.opacity, opacity);
-    gl.uniform3fv(at.ground, this.ground);
-    gl.uniformMatrix4fv(at.clip, false, clipFromPixels(header.width, header.height));
-    gl.bindVertexArray(kept.quad.array);
-    gl.drawElements(gl.TRIANGLES, kept.quad.solid, gl.UNSIGNED_INT, 0);
+    this.#image(header, picture, kept.quad, clipFromPixels(header.width, header.height), opacity);
     gl.disable(gl.BLEND);
     gl.enable(gl.DEPTH_TEST);
   }
