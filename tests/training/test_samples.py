@@ -155,11 +155,6 @@ def test_training_refuses_test_data(tmp_path):
     assert isinstance(rig_source(replace(SCENES, performers=other, motions=other), (0,), "0"), StudioRigs)
 
 
-def test_a_backdrop_is_the_only_difference_of_with_backdrop():
-    plain, staged = (random_studio(replace(SCENES, with_backdrop=on), 1, Random(2)) for on in (False, True))
-    assert staged == replace(plain, background="stage") != plain
-
-
 def test_hard_scenes_have_larger_errors_than_imperfect_ones():
     def errors(**changes):
         random = Random(3)
@@ -167,7 +162,7 @@ def test_hard_scenes_have_larger_errors_than_imperfect_ones():
 
     assert {it.calibration_px for it in errors(imperfect_fraction=0.0, hard_fraction=1.0)} == {0.0}
     usual, hard = errors(imperfect_fraction=1.0), errors(imperfect_fraction=1.0, hard_fraction=1.0)
-    assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in hard) <= 2.5
+    assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in hard) <= 4
     assert max(it.mask_edge_px for it in usual) <= 1 < max(it.mask_edge_px for it in hard) <= 2
 
 

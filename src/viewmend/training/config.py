@@ -41,9 +41,7 @@ class SceneConfig:
     imperfect_fraction: float = 0.6
     """Fraction of the studio scenes with noise, colour differences, and errors in masks and calibration."""
     hard_fraction: float = 0.0
-    """Fraction of the imperfect scenes whose errors are up to 2.5 times as large."""
-    with_backdrop: Annotated[bool, HIDDEN] = False
-    """Place every studio scene on a stage, not only half of the imperfect ones; the others are on black."""
+    """Fraction of the imperfect scenes whose errors are up to 4 times as large."""
     performers: Path | None = None
     """Folder of glTF characters for half of the studio scenes; without it, all people are procedural."""
     motions: Path | None = None

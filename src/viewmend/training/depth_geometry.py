@@ -34,6 +34,10 @@ class DepthErrors:
     """Pixels by which the silhouette grows; below 0 it shrinks."""
     holes: float = 0.0
     """Fraction of the surface without depth, in spots."""
+    points: float = 0.0
+    """Fraction of the pixels that remain, as squares of three pixels, like splatted points; 0 keeps all."""
+    behind: bool = False
+    """Whether a farther surface shows between the points, instead of none."""
 
     @classmethod
     def draw(cls, random: Random) -> "DepthErrors":
@@ -53,6 +57,8 @@ class DepthErrors:
             smooth_px=random.choice((0, 0, 1, 3, 6)),
             grow_px=random.choice((-2, -1, 0, 0, 1, 2, 4)),
             holes=some(0.08),
+            points=random.uniform(0.08, 0.4) if random.random() < 0.3 else 0.0,
+            behind=random.random() < 0.5,
         )
 
     def apply(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
@@ -76,7 +82,15 @@ class DepthErrors:
             depth = depth + self.waves_m * F.interpolate(coarse, size=depth.shape, mode="bicubic")[0, 0]
         if self.step_m:
             depth = (depth / self.step_m).round() * self.step_m
-        return torch.where(there, depth.clamp_min(1e-3), 0.0)
+        depth = torch.where(there, depth.clamp_min(1e-3), 0.0)
+        return self._splatted(depth) if self.points else depth
+
+    def _splatted(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+        """Some of the pixels as squares; the nearest square wins."""
+        kept = (depth > 0) & (torch.rand_like(depth) < self.points)
+        nearest = -F.max_pool2d(-torch.where(kept, depth, torch.inf)[None], 3, 1, 1)[0]
+        between = depth + 0.25 * (depth > 0) if self.behind else torch.zeros_like(depth)
+        return torch.where(nearest.isinf(), between, nearest)
 
 
 def _mean(depth: Float[Tensor, "height width"], radius_px: int) -> Float[Tensor, "height width"]:

@@ -19,7 +19,7 @@ from viewmend.training.held_back import HeldBack
 from viewmend.training.samples import Sample, rig_samples
 from viewmend.types import MultiViewFrame
 
-HARD_CALIBRATION, HARD_MASKS = 2.5, 2.0
+HARD_CALIBRATION, HARD_MASKS = 4.0, 2.0
 """Largest factors of the calibration and silhouette errors of hard scenes."""
 
 
@@ -66,7 +66,7 @@ class StudioRigs:
         studio = Studio(random_studio(self.config, max(self.frames) + 1, random, self.split))
 
         def truth(held: str, time: int) -> MultiViewFrame:
-            return studio.truth(studio.true_cameras.select([held]), time)
+            return studio.truth(studio.true_cameras.select([held]), time, on_stage=True)
 
         return Scene(LeaveOneOut({time: studio.read(time) for time in self.frames}, true_view=truth), random)
 
@@ -81,7 +81,7 @@ def random_studio(config: SceneConfig, frames: int, random: Random, split: Split
         rig=random.choice(("ring", "dome")),
         frames=frames,
         size_px=random.choice(config.sizes_px),
-        background=random.choice(("black", "stage")) if flawed else "black",
+        background=random.choice(("black", "stage", "stage")) if flawed else "black",
         imperfections=Imperfections(
             exposure_stops=0.1 * strength,
             white_balance=0.04 * strength,
@@ -103,8 +103,6 @@ def random_studio(config: SceneConfig, frames: int, random: Random, split: Split
         it = replace(it, calibration_px=factor * it.calibration_px, calibration_m=factor * it.calibration_m)
         it = replace(it, mask_edge_px=random.uniform(1, HARD_MASKS) * it.mask_edge_px)
         studio = replace(studio, imperfections=it)
-    if config.with_backdrop:
-        studio = replace(studio, background="stage")
     if config.performers is not None and config.motions is not None and random.random() < config.performers_fraction:
         variety = random.uniform(0.0, 1.0)
         studio = replace(studio, performers=config.performers, motions=config.motions, cloth_variety=variety)

@@ -56,6 +56,8 @@ WRONG = 0.08
 """Difference of a channel, in [0, 1], from which a rendered pixel counts as erroneous when crops are drawn."""
 CORRECT = 0.1
 """Largest difference of a channel with which a pixel counts as correct for confidence and error prediction."""
+RIGHT, DAMAGED = 0.05, 0.08
+"""Largest difference of a channel with which a rendered pixel is right, and from which a changed one is penalised."""
 VISIBLE = 0.02
 """A camera sees a point if its true depth there differs by less, in subject sizes."""
 GAIN_WEIGHT = 4.0
@@ -74,6 +76,8 @@ class ViewsLossWeights:
     """L1 of colours on black."""
     perceptual: float = 0.7
     """Weight of LPIPS (AlexNet) of a crop, which keeps views as sharp as photographs."""
+    damage: Annotated[float, HIDDEN] = 1.0
+    """Weight of errors beyond `DAMAGED` where the rendered colour was right."""
     holes: Annotated[float, HIDDEN] = 4.0
     """Additional weight of pixels that no source view colours."""
     log_error: Annotated[float, HIDDEN] = 0.5
@@ -265,6 +269,8 @@ class ViewsObjective(Objective[ViewSynthNet]):
         log_error = (off.square().mean() + MIN_SQUARE).log10()
         correct = (off.detach().abs().amax(1) < CORRECT).float()
         total = weights.colour * colour + weights.log_error * log_error
+        right = (crop.view.rgb - truth)[:, at[0], at[1]].abs().amax(0) < RIGHT
+        total = total + weights.damage * (right * F.relu(off.abs().amax(1) - DAMAGED)).mean()
         total = total + weights.gradient * _gradient_loss(made, off, crop.view.mask.shape)
         total = total + weights.alpha * ((made.alpha - alpha).abs().mean() + 0.3 * _cross_entropy(made.alpha, alpha))
         total = total + weights.confidence * _cross_entropy(made.confidence, correct)
@@ -333,7 +339,7 @@ class ViewsObjectiveConfig(ObjectiveConfig):
         default_factory=lambda: ViewsConfig(coarse_fill="rays", error_features=24)
     )
     sampling: Annotated[SamplingConfig, HIDDEN] = field(
-        default_factory=lambda: SamplingConfig(num_ray_views=8, depth_fraction=0.3)
+        default_factory=lambda: SamplingConfig(num_ray_views=8, depth_fraction=0.4)
     )
     train_params: Literal["all", "errors"] = "all"
     """Parameters to train: all but those of the ray fill, or only the error predictor of the model given by --from."""

@@ -76,6 +76,16 @@ def test_the_truth_is_not_darkened_at_outlines(folders):
     assert abs(levels[0] - levels[1]) < 0.25 * levels[1]
 
 
+def test_truth_on_stage_differs_from_that_on_black_only_where_the_mask_is_soft():
+    studio = Studio(StudioConfig(seed=3, cameras=2, frames=1, size_px=64, background="stage"))
+    alone, staged = (studio.truth(studio.cameras, 0, on_stage=on) for on in (False, True))
+    assert alone.mask is not None and staged.mask is not None and torch.equal(alone.mask, staged.mask)
+    other = (alone.rgb.int() - staged.rgb.int()).abs().amax(1) > 2
+    assert bool(other[alone.mask == 0].all()) and not bool(other[alone.mask == 255].any())
+    soft = (alone.mask > 0) & (alone.mask < 255)
+    assert bool(other[soft].float().mean() > 0.5)
+
+
 def test_imperfections_leave_the_truth_alone(folders):
     plain, wrong = Studio(config(folders)), Studio(config(folders, imperfections=Imperfections.typical()))
     view = orbit([1.0], (40, 40))

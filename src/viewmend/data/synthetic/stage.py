@@ -81,7 +81,7 @@ class Studio:
                 f"{config.fps}/s of {size} pixels; correct the studio's config"
             )
         seeds = map(int, np.random.SeedSequence(config.seed).generate_state(5))
-        performer_seed, rig_seed, light_seed, backdrop_seed, self._error_seed = seeds
+        performer_seed, rig_seed, light_seed, self._backdrop_seed, self._error_seed = seeds
         self.performer = performer or _cast(config, performer_seed)
         rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
         cameras = config.cameras if isinstance(config.cameras, Cameras) else rig(config.cameras, size, seed=rig_seed)
@@ -98,7 +98,7 @@ class Studio:
         self._lights = stage_lights(light_seed).to(config.device)
         self._backdrop = None
         if config.background == "stage":
-            self._backdrop = stage_backdrop(self.true_cameras, backdrop_seed)
+            self._backdrop = stage_backdrop(self.true_cameras, self._backdrop_seed)
         # Cache of the last frame, since a frame and its ground truth are read in pairs.
         self._last_surface: tuple[int, Surface] | None = None
         self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
@@ -132,12 +132,16 @@ class Studio:
         frame = imperfect_frame(frame, self.config.imperfections, self._error_seed, self._backdrop)
         return replace(frame, cameras=self.cameras)
 
-    def truth(self, cameras: Cameras, time: int) -> MultiViewFrame:
+    def truth(self, cameras: Cameras, time: int, on_stage: bool = False) -> MultiViewFrame:
         """What perfect cameras anywhere would see at index `time`, with exact mask and depth.
 
         Colours are the subject's own, not darkened where the mask is soft: times the mask, they are the view on black.
+        With `on_stage`, and a stage, they include what is behind soft pixels, as in the images of real cameras.
         """
-        frame = self._draw(cameras.to(self.config.device), time, None)
+        cameras = cameras.to(self.config.device)
+        if on_stage and self._backdrop is not None:
+            return self._draw(cameras, time, stage_backdrop(cameras, self._backdrop_seed))
+        frame = self._draw(cameras, time, None)
         assert frame.mask is not None, "the studio draws masks"
         share = (frame.mask[:, None].float() / 255).clamp_min(1 / 255)
         straight = srgb_from_linear((linear_from_srgb(frame.rgb.float() / 255) / share).clamp(0, 1))
