@@ -34,8 +34,8 @@ def test_it_reconnects_with_its_view_and_frame(ball):
         break_connections(ball)
         after = viewer.frame()
         assert viewer.connections == 2 and after.header["look"] == look and same_pose(before, after)
-        while (state := viewer.wait_for("state"))["time"] != 2 or state["playing"]:
-            pass
+        while (state := viewer.messages["state"])["time"] != 2 or state["playing"]:
+            viewer.wait_for("state")
 
 
 def test_a_seek_is_repeated_until_its_frame_is_shown(ball):

@@ -44,7 +44,7 @@ class Desk:
         return tuple(request.cameras[0].size_px[0].tolist())
 
     def change_clock(self, **change):
-        self.session.change_clock(ClockChange(**change), self.span)
+        self.session.change_clock(ClockChange(**change), self.span, 0.0)
 
     def pause(self):
         self.change_clock(playing=False)

@@ -76,10 +76,6 @@ class Options:
     """Write the scores to standard output as one JSON object, and nothing else."""
 
 
-FITTED_FRAMES, FITTED_RESOLUTION = 24, 64
-"""Frames from which the extent of a motion is taken, and the resolution of their hulls."""
-
-
 def run(options: Options) -> int:
     """Run the command; returns the exit code."""
     _check(options)
@@ -223,17 +219,12 @@ def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int])
 
     import torch
 
-    from viewmend.geometry.hull import HullConfig
-    from viewmend.geometry.orbit import fit_to, orbit_around
-    from viewmend.geometry.proxy import reconstruct
+    from viewmend.geometry.orbit import coarse_surface, fit_to, orbit_around, thinned
 
     shown, points = turntable.times(usable, capture.fps), []
-    moments = sorted(set(shown))
-    for time in moments[:: -(-len(moments) // FITTED_FRAMES)]:
-        frame = capture.read(time)
+    for frame in map(capture.read, thinned(sorted(set(shown)))):
         assert frame.mask is not None, "captures without masks are refused"
-        proxy = reconstruct(frame.mask, frame.cameras, capture.bounds, HullConfig(resolution=FITTED_RESOLUTION))
-        points.append(proxy.mesh.vertices)
+        points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
     extent = torch.cat(points)
     center, arc = (extent.amin(0) + extent.amax(0)) / 2, turntable.arc
     arc_rad = None if arc is None else math.radians(arc)

@@ -5,10 +5,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, project
+from viewmend.geometry.hull import HullConfig
+from viewmend.geometry.proxy import reconstruct
 from viewmend.geometry.rigid import look_at
 
 AGREED = 0.5
@@ -37,6 +40,8 @@ def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[T
 
 MARGIN = 0.06
 """Part of half an image that stays free around what it is fitted to."""
+FITTED_FRAMES, FITTED_RESOLUTION = 24, 64
+"""Frames of a motion, and voxels along the longest side of their hulls, to find what the motion covers."""
 FULL_TURN_GAP_RAD = math.radians(130)
 """A rig with a larger gap does not surround the subject: its orbit swings back and forth."""
 
@@ -120,6 +125,18 @@ def orbit_around(
         up=up.cpu(),
         visible_m=visible_m,
     )
+
+
+def coarse_surface(
+    mask: UInt8[Tensor, "camera height width"], cameras: Cameras, bounds: Bounds | None
+) -> Float[Tensor, "point 3"]:
+    """Points on the subject's surface in a frame, metres, to find what a motion covers."""
+    return reconstruct(mask, cameras, bounds, HullConfig(resolution=FITTED_RESOLUTION)).mesh.vertices.cpu()
+
+
+def thinned(moments: Sequence[int]) -> list[int]:
+    """At most `FITTED_FRAMES` of these, evenly spaced: enough to know what a motion covers."""
+    return list(moments[:: -(-len(moments) // FITTED_FRAMES) or 1])
 
 
 def fit_to(path: Cameras, points: Float[Tensor, "point 3"]) -> Cameras:

@@ -1,4 +1,4 @@
-"""One viewer's WebSocket: a task that reads, one that writes, and one that sends states and statistics."""
+"""One viewer's WebSocket: a task that reads and one that writes; one task for all sends states and statistics."""
 
 import asyncio
 import contextlib
@@ -39,6 +39,9 @@ ACK_S = 30.0
 FAULTS = (1.0, 19.0)
 """Malformed messages per second, and at once, that do not end a connection."""
 TICK_S = 0.1
+"""Seconds between checks of what viewers have to know."""
+STATE_S = 10.0
+"""Time after which a state is sent again though nothing has changed; pages continue its clock by themselves."""
 
 
 class Extension:
@@ -86,9 +89,33 @@ class SessionRegistry:
     """Fields of the message `welcome` that are the same for all viewers."""
     extensions: Sequence[Extension] = ()
     sessions: list[ViewerSession] = field(default_factory=list)
+    connections: "list[ViewerConnection]" = field(default_factory=list)
+    """Those that have said hello."""
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
     shown: dict[str, Any] | None = None
     """The message `show` that moved all pages last."""
+
+    _informer: "asyncio.Task[None] | None" = None
+
+    def join(self, connection: "ViewerConnection") -> None:
+        """Inform a viewer from now on."""
+        self.connections.append(connection)
+        connection.inform(self.source_json())
+        if self._informer is None or self._informer.done():
+            self._informer = asyncio.create_task(self._inform())
+
+    async def _inform(self) -> None:
+        """Let all connections send what is due, while there are any."""
+        shared = self.source_json()
+        while self.connections:
+            now = self.source_json()
+            shared = shared if now == shared else now
+            for connection in list(self.connections):
+                try:
+                    connection.inform(shared)
+                except Exception as error:  # ends this connection only
+                    connection.fail(error)
+            await asyncio.sleep(TICK_S)
 
     def show(self, message: dict[str, Any]) -> None:
         """Move all pages, and those that will be opened; from any thread."""
@@ -136,6 +163,12 @@ class ViewerConnection:
         self._rate, self._faults = RateLimit(rate, 2 * rate, self._now), RateLimit(*FAULTS, self._now)
         self._rig: dict[str, Any] | None = None
         self._shown: dict[str, Any] | None = None
+        self._failed: asyncio.Future[None] = self._loop.create_future()
+        self._seen: tuple[Any, ...] = ()
+        self._state: tuple[Any, ...] = ()
+        self._state_at = self._stats_at = -STATE_S
+        self._viewers = 0
+        """Viewers in the last statistics."""
         ladder = registry.service.renderer.ladder
         self._session = ViewerSession(self._send_frame, self._report_error, registry.budget_ms, ladder, self._now)
 
@@ -190,10 +223,12 @@ class ViewerConnection:
         await self._socket.send_text(json.dumps(welcome))
 
     async def _serve(self) -> None:
-        tasks = [asyncio.create_task(work()) for work in (self._read, self._write, self._send_status)]
+        tasks = [asyncio.create_task(work()) for work in (self._read, self._write)]
+        self._registry.join(self)
         try:
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait([*tasks, self._failed], return_when=asyncio.FIRST_COMPLETED)
         finally:
+            self._registry.connections.remove(self)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -245,7 +280,7 @@ class ViewerConnection:
             elif isinstance(message, Ack):
                 self._session.ack(message.frame)
             elif isinstance(message, ClockChange):
-                self._session.change_clock(message, self._service.source.span)
+                self._session.change_clock(message, self._service.source.span, self._service.edge)
             used = [extension.handle(self._session, message) for extension in self._registry.extensions]
             if not any(used) and not isinstance(message, Look | Cancel | Ack | ClockChange):
                 raise ProtocolError(
@@ -264,33 +299,46 @@ class ViewerConnection:
                     frame, self._frame = self._frame, None
                     await self._socket.send_bytes(frame)
 
-    async def _send_status(self) -> None:
-        """Send rig, state and statistics when they are due, and end a connection that acknowledges no frames."""
-        last, state_at, stats_at = None, 0.0, self._now()
-        while True:
-            now = self._now()
-            if self._service.is_ready:
-                self._send_new_rig()
-            shared = self._registry.source_json()
-            own = self._session.state_json(self._service.source.span, self._service.source.edge)
-            for extension in self._registry.extensions:
-                own |= extension.state_json(self._session)
-            steady = (
-                ("behind",) if self._service.source.span.live else ("time", "behind")
-            )  # a rig's frames are announced
-            state = (shared, {key: own[key] for key in own if key not in steady})
-            if state != last or now - state_at >= 0.5:
-                last, state_at = state, now
-                self._send_soon({"type": "state"} | shared | own)
-            if self._rig is not None and (shown := self._registry.shown) is not self._shown and shown:
-                self._shown = shown
-                self._send_soon(shown)
-            if now - stats_at >= 1:
-                stats_at = now
-                self._send_soon(self._session.stats_json(len(self._registry.sessions)))
-            if self._session.in_flight is not None and now - self._session.in_flight_since > ACK_S:
-                raise ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect")
-            await asyncio.sleep(TICK_S)
+    def inform(self, shared: dict[str, Any]) -> None:
+        """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
+
+        `shared` is the part of `state` that is the same for all viewers, and the same object while it is equal.
+        """
+        now, session = self._now(), self._session
+        if self._service.is_ready:
+            self._send_new_rig()
+        seen = (shared, session.clock_changes, session.buffering)
+        changing = self._registry.extensions or self._service.source.span.live  # at any time
+        if seen != self._seen or changing or now - self._state_at >= STATE_S:
+            self._seen = seen
+            self._send_state(shared)
+        if self._rig is not None and (shown := self._registry.shown) is not self._shown and shown:
+            self._shown = shown
+            self._send_soon(shown)
+        viewers = len(self._registry.sessions)
+        if now - self._stats_at >= 1 and (viewers != self._viewers or session.sent_since(self._stats_at - 1)):
+            self._stats_at, self._viewers = now, viewers
+            self._send_soon(session.stats_json(viewers))
+        if session.in_flight is not None and now - session.in_flight_since > ACK_S:
+            self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
+
+    def fail(self, error: Exception) -> None:
+        """End the connection."""
+        if not self._failed.done():
+            self._failed.set_exception(error)
+
+    def _send_state(self, shared: dict[str, Any]) -> None:
+        """Send a state, unless it is what a viewer expects after the last one: clocks run on."""
+        source, now = self._service.source, self._now()
+        with self._service.lock:
+            own = self._session.state_json(source.span, self._service.edge)
+        for extension in self._registry.extensions:
+            own |= extension.state_json(self._session)
+        expected = ("behind",) if source.span.live else ("time", "behind")  # a rig's frames are announced
+        state = (shared, self._seen[1], {key: own[key] for key in own if key not in expected})
+        if state != self._state or now - self._state_at >= STATE_S:
+            self._state, self._state_at = state, now
+            self._send_soon({"type": "state"} | shared | own)
 
     def _send_new_rig(self) -> None:
         if (rig := self._service.renderer.rig_json) is not None and rig is not self._rig:

@@ -1,20 +1,26 @@
 """Views requested over plain HTTP: single images, camera paths as videos, and the cameras' own images."""
 
+import math
 import time
 from abc import ABC, abstractmethod
 from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO
-from typing import Annotated, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import numpy as np
+import torch
+from jaxtyping import Float
 from msgspec import Meta, Struct
+from torch import Tensor
 
 from viewmend.data.videos import VideoWriter
+from viewmend.geometry.orbit import fit_to, orbit, thinned
 from viewmend.live import protocol
 from viewmend.live.encoding import Image, draw_mode, to_jpeg
-from viewmend.live.poses import stereo_pair, view_camera
+from viewmend.live.frame_source import Span
+from viewmend.live.poses import HomeView, stereo_pair, view_camera
 from viewmend.live.protocol import (
     EXTRA_MODES,
     MENDED_MODES,
@@ -32,6 +38,8 @@ from viewmend.types import MultiViewFrame
 from viewmend.utils.untrusted_input import one_of
 
 MAX_POSES = 900
+TURNTABLE_VIEWS = 25
+"""Views of a turntable in which the subject has to fit."""
 SOURCE_QUALITY = 90
 """JPEG quality of the cameras' own images."""
 Result = TypeVar("Result")
@@ -93,6 +101,37 @@ class SourceImageQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """The camera's name."""
     time: Literal["live"] | protocol.Count = "live"
     token: str = ""
+
+
+class TurntableQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The query of `GET /turntable`: a film around the subject."""
+
+    time: protocol.Count
+    """Its first frame's index."""
+    frames: Annotated[int, Meta(ge=1, le=MAX_POSES)] = 1
+    azimuth: protocol.Degrees = 0.0
+    """The middle of the arc."""
+    arc: Annotated[float, Meta(ge=1, le=360)] = 360.0
+    elevation: protocol.Elevation = 0.0
+    width: protocol.Side = 320
+    height: protocol.Side = 320
+    token: str = ""
+
+    def moments(self, span: Span) -> list[int]:
+        """The frames that show what the motion covers."""
+        count = span.end - span.first
+        shown = {span.first + (self.time - span.first + n) % count for n in range(min(self.frames, count))}
+        return thinned(sorted(shown))
+
+
+def frame_motion(asked: TurntableQuery, points: Float[Tensor, "point 3"], home: HomeView) -> dict[str, Any]:
+    """Target and distance (metres) and focal length (pixels) with which all images of a turntable show all points."""
+    center = (points.amin(0) + points.amax(0)) / 2
+    azimuths = torch.deg2rad(asked.azimuth + asked.arc * torch.linspace(-0.5, 0.5, TURNTABLE_VIEWS)).tolist()
+    elevation_rad, size_px = math.radians(asked.elevation), (asked.width, asked.height)
+    shape = {"radius_m": home.distance_m, "elevation_rad": elevation_rad, "center": center, "up": home.up}
+    path = fit_to(orbit(azimuths, size_px, **shape, visible_m=home.distance_m), points)
+    return {"target": center.tolist(), "distance": home.distance_m, "f": float(path.K[0, 0, 0])}
 
 
 class PathBody(ViewOptions, frozen=True, kw_only=True):

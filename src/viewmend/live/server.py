@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
+import torch
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
@@ -16,6 +17,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
+from viewmend.geometry.orbit import coarse_surface
 from viewmend.live.assets import AssetQuery, AssetStore, BusyError
 from viewmend.live.auth import AccessControl
 from viewmend.live.connection import Extension, SessionRegistry, ViewerConnection
@@ -28,6 +30,8 @@ from viewmend.live.render_jobs import (
     RenderJob,
     Result,
     SourceImageQuery,
+    TurntableQuery,
+    frame_motion,
     parse_path,
     parse_query,
     source_jpeg,
@@ -44,6 +48,7 @@ from viewmend.live.responses import (
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 from viewmend.models.checkpoint import shipped_models
+from viewmend.types import MultiViewFrame
 from viewmend.utils.plugins import import_object
 
 IMAGE_S, SOURCE_IMAGE_S, EXPORT_S = 60.0, 5.0, 3600.0
@@ -131,6 +136,7 @@ class LiveServer:
             Route("/camera.jpg", self._guard(self._source_image)),
             Route("/assets/{time}", self._guard(self._asset)),
             Route("/assets/{time}/{camera}", self._guard(self._asset)),
+            Route("/turntable", self._guard(self._turntable)),
             Route("/path", self._guard(self._progress)),
             Route("/path.mp4", self._guard(self._export), methods=["POST"]),
             WebSocketRoute("/ws", self._viewer),
@@ -242,19 +248,50 @@ class LiveServer:
         asked: SourceImageQuery = read_message(dict(request.query_params), SourceImageQuery, strict=False)
         if self._num_images >= MAX_IMAGES:
             return error_response(429, TOO_MANY_IMAGES)
-        source, end = self._service.source, time.monotonic() + SOURCE_IMAGE_S
+        source = self._service.source
         index = int(source.span.clamp(source.edge if asked.time == "live" else asked.time))
         self._num_images += 1
         try:
-            while (frame := source.read(index)) is None:
-                if time.monotonic() > end:
-                    return error_response(503, "the frame was not available in time; see /health")
-                await asyncio.sleep(0.05)
-            image = await asyncio.to_thread(source_jpeg, frame, asked.name)
+            image = await asyncio.to_thread(source_jpeg, await self._frame(index), asked.name)
+        except TimeoutError as error:
+            return error_response(503, str(error))
         finally:
             self._num_images -= 1
         headers = {"X-Viewmend-Time": str(index), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
+
+    async def _frame(self, index: int) -> MultiViewFrame:
+        """A frame of the source; TimeoutError if it is not read in time."""
+        end = time.monotonic() + SOURCE_IMAGE_S
+        while (frame := self._service.source.read(index)) is None:
+            if time.monotonic() > end:
+                raise TimeoutError("the frame was not available in time; see /health")
+            await asyncio.sleep(0.05)
+        return frame
+
+    async def _turntable(self, request: Request) -> Response:
+        asked: TurntableQuery = read_message(dict(request.query_params), TurntableQuery, strict=False)
+        self._config.limits.check_size(asked.width, asked.height)
+        source, home = self._service.source, self._service.renderer.home
+        if home is None or source.rig is None:
+            return error_response(503, "there is no frame yet; see /health")
+        if self._num_images >= MAX_IMAGES:
+            return error_response(429, TOO_MANY_IMAGES)
+        self._num_images += 1
+        points = []
+        try:
+            for index in asked.moments(source.span):
+                frame = await self._frame(index)
+                assert frame.mask is not None, "frames with geometry have masks"
+                points.append(await asyncio.to_thread(coarse_surface, frame.mask, frame.cameras, source.rig.bounds))
+                if await request.is_disconnected():
+                    break
+        except (TimeoutError, ValueError) as error:
+            return error_response(503, str(error))
+        finally:
+            self._num_images -= 1
+        fitted = frame_motion(asked, torch.cat(points), home)
+        return JSONResponse(fitted, headers={"Cache-Control": "no-store"})
 
     async def _asset(self, request: Request) -> Response:
         given = {**request.query_params, **request.path_params}

@@ -77,6 +77,15 @@ class RenderService:
         """Whether views can be rendered."""
         return self.renderer.home is not None and self.renderer.is_prepared_for(self.source.rig)
 
+    @property
+    def edge(self) -> float:
+        """The position of all who follow the edge, now."""
+        with self.lock:
+            now = self.now()
+            self.source.recording.advance(now - self._advanced_at, self.source.span)
+            self._advanced_at = now
+            return self.source.edge
+
     def _run(self) -> None:
         trimmer = HeapTrimmer()
         while not self._stopped:
@@ -90,7 +99,7 @@ class RenderService:
             trimmer.trim_if_due(idle=not worked)
             with self.lock:
                 if not worked and not self._stopped:
-                    self.lock.wait(TICK_S if self._sessions else IDLE_S)
+                    self.lock.wait(TICK_S if self._wants_views() else IDLE_S)
 
     def _prepare(self) -> bool:
         """Prepare the renderer for a new rig."""
@@ -104,11 +113,13 @@ class RenderService:
         self.error = None
         return done
 
+    def _wants_views(self) -> bool:
+        """Whether a session's clock has to be checked: one whose page draws by itself wants nothing."""
+        return any(not isinstance(s, ViewerSession) or s.newest_look is not None for s in self._sessions)
+
     def serve_next(self) -> bool:
         """Render and deliver one view; False if no session needs one. Called on the render thread."""
         now, span = self.now(), self.source.span
-        self.source.recording.advance(now - self._advanced_at, span)
-        self._advanced_at = now
         if not self.is_ready or self.renderer.home is None:
             return False
         with self.lock:
@@ -143,7 +154,7 @@ class RenderService:
         viewers = [session for session in self._sessions if isinstance(session, ViewerSession)]
         playback = PlaybackState(
             span,
-            self.source.edge,
+            self.edge,
             home,
             has_frame=lambda index: self.source.read(index) is not None,
             active_viewers=max(1, sum(viewer.is_active(now) for viewer in viewers)),

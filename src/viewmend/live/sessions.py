@@ -94,6 +94,7 @@ class ViewerSession:
         """
         self.viewer: State | None = None
         self.clock = Clock()
+        self.clock_changes = 0
         self.buffering = False
         self.dropped = 0
         """Looks and frames that were replaced before they were rendered."""
@@ -152,15 +153,27 @@ class ViewerSession:
         """The view to show; None before the first look."""
         return self._look
 
-    def change_clock(self, change: ClockChange, span: Span) -> None:
+    def frame(self, span: Span, edge: float) -> int:
+        """The index of the frame to show now; -1 while there is none."""
+        elapsed_s, self._advanced_at = self._now() - self._advanced_at, self._now()
+        self.clock.advance(elapsed_s, span, edge)
+        return self.clock.frame(span)
+
+    def change_clock(self, change: ClockChange, span: Span, edge: float) -> None:
         """Play, pause, seek, change the speed, or follow the edge."""
+        self.frame(span, edge)
         self.clock.change(change, span)
+        self.clock_changes += 1
         self._cancel_final_view()
 
     def is_active(self, now: float) -> bool:
         """Whether a frame was sent within the last second, or the newest look waits for its first one."""
         waits = self.in_flight is None and self._look is not None and self._look is not self._requested[0]
-        return waits or (bool(self.recent) and self.recent[-1].sent_s > now - 1)
+        return waits or self.sent_since(now - 1)
+
+    def sent_since(self, since_s: float) -> bool:
+        """Whether a frame was sent after this moment."""
+        return bool(self.recent) and self.recent[-1].sent_s > since_s
 
     def ack(self, frame: int) -> None:
         """Note that a frame has arrived."""
@@ -169,11 +182,10 @@ class ViewerSession:
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the clock's frame, or the same view again at a better level."""
-        elapsed_s, self._advanced_at = now - self._advanced_at, now
-        self.clock.advance(elapsed_s, playback.span, playback.edge)
-        look, index = self._look, self.clock.frame(playback.span)
         self.buffering = False
-        if look is None or index < 0 or self.in_flight is not None:
+        if (look := self._look) is None or self.in_flight is not None:
+            return None
+        if (index := self.frame(playback.span, playback.edge)) < 0:
             return None
         is_new_look = look is not self._requested[0]  # by identity: a repeated look is answered again
         is_new = is_new_look or index != self._requested[1]
@@ -276,9 +288,8 @@ class ViewerSession:
         self._report_error(message)
 
     def state_json(self, span: Span, edge: float) -> dict[str, Any]:
-        """This viewer's part of the message `state`."""
-        clock = self.clock
-        index = clock.frame(span)
+        """This viewer's part of the message `state`, under the service's lock."""
+        clock, index = self.clock, self.frame(span, edge)
         return {
             "time": index,
             "playing": clock.playing,

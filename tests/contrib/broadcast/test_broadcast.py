@@ -88,8 +88,8 @@ def wait_for_background(server, colour):
 
 def wait_for_state(viewer, **expected):
     """Wait for a state with these values."""
-    while any(viewer.wait_for("state").get(key) != value for key, value in expected.items()):
-        pass
+    while any(viewer.messages.get("state", {}).get(key) != value for key, value in expected.items()):
+        viewer.wait_for("state")
 
 
 def test_the_viewer_on_air_controls_the_broadcast_view(on_air):
@@ -302,6 +302,7 @@ def test_a_server_without_a_broadcast(ball):
         assert viewer.messages["welcome"]["broadcast"] is False
         viewer.on_air()
         assert "--broadcast" in viewer.wait_for("error")["message"]
+        viewer.send("clock", playing=False)
         assert "on_air" not in viewer.wait_for("state")
 
 

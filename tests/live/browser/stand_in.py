@@ -70,6 +70,7 @@ class StandIn:
     looks: list[dict] = field(default_factory=list)
     clocks: list[dict] = field(default_factory=list)
     paths: list[dict] = field(default_factory=list)
+    turntables: list[dict] = field(default_factory=list)
     hellos: list[dict] = field(default_factory=list)
     viewers: list[Seen] = field(default_factory=list)
 
@@ -77,6 +78,7 @@ class StandIn:
         self.files = page_files()
         routes = [Route("/", self._file), Route("/page/{name:path}", self._file)]
         routes += [Route("/path", self._progress), Route("/camera.jpg", self._original)]
+        routes += [Route("/turntable", self._turntable)]
         routes += [Route("/path.mp4", self._film, methods=["POST"]), WebSocketRoute("/ws", self._viewer)]
         config = uvicorn.Config(
             Starlette(routes=routes), port=0, log_config=None, log_level="error", ws="websockets-sansio", lifespan="off"
@@ -122,6 +124,10 @@ class StandIn:
 
     async def _progress(self, request: Request) -> Response:
         return JSONResponse(dict(zip(("done", "of"), self.film, strict=True)))
+
+    async def _turntable(self, request: Request) -> Response:
+        self.turntables.append(dict(request.query_params))
+        return JSONResponse({"target": [0.0, 0.1, 0.0], "distance": 2.5, "f": 600.0})
 
     async def _original(self, request: Request) -> Response:
         asked = dict(request.query_params)

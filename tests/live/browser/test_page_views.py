@@ -17,12 +17,17 @@ def test_a_turntable_and_the_order_of_views(desktop):
     page = desktop.page
     page.locator("#path-seconds").fill("4")
     page.get_by_role("button", name="Turntable").click()
-    assert "9 views, 4 s" in text(page) and moments(page) == [n / 2 for n in range(9)]
+    desktop.until(lambda: "9 views, 4 s" in text(page), 10)
+    (asked,) = desktop.server.turntables
+    assert (asked["arc"], asked["width"], asked["height"]) == ("360", "480", "480") and int(asked["frames"]) > 1
+    assert moments(page) == [n / 2 for n in range(9)]
     page.get_by_role("button", name="Export MP4").click()
     desktop.until(lambda: bool(desktop.server.paths), 30)
     page.get_by_role("button", name="Cancel").click()
     poses = desktop.server.paths[-1]["poses"]
     eyes = np.array([-np.reshape(pose["R"], (3, 3)).T @ pose["T"] for pose in poses])
+    assert {pose["fx"] for pose in poses} == {600.0}, "the lens that the server has fitted"
+    assert np.allclose(np.hypot(eyes[:, 0], eyes[:, 2]).max(), 2.5, atol=0.5)
     assert len(poses) == 121 and np.abs(eyes[0] - eyes[-1]).max() < 1e-3
     assert np.ptp(eyes[:, 1]) < 1e-3 and np.ptp(eyes[:, 0]) > 3 and np.ptp(eyes[:, 2]) > 3
     field = page.get_by_label("Seconds of view 2", exact=True)

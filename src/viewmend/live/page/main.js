@@ -25,8 +25,7 @@ import { buildTools, screenshot } from "./ui/tools.js";
 import { Transport } from "./ui/transport.js";
 import { listenToGestures } from "./view/gestures.js";
 import { Keys } from "./view/keys.js";
-import { contained, lensOf, resize, sharpSide, sizeFor } from "./view/lens.js";
-import { degrees } from "./view/matrix.js";
+import { contained, fovOf, lensOf, resize, sharpSide, sizeFor } from "./view/lens.js";
 import { Motion } from "./view/motion.js";
 import { Place, poseOf, poseText, timeOf } from "./view/url_state.js";
 import { extrinsicsOf, eyeOf, poseOfCamera } from "./view/pose.js";
@@ -143,8 +142,7 @@ class Page {
   snap(camera) {
     const { free } = this.frame();
     const f = Math.min((free.width / camera.width) * camera.K[0], (free.height / camera.height) * camera.K[4]);
-    const side = Math.min(free.height, 1.45 * free.width);
-    this.motion.snap(camera, degrees(2 * Math.atan(side / 2 / f)));
+    this.motion.snap(camera, fovOf(free, f));
     this.snapped = { camera, goal: this.motion.goal };
     this.wake();
   }

@@ -1,6 +1,7 @@
 // The section "Camera path": record, add views, play, and export as MP4 by the server.
 
-import { lensOf } from "../view/lens.js";
+import { address } from "../link/connection.js";
+import { fovOf, lensOf } from "../view/lens.js";
 import { FPS, MOST_POSES, Track } from "../view/camera_path.js";
 import { extrinsicsOf } from "../view/pose.js";
 import { pathFile, pointsOf } from "../view/camera_path_file.js";
@@ -41,7 +42,7 @@ export class PathPanel {
       this.playing = null;
       this.#show();
     });
-    byId("path-turntable").addEventListener("click", () => this.#turntable());
+    byId("path-turntable").addEventListener("click", () => void this.#turntable());
     byId("path-export").addEventListener("click", () => this.#export());
     byId("path-cancel").addEventListener("click", () => this.film?.cancel());
     byId("path-save").addEventListener("click", () => this.#save());
@@ -67,14 +68,33 @@ export class PathPanel {
     this.#show();
   }
 
-  #turntable() {
-    const { motion, transport } = this.around;
+  /** Around the subject at the height that is looked from, so that the film shows the whole motion. */
+  async #turntable() {
+    const { motion, transport, notices, token } = this.around;
     if (!motion.goal) return;
     this.recording = false;
     this.playing = null;
-    const seconds = clamp(Number(byId("path-seconds").value) || 6, 1, (MOST_POSES - 1) / FPS);
-    this.track.turntable(motion.goal, Number(byId("path-arc").value), seconds, Math.max(0, transport.shown));
-    this.#show();
+    const button = byId("path-turntable");
+    const [seconds, arc] = [clamp(Number(byId("path-seconds").value) || 6, 1, (MOST_POSES - 1) / FPS), Number(byId("path-arc").value)];
+    const { azimuth, elevation } = motion.goal;
+    const time = Math.max(0, transport.shown);
+    const frames = this.#still ? 1 : Math.ceil(seconds * (motion.rig.fps ?? 0)) + 1;
+    const { width, height } = this.#size();
+    const url = address("turntable", token);
+    for (const [name, value] of Object.entries({ time, frames, azimuth, arc, elevation, width, height })) url.searchParams.set(name, String(value));
+    button.disabled = true;
+    try {
+      const answer = await fetch(url);
+      const { error, target, distance, f } = await answer.json();
+      if (!answer.ok) throw new Error(error);
+      const fov = fovOf({ width, height }, f);
+      this.track.turntable({ target, azimuth, elevation, roll: 0, distance, fov }, arc, seconds, time);
+    } catch (error) {
+      notices.toast(`No turntable: ${/** @type {Error} */ (error).message}`, "error");
+    } finally {
+      button.disabled = false;
+      this.#show();
+    }
   }
 
   /** The views that were added, to be put in order. */
@@ -163,11 +183,21 @@ export class PathPanel {
     this.#list();
   }
 
+  /** Whether the film shows one frame only. */
+  get #still() {
+    return byId("path-time").value === "still";
+  }
+
+  /** Of one eye's pictures. @param {boolean} [stereo] */
+  #size(stereo = byId("path-stereo").checked) {
+    const [across, height] = byId("path-size").value.split("x").map(Number);
+    return { width: stereo ? across / 2 : across, height };
+  }
+
   /** What is posted: cameras and times of the film's frames. @param {boolean} stereo whether two eyes share its width */
   #request(stereo = false) {
     const { motion, transport, settings } = this.around;
-    const [across, height] = byId("path-size").value.split("x").map(Number);
-    const width = stereo ? across / 2 : across;
+    const { width, height } = this.#size(stereo);
     const box = { left: 0, top: 0, width, height };
     const short = (/** @type {number} */ value) => Number(value.toFixed(6));
     const moments = this.track.moments;
@@ -177,10 +207,9 @@ export class PathPanel {
       const { fx, fy, cx, cy } = lensOf(box, box, pose.fov);
       return { R: R.map(short), T: T.map(short), fx: short(fx), fy: short(fy), cx, cy };
     });
-    const still = byId("path-time").value === "still";
     const range = transport.state ?? { first: 0, end: 1 };
     const times = moments.map((seconds) =>
-      still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
+      this.#still ? transport.shown : this.track.timeAt(seconds, motion.rig.fps ?? FPS, range),
     );
     return { poses, times, fps: FPS, width, height, mode: settings.modes[settings.modes.length - 1], error_rule: settings.get("errorRule") || null, background: settings.ground, without: settings.without, model: settings.model, stereo_m: stereo ? EYES_M : null };
   }

@@ -1,6 +1,6 @@
 // From a field of view of the free part of the page to a camera of the whole picture.
 
-import { radians } from "./matrix.js";
+import { degrees, radians } from "./matrix.js";
 
 /** @typedef {{left: number, top: number, width: number, height: number}} Box CSS pixels */
 
@@ -14,6 +14,12 @@ import { radians } from "./matrix.js";
  * @property {number} height
  */
 
+/** What a field of view is measured along. @param {{width: number, height: number}} free */
+const sideOf = ({ width, height }) => Math.min(height, 1.45 * width);
+
+/** The field of view of a focal length in pixels, degrees. @param {{width: number, height: number}} free @param {number} f */
+export const fovOf = (free, f) => degrees(2 * Math.atan(sideOf(free) / 2 / f));
+
 /**
  * The lens in CSS pixels of the picture's box: its axis passes through the middle of what nothing covers.
  * In a box that is higher than wide the field of view is that of a square, as far as it goes.
@@ -21,8 +27,7 @@ import { radians } from "./matrix.js";
  * @returns {Lens}
  */
 export function lensOf(box, free, fov) {
-  const side = Math.min(free.height, 1.45 * free.width);
-  const f = side / 2 / Math.tan(radians(fov) / 2);
+  const f = sideOf(free) / 2 / Math.tan(radians(fov) / 2);
   return {
     fx: f,
     fy: f,
