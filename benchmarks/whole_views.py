@@ -6,7 +6,8 @@ Q:PERFORMERS, or CAPTURE:INPUTS, for example ../shared/captures/wd2:8. With a KI
 rendered from other geometry: the exact mesh, a decimated one, splatted points, or a noisy depth map.
 
 Columns: LPIPS in the subject's box; `sharpness`, the mean gradient of the view over that of the truth; `damaged`, the
-share of the pixels off by less than 0.05 as rendered that are off by more than 0.15 afterwards.
+share of the pixels off by less than 0.05 as rendered that are off by more than 0.15 afterwards; `calibration`, the mean
+distance of the confidence from the share of pixels that are correct, in ten bins of confidence.
 """
 
 import argparse
@@ -38,11 +39,22 @@ from viewmend.models.views.grid import rim_depth
 from viewmend.rendering.view import RenderConfig, render_depth
 from viewmend.stream import Stream, StreamConfig
 from viewmend.training.depth_geometry import DepthErrors, DepthMaps
+from viewmend.training.views import CORRECT
 from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
 from viewmend.utils.weight_files import MissingWeightsError
 
-SHOWN = ("psnr_whole", "ssim_whole", "lpips_alex", "lpips_vgg", "sharpness", "damaged", "psnr_holes", "alpha_iou")
+SHOWN = (
+    "psnr_whole",
+    "ssim_whole",
+    "lpips_alex",
+    "lpips_vgg",
+    "sharpness",
+    "damaged",
+    "calibration",
+    "psnr_holes",
+    "alpha_iou",
+)
 PROXIES = ("hull", "exact", "decimated", "splats", "depth")
 CELL_M, POINTS = 0.05, 40_000
 """Of decimated meshes and splatted points."""
@@ -94,6 +106,7 @@ def judge(scenes: Sequence[LeaveOneOutScene], options: argparse.Namespace) -> di
             rgb = composite(options.background, completed.rgb, completed.opacity)
             rendered = composite(options.background, completed.view.rgb, completed.view.mask)
             found = {key: getattr(own, key, None) for key in SHOWN} | detail_scores(rgb, rendered, truth, metrics)
+            found["calibration"] = calibration_error(rgb, completed, truth)
             scores[model].append(found)
             shown[f"{model} {own.psnr_whole:.2f} dB"] = completed.rgb
             shown["truth"] = shown.pop("truth", truth.rgb)  # at the end
@@ -128,6 +141,16 @@ def detail_scores(rgb: Tensor, rendered: Tensor, truth: TrueView, metrics: dict[
     was_right = (before < RIGHT) & truth.mask
     found["damaged"] = float((after[was_right] > WRONG).float().mean()) if bool(was_right.any()) else None
     return found
+
+
+def calibration_error(rgb: Tensor, completed: CompletedView, truth: TrueView) -> float | None:
+    """Expected calibration error of the confidence that no channel is off by a tenth, over the predicted pixels."""
+    if completed.confidence is None or not bool((inside := completed.view.error > 0).any()):
+        return None
+    confidence, correct = completed.confidence[inside], ((rgb - truth.rgb).abs().amax(0) < CORRECT)[inside].float()
+    part = (10 * confidence).long().clamp(0, 9)
+    gap = torch.zeros(10).index_add_(0, part, confidence - correct)
+    return float(gap.abs().sum() / len(confidence))
 
 
 def gradient(image: Tensor) -> Tensor:

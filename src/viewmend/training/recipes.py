@@ -107,7 +107,7 @@ def paper_small() -> TrainConfig:
 
 
 def finetune(start: str = "views") -> TrainConfig:
-    """A trained model adapted to your own captures, mixed with studio scenes; gently, and for 20 minutes.
+    """A trained model adapted to your own captures for 20 minutes, mixed with studio scenes against forgetting.
 
     Raises:
         WeightsError: the model does not exist, or is damaged.
@@ -126,7 +126,7 @@ def finetune(start: str = "views") -> TrainConfig:
         config,
         name="finetune",
         objective=objective,
-        scenes=replace(config.scenes, hold_out="auto", sizes_px=CAPTURE_SIZES_PX),
+        scenes=replace(config.scenes, hold_out="auto", sizes_px=CAPTURE_SIZES_PX, captures_fraction=0.5),
         start=start,
         steps=4000,
         minutes=20.0,
