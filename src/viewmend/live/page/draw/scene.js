@@ -180,15 +180,15 @@ export class Scene {
     const matrix = clipFromWorld(viewer);
     gl.bindVertexArray(own.array);
     gl.enable(gl.CULL_FACE); // the mesh is closed
-    gl.useProgram(this.depthOnly.program);
-    gl.uniformMatrix4fv(this.depthOnly.at.clip, false, matrix);
-    gl.colorMask(false, false, false, false);
-    gl.drawElements(gl.TRIANGLES, own.count, gl.UNSIGNED_INT, 0);
-    gl.colorMask(true, true, true, true);
-    gl.depthFunc(gl.EQUAL);
     const [first, hole] = [Math.min(MOST_SOURCES, blend.cameras), /** @type {any} */ (HOLES)[mode]];
     const passes = [sources.slice(0, first), ...(hole[3] ? [] : [sources.slice(first)])].filter((pass) => pass.length);
     if (passes.length > 1) {
+      gl.useProgram(this.depthOnly.program);
+      gl.uniformMatrix4fv(this.depthOnly.at.clip, false, matrix);
+      gl.colorMask(false, false, false, false);
+      gl.drawElements(gl.TRIANGLES, own.count, gl.UNSIGNED_INT, 0);
+      gl.colorMask(true, true, true, true);
+      gl.depthFunc(gl.EQUAL);
       gl.enable(gl.STENCIL_TEST); // other cameras fill the holes of the first pass
       gl.stencilFunc(gl.NOTEQUAL, DONE, 0xff);
       gl.stencilOp(gl.KEEP, gl.KEEP, gl.REPLACE);
@@ -200,7 +200,7 @@ export class Scene {
     gl.activeTexture(gl.TEXTURE0);
     gl.bindVertexArray(null);
     const textureBytes = sources.reduce((sum, { size }) => sum + 8 * size[0] * size[1], 0);
-    const draws = 1 + passes.length;
+    const draws = passes.length > 1 ? 1 + passes.length : 1;
     this.cost = { draws, triangles: (draws * own.count) / 3, textureBytes };
   }
 
