@@ -26,7 +26,8 @@ CONNECTIONS, FILLERS = 6, 3
 class Viewer:
     """One page."""
 
-    def __init__(self, address: str, start_deg: float, playing: bool) -> None:
+    def __init__(self, address: str, start_deg: float, playing: bool, forget_s: float) -> None:
+        self.forget_s = forget_s
         self.host, port = address.removeprefix("http://").rsplit(":", 1)
         self.port, self.start_deg, self.playing = int(port), start_deg, playing
         self.cached: dict[str, bytes] = {}
@@ -68,7 +69,11 @@ class Viewer:
     async def draw(self, end: float) -> None:
         begun = time.monotonic()
         fps = (self.rig["fps"] or 0.0) * self.playing
+        forgotten = begun
         while (now := time.monotonic()) < end:
+            if now - forgotten > self.forget_s:
+                forgotten = now
+                self.cached.clear()
             span = max(1, self.state["end"] - self.state["first"])
             shown = self.state["time"] * self.playing + int((now - self.heard_at) * fps)
             azimuth = math.radians(self.start_deg + 40 * (now - begun))
@@ -154,7 +159,7 @@ def resident_mb(pid: int) -> float:
 async def measure(address: str, pid: int, viewers: int, options: argparse.Namespace) -> None:
     begun = time.monotonic()
     end = begun + options.first + options.seconds
-    crowd = [Viewer(address, 360 * n / max(1, viewers), options.playing) for n in range(viewers)]
+    crowd = [Viewer(address, 360 * n / max(1, viewers), options.playing, options.forget) for n in range(viewers)]
     tasks = [asyncio.create_task(viewer.run(end)) for viewer in crowd]
     tasks += [asyncio.create_task(stall(address, end)) for _ in range(options.idle)]
     total = lambda name: sum(getattr(viewer, name) for viewer in crowd)  # noqa: E731
@@ -189,6 +194,7 @@ def main() -> None:
     parser.add_argument("--source", default="studio", help="a capture, or the synthetic studio")
     parser.add_argument("--playing", action="store_true", help="viewers follow the recording; without, they orbit")
     parser.add_argument("--viewers", type=int, nargs="+", default=[0, 1, 8, 64])
+    parser.add_argument("--forget", type=float, default=math.inf, help="seconds after which caches are emptied")
     parser.add_argument("--idle", type=int, default=0, help="viewers who read nothing")
     parser.add_argument("--first", type=float, default=5.0, help="seconds in which viewers arrive")
     parser.add_argument("--seconds", type=float, default=10.0)

@@ -38,10 +38,14 @@ ACK_S = 30.0
 """Time for the acknowledgement of a frame."""
 FAULTS = (1.0, 19.0)
 """Malformed messages per second, and at once, that do not end a connection."""
-TICK_S = 0.1
-"""Seconds between checks of what viewers have to know."""
-STATE_S = 10.0
+TICK_S, LIVE_TICK_S = 0.25, 0.1
+"""Seconds between checks of what viewers have to know, also while a rig announces its frames."""
+STATE_S = 60.0
 """Time after which a state is sent again though nothing has changed; pages continue its clock by themselves."""
+
+
+Common = tuple[dict[str, Any], dict[str, Any] | None, dict[str, Any] | None, int]
+"""See `SessionRegistry.common`."""
 
 
 class Extension:
@@ -100,22 +104,26 @@ class SessionRegistry:
     def join(self, connection: "ViewerConnection") -> None:
         """Inform a viewer from now on."""
         self.connections.append(connection)
-        connection.inform(self.source_json())
+        connection.inform(self.common())
         if self._informer is None or self._informer.done():
             self._informer = asyncio.create_task(self._inform())
 
     async def _inform(self) -> None:
         """Let all connections send what is due, while there are any."""
-        shared = self.source_json()
+        common = self.common()
         while self.connections:
-            now = self.source_json()
-            shared = shared if now == shared else now
+            now = self.common()
+            common = common if now == common else now
             for connection in list(self.connections):
                 try:
-                    connection.inform(shared)
+                    connection.inform(common)
                 except Exception as error:  # ends this connection only
                     connection.fail(error)
-            await asyncio.sleep(TICK_S)
+            await asyncio.sleep(LIVE_TICK_S if self.service.source.span.live else TICK_S)
+
+    def common(self) -> Common:
+        """What is the same for all viewers: their part of `state`, the messages `show` and `rig`, and their number."""
+        return self.source_json(), self.shown, self.service.renderer.rig_json, len(self.sessions)
 
     def show(self, message: dict[str, Any]) -> None:
         """Move all pages, and those that will be opened; from any thread."""
@@ -167,6 +175,7 @@ class ViewerConnection:
         self._seen: tuple[Any, ...] = ()
         self._state: tuple[Any, ...] = ()
         self._state_at = self._stats_at = -STATE_S
+        self._quiet_until = 0.0
         self._viewers = 0
         """Viewers in the last statistics."""
         ladder = registry.service.renderer.ladder
@@ -287,6 +296,8 @@ class ViewerConnection:
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
             self._service.lock.notify_all()
+        if isinstance(message, ClockChange):
+            self.inform(self._registry.common())
 
     async def _write(self) -> None:
         while True:
@@ -299,28 +310,32 @@ class ViewerConnection:
                     frame, self._frame = self._frame, None
                     await self._socket.send_bytes(frame)
 
-    def inform(self, shared: dict[str, Any]) -> None:
+    def inform(self, common: Common) -> None:
         """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
 
-        `shared` is the part of `state` that is the same for all viewers, and the same object while it is equal.
+        `common` is the same object while it is equal.
         """
-        now, session = self._now(), self._session
-        if self._service.is_ready:
-            self._send_new_rig()
-        seen = (shared, session.clock_changes, session.buffering)
+        session, (shared, shown, _, viewers) = self._session, common
+        wants_views = session.newest_look is not None or session.in_flight is not None
+        seen = (common, session.clock_changes, session.buffering)
+        now = self._now()
+        if seen == self._seen and now < self._quiet_until and not wants_views:
+            return
+        self._send_new_rig()
         changing = self._registry.extensions or self._service.source.span.live  # at any time
         if seen != self._seen or changing or now - self._state_at >= STATE_S:
             self._seen = seen
             self._send_state(shared)
-        if self._rig is not None and (shown := self._registry.shown) is not self._shown and shown:
+        if self._rig is not None and shown is not self._shown and shown:
             self._shown = shown
             self._send_soon(shown)
-        viewers = len(self._registry.sessions)
         if now - self._stats_at >= 1 and (viewers != self._viewers or session.sent_since(self._stats_at - 1)):
             self._stats_at, self._viewers = now, viewers
             self._send_soon(session.stats_json(viewers))
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
+        is_steady = self._viewers == viewers and not changing and not session.sent_since(now - 2)
+        self._quiet_until = self._state_at + STATE_S if is_steady else now
 
     def fail(self, error: Exception) -> None:
         """End the connection."""
@@ -341,7 +356,8 @@ class ViewerConnection:
             self._send_soon({"type": "state"} | shared | own)
 
     def _send_new_rig(self) -> None:
-        if (rig := self._service.renderer.rig_json) is not None and rig is not self._rig:
+        rig = self._service.renderer.rig_json
+        if rig is not self._rig and rig is not None and self._service.is_ready:
             self._rig = rig
             self._send_soon({"type": "rig"} | rig)
 

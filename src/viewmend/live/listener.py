@@ -31,7 +31,7 @@ class Server:
                 http=self.limits.connect,  # pyright: ignore[reportArgumentType]
                 ws="websockets-sansio",
                 ws_max_size=MAX_FRAME_BYTES,  # the limits of a viewer's and a rig's messages are lower
-                ws_ping_interval=20.0,
+                ws_ping_interval=45.0,  # proxies close what is silent for a minute
                 ws_ping_timeout=10.0,
                 ws_per_message_deflate=False,
                 limit_concurrency=MAX_CONNECTIONS,

@@ -120,7 +120,7 @@ class RenderService:
     def serve_next(self) -> bool:
         """Render and deliver one view; False if no session needs one. Called on the render thread."""
         now, span = self.now(), self.source.span
-        if not self.is_ready or self.renderer.home is None:
+        if not self._wants_views() or not self.is_ready or self.renderer.home is None:
             return False
         with self.lock:
             found = self._next_request(now, span, self.renderer.home)

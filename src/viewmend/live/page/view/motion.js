@@ -7,7 +7,7 @@ import { MOST_ELEVATION, alike, axes, between, eyeOf, handedness, outward, poseO
 
 /** Time constants: of a hand's movement, and of a jump to another place. */
 const HAND_MS = 30;
-const JUMP_MS = 130;
+const JUMP_MS = 100;
 /** The view counts as moving until it has been still for so long. */
 const REST_MS = 140;
 
