@@ -51,6 +51,7 @@ class Eager:
 
     viewer = None
     is_cancelled = False
+    wants_views = True
 
     def __init__(self, name, log, top_k=None, bad=False):
         self.name, self.log, self.top_k, self.bad = name, log, top_k, bad

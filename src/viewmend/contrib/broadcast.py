@@ -213,6 +213,11 @@ class BroadcastSession(ViewerSession):
         # Not as moving: the viewer may leave with this look, which is then shown at rest.
         super().look(replace(resized, scale=1.0, depth=False, moving=False, full=False))
 
+    @property
+    def wants_views(self) -> bool:
+        """Always: without a look, it shows the page's initial view."""
+        return True
+
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the edge."""
         if self._look is None:

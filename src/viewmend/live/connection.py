@@ -316,7 +316,7 @@ class ViewerConnection:
         `common` is the same object while it is equal.
         """
         session, (shared, shown, _, viewers) = self._session, common
-        wants_views = session.newest_look is not None or session.in_flight is not None
+        wants_views = session.wants_views or session.in_flight is not None
         seen = (common, session.clock_changes, session.buffering)
         now = self._now()
         if seen == self._seen and now < self._quiet_until and not wants_views:

@@ -170,6 +170,11 @@ class RenderJob(ABC, Generic[Result]):
         self.viewer: State | None = None
         self.done: Future[Result] = Future()
 
+    @property
+    def wants_views(self) -> bool:
+        """Always."""
+        return True
+
     @abstractmethod
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The next view; None while its frame is being read."""

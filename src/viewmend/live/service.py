@@ -73,6 +73,10 @@ class RenderService:
                 self._sessions.remove(session)
 
     @property
+    def _is_wanted(self) -> bool:
+        return any(session.wants_views for session in list(self._sessions))
+
+    @property
     def is_ready(self) -> bool:
         """Whether views can be rendered."""
         return self.renderer.home is not None and self.renderer.is_prepared_for(self.source.rig)
@@ -99,7 +103,7 @@ class RenderService:
             trimmer.trim_if_due(idle=not worked)
             with self.lock:
                 if not worked and not self._stopped:
-                    self.lock.wait(TICK_S if self._wants_views() else IDLE_S)
+                    self.lock.wait(TICK_S if self._is_wanted else IDLE_S)
 
     def _prepare(self) -> bool:
         """Prepare the renderer for a new rig."""
@@ -113,14 +117,10 @@ class RenderService:
         self.error = None
         return done
 
-    def _wants_views(self) -> bool:
-        """Whether a session's clock has to be checked: one whose page draws by itself wants nothing."""
-        return any(not isinstance(s, ViewerSession) or s.newest_look is not None for s in self._sessions)
-
     def serve_next(self) -> bool:
         """Render and deliver one view; False if no session needs one. Called on the render thread."""
         now, span = self.now(), self.source.span
-        if not self._wants_views() or not self.is_ready or self.renderer.home is None:
+        if not self._is_wanted or not self.is_ready or self.renderer.home is None:
             return False
         with self.lock:
             found = self._next_request(now, span, self.renderer.home)

@@ -46,6 +46,11 @@ class Session(Protocol):
 
     viewer: State | None
 
+    @property
+    def wants_views(self) -> bool:
+        """Whether a view may be due: if not, `next_request` need not be called."""
+        ...
+
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The view to render now; None for none."""
         ...
@@ -147,6 +152,11 @@ class ViewerSession:
     def give_up(self) -> None:
         """Render the view again if it is asked for again."""
         self._requested = (None, -1)
+
+    @property
+    def wants_views(self) -> bool:
+        """Whether there is a look; pages that draw by themselves have none while they move."""
+        return self._look is not None
 
     @property
     def newest_look(self) -> Look | None:
