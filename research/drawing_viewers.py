@@ -34,11 +34,11 @@ class Viewer:
         self.ranks: dict[int, tuple[np.ndarray, int]] = {}
         self.state: dict = {}
         self.heard_at = 0.0
-        self.http_bytes = self.ws_bytes = self.requests = self.frames = 0
+        self.http_bytes = self.ws_bytes = self.requests = self.refused = self.frames = 0
         self.waits_ms: list[float] = []
 
     async def run(self, end: float) -> None:
-        async with websockets.connect(f"ws://{self.host}:{self.port}/ws", compression=None) as socket:
+        async with websockets.connect(f"ws://{self.host}:{self.port}/ws", compression=None, open_timeout=60) as socket:
             await socket.send(json.dumps({"type": "hello", "version": 1, "codecs": ["jpeg"]}))
             self.rig: dict = {}
             listener = asyncio.create_task(self.listen(socket))
@@ -120,10 +120,12 @@ class Viewer:
             self.free.put_nowait(pair)
         self.requests += 1
         self.http_bytes += len(head) + size
-        if head.startswith(b"HTTP/1.1 200") and b"immutable" in head.lower():
+        if not head.startswith(b"HTTP/1.1 200"):  # not ready, or busy
+            self.refused += 1
+            await asyncio.sleep(1)
+            return await self.get(path)
+        if b"immutable" in head.lower():
             self.cached[path] = body if path.count("/") == 2 else b"1"
-        elif not head.startswith(b"HTTP/1.1 200"):
-            raise RuntimeError(head.decode())
         return body
 
 
@@ -163,7 +165,7 @@ async def measure(address: str, pid: int, viewers: int, options: argparse.Namesp
     tasks = [asyncio.create_task(viewer.run(end)) for viewer in crowd]
     tasks += [asyncio.create_task(stall(address, end)) for _ in range(options.idle)]
     total = lambda name: sum(getattr(viewer, name) for viewer in crowd)  # noqa: E731
-    names = ("http_bytes", "ws_bytes", "requests", "frames")
+    names = ("http_bytes", "ws_bytes", "requests", "refused", "frames")
     last = (processor_s(pid), dict.fromkeys(names, 0), begun)
     windows = [options.first] + [options.window or options.seconds] * round(
         options.seconds / (options.window or options.seconds)
