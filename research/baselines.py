@@ -30,7 +30,6 @@ from torch import Tensor
 from viewmend.contrib.baselines.framing import Canvas, Window, window_canvas, windows_over
 from viewmend.contrib.baselines.online import (
     Clip,
-    Frames,
     OnlineConfig,
     OnlineInpainter,
     OnlineNetwork,
@@ -57,7 +56,7 @@ SIZES = ((320, 320), (512, 612), (1024, 1224))
 RANDOM = {"paper_small": paper_small, "paper": paper}
 OURS = ("paper_small", "paper", *STREAMED)
 FRAMINGS = ("def", "win", "mul")
-RIVAL = ("dstt", True, "def")
+RIVAL = ("dstt", "def")
 """The fastest baseline, which is part of every run."""
 
 
@@ -93,9 +92,6 @@ class Clocked:
 
     def complete_clip(self, clip: Clip) -> Tensor:
         return self._timed(lambda: self.network.complete_clip(clip), clip.now.device.type)
-
-    def complete_remembering(self, now: Frames, memory: tuple[Any, ...]) -> tuple[Tensor, Any]:
-        return self._timed(lambda: self.network.complete_remembering(now, memory), now.device.type)
 
     def take_s(self) -> float:
         """Seconds since the last call."""
@@ -150,18 +146,17 @@ def ours(name: str, views: list[IncompleteView], context: ContextProvider, devic
     return inpainter, state
 
 
-def baseline(name: str, memory: bool, framing: str, views: list[IncompleteView], context: ContextProvider, options):
+def baseline(name: str, framing: str, views: list[IncompleteView], context: ContextProvider, options):
     """A baseline whose past repeats one frame: values do not affect its speed."""
     torch.manual_seed(0)
     network = NETWORKS[name]().to(options.device).eval()
-    config = OnlineConfig(framing=framing, memory=memory, sampling=Sampling(step=STEP))  # pyright: ignore
+    config = OnlineConfig(framing=framing, sampling=Sampling(step=STEP))  # pyright: ignore
     inpainter = FewWindows(network, config, options.windows)
     _, first = inpainter.step(replace(views[NOW], time=NOW - 1), context, inpainter.initial_state())
     times = config.sampling.times(NOW)
     assert len(times) == 6
     frames = {t: frame for t in times for frame in first.frames.values()}
-    slots = {(window, t): slot for t in times for (window, _), slot in first.slots.items()}
-    return inpainter, OnlineState(frames=frames, slots=slots, canvas_px=first.canvas_px)
+    return inpainter, OnlineState(frames=frames, canvas_px=first.canvas_px)
 
 
 def timed_steps(
@@ -214,8 +209,7 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
     figures: dict[str, dict[str, float]] = {}
     load = round(os.getloadavg()[0], 1)
     result: dict[str, object] = {**setting(views[NOW]), "load_average": load, "methods": figures}
-    memories = [variant == "om" for variant in options.variants]
-    wanted = [*product(options.networks, memories, options.framings)]
+    wanted = [*product(options.networks, options.framings)]
 
     def add(name: str, inpainter: Inpainter, state: State, view: IncompleteView = views[NOW]) -> None:
         figures[name] = timed_steps(inpainter, state, view, context, options.device, options.seconds)
@@ -229,9 +223,8 @@ def measure(size: tuple[int, int], options: argparse.Namespace, done: Callable[[
                 add(name, inpainter, State(), part)
             else:
                 add(name, *ours(name, views, context, options.device, options.precision))
-        for network, memory, framing in dict.fromkeys((RIVAL, *wanted)):
-            made = baseline(network, memory, framing, views, context, options)
-            add(f"{network}-{'om' if memory else 'o'}-{framing}", *made)
+        for network, framing in dict.fromkeys((RIVAL, *wanted)):
+            add(f"{network}-o-{framing}", *baseline(network, framing, views, context, options))
     result["fps_of_ours_over"] = ratios(figures)
     done(result)
     return result
@@ -245,7 +238,6 @@ def main() -> None:
     )
     parser.add_argument("--ours", nargs="+", default=list(OURS), choices=list(OURS))
     parser.add_argument("--networks", nargs="+", default=list(NETWORKS), choices=list(NETWORKS))
-    parser.add_argument("--variants", nargs="+", default=["o", "om"], choices=("o", "om"))
     parser.add_argument("--framings", nargs="+", default=list(FRAMINGS), choices=FRAMINGS)
     parser.add_argument("--windows", type=int, default=1000, help="run at most this many windows of a view")
     parser.add_argument("--seconds", type=float, default=20.0, help="time per method and size; at least one step")
@@ -270,7 +262,7 @@ def main() -> None:
         width, height = (int(side) for side in text.split("x"))
 
         def done(result: dict, text: str = text) -> None:
-            results[f"{text}, {' '.join(options.networks)}, {' '.join(options.variants)}"] = result
+            results[f"{text}, {' '.join(options.networks)}"] = result
             if options.write:
                 write("baselines", options.device, config, results)
 

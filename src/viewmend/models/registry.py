@@ -41,9 +41,7 @@ METHODS: dict[str, str] = {
     "rgvi": "viewmend.contrib.baselines.rgvi:make_rgvi",
 }
 """MODULE:NAME of each method's factory, imported on demand, and called with the device if it takes one."""
-FAMILIES = dict.fromkeys(
-    ("dstt", "fuseformer", "e2fgvi", "riftcast"), "viewmend.contrib.baselines.published:make_baseline"
-)
+FAMILIES = dict.fromkeys(("dstt", "fuseformer", "e2fgvi"), "viewmend.contrib.baselines.published:make_baseline")
 """MODULE:NAME of the factory of all methods whose names start with this word; called with the name and the device."""
 BASELINES = tuple(
     f"{network}-o-{framing}{weights}"

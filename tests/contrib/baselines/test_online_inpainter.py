@@ -21,7 +21,7 @@ class Recorder:
     """A network that writes down what it is shown, and fills everything with a pattern of its own."""
 
     def __init__(self):
-        self.clips, self.memories = [], []
+        self.clips = []
 
     def check_size(self, height, width):
         pass
@@ -29,10 +29,6 @@ class Recorder:
     def complete_clip(self, clip):
         self.clips.append(clip)
         return torch.linspace(-3, 3, 3 * 48 * 48).view(3, *SIZE)
-
-    def complete_remembering(self, now, memory):
-        self.memories.append((now, memory))
-        return torch.linspace(-3, 3, 3 * 48 * 48).view(3, *SIZE), now
 
 
 def config(**options):
@@ -58,10 +54,9 @@ def times_in(frames):
 
 
 @pytest.mark.parametrize("framing", FRAMINGS)
-@pytest.mark.parametrize("memory", [False, True], ids=["o", "om"])
-def test_every_hole_pixel_is_filled_and_nothing_else_changes(framing, memory):
+def test_every_hole_pixel_is_filled_and_nothing_else_changes(framing):
     network = Recorder()
-    inpainter = OnlineInpainter(network, config(framing=framing, memory=memory))
+    inpainter = OnlineInpainter(network, config(framing=framing))
     assert isinstance(inpainter, Inpainter)
     holes = ((20, 40, 30, 55), (18, 20, 20, 70), (35, 74, 44, 46), None, (37, 38, 45, 46))
     views = [plate(time, hole) for time, hole in enumerate(holes)]
@@ -72,7 +67,7 @@ def test_every_hole_pixel_is_filled_and_nothing_else_changes(framing, memory):
         assert bool((rgb >= 0).all()) and bool((rgb <= 1).all())
         whole = view.error == 1
         assert bool((rgb[:, whole].abs().sum(0) > 0).all()), "the pattern is nowhere black"
-    calls = len(network.clips) + len(network.memories)
+    calls = len(network.clips)
     assert calls >= 4 and (framing != "def" or calls == 4), "a view without holes costs nothing"
 
 
@@ -86,7 +81,7 @@ def test_a_hole_keeps_the_share_of_the_render_that_e_says(framing):
     assert torch.allclose((completed.rgb - black.rgb)[:, soft], 0.5 * view.rgb[:, soft], atol=1e-6)
 
 
-def test_o_sees_three_neighbours_and_three_references_of_the_absolute_grid():
+def test_a_view_sees_three_neighbours_and_three_references_of_the_absolute_grid():
     network = Recorder()
     list(stream(OnlineInpainter(network, config()), [times_view(t) for t in range(58)]))
     clip = network.clips[57]
@@ -107,19 +102,9 @@ def test_the_relative_grid_is_the_other_papers():
 
 
 @pytest.mark.parametrize("grid", ["absolute", "relative"])
-@pytest.mark.parametrize("memory", [False, True], ids=["o", "om"])
-def test_memory_is_bounded_and_holds_all_that_is_looked_at(grid, memory):
-    sampling, network = Sampling(grid=grid), Recorder()
-    inpainter = OnlineInpainter(network, config(sampling=sampling, memory=memory))
-    most = 0
-    for time, (_, state) in enumerate(stream(inpainter, (times_view(t) for t in range(75)))):
-        kept = state.slots if memory else state.frames
-        assert not (state.frames if memory else state.slots)
-        most = max(most, len(kept))
-        if memory:
-            now, past = network.memories[time]
-            seen = [times_in(slot)[0] for slot in past]
-            assert times_in(now) == [time] and seen == sorted(sampling.times(time)), "oldest first"
+def test_the_kept_past_is_bounded(grid):
+    inpainter = OnlineInpainter(Recorder(), config(sampling=Sampling(grid=grid)))
+    most = max(len(state.frames) for _, state in stream(inpainter, map(times_view, range(75))))
     # 3 neighbours, 3 references and those that will be; or every frame of the last 30, this one too.
     assert most <= {"absolute": 7, "relative": 30}[grid]
 
@@ -147,7 +132,6 @@ def test_a_view_that_nobody_wants_filled_leaves_the_state_that_filling_leaves(fr
         assert all(torch.equal(passed.frames[t], filled.frames[t]) for t in filled.frames)
         assert passed.canvas_px == filled.canvas_px
     assert sorted(filled.frames) == [0, 10, 20, 22, 23, 24]
-    assert OnlineInpainter(network, config(memory=True)).advance_state(times_view(0), filled) is None
 
 
 @pytest.mark.parametrize("wrong", [{"step": 0}, {"neighbours": -1}, {"references": -1}])
@@ -156,50 +140,28 @@ def test_samplings_that_cannot_be_are_refused(wrong):
         Sampling(**wrong)
 
 
-def test_a_window_remembers_the_times_when_it_had_holes():
+def test_another_size_starts_a_new_stream_and_going_back_in_time_forgets_the_future():
     network = Recorder()
-    left, right = (28, 34, 20, 26), (28, 34, 64, 70)
-    views = [plate(t, hole) for t, hole in enumerate((left, right, right, left))]
-    *_, (_, state) = stream(OnlineInpainter(network, config(framing="win", memory=True)), views)
-    assert [len(memory) for _, memory in network.memories] == [0, 0, 1, 1]
-    assert len({window for window, _ in state.slots}) == 2
-
-
-@pytest.mark.parametrize("memory", [False, True], ids=["o", "om"])
-def test_another_size_starts_a_new_stream_and_going_back_in_time_forgets_the_future(memory):
-    network = Recorder()
-    inpainter = OnlineInpainter(network, config(framing="win", memory=memory))
+    inpainter = OnlineInpainter(network, config(framing="win"))
     views = [plate(5), plate(6), plate(5), plate(6, width=130)]
-    past = lambda: network.memories[-1][1] if memory else network.clips[-1].neighbours  # noqa: E731
-    assert [len(past()) for _ in stream(inpainter, views)] == [0, 1, 0, 0]
+    assert [len(network.clips[-1].neighbours) for _ in stream(inpainter, views)] == [0, 1, 0, 0]
     again = [plate(5), plate(6), plate(5), plate(7)]
-    assert [len(past()) for _ in stream(inpainter, again)] == [0, 1, 0, 1], "6 was seen by another look"
+    past = [len(network.clips[-1].neighbours) for _ in stream(inpainter, again)]
+    assert past == [0, 1, 0, 1], "6 was seen by another look"
 
 
-def test_streams_do_not_touch_one_another():
-    inpainter = OnlineInpainter(Recorder(), config(memory=True))
-    one = [state for _, state in stream(inpainter, map(times_view, range(3)))]
-    before = {key: slot.clone() for key, slot in one[1].slots.items()}
-    inpainter.step(times_view(9), Rig(), one[1])
-    assert one[1].slots.keys() == before.keys()
-    assert all(torch.equal(slot, before[key]) for key, slot in one[1].slots.items())
-
-
-@pytest.mark.parametrize("memory", [False, True], ids=["o", "om"])
-def test_only_mul_asks_for_cameras_and_never_for_the_future(memory):
+def test_only_mul_asks_for_cameras_and_never_for_the_future():
     for framing in FRAMINGS:
         rig, network = Rig(), Recorder()
-        inpainter = OnlineInpainter(network, config(framing=framing, memory=memory))
+        inpainter = OnlineInpainter(network, config(framing=framing))
         list(stream(inpainter, [plate(t) for t in range(3)], rig))
         if framing != "mul":
             assert rig.asked == []
             continue
-        now = [now for now, _ in network.memories] if memory else [clip.now for clip in network.clips]
-        assert all(len(frames) == 3 for frames in now), "the view and the two cameras that coloured it"
+        assert all(len(clip.now) == 3 for clip in network.clips), "the view and the two cameras that coloured it"
         assert {names for _, names in rig.asked} == {("left", "right")}
         assert max(time for time, _ in rig.asked) == 2
-        latest = rig.asked[-3:] if not memory else rig.asked[-1:]
-        assert sorted(time for time, _ in latest) == ([0, 1, 2] if not memory else [2])
+        assert sorted(time for time, _ in rig.asked[-3:]) == [0, 1, 2]
 
 
 def test_mul_does_with_the_cameras_that_are_there():

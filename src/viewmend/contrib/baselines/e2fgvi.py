@@ -1,6 +1,5 @@
 """E2FGVI and E2FGVI-HQ: flow completion, feature propagation and focal transformer (Li et al. 2022)."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from viewmend.contrib.baselines.e2fgvi_propagation import AlignedConvolution, Propagated, Propagation, SPyNet
+from viewmend.contrib.baselines.e2fgvi_propagation import AlignedConvolution, Propagation, SPyNet
 from viewmend.contrib.baselines.layers import (
     DIM,
     STEP_PX,
@@ -20,7 +19,7 @@ from viewmend.contrib.baselines.layers import (
     SoftComposition,
     SoftSplit,
 )
-from viewmend.contrib.baselines.online import Clip, Frames
+from viewmend.contrib.baselines.online import Clip
 from viewmend.contrib.baselines.token_transformers import BLOCKS, CELLS, HEADS, NATIVE_PX, initialise
 
 WINDOW = (5, 9)
@@ -31,7 +30,7 @@ REACH = (WINDOW[0] // 2, WINDOW[1] // 2)
 
 @dataclass(frozen=True)
 class FocalTokens:
-    """Frames' tokens in one block, which this and later frames attend to."""
+    """Frames' tokens in one block."""
 
     fine: Float[Tensor, "sample frame row column dim"]
     """After the block's first norm."""
@@ -51,17 +50,14 @@ class FocalAttention(nn.Module):
         self.proj = nn.Linear(dim, dim)
         self.register_buffer("valid_ind_rolled", _outside_of_window())
 
-    def forward(
-        self, own: FocalTokens, past: Sequence[FocalTokens] = ()
-    ) -> Float[Tensor, "sample frame row column dim"]:
-        """The frames' tokens after attention to them and to the `past` frames."""
+    def forward(self, own: FocalTokens) -> Float[Tensor, "sample frame row column dim"]:
+        """The frames' tokens after attention to those of all frames."""
         batch, dim, grid = own.fine.shape[0], own.fine.shape[-1], (own.pooled.shape[2], own.pooled.shape[3])
-        frames = (own, *past)
 
         # Keys and values of every window: the same places in all frames.
         weight, bias = self.qkv.weight.split([dim, 2 * dim]), self.qkv.bias.split([dim, 2 * dim])
-        fine = F.linear(torch.cat([x.fine for x in frames], 1), weight[1], bias[1]).flatten(2, 3)
-        pooled = F.linear(torch.cat([x.pooled for x in frames], 1), weight[1], bias[1]).flatten(2, 3)
+        fine = F.linear(own.fine, weight[1], bias[1]).flatten(2, 3)
+        pooled = F.linear(own.pooled, weight[1], bias[1]).flatten(2, 3)
         places = self._places(grid).to(fine.device)
         cells, near = (x.to(fine.device) for x in pooled_places(grid))
         KV = torch.cat([fine[:, :, places], pooled[:, :, cells]], 3)
@@ -141,18 +137,6 @@ class LocalFlows:
     to_previous: Float[Tensor, "sample pair 2 rows cols"]
 
 
-@dataclass(frozen=True)
-class E2FGVIMemory:
-    """What is remembered of one time of a stream (OM)."""
-
-    small: Float[Tensor, "1 3 rows cols"]
-    """The view as the flow network takes it."""
-    propagated: Propagated
-    """The forward sweep's last results."""
-    tokens: tuple[FocalTokens, ...]
-    """The tokens of all frames of that time, block by block."""
-
-
 class FocalBlock(nn.Module):
     """One pre-norm block: focal attention, then the fusion feed-forward."""
 
@@ -165,24 +149,18 @@ class FocalBlock(nn.Module):
         self.mlp = FusionFeedForward(nn.GELU())
 
     def forward(
-        self,
-        tokens: Float[Tensor, "sample frame row column 512"],
-        size: tuple[int, int],
-        past: Sequence[FocalTokens] = (),
-    ) -> tuple[Float[Tensor, "sample frame row column 512"], FocalTokens]:
-        """The tokens after the block, which also sees the `past` frames, and what later frames need of these."""
+        self, tokens: Float[Tensor, "sample frame row column 512"], size: tuple[int, int]
+    ) -> Float[Tensor, "sample frame row column 512"]:
+        """The tokens after the block; `size` is that of the feature map."""
         normed = self.norm1(tokens)
         windows = rearrange(normed, "b t (i y) (j x) c -> b t i j c (y x)", y=WINDOW[0], x=WINDOW[1])
-        own = FocalTokens(normed, self.pool_layers[0](windows)[..., 0])
-        tokens = tokens + self.attn(own, past)
+        tokens = tokens + self.attn(FocalTokens(normed, self.pool_layers[0](windows)[..., 0]))
         mixed = self.mlp(self.norm2(tokens).flatten(0, 1), size)
-        return tokens + mixed.unflatten(0, tokens.shape[:2]), own
+        return tokens + mixed.unflatten(0, tokens.shape[:2])
 
 
 class E2FGVI(nn.Module):
     """41.8 M parameters; 243 tensors, named as in the official checkpoint. Takes 432x240; in training, also less."""
-
-    name = "E2FGVI"
 
     def __init__(self) -> None:
         super().__init__()
@@ -222,8 +200,7 @@ class E2FGVI(nn.Module):
         features = self.encode(frames)
         consecutive = self.feat_prop_module(features[:, :local], flows.to_next, flows.to_previous)
         features = torch.cat([consecutive, features[:, local:]], 1)
-        completed, _ = self.transform(features)
-        return self.decode(completed), flows
+        return self.decode(self.transform(features)), flows
 
     def check_size(self, height: int, width: int) -> None:
         """ValueError unless the frame is 432x240: the bias map is learned for this size.
@@ -258,17 +235,13 @@ class E2FGVI(nn.Module):
         """Features of each frame by itself, at a quarter of its size."""
         return self.encoder(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
 
-    def transform(
-        self, features: Features, memory: Sequence[E2FGVIMemory] = ()
-    ) -> tuple[Features, tuple[FocalTokens, ...]]:
-        """Features after the transformer, which also sees what is remembered, and each block's tokens of these."""
+    def transform(self, features: Features) -> Features:
+        """Features after the transformer."""
         size = (features.shape[-2], features.shape[-1])
         tokens = self.ss(features.flatten(0, 1)).unflatten(0, features.shape[:2])
-        kept = []
-        for number, block in enumerate(self.transformer):
-            tokens, own = block(tokens, size, [slot.tokens[number] for slot in memory])
-            kept.append(own)
-        return features + self.sc(tokens.flatten(0, 1), size).unflatten(0, features.shape[:2]), tuple(kept)
+        for block in self.transformer:
+            tokens = block(tokens, size)
+        return features + self.sc(tokens.flatten(0, 1), size).unflatten(0, features.shape[:2])
 
     def decode(self, features: Features) -> Clips:
         """Frames in [-1, 1]."""
@@ -284,34 +257,9 @@ class E2FGVI(nn.Module):
         others = [frames[1:] for frames in times]
         return self(torch.cat([*local, *others, *clip.references])[None], len(local))[0, len(local) - 1]
 
-    def complete_remembering(
-        self, now: Frames, memory: tuple[E2FGVIMemory, ...]
-    ) -> tuple[Float[Tensor, "3 height width"], E2FGVIMemory]:
-        """See `OnlineNetwork`. Features propagate from the latest remembered time.
-
-        Only the forward sweep has a memory: the backward one would need later frames.
-        """
-        self.check_size(now.shape[-2], now.shape[-1])
-        small = self.shrink(now[None, :1])[:, 0]
-        last = memory[-1] if memory else None
-        if last is not None and last.small.shape != small.shape:
-            raise ValueError(
-                f"{self.name}: expected memory of frames of {now.shape[-1]}x{now.shape[-2]} as this one is, got one of "
-                f"{STRIDE_PX * last.small.shape[-1]}x{STRIDE_PX * last.small.shape[-2]}; start a new stream"
-            )
-        flow = None if last is None else self.update_spynet(small, last.small)
-        features = self.encode(now[None])
-        followed, propagated = self.feat_prop_module.follow(
-            features[:, 0], flow, Propagated() if last is None else last.propagated
-        )
-        completed, tokens = self.transform(torch.cat([followed[:, None], features[:, 1:]], 1), memory)
-        return self.decode(completed[:, :1])[0, 0], E2FGVIMemory(small, propagated, tokens)
-
 
 class E2FGVIHQ(E2FGVI):
     """41.1 M parameters; 244 tensors. Takes any multiple of 60 x 108 pixels (height x width)."""
-
-    name = "E2FGVI-HQ"
 
     def _composition(self) -> SoftComposition:
         return SoftComposition(bias_convolution=True)

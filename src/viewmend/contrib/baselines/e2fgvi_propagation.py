@@ -226,23 +226,17 @@ class Propagation(nn.Module):
         forward = self._sweep("forward_", known, to_previous.unbind(1))
         return torch.stack([self._fuse(x, back, ahead) for (x, back), ahead in zip(known, forward, strict=True)], 1)
 
-    def follow(self, current: Feature, flow: Flow | None, state: Propagated) -> tuple[Feature, Propagated]:
-        """One step of a stream: the forward sweep continues, the backward one starts here."""
-        backward, _ = self.step("backward_", (current,), None, Propagated())
-        forward, state = self.step("forward_", (current, backward), flow, state)
-        return self._fuse(current, backward, forward), state
-
     def _fuse(self, current: Feature, backward: Feature, forward: Feature) -> Feature:
         return current + self.fusion(torch.cat([backward, forward], 1))
 
     def _sweep(self, way: str, known: Sequence[tuple[Feature, ...]], flows: Sequence[Flow]) -> list[Feature]:
         state, results = Propagated(), []
         for number, seen in enumerate(known):
-            result, state = self.step(way, seen, flows[number - 1] if number else None, state)
+            result, state = self._step(way, seen, flows[number - 1] if number else None, state)
             results.append(result)
         return results
 
-    def step(
+    def _step(
         self, way: str, seen: tuple[Feature, ...], flow: Flow | None, state: Propagated
     ) -> tuple[Feature, Propagated]:
         """The result at one frame, and the state for the next."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -30,7 +30,7 @@ Frames = Float[Tensor, "_frame 3 height width"]
 
 @dataclass(frozen=True)
 class Clip:
-    """One window of a stream at all times that are input together (O)."""
+    """One window of a stream at all times that are input together."""
 
     now: Frames
     neighbours: tuple[Frames, ...] = ()
@@ -48,14 +48,7 @@ class OnlineNetwork(Protocol):
         ...
 
     def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
-        """O: the first frame of `clip.now`, filled, in [-1, 1], by a run of the unchanged network on all frames."""
-        ...
-
-    def complete_remembering(self, now: Frames, memory: tuple[Any, ...]) -> tuple[Float[Tensor, "3 height width"], Any]:
-        """OM: the first frame of `now`, filled, and what later steps remember of this time.
-
-        `memory` is what this method returned at earlier times, oldest first.
-        """
+        """The first frame of `clip.now`, filled, in [-1, 1], by a run of the unchanged network on all frames."""
         ...
 
 
@@ -108,10 +101,8 @@ class OnlineConfig:
     framing: Literal["def", "win", "mul"] = "def"
     """The whole view resized to the network's size; overlapping windows in the view's own resolution; or windows, and
     the source cameras of the view next to it in each frame."""
-    memory: bool = False
-    """Remember tokens (OM) instead of running the network on all frames again (O)."""
     sampling: Sampling = field(default_factory=Sampling)
-    """Which past times are input or remembered."""
+    """Which past times are input."""
     size_px: tuple[int, int] = (240, 432)
     """Height and width that the network is run at."""
     dilation_px: int = 4
@@ -128,9 +119,7 @@ class OnlineState(State):
     """Past frames of a stream that the sampling may still use."""
 
     frames: Mapping[int, Float[Tensor, "3 height width"]] = field(default_factory=dict)
-    """O: past canvases by time."""
-    slots: Mapping[tuple[Window, int], Any] = field(default_factory=dict)
-    """OM: what the network remembers of each window at each time."""
+    """Past canvases by time."""
     canvas_px: tuple[int, int] = (0, 0)
     """Height and width of the canvas that all this belongs to."""
 
@@ -138,8 +127,7 @@ class OnlineState(State):
 class OnlineInpainter(Inpainter):
     """A published network behind the protocol of all inpainters.
 
-    Only windows with holes are run, so a window remembers (OM) only the times when it had some. Only pixels with
-    E > 0 change.
+    Only windows with holes are run. Only pixels with E > 0 change.
 
     Raises:
         ValueError: the network cannot take frames of `config.size_px`.
@@ -158,32 +146,24 @@ class OnlineInpainter(Inpainter):
         """The completed view; only the variant mul uses `context`."""
         canvas = self._canvas(view)
         state = self._past(state, view.time, canvas)
-        completed, slots = view.rgb, state.slots
+        completed = view.rgb
         windows = self._windows_with_holes(view, canvas)
         if windows:
             look = _WindowFrames(self.config, view, context, {view.time: canvas.image, **state.frames})
-            run = self._remembering if self.config.memory else self._at_once
-            pieces, slots = run(windows, look, state)
+            pieces = [self._piece(window, look, state) for window in windows]
             filled = self._fitted(stitch(pieces, windows, state.canvas_px, self.config.overlap_px), view)
             completed = blend(view.rgb, view.error, filled, torch.ones_like(view.error))
-        return CompletedView(view, completed), self._kept(replace(state, slots=slots), view.time, canvas)
+        return CompletedView(view, completed), self._kept(state, view.time, canvas)
 
-    def advance_state(self, view: IncompleteView, state: State) -> OnlineState | None:
-        """The state after a frame that is not scored; None for OM, whose memory needs the network."""
-        if self.config.memory:
-            return None
+    def advance_state(self, view: IncompleteView, state: State) -> OnlineState:
+        """The state after a frame that is not scored."""
         canvas = self._canvas(view)
         return self._kept(self._past(state, view.time, canvas), view.time, canvas)
 
     def _kept(self, state: OnlineState, time: int, canvas: Canvas) -> OnlineState:
         """The parts of the past and of this time that later views may use."""
-        frames = {} if self.config.memory else {time: canvas.image, **state.frames}
-        wanted = self.config.sampling.is_wanted_after
-        return replace(
-            state,
-            frames={past: frame for past, frame in frames.items() if wanted(past, time)},
-            slots={(window, past): slot for (window, past), slot in state.slots.items() if wanted(past, time)},
-        )
+        frames, wanted = {time: canvas.image, **state.frames}, self.config.sampling.is_wanted_after
+        return replace(state, frames={past: frame for past, frame in frames.items() if wanted(past, time)})
 
     def _canvas(self, view: IncompleteView) -> Canvas:
         make = resized_canvas if self.config.framing == "def" else window_canvas
@@ -194,41 +174,19 @@ class OnlineInpainter(Inpainter):
         height, width = canvas.image.shape[1:]
         if not isinstance(state, OnlineState) or state.canvas_px != (height, width):
             return OnlineState(canvas_px=(height, width))
-        return replace(
-            state,
-            frames={t: frame for t, frame in state.frames.items() if t < time},
-            slots={(window, t): slot for (window, t), slot in state.slots.items() if t < time},
-        )
+        return replace(state, frames={t: frame for t, frame in state.frames.items() if t < time})
 
     def _windows_with_holes(self, view: IncompleteView, canvas: Canvas) -> list[Window]:
         if self.config.framing == "def":  # a hole may be too thin for the small canvas, but the view still has it
             return [Window(0, 0)] if bool((view.error > 0).any()) else []
         return list(windows_over(canvas.holes, self.config.size_px, self.config.overlap_px))
 
-    def _at_once(
-        self, windows: list[Window], look: "_WindowFrames", state: OnlineState
-    ) -> tuple[list[Tensor], Mapping[tuple[Window, int], Any]]:
-        """O: each window by a run on all its frames."""
+    def _piece(self, window: Window, look: "_WindowFrames", state: OnlineState) -> Tensor:
+        """A window completed by a run on all of its frames."""
         time, sampling = look.view.time, self.config.sampling
-        pieces = []
-        for window in windows:
-            near, far = sampling.neighbour_times(time), sampling.reference_times(time)
-            past = (tuple(look(window, t) for t in times if t in state.frames) for times in (near, far))
-            pieces.append(self.network.complete_clip(Clip(look(window, time), *past)))
-        return pieces, state.slots
-
-    def _remembering(
-        self, windows: list[Window], look: "_WindowFrames", state: OnlineState
-    ) -> tuple[list[Tensor], Mapping[tuple[Window, int], Any]]:
-        """OM: each window by a run on its frames of this time and what it remembers."""
-        time, slots = look.view.time, dict(state.slots)
-        pieces = []
-        for window in windows:
-            past = [(window, t) for t in sorted(self.config.sampling.times(time))]
-            memory = tuple(slots[key] for key in past if key in slots)
-            piece, slots[window, time] = self.network.complete_remembering(look(window, time), memory)
-            pieces.append(piece)
-        return pieces, slots
+        near, far = sampling.neighbour_times(time), sampling.reference_times(time)
+        past = (tuple(look(window, t) for t in times if t in state.frames) for times in (near, far))
+        return self.network.complete_clip(Clip(look(window, time), *past))
 
     def _fitted(
         self, filled: Float[Tensor, "3 canvasheight canvaswidth"], view: IncompleteView

@@ -1,11 +1,10 @@
-"""DSTT and FuseFormer: frames to tokens, blocks of attention, tokens to frames; all at once or online.
+"""DSTT and FuseFormer: frames to tokens, blocks of attention, tokens to frames.
 
 DSTT: Liu et al. 2021, "Decoupled Spatial-Temporal Transformer for Video Inpainting". FuseFormer: Liu et al. 2021,
 "Fusing Fine-Grained Information in Transformers for Video Inpainting".
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 
 import torch
 from einops import rearrange
@@ -31,7 +30,7 @@ from viewmend.contrib.baselines.layers import (
     shallow_layers,
     token_grid,
 )
-from viewmend.contrib.baselines.online import Clip, Frames
+from viewmend.contrib.baselines.online import Clip
 
 HEADS = 4
 BLOCKS = 8
@@ -42,8 +41,6 @@ CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
 
 TokenClips = Float[Tensor, "sample frame rows cols 512"]
 """Tokens of clips in the grid of their patches."""
-MemorySlot = Float[Tensor, "block frame rows cols 512"]
-"""The memory of one time: its frames' tokens as input to each block's attention, after the first norm."""
 
 
 class MultiHeadAttention(nn.Module):
@@ -75,13 +72,8 @@ class TokenBlock(nn.Module, ABC):
         self.norm1, self.norm2 = nn.LayerNorm(DIM), nn.LayerNorm(DIM)
 
     @abstractmethod
-    def forward(
-        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
-    ) -> tuple[TokenClips, TokenClips]:
-        """The tokens after the block, and what it remembers of them.
-
-        `memory` is what it remembered of earlier frames: keys and values, never queries.
-        """
+    def forward(self, tokens: TokenClips) -> TokenClips:
+        """The tokens after the block."""
 
 
 class TokenTransformer(nn.Module, ABC):
@@ -89,8 +81,6 @@ class TokenTransformer(nn.Module, ABC):
 
     encoder: nn.Module
     transformer: nn.ModuleList
-    name: str
-    """The network's name in messages."""
 
     @abstractmethod
     def check_size(self, height: int, width: int) -> None:
@@ -125,37 +115,12 @@ class TokenTransformer(nn.Module, ABC):
         features = self.encode(clips.flatten(0, 1))
         tokens = self.split(features).unflatten(0, clips.shape[:2])
         for block in self.transformer:
-            tokens, _ = block(tokens)
+            tokens = block(tokens)
         return self.decode(features, tokens.flatten(0, 1)).unflatten(0, clips.shape[:2])
 
     def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
         """See `OnlineNetwork`."""
         return self(torch.cat([clip.now, *clip.neighbours, *clip.references])[None])[0, 0]
-
-    def complete_remembering(
-        self, now: Frames, memory: Sequence[MemorySlot]
-    ) -> tuple[Float[Tensor, "3 height width"], MemorySlot]:
-        """See `OnlineNetwork`: only the frames of one time go through the network (Thiry et al., OM).
-
-        The order of `memory` does not matter.
-
-        Raises:
-            ValueError: an unsupported size, or slots of another size.
-        """
-        self.check_size(*now.shape[-2:])
-        features = self.encode(now)
-        tokens = self.split(features)[None]
-        if any(slot.shape[2:] != tokens.shape[2:] for slot in memory):
-            raise ValueError(
-                f"{self.name}: expected memory of {tuple(tokens.shape[2:4])} tokens a frame as this frame has, got "
-                f"{[tuple(slot.shape[2:4]) for slot in memory]}; start a new stream for another size"
-            )
-        remembered = []
-        for number, block in enumerate(self.transformer):
-            past = torch.cat([slot[number] for slot in memory])[None] if memory else None
-            tokens, own = block(tokens, past)
-            remembered.append(own[0])
-        return self.decode(features[:1], tokens[0, :1])[0], torch.stack(remembered)
 
 
 def initialise(network: nn.Module) -> None:
@@ -196,18 +161,16 @@ class DecoupledBlock(TokenBlock):
         super().__init__(FeedForward())
         self.temporal = temporal
 
-    def forward(
-        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
-    ) -> tuple[TokenClips, TokenClips]:
-        """See `TokenBlock`; a spatial block does not use the memory."""
+    def forward(self, tokens: TokenClips) -> TokenClips:
+        """See `TokenBlock`."""
         own = self.norm1(tokens)
-        x = own + (self._over_time(own, memory) if self.temporal else self._over_frames(own))
-        return x + self.ffn(self.norm2(x)), own
+        x = own + (self._over_time(own) if self.temporal else self._over_frames(own))
+        return x + self.ffn(self.norm2(x))
 
-    def _over_time(self, own: TokenClips, memory: Tensor | None) -> TokenClips:
+    def _over_time(self, own: TokenClips) -> TokenClips:
         samples, frames, rows, cols, _ = own.shape
-        sources = own if memory is None else torch.cat([own, memory], 1)
-        mixed = self.attention(_zones(own), _zones(sources))
+        zones = rearrange(own, "b f (i r) (j c) d -> (b i j) (f r c) d", i=ZONES, j=ZONES)
+        mixed = self.attention(zones, zones)
         return rearrange(
             mixed,
             "(b i j) (f r c) d -> b f (i r) (j c) d",
@@ -224,14 +187,8 @@ class DecoupledBlock(TokenBlock):
         return self.attention(flat, flat).reshape(own.shape)
 
 
-def _zones(tokens: TokenClips) -> Float[Tensor, "zone token 512"]:
-    return rearrange(tokens, "b f (i r) (j c) d -> (b i j) (f r c) d", i=ZONES, j=ZONES)
-
-
 class DSTT(TokenTransformer):
     """34.5 M parameters; 158 tensors, named as in the official checkpoint's `netG`. Takes multiples of 24 x 24 px."""
-
-    name = "DSTT"
 
     def __init__(self) -> None:
         super().__init__()
@@ -276,17 +233,13 @@ class JointBlock(TokenBlock):
     def __init__(self) -> None:
         super().__init__(FusionFeedForward(nn.ReLU(inplace=True), nn.Identity()))
 
-    def forward(
-        self, tokens: TokenClips, memory: Float[Tensor, "sample slot rows cols 512"] | None = None
-    ) -> tuple[TokenClips, TokenClips]:
+    def forward(self, tokens: TokenClips) -> TokenClips:
         """See `TokenBlock`."""
-        own = self.norm1(tokens)
-        sources = own if memory is None else torch.cat([own, memory], 1)
-        queries, keys = (rearrange(x, "b f r c d -> b (f r c) d") for x in (own, sources))
-        x = tokens + self.attention(queries, keys).reshape(tokens.shape)
+        flat = rearrange(self.norm1(tokens), "b f r c d -> b (f r c) d")
+        x = tokens + self.attention(flat, flat).reshape(tokens.shape)
         size = (STEP_CELLS * x.shape[2], STEP_CELLS * x.shape[3])
         fused = self.ffn(self.norm2(x).flatten(0, 1), size)
-        return x + fused.reshape(x.shape), own
+        return x + fused.reshape(x.shape)
 
 
 class PositionalEmbedding(nn.Module):
@@ -306,8 +259,6 @@ class PositionalEmbedding(nn.Module):
 
 class FuseFormer(TokenTransformer):
     """36.6 M parameters; 160 tensors, named as in the official checkpoint. Takes 432x240; in training, also less."""
-
-    name = "FuseFormer"
 
     def __init__(self) -> None:
         super().__init__()
