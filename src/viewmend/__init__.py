@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from viewmend.data.errors import CaptureError
-    from viewmend.data.holdout.riftcast_views import RiftcastViews
     from viewmend.data.native_capture import open_capture
     from viewmend.data.prepare import prepare
     from viewmend.frame_cache import CachedFrame, DepthProvider
@@ -47,7 +46,6 @@ __all__ = [
     "Publisher",
     "RenderConfig",
     "RenderQuality",
-    "RiftcastViews",
     "Silhouettes",
     "StageTimes",
     "State",
@@ -83,7 +81,6 @@ _MODULES = {
     "Publisher": "live.client",
     "RenderConfig": "rendering.view",
     "RenderQuality": "models.base",
-    "RiftcastViews": "data.holdout.riftcast_views",
     "Silhouettes": "types",
     "StageTimes": "utils.timing",
     "State": "models.base",

@@ -1,17 +1,11 @@
-"""Written captures, in our own format and for RIFTCast, read back the same; folders are complete or absent."""
+"""Written captures, in our own format read back the same; folders are complete or absent."""
 
 import json
-import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from reference.ball import BallCapture, ring
-from reference.foreign_studios import write_easyvolcap
-from reference.random_rigs import named, random_rig
 
-from viewmend.cli import main
 from viewmend.data.errors import CaptureError
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
@@ -103,63 +97,3 @@ def test_camera_names_may_be_invalid_file_names(plain, tmp_path):
     write_capture(source, tmp_path / "copy", images="png")
     assert_same(open_capture(tmp_path / "copy"), source)
     assert sorted(p.name for p in (tmp_path / "copy" / "image").iterdir()) == ["camera00", "camera01", "camera02", "ok"]
-
-
-# RIFTCast data sets.
-
-
-@pytest.fixture
-def ball(tmp_path):
-    write_capture(BallCapture(ring(4)), tmp_path / "plain", images="png")
-    file = tmp_path / "plain/cameras.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"up": [0.0, 0.6, 0.8]}))
-    assert main(["convert", str(tmp_path / "plain"), str(tmp_path / "out"), "--to", "riftcast"]) == 0
-    return tmp_path
-
-
-def test_captures_convert_to_riftcast_and_back(ball):
-    before = open_capture(ball / "plain")
-    for path in (ball / "out", ball / "out/dataset.json"):
-        after = open_capture(path)
-        assert after.cameras.names == tuple(str(n) for n in range(4))
-        torch.testing.assert_close(after.cameras.K, before.cameras.K)
-        torch.testing.assert_close(after.cameras.camera_from_world, before.cameras.camera_from_world)
-        one, other = before.read(0), after.read(0)
-        assert torch.equal(one.mask > 127, other.mask == 255)
-        assert (one.rgb.float() - other.rgb.float()).abs().mean() < 2  # JPEG
-        torch.testing.assert_close(after.up, before.up, atol=1e-6, rtol=0)
-
-
-def test_riftcasts_frame_has_y_up_and_its_cube_contains_the_subject(ball):
-    """Uses the program's own formula V_gl = D V_file D to_world."""
-    meta = json.loads((ball / "out/dataset.json").read_text())
-    stored = json.loads((ball / "out/calibration.json").read_text())["cameras"][1]
-    D = np.diag([1.0, -1, -1, 1])
-    to_world = np.array(meta["dataset"]["to_world"]).reshape(4, 4)
-    view = D @ np.array(stored["extrinsics"]["view_matrix"]).reshape(4, 4) @ D @ to_world
-    capture, point = open_capture(ball / "plain"), np.array([0.1, 0.7, -0.2, 1.0])
-    K, pose = (x[1].double().numpy() for x in (capture.cameras.K, capture.cameras.camera_from_world))
-    np.testing.assert_allclose(view @ point, D @ pose @ [*(D @ to_world @ point)[:3], 1.0], atol=1e-5)
-    np.testing.assert_allclose((D @ to_world)[:3, 1], capture.up, atol=1e-6)
-    center, half = np.array(meta["volume"]["position"]), meta["volume"]["scale"]
-    uv = K @ (pose @ [*(D @ to_world)[:3, :3] @ center, 1])[:3]
-    assert 0.01 < half < 10 and int(capture.read(0).mask[1, int(uv[1] / uv[2]), int(uv[0] / uv[2])]) == 255
-
-
-@pytest.mark.parametrize(
-    ("fault", "message"),
-    [
-        ("gaps", "expected all cameras, got 2 of 3"),
-        ("sizes", "expected images of one size"),
-        ("no masks", "expected masks, which RIFTCast needs"),
-    ],
-)
-def test_captures_that_riftcast_cannot_have_are_rejected(tmp_path, capsys, fault, message):
-    rig = named([c | {"width": 20, "height": 16} for c in random_rig(3, 3)], "{:02d}")
-    gaps = {(rig[0]["name"], "000001")} if fault == "gaps" else ()
-    rig[0]["width"] = 24 if fault == "sizes" else 20
-    write_easyvolcap(tmp_path / "take", rig, ["000000", "000001"], gaps)
-    if fault == "no masks":
-        shutil.rmtree(tmp_path / "take/masks")
-    assert main(["convert", str(tmp_path / "take"), str(tmp_path / "out"), "--to", "riftcast"]) == 2
-    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -10,17 +10,12 @@ import tyro
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Convert a capture of any supported format to our own: undistorted images, masks and cameras.json.
-
-    Or, with --to riftcast, to a RIFTCast data set: JPEG images, run-length masks, calibration.json and dataset.json.
-    """
+    """Convert a capture of any supported format to our own: undistorted images, masks and cameras.json."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """Folder of the capture, or the file that stands for it (a .smc file of DNA-Rendering, a RIFTCast meta file)."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Output folder; it must be new or empty."""
-    to: Literal["plain", "riftcast"] = "plain"
-    """Output format."""
     format: str | None = None
     """Format of the source, see docs/formats.md; by default it is recognised."""
     frames: str | None = None
@@ -30,14 +25,13 @@ class Options:
     cameras: tuple[str, ...] = ()
     """Names of the cameras to keep; by default all."""
     images: Literal["jpeg", "png"] = "png"
-    """Image files of the plain format: lossless PNG, or smaller JPEG."""
+    """Image files: lossless PNG, or smaller JPEG."""
 
 
 def run(options: Options) -> int:
     """Run the command and return the exit code."""
     from viewmend.cli.checks import chosen_times
     from viewmend.cli.console import say, track
-    from viewmend.data.formats.riftcast import write_riftcast
     from viewmend.data.native_capture import open_capture
     from viewmend.data.native_writer import write_capture
     from viewmend.data.source import CaptureSubset
@@ -50,9 +44,6 @@ def run(options: Options) -> int:
     def progress(times: Iterable[int]) -> Iterable[int]:
         return track(times, options.out.name)
 
-    if options.to == "riftcast":
-        write_riftcast(subset, options.out, progress=progress)
-    else:
-        write_capture(subset, options.out, images=options.images, progress=progress)
+    write_capture(subset, options.out, images=options.images, progress=progress)
     say(f"{options.out}: {len(subset.cameras)} cameras, {len(subset.frame_ids)} frames")
     return 0

@@ -186,13 +186,6 @@ def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.
     return np.repeat(values.astype(np.uint8), runs).reshape(height, width)
 
 
-def encode_run_lengths(mask: UInt8[np.ndarray, "height width"]) -> bytes:
-    """Encode a mask as run lengths; values above 127 are foreground."""
-    flat = mask.ravel() > 127
-    ends = np.append(np.flatnonzero(flat[1:] != flat[:-1]) + 1, flat.size)
-    return np.concatenate([[int(flat[0])], ends]).astype("<i4").tobytes()
-
-
 def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
     """Read a 16-bit PNG of millimetres as z-depth in metres; 0 means no surface.
 

@@ -3,34 +3,23 @@
 RIFTCast is started with a meta file, which names the data set's folder, its frames, and the volume of the subject.
 """
 
-import json
 import re
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 from msgspec import Meta, Struct
 
-from viewmend.data.errors import CaptureError
 from viewmend.data.formats.files import to_distortion
-from viewmend.data.images import RUN_LENGTH_SUFFIX, encode_run_lengths, write_image
+from viewmend.data.images import RUN_LENGTH_SUFFIX
 from viewmend.data.native_format import stays_inside
-from viewmend.data.native_writer import atomic_folder
-from viewmend.data.source import CaptureSource, prefetch
-from viewmend.geometry.bounds import Bounds
-from viewmend.geometry.proxy import reconstruct
-from viewmend.types import MultiViewFrame
 from viewmend.utils.untrusted_input import Number, Triple, bounded_bytes, read_json, typed
 
-CALIBRATION, META = "calibration.json", "dataset.json"
+CALIBRATION = "calibration.json"
 TYPES = ("VCI", "VCI_REAL")
 MAX_META_BYTES = 2**16
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """Between OpenGL axes, which the program uses, and OpenCV axes, which its files use."""
-MARGIN = 1.2
-"""Size of the written cube relative to the hull of the first frame, if the source has no bounds."""
 Sixteen = Annotated[list[Number], Meta(min_length=16, max_length=16)]
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
@@ -122,18 +111,8 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     return result | (_meta_keys(meta) if meta else {})
 
 
-def stored_from_program(path: Path) -> np.ndarray:
-    """The 4 x 4 transform from the program's frame, y up, to that of `calibration.json` (of a data set or meta file).
-
-    Raises:
-        ValueError: this is not a data set, or its meta file has other content.
-    """
-    if (file := find(path)) is None:
-        raise ValueError(f"expected a data set of RIFTCast or its meta file, got {path}; check the path")
-    return _stored_from_program(_meta_of(path, file))
-
-
 def _stored_from_program(meta: MetaFile | None) -> np.ndarray:
+    """The 4 x 4 transform from the program's frame, y up, to that of `calibration.json`."""
     if meta is None or meta.dataset.to_world is None:
         return FLIP
     return FLIP @ np.array(meta.dataset.to_world).reshape(4, 4)
@@ -203,95 +182,3 @@ def _read_meta(file: Path) -> MetaFile:
 def _without_comments(data: bytes) -> bytes:
     """Remove comments, from // to the end of the line, outside of strings."""
     return re.sub(rb'("(?:\\.|[^"\\\n])*")|//[^\n]*', lambda found: found[1] or b"", data)
-
-
-def write_riftcast(
-    source: CaptureSource, out: Path, *, progress: Callable[[Iterable[int]], Iterable[int]] | None = None
-) -> None:
-    """Write a source as a RIFTCast data set: JPEG images, run-length masks, `calibration.json`, and `dataset.json`.
-
-    Cameras are numbered in their order. In the program's frame y is up, if the source knows up, and the cube contains
-    the bounds of the source, or the hull of the first frame. `out` is complete or absent. `progress` wraps the iterated
-    frame indices.
-
-    Raises:
-        CaptureError: `out` is in use, or the source has images of different sizes, gaps or no masks.
-    """
-    sizes = sorted({tuple(size) for size in source.cameras.size_px.tolist()})
-    if len(sizes) > 1:
-        raise CaptureError(f"{source.name}: expected images of one size, got {sizes}; choose cameras of one size")
-    times = range(len(source.frame_ids))
-    bounds = source.bounds
-    with atomic_folder(out) as folder:
-        for number, frame in enumerate(prefetch(source, times if progress is None else progress(times))):
-            _write_frame(source, frame, folder / f"frame_{number:05d}")
-            if bounds is None:
-                bounds = _hull_bounds(frame)
-        calibration, meta = {"cameras": _camera_entries(source)}, _meta_content(source, bounds, Path(out).resolve())
-        for name, value in ((CALIBRATION, calibration), (META, meta)):
-            (folder / name).write_text(json.dumps(value, indent=1), encoding="utf-8")
-
-
-def _write_frame(source: CaptureSource, frame: MultiViewFrame, folder: Path) -> None:
-    where = f"{source.name}: frame '{source.frame_ids[frame.time]}'"
-    if frame.mask is None:
-        raise CaptureError(f"{where}: expected masks, which RIFTCast needs for its hull, got none; make them first")
-    if len(frame.cameras) < len(source.cameras):
-        got = f"{len(frame.cameras)} of {len(source.cameras)}"
-        raise CaptureError(f"{where}: expected all cameras, got {got}; leave out the frame or the cameras")
-    for view in range(len(frame.cameras)):
-        write_image(folder / f"rgb/rgb_{view}.jpeg", frame.rgb[view].permute(1, 2, 0).contiguous().cpu().numpy())
-        file = folder / f"mask/mask_{view}{RUN_LENGTH_SUFFIX}"
-        file.parent.mkdir(exist_ok=True)
-        file.write_bytes(encode_run_lengths(frame.mask[view].cpu().numpy()))
-
-
-def _hull_bounds(frame: MultiViewFrame) -> Bounds | None:
-    assert frame.mask is not None
-    vertices = reconstruct(frame.mask, frame.cameras, None).mesh.vertices
-    if not len(vertices):
-        return None
-    low, high = vertices.amin(0), vertices.amax(0)
-    grow = (MARGIN - 1) / 2 * (high - low)
-    return Bounds(low - grow, high + grow)
-
-
-def _camera_entries(source: CaptureSource) -> list[dict[str, Any]]:
-    cameras = source.cameras.to("cpu")
-    return [
-        {
-            "camera_id": view,
-            "camera_model_name": name,
-            "extrinsics": {"view_matrix": cameras.camera_from_world[view].flatten().tolist()},
-            "intrinsics": {
-                "camera_matrix": cameras.K[view].flatten().tolist(),
-                "resolution": cameras.size_px[view].tolist(),
-            },
-        }
-        for view, name in enumerate(cameras.names)
-    ]
-
-
-def _meta_content(source: CaptureSource, bounds: Bounds | None, path: Path) -> dict[str, Any]:
-    turn = _source_from_y_up(source)
-    dataset = {"frame_count": len(source.frame_ids), "start_frame": 0, "path": str(path), "camera_path": CALIBRATION}
-    to_world = np.eye(4)
-    to_world[:3, :3] = FLIP[:3, :3] @ turn  # stored = FLIP @ to_world @ program
-    dataset |= {"flip_images": True, "flip_masks": True, "to_world": to_world.ravel().tolist()}
-    meta = {"type": "VCI", "version": "2.0.0", "dataset": dataset, "reconstructor": {"partial_masks": True}}
-    if bounds is not None:
-        low, high = torch.stack([bounds.low, bounds.high]).double().cpu().numpy()
-        corners = np.where(CORNERS > 0, high, low) @ turn
-        low, high = corners.min(0), corners.max(0)
-        meta["volume"] = {"position": ((low + high) / 2).tolist(), "scale": float((high - low).max() / 2)}
-    return meta
-
-
-def _source_from_y_up(source: CaptureSource) -> np.ndarray:
-    """A rotation from a frame with y up to the source's frame; the identity if the source does not know up."""
-    if source.up is None:
-        return np.eye(3)
-    up = source.up.double().cpu().numpy()
-    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    side /= np.linalg.norm(side)
-    return np.stack([side, up, np.cross(side, up)], 1)
