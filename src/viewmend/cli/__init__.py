@@ -39,8 +39,7 @@ COMMANDS = (
     Command("make-dataset", "viewmend.cli.make_dataset", "Generate training samples in advance."),
     Command("evaluate", "viewmend.cli.evaluate", "Compare methods on standard scenes and on captures."),
     Command("evaluate paper-table", "viewmend.cli.paper_table", "Compute the paper's tables on your own data."),
-    Command("benchmark", "viewmend.cli.benchmark", "Measure the time per view, stage by stage."),
-    Command("weights", "viewmend.cli.weights", "List and check third-party weights."),
+    Command("weights", "viewmend.cli.weights", "List third-party weights."),
     Command("weights get", "viewmend.cli.weights_get", "Download the networks of LPIPS (VGG16) and VFID (I3D)."),
     Command("masks", "viewmend.cli.masks", "Make masks for a capture."),
     Command("calibrate", "viewmend.cli.calibrate", "Calibrate cameras with a board, or refine them with silhouettes."),
@@ -48,8 +47,9 @@ COMMANDS = (
     Command("convert", "viewmend.cli.convert", "Convert a capture of any supported format."),
     Command("export-scene", "viewmend.cli.export_scene", "Export a capture for game engines: mesh, points, depth."),
     Command("export", "viewmend.cli.export", "Export a model for C++ and other runtimes."),
-    Command("check", "viewmend.cli.check", "Check a capture or a model, and describe it."),
+    Command("check", "viewmend.cli.check", "Check a capture, and describe it."),
 )
+
 ALIASES = {"info": "check"}
 """Former names of commands. They still work, but the overview does not list them."""
 

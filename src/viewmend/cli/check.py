@@ -1,4 +1,4 @@
-"""`viewmend check`: checks and describes a capture or a model."""
+"""`viewmend check`: checks and describes a capture."""
 
 import math
 from collections.abc import Sequence
@@ -12,22 +12,17 @@ if TYPE_CHECKING:
     from viewmend.data.checks.calibration import CalibrationCheck
     from viewmend.data.native_capture import NativeCapture
 
-MAX_CARD_BYTES = 100_000
-"""Bytes of a model card that are read."""
-TRIAL_PX = 64
-"""Width and height of the view that a model inpaints as a trial."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Check and describe a capture or a model.
+    """Check and describe a capture.
 
-    For a capture: checks that all files exist, that masks, calibration and images of one frame agree, and that cameras
-    and films are in step. For a model: runs it once on a small view, and fails if the result is not finite.
+    Checks that all files exist, that masks, calibration and images of one frame agree, and that cameras and films are
+    in step.
     """
 
-    target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|MODEL")]
-    """A capture of any supported format, or a model: a name or a folder with config.json and model.safetensors."""
+    capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
+    """A capture of any supported format."""
     format: str | None = None
     """Format of the capture, see docs/formats.md; by default it is recognised."""
     out: Path | None = None
@@ -42,63 +37,13 @@ def run(options: Options) -> int:
     """Run the command and return the exit code."""
     from viewmend.cli.console import print_json, show
 
-    if _is_model(options.target):
-        if options.out is not None:
-            raise ValueError(f"expected --out with a capture, got the model {options.target}; remove --out")
-        description = _describe_model(options.target)
-        _try_model(options.target)
-        lines = _model_as_text(description)
-    else:
-        capture, check, changes = _check_capture(options)
-        description = describe_capture(capture, check) | {"adjustments": list(changes)}
-        lines = _capture_as_text(description)
+    capture, check, changes = _check_capture(options)
+    description = describe_capture(capture, check) | {"adjustments": list(changes)}
     if options.json:
         print_json(description)
     else:
-        show(*lines)
+        show(*_capture_as_text(description))
     return 0
-
-
-def _is_model(target: str) -> bool:
-    from viewmend.models.checkpoint import CONFIG, WEIGHTS, shipped_models
-
-    folder = Path(target)
-    if not folder.exists() and target not in shipped_models():
-        raise ValueError(
-            f"expected a capture folder (with cameras.json), a model folder or one of the models "
-            f"{list(shipped_models())}, got '{target}'; check the path"
-        )
-    if (folder / "cameras.json").exists():
-        return False
-    return not folder.exists() or any((folder / name).exists() for name in (CONFIG, WEIGHTS))
-
-
-def _describe_model(name_or_path: str) -> dict[str, Any]:
-    """Load a model and describe it; raises a ValueError if it is damaged."""
-    from viewmend.models.checkpoint import CARD, load_network, model_folder
-
-    network, folder = load_network(name_or_path), model_folder(name_or_path)
-    card = None
-    if (folder / CARD).is_file():
-        with (folder / CARD).open("rb") as file:
-            card = file.read(MAX_CARD_BYTES).decode(errors="replace")
-    parameters = sum(parameter.numel() for parameter in network.parameters())
-    config = network.config.to_dict()
-    return {"kind": "model", "path": str(folder), "parameters": parameters, "config": config, "card": card}
-
-
-def _try_model(model: str) -> None:
-    """Inpaint a small view; raises a ValueError if the result is not finite."""
-    from viewmend.cli.console import busy
-    from viewmend.data.synthetic.rigs import orbit
-    from viewmend.data.synthetic.stage import Studio, StudioConfig
-    from viewmend.models.checkpoint import load_inpainter
-    from viewmend.stream import Stream
-
-    with busy("running the model"):
-        stream = Stream(load_inpainter(model))
-        stream.add_frame(Studio(StudioConfig(cameras=4, frames=1, size_px=TRIAL_PX)).read(0))
-        stream.view(orbit([0.4], (TRIAL_PX, TRIAL_PX), elevation_rad=0.2))
 
 
 FEW_CAMERAS, WIDE_DEG = 6, 60.0
@@ -115,10 +60,10 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
     from viewmend.data.prepare import adjustments
     from viewmend.utils.atomic_writes import remove_partial_file
 
-    capture = NativeCapture(Path(options.target), format=options.format)
+    capture = NativeCapture(options.capture, format=options.format)
     if not 0 <= options.time < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
-        raise ValueError(f"{options.target}: expected --time of 0 to {last}, got {options.time}; choose again")
+        raise ValueError(f"{options.capture}: expected --time of 0 to {last}, got {options.time}; choose again")
     with busy("computing the hull"):
         check = check_calibration(capture.read(options.time), capture.bounds)
         good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
@@ -181,14 +126,6 @@ def _describe_camera(capture: "NativeCapture", check: "CalibrationCheck", view: 
         "hull_iou": check.iou.get(name),
         "films": [] if capture.clock is None else capture.clock.describe(name),
     }
-
-
-def _model_as_text(model: dict[str, Any]) -> list[str]:
-    width = max(len(key) for key in model["config"])
-    lines = [f"{model['path']}: an inpainting model of {model['parameters'] / 1e6:.2f} million parameters", ""]
-    lines += [f"  {key:<{width}}  {value}" for key, value in model["config"].items()]
-    card = model["card"].strip() if model["card"] else "It has no model card, so its training is not documented."
-    return [*lines, "", *card.split("\n")]
 
 
 def _capture_as_text(capture: dict[str, Any]) -> list[str]:

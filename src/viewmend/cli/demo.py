@@ -10,7 +10,7 @@ from viewmend.cli.checks import ViewOptions
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
-    from viewmend.evaluation.mending import Fill, MendStep, MendSummary
+    from viewmend.evaluation.mending import MendStep
     from viewmend.geometry.cameras import Cameras
 
 FPS = 15.0
@@ -27,7 +27,7 @@ class Options:
     """Render and complete a moving procedural scene, captured by six cameras, from a moving camera. Needs no data.
 
     OUT gets demo.mp4 (rendered, completed and true views side by side) and contact_sheet.png. The table compares
-    unfilled holes, OpenCV's Telea and the model with the truth.
+    the rendered view, OpenCV's Telea and the model with the truth.
     """
 
     out: Path = Path("out/demo")
@@ -54,6 +54,7 @@ def run(options: Options) -> int:
         raise ValueError(f"expected a positive --{wrong[0]}, got {getattr(options, wrong[0])}; see --help")
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import print_json, say, show, track
+    from viewmend.cli.mend_output import in_words
     from viewmend.data.source import prefetch
     from viewmend.data.synthetic.stage import Studio, StudioConfig
     from viewmend.evaluation.mending import Mender, MendSummary
@@ -83,9 +84,9 @@ def run(options: Options) -> int:
     for name in RESULTS:
         say(f"wrote {options.out / name}")
     if options.json:
-        print_json(_report(summary))
+        print_json(summary.as_json())
     else:
-        show(*_table(summary, steps))
+        show(*in_words(summary))
     return 0
 
 
@@ -116,27 +117,3 @@ def _write(out: Path, steps: "Sequence[MendStep]") -> None:
         if len(chosen) < SHEET_ROWS and all(abs(n - other) >= MIN_GAP for other in chosen):
             chosen.append(n)
     write_image(out / "contact_sheet.png", contact_sheet([sheet_row(steps[n]) for n in sorted(chosen)], 260, 340))
-
-
-def _report(summary: "MendSummary") -> dict[str, object]:
-    fills: dict[str, Fill] = {"unfilled": "unfilled", "telea": "telea", "unseen": "holes_only", "ours": "ours"}
-    metrics = ("psnr_whole", "psnr_subject", "psnr_holes", "psnr_holes_fg")
-    scores = {key: {metric: summary.mean(fill, metric) for metric in metrics} for key, fill in fills.items()}
-    rest = summary.as_json()
-    kept = ("frames", "background", "hole_fraction", "mended_fraction", "ssim_whole", "alpha_iou", "stage_ms")
-    return scores | {key: rest[key] for key in kept}
-
-
-def _table(summary: "MendSummary", steps: "Sequence[MendStep]") -> list[str]:
-    from viewmend.cli.console import in_db
-
-    holes = sum(int(s.completed.view.holes.sum()) for s in steps)
-    lines = [f"{len(steps)} frames, {holes} hole pixels; PSNR on {summary.background} in dB:"]
-    lines.append("              whole image   holes   holes on the subject")
-    rows: list[tuple[str, Fill]] = [("unfilled", "unfilled"), ("Telea", "telea"), ("viewmend", "ours")]
-    for label, fill in rows:
-        whole, inside = summary.mean(fill, "psnr_whole"), summary.mean(fill, "psnr_holes")
-        subject = summary.mean(fill, "psnr_holes_fg")
-        lines.append(f"  {label:<12}      {in_db(whole)}   {in_db(inside)}                  {in_db(subject)}")
-    stages = ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items())
-    return [*lines, f"time per frame: {stages}"]

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from viewmend.data.camera_path import Turntable
     from viewmend.data.native_capture import NativeCapture
     from viewmend.data.source import CaptureSource
-    from viewmend.evaluation.mending import MendSummary
     from viewmend.geometry.cameras import Cameras
 
 
@@ -27,12 +26,11 @@ class Options:
     of a held-out camera (truth/*.png), all of them side by side (compared.mp4), and contact_sheet.png.
 
     With --leave-out, the view of that camera is rendered without its image and mask, and compared with them: PSNR in dB
-    of the whole image (also as rendered, and with only the holes inpainted: unseen), of the subject (inside the true
-    mask), of the pixels that a camera colours (valid), and of the holes (fg: inside the true mask), the last two also
-    for OpenCV's Telea fill; SSIM of the whole image; LPIPS (AlexNet) of the whole image and of the
-    subject; IoU of alpha and the true mask. PSNRs are means over frames; in
-    the holes, over frames with at least 50 such pixels, if there are any. hole_fraction is the fraction of the hull's
-    pixels that are holes, mended_fraction the fraction with E > 0.
+    of the whole image (also as rendered), of the subject (inside the true mask), of the pixels that a camera colours
+    (valid), and of the holes (fg: inside the true mask), the last two also for OpenCV's Telea fill; SSIM of the whole
+    image; LPIPS (AlexNet) of the whole image and of the subject; IoU of alpha and the true mask. PSNRs are means over
+    frames; in the holes, over frames with at least 50 such pixels, if there are any. hole_fraction is the fraction of
+    the hull's pixels that are holes, mended_fraction the fraction with E > 0.
 
     Images and scores are on black, or on white for a model trained on white (paper-small, as in the paper).
     """
@@ -81,7 +79,7 @@ def run(options: Options) -> int:
     _check(options)
     from viewmend.cli.checks import chosen_times, load_named, log_preparation
     from viewmend.cli.console import print_json, say, show, track
-    from viewmend.cli.mend_output import MendOutput
+    from viewmend.cli.mend_output import MendOutput, in_words
     from viewmend.data.camera_path import STATIC_FPS, parse_turntable
     from viewmend.data.prepare import prepare
     from viewmend.data.source import prefetch
@@ -122,7 +120,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(summary.as_json())
     else:
-        show(*_in_words(summary))
+        show(*in_words(summary))
     return 0
 
 
@@ -136,34 +134,6 @@ def _check(options: Options) -> None:
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     if options.top_k is not None and options.top_k < 1:
         raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; omit it to keep all")
-
-
-def _in_words(summary: "MendSummary") -> list[str]:
-    from viewmend.cli.console import in_db
-
-    iou = [value for values in summary.hull_iou.values() for value in values]
-    lines = [
-        f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
-        f"of the hull's pixels, {100 * (summary.mended_fraction or 0):.2f} % to be inpainted; "
-        f"hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}",
-        "a frame takes " + ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items()),
-    ]
-    if summary.mean("ours", "psnr_whole") is None:
-        return lines
-    whole = [in_db(summary.mean(fill, "psnr_whole")) for fill in ("ours", "unfilled", "holes_only")]
-    lines += [
-        f"PSNR on {summary.background}, dB; protocol {summary.protocol}",
-        f"  whole image           {whole[0]}   rendered {whole[1]}   only holes inpainted {whole[2]}",
-    ]
-    lines.append(f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}")
-    lines.append(f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}")
-    holes: dict[str, str] = {"holes": "psnr_holes", "holes on the subject": "psnr_holes_fg"}
-    for kind, metric in holes.items():
-        ours, telea = summary.mean("ours", metric), summary.mean("telea", metric)
-        lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
-    lpips = [summary.mean("ours", f"lpips_alex_{region}") for region in ("whole", "subject")]
-    lines.append(f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}")
-    return lines
 
 
 def _open(options: Options, held: tuple[str, ...]) -> "NativeCapture":

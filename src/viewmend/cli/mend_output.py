@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float32, UInt8
 from torch import Tensor
 
+from viewmend.cli.console import in_db
 from viewmend.data.images import MAX_DEPTH_M, read_rgb, read_rgba, write_depth, write_image
 from viewmend.data.videos import write_mp4, write_webm
-from viewmend.evaluation.mending import MendStep
+from viewmend.evaluation.mending import MendStep, MendSummary
 from viewmend.export.scene import cutout
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.types import CompletedView
@@ -143,3 +144,28 @@ def _box(mask: Tensor) -> tuple[slice, slice]:
     margin = 4 + len(rows) // 20
     top, bottom, left, right = int(rows[0]), int(rows[-1]), int(columns[0]), int(columns[-1])
     return slice(max(0, top - margin), bottom + 1 + margin), slice(max(0, left - margin), right + 1 + margin)
+
+
+def in_words(summary: MendSummary) -> list[str]:
+    """The scores and times of a run as text."""
+    iou = [value for values in summary.hull_iou.values() for value in values]
+    lines = [
+        f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
+        f"of the hull's pixels, {100 * (summary.mended_fraction or 0):.2f} % to be inpainted; "
+        f"hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}",
+        "a frame takes " + ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items()),
+    ]
+    if summary.mean("ours", "psnr_whole") is None:
+        return lines
+    whole, rendered = (in_db(summary.mean(fill, "psnr_whole")) for fill in ("ours", "unfilled"))
+    lines += [
+        f"PSNR on {summary.background}, dB; protocol {summary.protocol}",
+        f"  whole image           {whole}   rendered {rendered}",
+        f"  subject               {in_db(summary.mean('ours', 'psnr_subject'))}",
+        f"  coloured pixels       {in_db(summary.mean('ours', 'psnr_valid'))}",
+    ]
+    for kind, metric in {"holes": "psnr_holes", "holes on the subject": "psnr_holes_fg"}.items():
+        ours, telea = summary.mean("ours", metric), summary.mean("telea", metric)
+        lines.append(f"  {kind:<20}  {in_db(ours)}   Telea {in_db(telea)}")
+    lpips = [summary.mean("ours", f"lpips_alex_{region}") for region in ("whole", "subject")]
+    return [*lines, f"LPIPS                   {' subject '.join('-' if v is None else f'{v:.4f}' for v in lpips)}"]

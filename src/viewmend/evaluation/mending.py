@@ -22,7 +22,7 @@ from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
 from viewmend.utils.timing import StageTimes
 
-Fill = Literal["unfilled", "telea", "holes_only", "ours"]
+Fill = Literal["unfilled", "telea", "ours"]
 SLOW_MS = 10_000.0
 """A first step that takes longer is not repeated for its timing: compilation is a small part of it."""
 
@@ -65,7 +65,6 @@ class Mender:
         self._protocol: Protocol = protocol
         self._scorers: Scorers | None = None
         self._warm_up: Stream | None = None
-        self._holes_state: State | None = None
 
     def add_frame(self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None) -> CachedFrame:
         """Add a frame, with its proxy and depths if another stream computed them; `carving` as for `Stream`."""
@@ -121,10 +120,7 @@ class Mender:
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> "MendStep":
         """Complete and score the next view; several views of the same frame may follow each other.
 
-        Args:
-            frame: the input cameras.
-            target: the novel view's camera.
-            truth: the image of a camera at that pose (one view), used for scores only; None if there is none.
+        The image of a camera at the target's pose, `truth` (one view), is used for scores only.
 
         Raises:
             ValueError: the inpainter returns colours that are not finite.
@@ -145,20 +141,11 @@ class Mender:
         scores = FillScores(
             unfilled=score_view(CompletedView(view, view.cut_rgb), true, psnr_only),
             telea=score_view(telea, true, psnr_only),
-            holes_only=score_view(self._fill_holes(made.completed, holes), true, psnr_only),
             ours=score_view(made.completed, true, self._scorers),
         )
         if scores.ours.hull_iou is not None:
             iou[truth.cameras.names[0]] = scores.ours.hull_iou
         return MendStep(frame, made.completed, self.background, true.rgb, scores, iou, made.times)
-
-    def _fill_holes(self, completed: CompletedView, holes: IncompleteView) -> CompletedView:
-        """The same view with only its holes inpainted, as a stream of its own."""
-        if self.stream.error_rule == "holes":
-            return completed
-        made = self.stream.mend(holes, self._holes_state, self._quality, self._exclude)
-        self._holes_state = made.viewer
-        return made.completed
 
 
 @dataclass(frozen=True)
@@ -167,8 +154,6 @@ class FillScores:
 
     unfilled: ViewScores
     telea: ViewScores
-    holes_only: ViewScores
-    """Only the holes are inpainted, by the same inpainter as `ours`; equal for the error rule 'holes'."""
     ours: ViewScores
 
 
@@ -244,7 +229,6 @@ class MendSummary:
             "mended_fraction": self.mended_fraction,
             "psnr_whole": self.mean("ours", "psnr_whole"),
             "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
-            "psnr_whole_unseen": self.mean("holes_only", "psnr_whole"),
             "ssim_whole": self.mean("ours", "ssim_whole"),
             "lpips_whole": self.mean("ours", "lpips_alex_whole"),
             "lpips_subject": self.mean("ours", "lpips_alex_subject"),
