@@ -7,6 +7,7 @@ on the first scenes of the procedural test set, on white. OUT gets samples/, mod
 .svg. The same command resumes an interrupted run.
 """
 
+import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,8 +21,6 @@ from viewmend.cli.console import say, show, track
 from viewmend.cli.evaluate import report_folder
 from viewmend.data.holdout.studio_scenes import procedural_set
 from viewmend.evaluation.averages import Records, Row, gains, mean, records, tables
-from viewmend.evaluation.report_page import PLOT_STYLE as STYLE
-from viewmend.evaluation.report_page import figure_svg, require_matplotlib
 from viewmend.evaluation.result_cache import Cell, CellStore
 from viewmend.evaluation.runner import process_pool, run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
@@ -154,7 +153,8 @@ def variant_recipe(name: str, options: Options, seed: int) -> TrainConfig:
 
 def run(options: Options) -> int:
     """Run the ablation; returns 1 if an evaluation failed, else 0."""
-    require_matplotlib()  # before days of training
+    import matplotlib  # noqa: F401 (before days of training)
+
     if unknown := [name for name in options.variants if name not in VARIANTS]:
         raise ValueError(f"expected variants among {', '.join(VARIANTS)}, got {', '.join(unknown)}; see --help")
     names = dict.fromkeys(["full", *options.variants])
@@ -309,7 +309,7 @@ def plots(ablation: Ablation) -> str:
     variants = ablation.variants[1:]
     points = [(line.name, line.ms, mean(line.holes)) for line in ablation.top_k]
     points = [(name, ms, db) for name, ms, db in points if ms is not None and db is not None]
-    with rc_context(STYLE):
+    with rc_context({"svg.hashsalt": "viewmend", "svg.fonttype": "none", "font.size": 12}):
         figure = Figure((12, 2 + 0.35 * len(variants)), dpi=72, layout="constrained")
         left, right = figure.subplots(1, 2)
         left.set(title="loss in the holes against full, dB", xlabel="dB", yticks=range(len(variants)))
@@ -323,7 +323,9 @@ def plots(ablation: Ablation) -> str:
         right.plot([ms for _, ms, _ in points], [db for _, _, db in points], "o-", color="#3366cc", gid="top-k")
         for name, ms, db in points:
             right.annotate(name, (ms, db), (6, 6), textcoords="offset points")
-        return figure_svg(figure)
+        file = io.StringIO()
+        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    return file.getvalue()[file.getvalue().index("<svg ") :]
 
 
 if __name__ == "__main__":

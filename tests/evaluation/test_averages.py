@@ -6,7 +6,7 @@ from dataclasses import fields
 import pytest
 import torch
 
-from viewmend.evaluation.averages import gains, records, speed, tables, tables_by_kind
+from viewmend.evaluation.averages import gains, records, speed, tables
 from viewmend.evaluation.scores import ViewScores
 
 METHODS = ("ours", "telea")
@@ -84,9 +84,8 @@ def test_omitted_frames_and_failures_are_counted(cells):
     assert (overall.rows[0].scenes, overall.rows[0].failed) == (5, 1)
 
 
-def test_one_set_has_no_overall_table_and_one_kind_no_table_by_kind(cells):
+def test_one_set_has_no_overall_table(cells):
     assert [table.title for table in tables(cells[:4], METHODS)] == ["A"]
-    assert tables_by_kind(cells, METHODS) == []
 
 
 def test_nothing_to_average_is_none(make_cell, make_frame):
@@ -104,7 +103,6 @@ def test_each_score_of_a_frame_becomes_one_record(make_cell, make_frame):
     assert sorted(by_metric.values()) == sorted(values.values())
     assert {metric for metric, _ in by_metric} == {
         "psnr", "psnr_rendered", "ssim", "lpips_alex", "lpips_vgg", "alpha_iou", "hull_iou", "flicker", "change",
-        "change_truth", "warp_error", "warp_error_truth",
     }  # fmt: skip
     for metric_and_region, field in {
         ("psnr", "holes_fg"): "psnr_holes_fg",

@@ -68,7 +68,7 @@ def test_scores_match_hand_computed_values(case):
     assert scores.psnr_whole_rendered == pytest.approx(decibel(50 * 0.25 / 2000), abs=1e-4)
     assert scores.psnr_subject == pytest.approx(decibel(50 * 0.01 / 1950), abs=1e-4)
     assert scores.alpha_iou == scores.hull_iou == pytest.approx(1950 / 2000), "M stands in for a missing alpha"
-    assert scores.flicker is scores.change is scores.lpips_alex_whole is None
+    assert scores.flicker is scores.change_still is scores.lpips_alex_whole is None
     completed, truth = case
     alpha = torch.where(truth.mask, 0.51, 0.49)
     alpha[0] = 0.2
@@ -127,16 +127,13 @@ def temporal(case, moving, ours_before, ours_now):
     before, now, source = moving
     completed, truth = case
     view = completed.view
-    previous = PreviousView(ours_before, before, view.holes)
+    previous = PreviousView(ours_before, before)
     return score_view(CompletedView(view, ours_now), TrueView(now, truth.mask, source), SSIM, previous)
 
 
 def test_a_perfect_stream_has_no_flicker(case, moving):
     before, now, _ = moving
-    scores = temporal(case, moving, before, now)
-    assert scores.flicker == 0
-    assert scores.warp_error == scores.warp_error_truth == pytest.approx(0, abs=1e-6)
-    assert scores.change == scores.change_truth > 0.1
+    assert temporal(case, moving, before, now).flicker == 0
 
 
 def test_flicker_is_error_that_does_not_move_with_the_surface(case, moving):
@@ -147,8 +144,7 @@ def test_flicker_is_error_that_does_not_move_with_the_surface(case, moving):
     outside[:, ~case[0].view.holes] += 0.1
     assert temporal(case, moving, before, outside).flicker == pytest.approx(0, abs=1e-6)
     assert 0.08 < temporal(case, moving, before, outside).flicker_whole < 0.1, "over everything, holes included"
-    stuck = temporal(case, moving, before, before)
-    assert stuck.change == 0 and stuck.flicker > 0.1 and stuck.warp_error == pytest.approx(stuck.flicker, abs=1e-6)
+    assert temporal(case, moving, before, before).flicker > 0.1
 
 
 def test_change_where_the_truth_is_still(case):
@@ -156,21 +152,11 @@ def test_change_where_the_truth_is_still(case):
     still = torch.zeros(3, HEIGHT, WIDTH)
     still[:, :, : WIDTH // 2] = 0.5
     then, now = truth.rgb, replace(truth, rgb=truth.rgb + still)
-    previous = PreviousView(completed.rgb, then, completed.view.holes)
+    previous = PreviousView(completed.rgb, then)
     for added, expected in ((0.2, 0.2), (still, 0.0)):
         scores = score_view(replace(completed, rgb=completed.rgb + added), now, SSIM, previous)
         assert scores.change_still == pytest.approx(expected, abs=1e-6)
     assert score_view(completed, truth, SSIM).change_still is None
-
-
-def test_change_covers_the_holes_of_both_frames(case):
-    completed, truth = case
-    then = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    then[25:35, 20:30] = True  # as many pixels as this frame's holes, elsewhere
-    shown = completed.rgb.clone()
-    shown[:, then] += 0.3
-    scores = score_view(completed, truth, SSIM, PreviousView(shown, truth.rgb, then))
-    assert scores.change == pytest.approx(0.15, abs=1e-6) and scores.change_truth == 0
 
 
 @pytest.mark.parametrize("background", ["black", "white"])

@@ -72,8 +72,6 @@ class RunOptions:
     """Precision of our networks."""
     shown: int = 12
     """Scenes of each set with images in report.html; sheets/ has all of them."""
-    video: bool = True
-    """Leave videos out of report.html."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,11 +98,11 @@ class Options(RunOptions):
 def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.console import show
-    from viewmend.evaluation.report import report_json, summary
+    from viewmend.evaluation.report import markdown, report_json, summary
 
     with report_folder(options.out):
         report = evaluate(options, options.sets, options.methods)
-    text = report_json(report) if options.json else summary(report)
+    text = report_json(report) if options.json else markdown(summary(report))
     show(*text.rstrip().split("\n"))
     return exit_code(report)
 
@@ -176,14 +174,14 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
 
 def _write(options: RunOptions, report: "Report", store: "CellStore") -> None:
     from viewmend.cli.console import say
-    from viewmend.evaluation.report import markdown, report_csv, report_json
+    from viewmend.evaluation.report import blocks, markdown, report_csv, report_json
     from viewmend.evaluation.report_page import page, write_sheets
     from viewmend.utils.atomic_writes import write_text
 
     if not report.cells and (options.out / "report.json").exists():
         raise ValueError(f"{options.out}: expected results for the report there, got none; it is unchanged")
-    forms = {"md": markdown(report), "csv": report_csv(report), "json": report_json(report)}
-    forms["html"] = page(report, store, options.shown, options.video)
+    forms = {"md": markdown(blocks(report)), "csv": report_csv(report), "json": report_json(report)}
+    forms["html"] = page(report, store, options.shown)
     for name, text in forms.items():
         write_text(options.out / f"report.{name}", text)
     write_sheets(report.cells, store, options.out / "sheets")

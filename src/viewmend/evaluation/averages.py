@@ -122,19 +122,6 @@ def tables(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
     return per_set if len(sets) < 2 else [_overall(per_set, cells), *per_set]
 
 
-def tables_by_kind(cells: Sequence[Cell], methods: Sequence[str]) -> list[Table]:
-    """For each set, one table per rig and per style, where it has several."""
-    found = []
-    for name in dict.fromkeys(cell.set for cell in cells):
-        own = [c for c in cells if c.set == name]
-        for kind in ("rig", "style"):
-            values = list(dict.fromkeys(getattr(c, kind) for c in own))
-            for value in values if len(values) > 1 else []:
-                part = [c for c in own if getattr(c, kind) == value]
-                found.append(_table(f"{name}, {value}", part, methods))
-    return found
-
-
 def gains(own: Records, other: Records) -> dict[str, float]:
     """Gain of one method's PSNR in the holes over another's, by scene, where both have a score."""
     reference = other.by_scene("psnr", "holes")

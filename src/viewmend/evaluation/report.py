@@ -16,7 +16,6 @@ from viewmend.evaluation.averages import (
     records,
     speed,
     tables,
-    tables_by_kind,
 )
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import PROTOCOL, Cell
@@ -56,8 +55,6 @@ RULES = (
     f"The gain over {REFERENCE} is the mean over the scenes where both have a score.",
     '"Flicker" is the change of the error (completed view minus truth) since the previous frame, warped by the true '
     "motion of the surface: mean absolute difference over the holes, in 255ths. The truth has 0.",
-    '"Warp" is the mean absolute difference from the previous frame warped in the same way, over the holes, in 255ths; '
-    '"change" is the difference in place, over the holes of both frames. The truth is not 0 in either: see its row.',
     "Milliseconds are the inpainter's step without hull and rendering, with its caches as in production, over the "
     "frames with holes: median and 95th percentile. A method's first step is run twice and the second is timed, "
     f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
@@ -79,12 +76,10 @@ COLUMNS = (
     ("flicker", "flicker", "holes", 255, 2),
     ("flicker whole", "flicker", "whole", 255, 2),
     ("still", "change", "still", 255, 2),
-    ("warp", "warp_error", "holes", 255, 2),
-    ("change", "change", "holes", 255, 2),
 )
 """Columns of the main table: heading, metric, region, factor, decimals."""
 HIGHER, LOWER = ("psnr", "ssim", "alpha_iou"), ("flicker",)
-"""Metrics whose largest, or smallest, mean is the best; the truth has no extreme of the others."""
+"""Metrics whose largest, or smallest, mean is the best."""
 SPREAD = (("psnr", "holes"), ("psnr", "whole"), ("psnr", "subject"))
 """Columns that show the standard deviation over scenes, too."""
 MIN_SPREAD_SCENES = 3
@@ -107,8 +102,6 @@ class Report:
     """Class, parameters and hash of the weights of each method."""
     tables: tuple[Table, ...]
     """One per set; with several sets, first one over all."""
-    kinds: tuple[Table, ...]
-    """Each set's rigs and styles."""
     scores: Records
     cells: tuple[Cell, ...]
     """All cells, including failed ones."""
@@ -134,7 +127,6 @@ def make_report(
         methods=methods,
         identities={cell.key.method: cell.identity for cell in cells},
         tables=tuple(tables(cells, methods)),
-        kinds=tuple(tables_by_kind(cells, methods)),
         scores=records(cells),
         cells=tuple(cells),
         missing=missing or {},
@@ -145,7 +137,7 @@ def make_report(
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of text, with `**bold**` and `*italic*` as in Markdown."""
+    """A table of text, with `**bold**` as in Markdown."""
 
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -196,14 +188,13 @@ def holes_line(table: Table) -> str:
 
 
 def main_grid(table: Table) -> Grid:
-    """The main scores, speed and failures, in columns that have any; the last row is the truth's own change.
+    """The main scores, speed and failures, in columns that have any.
 
     The best of several values is bold, and scores over all scenes have the standard deviation over them.
     """
     heads = ("method", f"over {REFERENCE}", *(c[0] for c in COLUMNS), "VFID", "ms", "ms p95", "scenes", "failed")
     best = {column: _best(table.rows, column) for column in range(len(COLUMNS))}
-    rows = [_method_row(row, len(heads), best) for row in table.rows]
-    return _without_empty_columns(Grid(heads, (*rows, _truth_row(table.rows, len(heads)))))
+    return _without_empty_columns(Grid(heads, tuple(_method_row(row, len(heads), best) for row in table.rows)))
 
 
 def _without_empty_columns(grid: Grid) -> Grid:
@@ -246,15 +237,6 @@ def readings_grid(table: Table) -> Grid:
     return _without_empty_columns(Grid(heads, tuple(rows)))
 
 
-def kinds_grid(report: Report) -> Grid:
-    """PSNR in the holes by rig and style, and the gain over the reference."""
-    rows = []
-    for table in report.kinds:
-        cells = (f"{number(r.scores.mean('psnr', 'holes'), 1, 2)} ({_signed(r.over_reference)})" for r in table.rows)
-        rows.append((table.title, *cells))
-    return Grid(("kind", *report.methods), tuple(rows))
-
-
 def scenes_grid(report: Report) -> Grid:
     """PSNR in the holes of each scene."""
     holes = {(r.scene, r.method): number(r.value, 1, 2) for r in report.scores.where(metric="psnr", region="holes")}
@@ -279,28 +261,39 @@ def number(value: float | None, factor: int, digits: int, none: str = "-") -> st
     return none if value is None else f"{factor * value:.{digits}f}"
 
 
-def markdown(report: Report) -> str:
-    """The whole report as Markdown."""
-    parts = ["# Evaluation", "\n".join(setting_lines(report))]
+Block = str | list[str] | Grid
+"""Part of a report: a paragraph, or a heading if it begins with "#"; a list; a table."""
+
+
+def blocks(report: Report) -> list[Block]:
+    """The whole report, for Markdown and HTML."""
+    parts: list[Block] = ["# Evaluation", setting_lines(report)]
     for table in report.tables:
-        parts += [_main(table), markdown_table(readings_grid(table))]
+        parts += [*_main(table), readings_grid(table)]
     if missing := not_available(report):
-        parts += ["## Not available", bullets(missing)]
-    if report.kinds:
-        by_kind = markdown_table(kinds_grid(report))
-        parts += ["## By rig and style", f"PSNR in the holes, dB; gain over {REFERENCE}.", by_kind]
-    parts += ["## Scenes", "PSNR in the holes, dB.", markdown_table(scenes_grid(report))]
-    failed = [cell for cell in report.cells if cell.error is not None]
+        parts += ["## Not available", missing]
+    parts += ["## Scenes", "PSNR in the holes, dB.", scenes_grid(report)]
+    failed = [printable(f"{c.key.scene}, {c.key.method}: {c.error}") for c in report.cells if c.error is not None]
     if failed:
-        parts += ["## Failed", bullets(printable(f"{c.key.scene}, {c.key.method}: {c.error}") for c in failed)]
-    parts += ["## What the figures mean", bullets(RULES)]
-    parts += ["## Methods", bullets(f"{name}: `{report.identities.get(name, '?')}`" for name in report.methods)]
-    return "\n\n".join(parts) + "\n"
+        parts += ["## Failed", failed]
+    parts += ["## What the figures mean", list(RULES)]
+    return [*parts, "## Methods", [f"{name}: {report.identities.get(name, '?')}" for name in report.methods]]
 
 
-def summary(report: Report) -> str:
-    """The main tables only, as Markdown."""
-    return "\n\n".join([*(_main(table) for table in report.tables), *background_lines(report)]) + "\n"
+def markdown(parts: Iterable[Block]) -> str:
+    """Blocks as Markdown."""
+    return "\n\n".join(map(_as_markdown, parts)) + "\n"
+
+
+def _as_markdown(block: Block) -> str:
+    if isinstance(block, Grid):
+        return markdown_table(block)
+    return bullets(block) if isinstance(block, list) else block
+
+
+def summary(report: Report) -> list[Block]:
+    """The main tables only."""
+    return [*(block for table in report.tables for block in _main(table)), *background_lines(report)]
 
 
 def markdown_table(grid: Grid) -> str:
@@ -322,7 +315,6 @@ def report_json(report: Report) -> str:
         "missing_networks": report.missing_networks,
         "origins": [asdict(origin) for origin in report.origins],
         "tables": [_table_values(table) for table in report.tables],
-        "kinds": [_table_values(table) for table in report.kinds],
         "cells": [_cell_values(cell, report.scores) for cell in report.cells],
     }
     return json.dumps(value, indent=1, allow_nan=False) + "\n"
@@ -371,8 +363,8 @@ def _cell_values(cell: Cell, scores: Records) -> dict[str, object]:
     }
 
 
-def _main(table: Table) -> str:
-    return f"## {printable(table.title)}\n\n{holes_line(table)}\n\n{markdown_table(main_grid(table))}"
+def _main(table: Table) -> tuple[str, str, Grid]:
+    return f"## {printable(table.title)}", holes_line(table), main_grid(table)
 
 
 def bullets(lines: Iterable[str]) -> str:
@@ -393,15 +385,6 @@ def _method_row(row: Row, width: int, best: dict[int, float | None]) -> tuple[st
         str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
         f"**{row.failed}**" if row.failed else "0",
     )
-
-
-def _truth_row(rows: Sequence[Row], width: int) -> tuple[str, ...]:
-    """The truth's own change, which a perfect method would have."""
-    shown = []
-    for _, metric, region, factor, digits in COLUMNS:
-        means = (row.scores.mean(f"{metric}_truth", region) for row in rows)
-        shown.append(number(next((value for value in means if value is not None), None), factor, digits, ""))
-    return ("*truth*", "", *shown, *[""] * (width - 2 - len(shown)))
 
 
 def _signed(value: float | None) -> str:

@@ -20,10 +20,10 @@ from viewmend.data.images import read_rgb, write_image
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
 from viewmend.evaluation.scores import FEATURES, KINDS, Features, ViewScores
-from viewmend.evaluation.video_strip import STRIP_FRAMES, Picture, split_strip
 from viewmend.models.registry import identity, make_method
 from viewmend.rendering.error_mask import error_rule
 from viewmend.utils.atomic_writes import write_atomically, write_text
+from viewmend.utils.contact_sheet import Picture
 from viewmend.utils.untrusted_input import typed
 
 PROTOCOL = 5
@@ -107,7 +107,7 @@ class CellStore:
 
     def save(self, cell: Cell, run: MethodRun) -> None:
         """Store a cell; its JSON file comes last, so that a cell that is there is complete."""
-        self._write(cell.key.stem, run.image, run.strip, run.features)
+        self._write(cell.key.stem, run.image, run.features)
         values = asdict(replace(cell, features=None, true_features=None))
         text = json.dumps({name: values[name] for name in STORED}, indent=1, allow_nan=False) + "\n"
         write_text(self.folder / f"{cell.key.stem}.json", text)
@@ -115,7 +115,7 @@ class CellStore:
     def save_scene(self, key: CellKey, run: SceneRun) -> None:
         """Store what all methods of a scene share: rendered view, E, truth, and the features of the true videos."""
         image = None if run.images is None else np.concatenate(run.images, 1)
-        self._write(key.scene_stem, image, run.strip, run.features)
+        self._write(key.scene_stem, image, run.features)
 
     def image(self, key: CellKey) -> Picture | None:
         """The completed view of a cell; None if there is none."""
@@ -126,24 +126,9 @@ class CellStore:
         joined = self._read_image(f"{key.scene_stem}.png")
         return None if joined is None else SceneImages(*(np.ascontiguousarray(p) for p in np.split(joined, 3, 1)))
 
-    def strip(self, cell: Cell) -> list[Picture]:
-        """The first frames of a cell; empty if there are none."""
-        strip = self._read_image(f"{cell.key.stem}.jpg")
-        return [] if strip is None or not cell.frames else split_strip(strip, min(STRIP_FRAMES, len(cell.frames)))
-
-    def scene_strip(self, cell: Cell) -> tuple[list[Picture], list[Picture]]:
-        """The first frames of the cell's scene: rendered, and the truth."""
-        strip = self._read_image(f"{cell.key.scene_stem}.jpg")
-        if strip is None or not cell.frames:
-            return [], []
-        count = min(STRIP_FRAMES, len(cell.frames))
-        rendered, truth = (split_strip(part, count) for part in np.split(strip, 2, 1))
-        return rendered, truth
-
-    def _write(self, stem: str, image: Picture | None, strip: Picture | None, features: Features | None) -> None:
-        for suffix, pixels in (("png", image), ("jpg", strip)):
-            if pixels is not None:
-                write_image(self.folder / f"{stem}.{suffix}", pixels)
+    def _write(self, stem: str, image: Picture | None, features: Features | None) -> None:
+        if image is not None:
+            write_image(self.folder / f"{stem}.png", image)
         if features is not None:
 
             def write(path: Path) -> None:

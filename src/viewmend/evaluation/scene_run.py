@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 
 from viewmend.data.holdout.scenes import LeaveOneOutScene, Protocol, revealed
@@ -19,7 +18,6 @@ from viewmend.evaluation.scores import (
     score_view,
     true_view,
 )
-from viewmend.evaluation.video_strip import STRIP_FRAMES, Box, Picture, make_strip, subject_box
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.metrics.image_quality import SsimWindow
@@ -29,7 +27,7 @@ from viewmend.models.compositing import Background, composite
 from viewmend.models.registry import error_model_for, make_method
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
-from viewmend.utils.contact_sheet import picture
+from viewmend.utils.contact_sheet import Picture, picture
 
 __all__ = ["SLOW_MS", "MethodRun", "RunSettings", "SceneRun", "evaluate_scene"]
 
@@ -66,8 +64,6 @@ class MethodRun:
     """Why it failed."""
     image: Picture | None = None
     """The completed view of the frame with the largest hole."""
-    strip: Picture | None = None
-    """The first frames (`make_strip`)."""
     features: Features | None = None
     """Features of the completed videos, for VFID; None without I3D."""
 
@@ -80,8 +76,6 @@ class SceneRun:
     runs: tuple[MethodRun, ...]
     images: tuple[Picture, Picture, Picture] | None = None
     """Rendered view, E and truth of the frame with the largest hole; None if the scene could not be rendered."""
-    strip: Picture | None = None
-    """The first frames: rendered on the left, the truth on the right."""
     features: Features | None = None
     """Features of the true videos."""
 
@@ -115,21 +109,24 @@ def evaluate_scene(
     """
     loaded = {} if loaded is None else loaded
     scorers = load_scorers(settings.background, settings.ssim, settings.networks, settings.device)
-    shared = _SharedImages(scorers)
+    images, videos = None, VideoFeatures(scorers.i3d)
     streams = [_MethodStream(name, settings, scorers, loaded) for name in methods]
     try:
         with torch.no_grad():
             for frame in _frames(scene, settings):
                 if frame.scored:
-                    shared.add(frame)
+                    videos.add(frame.truth.rgb, frame.view.holes)
+                if frame.largest:
+                    rendered = composite(settings.background, frame.view.cut_rgb, frame.view.silhouette)
+                    images = picture(rendered), picture(frame.view.error[None]), picture(frame.truth.rgb)
                 for stream in streams:
                     stream.add(frame)
-        if shared.images is None:
+        if images is None:
             raise ValueError(f"{scene.name}: expected frames of the held-out camera, got none")
     except Exception as error:
         return SceneRun(scene.name, tuple(MethodRun(name, error=_message(error)) for name in methods))
-    runs = tuple(stream.result(shared.box) for stream in streams)
-    return SceneRun(scene.name, runs, shared.images, shared.strip(), shared.videos.features())
+    runs = tuple(stream.result() for stream in streams)
+    return SceneRun(scene.name, runs, images, videos.features())
 
 
 def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
@@ -148,34 +145,6 @@ def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
         most, last = max(most, holes) if scored else most, replace(last, previous=None)
 
 
-class _SharedImages:
-    """Rendered views and truth of a scene, to be shown next to every method's."""
-
-    def __init__(self, scorers: Scorers) -> None:
-        self.videos = VideoFeatures(scorers.i3d)
-        self.images: tuple[Picture, Picture, Picture] | None = None
-        self.box: Box | None = None
-        self._background: Background = scorers.background
-        self._rendered: list[Picture] = []
-        self._truth: list[Picture] = []
-
-    def add(self, frame: _Frame) -> None:
-        view, truth = frame.view, frame.truth
-        rendered = composite(self._background, view.cut_rgb, view.silhouette)
-        self.videos.add(truth.rgb, view.holes)
-        if frame.largest:
-            self.images = picture(rendered), picture(view.error[None]), picture(truth.rgb)
-        if len(self._truth) < STRIP_FRAMES:
-            box = subject_box((view.mask > 0) | truth.mask)
-            self.box = box if self.box is None else self.box if box is None else self.box.union(box)
-            self._rendered.append(picture(rendered))
-            self._truth.append(picture(truth.rgb))
-
-    def strip(self) -> Picture | None:
-        strips = [make_strip(frames, self.box) for frames in (self._rendered, self._truth)]
-        return None if strips[0] is None or strips[1] is None else np.concatenate([strips[0], strips[1]], 1)
-
-
 class _MethodStream:
     """One method's stream through the scene."""
 
@@ -189,7 +158,6 @@ class _MethodStream:
         self._step_ms: list[float] = []
         self._videos = VideoFeatures(scorers.i3d)
         self._image: Picture | None = None
-        self._strip: list[Picture] = []
 
     def add(self, frame: _Frame) -> None:
         """Complete and score the view of the next frame; do nothing after an error."""
@@ -227,24 +195,20 @@ class _MethodStream:
         rgb = composite(self._settings.background, completed.rgb, completed.opacity)
         previous = None
         if frame.previous is not None and self._previous is not None:
-            previous = PreviousView(self._previous, frame.previous.truth.rgb, frame.previous.view.holes)
+            previous = PreviousView(self._previous, frame.previous.truth.rgb)
         self._scores.append(score_view(completed, frame.truth, self._scorers, previous))
         self._step_ms.append(made.times.context + made.times.inpainting)
         self._videos.add(rgb, frame.view.holes)
         self._previous = rgb
-        if len(self._strip) < STRIP_FRAMES:
-            self._strip.append(picture(rgb))
         if frame.largest:
             self._image = picture(rgb)
 
-    def result(self, box: Box | None) -> MethodRun:
-        """The result; `box` is the part that its video shows."""
+    def result(self) -> MethodRun:
+        """The result."""
         if self._error is not None:
             return MethodRun(self.method, error=self._error)
-        strip, features = make_strip(self._strip, box), self._videos.features()
-        return MethodRun(
-            self.method, tuple(self._scores), tuple(self._step_ms), image=self._image, strip=strip, features=features
-        )
+        scores, step_ms = tuple(self._scores), tuple(self._step_ms)
+        return MethodRun(self.method, scores, step_ms, image=self._image, features=self._videos.features())
 
 
 def _check(completed: CompletedView) -> None:

@@ -135,12 +135,6 @@ class ViewScores:
     """The same over the subject and the proxy; compare with the method `unfilled`, which shows the rendered view."""
     change_still: float | None = None
     """Change since the previous frame where the truth is still (`STILL`); needs no true motion."""
-    warp_error: float | None = None
-    """Change of the view since the previous frame along the true motion, over the holes."""
-    warp_error_truth: float | None = None
-    change: float | None = None
-    """Change since the previous frame in place, over the holes of both frames."""
-    change_truth: float | None = None
 
     @property
     def image_px(self) -> int:
@@ -167,7 +161,6 @@ class PreviousView:
 
     rgb: Float[Tensor, "3 height width"]
     truth: Float[Tensor, "3 height width"]
-    holes: Bool[Tensor, "height width"]
 
 
 def true_view(
@@ -269,16 +262,10 @@ def _temporal(
 ) -> dict[str, float | None]:
     then, true_now, true_then = previous.rgb, truth.rgb, previous.truth
     still = shown & ((true_now - true_then).abs().amax(0) < STILL)
-    found = {
-        "change_still": change(now, then, still, MIN_HOLE_PX),
-        "change": change(now, then, holes | previous.holes, MIN_HOLE_PX),
-        "change_truth": change(true_now, true_then, holes | previous.holes, MIN_HOLE_PX),
-    }
+    found = {"change_still": change(now, then, still, MIN_HOLE_PX)}
     if (flow := truth.backward_flow_px) is not None:
         found["flicker_whole"] = warp_error(now - true_now, then - true_then, flow, shown)
         found["flicker"] = warp_error(now - true_now, then - true_then, flow, holes, MIN_HOLE_PX)
-        found["warp_error"] = warp_error(now, then, flow, holes, MIN_HOLE_PX)
-        found["warp_error_truth"] = warp_error(true_now, true_then, flow, holes, MIN_HOLE_PX)
     return found
 
 

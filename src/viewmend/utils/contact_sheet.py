@@ -7,6 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+Picture = UInt8[np.ndarray, "_height _width 3"]
+"""An RGB image."""
 LABEL_PX = 22
 GAP_PX = 4
 BACKGROUND = 32

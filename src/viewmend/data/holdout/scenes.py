@@ -117,9 +117,9 @@ class LeaveOneOutScene(ABC):
     set: str
     """The set it belongs to: scores are averaged over it."""
     rig: str
-    """Which cameras look, for tables by kind."""
+    """Which cameras look, for reports."""
     style: str
-    """What happens, for tables by kind."""
+    """What happens, for reports."""
     held: str
     """The camera that is left out."""
     scored_from: int = 0
