@@ -166,12 +166,7 @@ class ColourMatch:
 
 
 def match_colours(frame: MultiViewFrame, bounds: Bounds | None) -> ColourMatch | None:
-    """Fit colour maps to the cameras of one frame with masks; None if too few cameras share surface.
-
-    Args:
-        frame: the input cameras.
-        bounds: the volume that contains the subject; None to find it from the masks.
-    """
+    """Fit colour maps to the cameras of one frame with masks; None if too few cameras share surface."""
     small = limit_size(frame, LONGEST_PX)
     if small.mask is None or len(small.cameras) < MIN_CAMERAS:
         return None

@@ -342,14 +342,7 @@ class CameraImages:
 
 
 class CameraReader:
-    """Reads the files of one camera. Keeps its videos open and its undistortion map. Thread-safe.
-
-    Args:
-        folder: the folder that its paths are relative to.
-        camera: the camera.
-        frames: the ids of the capture's frames.
-        clock: which frames of its films belong to them; None without films.
-    """
+    """Reads the files of one camera. Keeps its videos open and its undistortion map. Thread-safe."""
 
     def __init__(self, folder: Path, camera: NativeCamera, frames: Sequence[str], clock: VideoClock | None):
         self.camera = camera

@@ -211,9 +211,7 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
 def to_rgb(frame: "VideoFrame", size_px: tuple[int, int] | None = None) -> Image:
     """A decoded frame as an upright RGB image, by the matrix and the range that it declares, BT.601 by default.
 
-    Args:
-        frame: the frame.
-        size_px: width and height of the upright image; the frame's by default.
+    `size_px` is another width and height for the upright image.
     """
     if size_px is None or size_px == ((frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)):
         return np.ascontiguousarray(_upright(frame.to_ndarray(format="rgb24", interpolation=NO_CHROMA_FILTER), frame))

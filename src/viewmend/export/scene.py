@@ -244,13 +244,7 @@ def write_ply(
     colours: Float[Tensor, "vertex 3"],
     faces: Int[Tensor, "face 3"] | None = None,
 ) -> None:
-    """Writes points or a mesh as binary PLY: float positions, 8-bit colours.
-
-    Args:
-        path: the file.
-        vertices: metres.
-        colours: sRGB in [0, 1], one per vertex.
-        faces: counter-clockwise from outside; None for points.
+    """Writes points, or a mesh of counter-clockwise faces, as binary PLY: metres, and sRGB in [0, 1] as 8 bit.
 
     Raises:
         OSError: the file cannot be written.

@@ -142,13 +142,7 @@ def select_by_gain(
 
 
 def attenuate_background(view: IncompleteView, found: ErrorMap, fraction: float) -> IncompleteView:
-    """The view with a soft E: 1 where a pixel is to be re-synthesised, elsewhere its predicted background fraction.
-
-    Args:
-        view: the view as rendered.
-        found: the errors predicted for it.
-        fraction: as in `select_by_gain`.
-    """
+    """The view with a soft E: 1 where a pixel is to be re-synthesised, elsewhere its predicted background fraction."""
     chosen = torch.minimum(select_by_gain(view, found.rest, fraction), (view.error > 0).to(view.error))
     background = torch.where((chosen == 0) & (view.mask > 0), torch.minimum(1 - found.alpha, view.error), 0.0)
     fade = torch.where(background > MIN_FADE, background, 0.0)

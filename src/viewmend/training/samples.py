@@ -117,14 +117,7 @@ class HeldOutCamera:
 def rig_samples(
     rig: LeaveOneOut, scenes: SceneConfig, sampling: SamplingConfig, random: Random, held_out: str | None = None
 ) -> list[Sample]:
-    """Hold out some cameras of a rig in turn, each at some of its frames.
-
-    Args:
-        rig: the images of all cameras.
-        scenes: number of held-out cameras, and resolution of the hull.
-        sampling: number of frames and context of a sample.
-        random: draws cameras, frames and source views.
-        held_out: the only camera to hold out, if it is there; None for any.
+    """Hold out some cameras of a rig in turn (or only `held_out`), each at some of its frames.
 
     Raises:
         ValueError: the rig has too few frames.

@@ -112,14 +112,7 @@ class ShardScenes(Generic[Kind]):
     """Shards as scenes, in another random order each time all have been used."""
 
     def __init__(self, folder: Path, seed: str, kind: type[Kind], whole: bool = True, clip_length: int = 1) -> None:
-        """Find the shards.
-
-        Args:
-            folder: where they are.
-            seed: determines their order.
-            kind: what they must hold.
-            whole: whether a scene is a whole shard, its samples in random order; else it is a single item.
-            clip_length: frames that each `Sample` must have at least.
+        """Find the shards. A scene is a whole shard, its samples in random order, or unless `whole` a single item.
 
         Raises:
             ShardError: there are none, or the first is damaged.

@@ -37,12 +37,7 @@ class MismatchedWeightsError(WeightsError):
 
 
 def load_weights(network: Network, path: str | Path, device: torch.device | str = "cpu") -> Network:
-    """Load the weights of a file into a network, move it to `device` and set evaluation mode.
-
-    Args:
-        network: modified in place and returned.
-        path: a .safetensors file, or a PyTorch file, read with `weights_only=True`.
-        device: where the network computes.
+    """Load a .safetensors file, or a PyTorch file of weights alone, into a network; set device and evaluation mode.
 
     Raises:
         DamagedWeightsError: the file is missing, unreadable or truncated.

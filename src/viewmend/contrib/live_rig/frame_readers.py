@@ -113,11 +113,7 @@ class Playback:
 def pictures_of(camera: LiveCamera, counts: "Counter[str]", playback: Playback, wait: Callable[[float], bool]) -> Any:
     """Generate the images of a camera from now on, until it fails; close the generator after use.
 
-    Args:
-        camera: its address.
-        counts: "torn" (damaged) and "duplicated" images are counted there.
-        playback: the position of recordings.
-        wait: waits for a number of seconds; True if no more images are wanted.
+    Damaged ("torn") and "duplicated" images are counted in `counts`. `wait(seconds)` is True once none are wanted.
 
     Raises:
         OSError: it cannot be opened, ends, or is silent.

@@ -69,14 +69,10 @@ def family_table(family: str) -> dict[str, str]:
 
 
 def find_parts(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
-    """Part -> joint name of any skeleton; parts that it lacks are absent.
+    """Part -> joint name of any skeleton, given with parents first (-1: none); parts that it lacks are absent.
 
     A family's table is taken where its required parts are all there, under any common prefix such as `mixamorig:`
     (the family with the most parts wins); otherwise the parts are guessed from the words in the names.
-
-    Args:
-        names: joints, parents before children.
-        parents: position of each joint's parent, -1 for a root.
 
     Raises:
         ValueError: a required part (hips, arms, legs) is found in neither way.

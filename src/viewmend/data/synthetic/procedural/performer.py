@@ -149,10 +149,6 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
 
     The same seed and style give the same scene, bit for bit.
 
-    Args:
-        seed: any non-negative number; from 10000 on they are for tests, never for training.
-        style: what to fix.
-
     Raises:
         ValueError: the style names a motion that does not exist, or another number of people than 1 or 2.
     """
