@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.data.images import write_image
+from viewmend.data.synthetic.performer import linear_from_srgb
 from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.cameras import Cameras, pixel_centers, project, unproject
 from viewmend.geometry.hull import FOREGROUND
@@ -188,7 +189,7 @@ def write_glb(
     Raises:
         OSError: the file cannot be written.
     """
-    linear = np.rint(65535 * _linear(colours.clamp(0, 1).cpu().numpy())).astype("<u2")
+    linear = np.rint(65535 * linear_from_srgb(colours.clamp(0, 1)).cpu().numpy()).astype("<u2")
     rgba = np.concatenate([linear, np.full((len(linear), 1), 65535, "<u2")], 1)
     position = vertices.cpu().numpy().astype("<f4")
     parts = {
@@ -261,11 +262,6 @@ def write_ply(
     head = "\n".join([*lines, "end_header", ""]).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda draft: draft.write_bytes(head + points.tobytes() + triangles.tobytes()))
-
-
-def _linear(srgb: Shaped[np.ndarray, "vertex 3"]) -> Shaped[np.ndarray, "vertex 3"]:
-    """Linear values of sRGB (IEC 61966-2-1), both in [0, 1]."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 RESULTS = ("hull", "points", "rgba", "depth", "cameras.usda", "open_in_blender.py")
