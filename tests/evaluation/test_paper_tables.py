@@ -84,7 +84,7 @@ def test_models_of_the_ablation_are_found_by_name(tmp_path):
 def test_the_command_writes_the_table_in_every_format(tmp_path, monkeypatch, capsys):
     for name in (FOLDERS_VARIABLE, "XDG_CACHE_HOME", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "nowhere"))
-    command = ["evaluate", "paper-table", "1", "--out", str(tmp_path), "--ours", "nearest", "--no-video"]
+    command = ["evaluate", "paper-table", "1", "--out", str(tmp_path), "--ours", "nearest"]
     assert cli.main([*command, "--frames", "1", "--scenes", "1", "--size", "128"]) == 0
     text, lines = capsys.readouterr().out, json.loads((tmp_path / "table1.json").read_text())
     assert len(lines) == 25 and lines[19]["here"] == "none" and lines[1]["PSNR (here)"] == "n/a"
