@@ -95,7 +95,14 @@ class Cameras:
         return replace(self, K=K)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> "Cameras":
-        """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image."""
+        """Cameras that see the window at (left, top) of size width x height, in pixels; it may leave the image.
+
+        Args:
+            left: the window's first column in the image; below 0 it begins outside.
+            top: its first row.
+            width: its width.
+            height: its height.
+        """
         K = self.K.clone()
         K[:, 0, 2] -= left
         K[:, 1, 2] -= top
