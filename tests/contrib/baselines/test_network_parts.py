@@ -105,12 +105,11 @@ def test_focal_attention_is_attention_to_those_places(rng):
     attention = FocalAttention(8, 2)
     fine = torch.randn(1, 3, 10, 18, 8, generator=rng)
     pooled = torch.randn(1, 3, 2, 2, 8, generator=rng)
-    own, past = (FocalTokens(fine[:, part], pooled[:, part]) for part in (slice(0, 2), slice(2, 3)))
     with torch.no_grad():
-        out = attention(own, [past])
+        out = attention(FocalTokens(fine, pooled))
         frames = [(fine[0, t], pooled[0, t]) for t in range(3)]
         assert torch.allclose(out[0, 0], focal_attention_twin(attention, frames), atol=1e-5)
-        # Frames have no order: each of the two sees the same three.
+        # Frames have no order: each sees the same three.
         frames = [frames[1], frames[0], frames[2]]
         assert torch.allclose(out[0, 1], focal_attention_twin(attention, frames), atol=1e-5)
 
