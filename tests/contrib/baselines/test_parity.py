@@ -56,8 +56,8 @@ def test_the_baselines_compute_what_the_published_networks_do(name, shared):
     kind, frames, seed = (case[key].item() for key in ("name", "frames", "seed"))
     network = NETWORKS[kind.removesuffix("_OM")]().eval()
     network.load_state_dict(drawn_weights(network, seed))
-    local, shown = (int(case["n_local"]),) if "n_local" in case else (), 1 if kind.endswith("_OM") else frames
-    output = network(drawn_frames(frames, seed)[None, :shown], *local)[0].numpy()
+    local, shown = case["n_local"].item() if "n_local" in case else 0, 1 if kind.endswith("_OM") else frames
+    output = network(drawn_frames(frames, seed)[None, :shown], *[local] * (local > 0))[0].numpy()
     # Rounding is 1e-5 at most; an epsilon of a norm, or a border read differently, is 1e-3 and more.
     np.testing.assert_allclose(output[..., ::6, ::6], case["output"][:shown], rtol=0, atol=5e-5)
     np.testing.assert_allclose(output.mean((1, 2, 3)), case["mean"][:shown], rtol=0, atol=5e-5)
