@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-from corruptions_lib import MIDDLE, corrupt
+from corruptions_lib import corrupt, middle
 from measure import write
 
 from viewmend.data.native_capture import open_capture
@@ -63,7 +63,8 @@ class Judge:
         capture = open_capture(good)
         self.names = capture.cameras.names
         self.centers = capture.cameras.centers
-        self.time = int(MIDDLE * len(capture.frame_ids))
+        self.time = middle(len(capture.frame_ids))
+        self.fps = capture.fps or 1.0
         self._scores: dict[str, float] = {}
         self._offsets: dict[str, tuple[float, float]] = {}
 
@@ -104,13 +105,15 @@ class Judge:
         try:
             source = open_masked(folder, held=1)
             inputs = [name for name in source.cameras.names if name != held]
-            capture = prepare(source, inputs, first=self.time)
+            clock = open_capture(folder).clock  # some films of half the rate set the times
+            time = self.time if clock is None else int(abs(clock.times_s - self.time / self.fps).argmin())
+            capture = prepare(source, inputs, first=time)
             offset = capture.alignment.offset_px if capture.alignment else (0.0, 0.0)
             if folder == self.good:
                 self._offsets[held] = offset
             elif math.dist(offset, self._offsets[held]) > LEAST_SHIFT_PX:
                 said.append(f"all principal points moved by {offset}")
-            frame = capture.read(self.time)
+            frame = capture.read(time)
         finally:
             log.removeHandler(handler)
         truth = open_capture(self.good).read(self.time).select([held])

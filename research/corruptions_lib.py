@@ -11,8 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-MIDDLE = 0.5
-"""Position of the evaluated frame in the capture."""
+
+def middle(frames: int) -> int:
+    """Index of the evaluated frame, which films of half the rate have too."""
+    return frames // 2 // 2 * 2
 
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -160,7 +162,7 @@ def damaged_json(s: Corruption) -> str:
 def damaged_file(s: Corruption) -> str:
     stream = str(s.rng.choice(["image", "mask"]))
     how = str(s.rng.choice(["missing", "cut short", "empty", "another size", "text"]))
-    file = s.files(stream)[_time(s)]
+    file = s.files(stream)[middle(len(s.description["frames"]))]
     if how == "missing":
         file.unlink()
     elif how == "another size":
@@ -369,10 +371,6 @@ KINDS = (
 )  # fmt: skip
 ONE_FRAME = (late, films)
 """Kinds that need several frames."""
-
-
-def _time(s: Corruption) -> int:
-    return int(MIDDLE * len(s.description["frames"]))
 
 
 def corrupt(good: Path, folder: Path, seed: int) -> tuple[str, str, str]:

@@ -23,6 +23,8 @@ PNG_PALETTE, PNG_WITHOUT_ALPHA = 3, (b"\0", b"\2")
 """The types of colour, in byte 25 of a PNG: a palette; grey and RGB."""
 MAX_LABELS = 32
 """Masks with more values hold opacities, not labels."""
+OPAQUE_ALPHA = 128
+"""Alpha that is nowhere below this is no mask."""
 FULL_16_BIT = 4096
 """16-bit images whose values stay below this hold 8, 10 or 12 bits; the upper 8 of 16 bits would be black."""
 RUN_LENGTH_SUFFIX = ".bin"
@@ -87,14 +89,19 @@ def read_alpha(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
         CaptureError: the file cannot be read or decoded, or its alpha cuts nothing out.
     """
     alpha = read_rgba(path, where)[..., 3]
-    if (alpha == 255).all():
+    if is_opaque(alpha):
         next_step = "export it with alpha, or leave the camera out"
         raise CaptureError(f"{where}: expected alpha that cuts out the subject, got an opaque image; {next_step}")
     return alpha
 
 
+def is_opaque(alpha: UInt8[np.ndarray, "height width"]) -> bool:
+    """Whether an alpha channel cuts nothing out."""
+    return int(alpha.min()) >= OPAQUE_ALPHA
+
+
 def uses_alpha(path: Path) -> bool:
-    """Whether this is an image with alpha that is not opaque everywhere."""
+    """Whether this is an image with alpha that cuts something out."""
     try:
         head = read_bytes(path, 26)
         if head.startswith(b"\xff\xd8") or (head.startswith(PNG_START) and head[25:] in PNG_WITHOUT_ALPHA):
@@ -111,7 +118,7 @@ def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
     Background are index 0 of a coloured palette, black among other colours, and 0 among few values of 16 bit.
 
     Raises:
-        CaptureError: the file cannot be read or decoded, or its values have no known meaning.
+        CaptureError: the file cannot be read or decoded, its values have no known meaning, or no colour is black.
     """
     import cv2
 
@@ -121,8 +128,8 @@ def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
         mask = _from_16_bit(mask)
     if mask.dtype != np.uint8:
         raise CaptureError(f"{where}: expected an 8-bit mask, got {mask.dtype}; write it as 8-bit PNG")
-    if mask.ndim == 3 and (mask.shape[2] == 3 or (mask.shape[2] == 4 and (mask[..., 3] == 255).all())):
-        background = _background(mask[..., :3], data)
+    if mask.ndim == 3 and (mask.shape[2] == 3 or (mask.shape[2] == 4 and is_opaque(mask[..., 3]))):
+        background = _background(mask[..., :3], data, where)
         if background is not None:
             return 255 * (mask[..., :3] != background).any(-1).astype(np.uint8)
     return to_mask(mask)
@@ -137,8 +144,12 @@ def _from_16_bit(mask: UInt16[np.ndarray, "height width *channel"]) -> np.ndarra
     return (mask >> 8).astype(np.uint8) if mask.max() >= FULL_16_BIT else mask
 
 
-def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes) -> tuple[int, ...] | None:
-    """The colour of the background if colours are labels; None if they are shades of one."""
+def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes, where: str) -> tuple[int, ...] | None:
+    """The colour of the background if colours are labels; None if they are shades of one.
+
+    Raises:
+        CaptureError: there are several colours without a palette, none of them black.
+    """
     blue, green, red = (bgr[..., channel] for channel in range(3))
     if (blue == green).all() and (green == red).all():
         return None
@@ -146,12 +157,16 @@ def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes) -> tuple[
         return tuple(data[at + 6 : at + 3 : -1])
     packed = bgr.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
     colours = np.unique(packed)
-    several = len(colours) <= MAX_LABELS and np.linalg.matrix_rank(colours[:, None] >> [16, 8, 0] & 255) > 1
-    return (0, 0, 0) if several else None
+    if len(colours) > MAX_LABELS or np.linalg.matrix_rank(colours[:, None] >> [16, 8, 0] & 255) < 2:
+        return None
+    if colours[0]:
+        found = ", ".join(f"{colour & 255} {colour >> 8 & 255} {colour >> 16}" for colour in colours[:3].tolist())
+        raise CaptureError(f"{where}: expected black as a mask's background, got the colours {found}; write 0 and 255")
+    return (0, 0, 0)
 
 
 def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "height width"]:
-    """Convert an image of 1 to 4 channels to a mask: alpha if it is not opaque everywhere, else the largest channel."""
+    """Convert an image of 1 to 4 channels to a mask: alpha if it cuts something out, else the largest channel."""
     import cv2
 
     if image.ndim == 2:
@@ -159,7 +174,7 @@ def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarr
     channels = cv2.split(image)
     if len(channels) in (2, 4):
         alpha = channels[-1]
-        if (alpha != 255).any():
+        if not is_opaque(alpha):
             return alpha
         channels = channels[:-1]
     return functools.reduce(cv2.max, channels)  # pyright: ignore[reportArgumentType]

@@ -41,6 +41,9 @@ OPAQUE = 250
 """Masks of which none reaches this value hold labels if their values are few."""
 LEAST_LABELLED = 0.005
 """A single mask holds labels if at least this share of it is 1, and nothing is above."""
+ONE_LEVEL, LEVEL_SPREAD = 0.8, 0.25
+"""Masks without an opaque pixel, and with many values, hold one label if the first share of their foreground differs
+from its median by at most the second: edges and JPEG add values."""
 
 
 def open_capture(
@@ -184,8 +187,8 @@ class NativeCapture:
     def _from_labels(self, frame: MultiViewFrame) -> MultiViewFrame:
         """The frame with labels in its masks as 255.
 
-        Masks hold labels if no mask so far had an opaque pixel and values are few. So does one of 0 and 1 alone, unless
-        its ones are few: they may be nearly transparent.
+        Masks hold labels if no mask so far had an opaque pixel, and values are few or nearly all about one level. So
+        does one of 0 and 1 alone, unless its ones are few: they may be nearly transparent.
         """
         assert frame.mask is not None
         highest = frame.mask.flatten(1).amax(1)
@@ -196,18 +199,25 @@ class NativeCapture:
             whose = f"masks of {', '.join(frame.cameras.names[view] for view in views)}"
         else:
             few = len(torch.bincount(frame.mask.flatten(), minlength=256).nonzero()) <= MAX_LABELS
+            inside = frame.mask[frame.mask > int(highest.max()) // 4].float()
+            level = float(inside.median()) if len(inside) else 0.0
+            if not few and float(((inside - level).abs() <= LEVEL_SPREAD * level).float().mean()) >= ONE_LEVEL:
+                scaled = (frame.mask * (255 / level)).round().clamp(max=255).to(torch.uint8)
+                self._warn_of_labels("masks", f"they are scaled, with {level:.0f} as opaque", int(highest.max()))
+                return replace(frame, mask=scaled)
             views, whose = (list(range(len(highest))) if few and bool(highest.any()) else []), "masks"
         if not views:
             return frame
-        if whose not in self._warned_of_labels:
-            self._warned_of_labels.add(whose)
-            above = int(highest[views].max())
-            logging.getLogger("viewmend").warning(
-                f"{self.name}: {whose} have no values above {above}: they are read as labels, with 0 as background"
-            )
+        self._warn_of_labels(whose, "they are read as labels, with 0 as background", int(highest[views].max()))
         mask = frame.mask.clone()
         mask[views] = 255 * (mask[views] > 0).to(torch.uint8)
         return replace(frame, mask=mask)
+
+    def _warn_of_labels(self, whose: str, what: str, above: int) -> None:
+        """Say once how these masks are read, which have no values above this."""
+        if whose not in self._warned_of_labels:
+            self._warned_of_labels.add(whose)
+            logging.getLogger("viewmend").warning(f"{self.name}: {whose} have no values above {above}: {what}")
 
     def _warn_of_rotation(self) -> None:
         rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]

@@ -235,7 +235,8 @@ def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLA
                 if paths := match_names(names, found):
                     return collect_footage(folder, dict(zip(names, paths, strict=True)))
     inner = [place for place in PLACES if place]
-    trials = [name for name in _subfolders(folder) if any((folder / name / place).is_dir() for place in inner)]
+    within = [*_subfolders(folder), *(f"{a}/{b}" for a in _subfolders(folder) for b in _subfolders(folder / a))]
+    trials = [name for name in within if any((folder / name / place).is_dir() for place in inner)]
     if trials:
         raise ValueError(f"expected one recording, got a folder with {', '.join(trials)[:200]}; open one of these")
     searched = ", ".join(place or "the folder" for place in places)
@@ -271,7 +272,7 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
         if images.ignored and not ignored:
             ignored = f"{name}: {images.ignored}"
     if ignored:
-        warn(f"images of {ignored}, are ignored, as their names differ from the others' in more than one number")
+        warn(f"images of {ignored}, are ignored, as their names follow another pattern than the others'")
     masks = _find_masks(folder, tuple(paths))
     _compare_ids(ids | {f"{name} (masks)": found for name, (_, found) in masks.items() if found and name in ids})
     for name, (mask, _) in masks.items():
@@ -286,24 +287,29 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
 
 
 def list_images(folder: Path, place: str) -> ImageList | None:
-    """The images in a subfolder whose names differ only in a number, of the most frequent pattern; None without any."""
-    named = [re.fullmatch(r"(.*?)(\d+)([^\d]*)(\.\w+)|([^.].*)()()(\.\w+)", name) for name in _files(folder / place)]
-    images = [m for m in named if m and (m[4] or m[8]).lower() in IMAGE_SUFFIXES]
-    parts = [m.groups()[:4] if m[2] else ("", m[5], "", m[8]) for m in images]
-    if not parts:
+    """The images in a subfolder whose names differ only in numbers, of the most frequent pattern; None without any.
+
+    A frame's id is the number, or the part from the first to the last number, in which names differ.
+    """
+    names = [name for name in _files(folder / place) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+    if not names:
         return None
-    alike = Counter(sorted((p[0], p[2], p[3]) for p in parts))
-    (before, after, suffix), count = alike.most_common(1)[0]
-    others = ["".join(p) for p in parts if (p[0], p[2], p[3]) != (before, after, suffix)]
-    if count == 1 and len(others) > 1:
-        raise ValueError(
-            f"expected images in {place} whose names differ in one number, got {', '.join(sorted(others)[:2])}; "
-            "rename them by their frame alone"
-        )
-    ignored = f"{len(others)} of {len(parts)}, such as {others[0]}" if others else ""
-    frames = frozenset(p[1] for p in parts if (p[0], p[2], p[3]) == (before, after, suffix))
-    pattern = f"{place}/{before}{{frame}}{after}{suffix}".removeprefix("/")
-    return ImageList(pattern, frames, ignored)
+    by_pattern: dict[tuple[bool, str], list[str]] = {}
+    for name in names:
+        numbered = any(map(str.isdecimal, Path(name).stem))
+        pattern = re.sub(r"\d+", "0", name) if numbered else Path(name).suffix
+        by_pattern.setdefault((numbered, pattern), []).append(name)
+    (numbered, _), alike = max(sorted(by_pattern.items()), key=lambda item: (item[0][0], len(item[1])))
+    if numbered and len(alike) > 1:
+        pattern, frames = frame_pattern(alike)
+    elif numbered:
+        before, number, after = re.findall(r"(.*?)(\d+)(\D*\.\w+)", alike[0])[0]
+        pattern, frames = f"{before}{{frame}}{after}", (number,)
+    else:
+        pattern, frames = f"{{frame}}{Path(alike[0]).suffix}", tuple(Path(name).stem for name in alike)
+    others = [name for name in names if name not in set(alike)]
+    ignored = f"{len(others)} of {len(names)}, such as {others[0]}" if others else ""
+    return ImageList(f"{place}/{pattern}".removeprefix("/"), frozenset(frames), ignored)
 
 
 def _compare_ids(ids: dict[str, frozenset[str]]) -> None:

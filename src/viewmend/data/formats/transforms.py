@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, structs
 
-from viewmend.data.formats.files import existing, forward_slashes, frame_pattern, image_size_px, names_from_paths
+from viewmend.data.formats.files import existing, forward_slashes, frame_pattern, image_size_px, names_from_paths, warn
 from viewmend.data.images import uses_alpha
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, bounded_bytes, read_json, typed
@@ -21,6 +21,16 @@ MILLIMETRES = 0.001
 """The only supported unit of depth."""
 POSE_DIGITS = 6
 """Poses that are equal to this many decimals are those of one camera."""
+OTHER_MEANING = ("equirectangular", "latlong", "from_mitsuba", "ftheta_p0", "ortho_scale")
+"""Keys that give images or poses another meaning if set."""
+WITHOUT_EFFECT = frozenset(
+    "aabb_scale scale offset up applied_transform applied_scale ply_file_path train_filenames val_filenames "
+    "test_filenames orientation_override auto_scale_poses_override n_extra_learnable_dims white_transparent "
+    "black_transparent render_aabb sharpen sharpness enable_depth_loading fix_premult envmap colmap_im_id rotation "
+    "camera_angle fovx fovy fov_x fov_y fisheye_crop_radius normal_file_path semantics_path "
+    "transform_matrix_start transform_matrix_end name version".split()
+)
+"""Keys that change neither images nor cameras."""
 Row = tuple[Number, Number, Number, Number]
 Angle = Annotated[float, Meta(gt=0, lt=3.14)]
 Side = Annotated[int, Meta(ge=1, le=2**16)]
@@ -82,7 +92,9 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         ValueError: a value is invalid, a key's meaning is not supported, `time` does not fit the poses, or an image is
             missing whose size is needed.
     """
-    read = typed(read_json(bounded_bytes(file)), TransformsFile, "see docs/formats.md")
+    parsed = read_json(bounded_bytes(file))
+    read = typed(parsed, TransformsFile, "see docs/formats.md")
+    _check_keys(file, parsed)
     frames = [_with_local_paths(folder, frame) for frame in read.frames]
     if len({frame.time for frame in frames}) <= 1:
         frames = existing(folder, frames, lambda frame: frame.file_path)
@@ -101,6 +113,20 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
         files = {"image": pattern.file_path, "mask": pattern.mask_path, "depth": pattern.depth_file_path}
         entries.append(entry | files | ({"mask": pattern.file_path} if alpha else {}))
     return {"first_pixel_center": [0.5, 0.5], "up": [0.0, 0.0, 1.0], "frames": ids, "cameras": entries}
+
+
+def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
+    """Warn of keys whose effect is unknown; raise a ValueError for those that give images or poses another meaning."""
+    parts = [parsed, *parsed["frames"]]
+    other = [key for key in OTHER_MEANING if any(part.get(key) for part in parts)]
+    if any(part.get("transform_matrix_start") != part.get("transform_matrix_end") for part in parts):
+        other.append("transform_matrix_start other than transform_matrix_end")
+    if other:
+        raise ValueError(f"expected perspective images of one moment, OpenGL axes, got {', '.join(other)}; convert them")
+    known = {*TransformsFile.__struct_fields__, *TransformsFrameEntry.__struct_fields__, *OTHER_MEANING}
+    unknown = sorted({key for part in parts for key in part} - known - WITHOUT_EFFECT)
+    if unknown:
+        warn(f"{file}: these keys are not known and have no effect: {', '.join(unknown)[:200]}")
 
 
 def _with_local_paths(folder: Path, frame: TransformsFrameEntry) -> TransformsFrameEntry:
@@ -143,6 +169,8 @@ def _cameras_of(
             patterns[key] = pattern
             if any(ids.setdefault(time, name) != name for time, name in zip(at_pose, found, strict=False)):
                 raise ValueError(f"expected equal numbers in {key} for equal 'time', got others; rename the files")
+            if len(set(ids.values())) < len(ids):
+                raise ValueError(f"expected equal 'time' for equal numbers in {key}, got others; round them alike")
         cameras.append((structs.replace(entries[0], **patterns), entries[0]))
     return cameras, tuple(ids[time] for time in sorted(times))  # pyright: ignore[reportArgumentType]
 
@@ -156,9 +184,10 @@ def _names_of_patterns(patterns: list[str]) -> list[str]:
 
 def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str, Any]:
     lens = {key: _first(getattr(frame, key), getattr(default, key)) for key in Lens.__struct_fields__}
-    model = lens["camera_model"] or MODELS[0]
-    if model not in MODELS or lens["is_fisheye"] or any(lens[key] for key in ("k4", "k5", "k6")):
-        got = "k4 or a fisheye" if model in MODELS else model[:40]
+    others = [part.camera_model for part in (default, frame) if part.camera_model not in (None, *MODELS)]
+    fisheye = default.is_fisheye or frame.is_fisheye or any(lens[key] for key in ("k4", "k5", "k6"))
+    if others or fisheye:
+        got = str(others[0])[:40] if others else "k4 or a fisheye"
         raise ValueError(f"expected a camera_model among {', '.join(MODELS)}, got {got}; undistort the images first")
     if any(lens["rolling_shutter"] or ()):
         raise ValueError("expected images of one moment, got rolling_shutter; correct the images and set it to zeros")
