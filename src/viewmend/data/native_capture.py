@@ -40,10 +40,10 @@ from viewmend.types import MultiViewFrame
 OPAQUE = 250
 """Masks of which none reaches this value hold labels if their values are few."""
 LEAST_LABELLED = 0.005
-"""A single mask holds labels if at least this share of it is 1, and nothing is above."""
+"""A single mask holds labels if at least this share of it has one low value, and the rest is 0."""
 ONE_LEVEL, LEVEL_SPREAD = 0.8, 0.25
-"""Masks without an opaque pixel, and with many values, hold one label if the first share of their foreground differs
-from its median by at most the second: edges and JPEG add values."""
+"""Masks without an opaque pixel hold one label if the first share of their foreground differs from its median by at
+most the second: edges and JPEG add values."""
 
 
 def open_capture(
@@ -188,20 +188,23 @@ class NativeCapture:
         """The frame with labels in its masks as 255.
 
         Masks hold labels if no mask so far had an opaque pixel, and values are few or nearly all about one level. So
-        does one of 0 and 1 alone, unless its ones are few: they may be nearly transparent.
+        does one alone of 0 and one low value, unless that is rare: it may be nearly transparent.
         """
         assert frame.mask is not None
         highest = frame.mask.flatten(1).amax(1)
         self._masks_are_opaque = self._masks_are_opaque or int(highest.max()) >= OPAQUE
         if self._masks_are_opaque:
             least = LEAST_LABELLED * frame.mask[0].numel()
-            views = [v for v, top in enumerate(highest.tolist()) if top == 1 and frame.mask[v].count_nonzero() > least]
+            low = [(view, top) for view, top in enumerate(highest.tolist()) if top < OPAQUE]
+            inside = {view: int(frame.mask[view].count_nonzero()) for view, _ in low}
+            labelled = {view: int((frame.mask[view] == top).sum()) for view, top in low}
+            views = [view for view, _ in low if labelled[view] >= ONE_LEVEL * inside[view] > least]
             whose = f"masks of {', '.join(frame.cameras.names[view] for view in views)}"
         else:
             few = len(torch.bincount(frame.mask.flatten(), minlength=256).nonzero()) <= MAX_LABELS
-            inside = frame.mask[frame.mask > int(highest.max()) // 4].float()
-            level = float(inside.median()) if len(inside) else 0.0
-            if not few and float(((inside - level).abs() <= LEVEL_SPREAD * level).float().mean()) >= ONE_LEVEL:
+            values = frame.mask[frame.mask > int(highest.max()) // 4].float()
+            level = float(values.median()) if len(values) else 0.0
+            if not few and float(((values - level).abs() <= LEVEL_SPREAD * level).float().mean()) >= ONE_LEVEL:
                 scaled = (frame.mask * (255 / level)).round().clamp(max=255).to(torch.uint8)
                 self._warn_of_labels("masks", f"they are scaled, with {level:.0f} as opaque", int(highest.max()))
                 return replace(frame, mask=scaled)

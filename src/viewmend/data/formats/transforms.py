@@ -23,12 +23,13 @@ POSE_DIGITS = 6
 """Poses that are equal to this many decimals are those of one camera."""
 OTHER_MEANING = ("equirectangular", "latlong", "from_mitsuba", "ftheta_p0", "ortho_scale")
 """Keys that give images or poses another meaning if set."""
-WITHOUT_EFFECT = frozenset(
-    "aabb_scale scale offset up applied_transform applied_scale ply_file_path train_filenames val_filenames "
-    "test_filenames orientation_override auto_scale_poses_override n_extra_learnable_dims white_transparent "
-    "black_transparent render_aabb sharpen sharpness enable_depth_loading fix_premult envmap colmap_im_id rotation "
-    "camera_angle fovx fovy fov_x fov_y fisheye_crop_radius normal_file_path semantics_path "
-    "transform_matrix_start transform_matrix_end name version".split()
+WITHOUT_EFFECT = (
+    *("aabb_scale", "scale", "offset", "up", "applied_transform", "applied_scale", "ply_file_path", "name", "version"),
+    *("train_filenames", "val_filenames", "test_filenames", "orientation_override", "auto_scale_poses_override"),
+    *("n_extra_learnable_dims", "white_transparent", "black_transparent", "render_aabb", "sharpen", "sharpness"),
+    *("enable_depth_loading", "fix_premult", "envmap", "colmap_im_id", "rotation", "camera_angle", "fovx", "fovy"),
+    *("fov_x", "fov_y", "fisheye_crop_radius", "normal_file_path", "semantics_path"),
+    *("transform_matrix_start", "transform_matrix_end"),
 )
 """Keys that change neither images nor cameras."""
 Row = tuple[Number, Number, Number, Number]
@@ -122,9 +123,16 @@ def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
     if any(part.get("transform_matrix_start") != part.get("transform_matrix_end") for part in parts):
         other.append("transform_matrix_start other than transform_matrix_end")
     if other:
-        raise ValueError(f"expected perspective images of one moment, OpenGL axes, got {', '.join(other)}; convert them")
-    known = {*TransformsFile.__struct_fields__, *TransformsFrameEntry.__struct_fields__, *OTHER_MEANING}
-    unknown = sorted({key for part in parts for key in part} - known - WITHOUT_EFFECT)
+        raise ValueError(
+            f"expected perspective images of one moment, OpenGL axes, got {', '.join(other)}; convert them"
+        )
+    known = {
+        *TransformsFile.__struct_fields__,
+        *TransformsFrameEntry.__struct_fields__,
+        *OTHER_MEANING,
+        *WITHOUT_EFFECT,
+    }
+    unknown = sorted({key for part in parts for key in part} - known)
     if unknown:
         warn(f"{file}: these keys are not known and have no effect: {', '.join(unknown)[:200]}")
 
