@@ -50,7 +50,8 @@ class Outcome:
     what: str
     camera: str
     kind: str
-    """'refused', 'named', 'misnamed' (about another camera or cause; also refusals), 'harmless' or 'silent'."""
+    """'refused', 'named', 'misnamed' (about another camera or cause; also refusals), 'mixed' (both), 'harmless' or
+    'silent'."""
     said: str
     loss_db: float | None
 
@@ -85,7 +86,8 @@ class Judge:
         if said:
             whole = any(word in what for word in ("all", "two cameras", "metres_per_unit", "convention"))
             place = any((whole or camera in text) and re.search(cause, text) for text in said)
-            kind = "named" if place else "misnamed"
+            accused = {name for text in said for name in re.findall(r"'(\w+)'", text) if name in self.names}
+            kind = "misnamed" if not place else "named" if whole or accused <= {camera} else "mixed"
         return Outcome(seed, what, camera, kind, "; ".join(said), loss)
 
     def _neighbour(self, camera: str) -> str:
@@ -160,7 +162,7 @@ def main() -> None:
         counts[outcome.kind] += 1
         loss = "" if outcome.loss_db is None else f"{outcome.loss_db:.2f} dB"
         print(
-            f"{outcome.seed:4d} {outcome.kind:8s} {loss:>9s}  {outcome.camera}: {outcome.what} | {outcome.said[:150]}",
+            f"{outcome.seed:4d} {outcome.kind:8s} {loss:>9s}  {outcome.camera}: {outcome.what} | {outcome.said}",
             flush=True,
         )
         losses.append(outcome.__dict__)

@@ -114,6 +114,9 @@ FATAL = {
     "are swapped; exchange their files": lambda f: edit(f, swap_calibrations),
     "K is for images 2 times as large; scale fx, fy, cx, cy and the skew by 0.5": lambda f: edit(f, double_intrinsics),
     "they are inverted": lambda f: change_images(f, invert),
+    "they are full": lambda f: change_images(f, lambda mask: 0 * mask + 255),
+    "all masks are mirrored": lambda f: change_images(f, lambda mask: mask[:, ::-1]),
+    "all masks are upside down": lambda f: change_images(f, lambda mask: mask[::-1]),
 }
 
 
@@ -254,6 +257,10 @@ FAULTS = {
     "mirrored": (spoil(lambda image: image[:, ::-1]), "fit much better mirrored"),
     "blurred": (spoil(lambda image: cv2.GaussianBlur(image, (0, 0), 4)), "'{}'"),
     "grey": (spoil(to_grey), "are grey"),
+    "black": (spoil(lambda image: 0 * image), "are of one colour, or black"),
+    "white": (spoil(lambda image: 0 * image + 255), "are of one colour, or black"),
+    "full mask": (spoil(lambda mask: 0 * mask + 255, "mask"), "mask is full, so it is left out"),
+    "mask upside down": (spoil(lambda mask: mask[::-1], "mask"), "the mask of camera '{}' is upside down"),
     "exchanged images": (exchange_images, "do not match those of the other cameras"),
 }
 
@@ -279,6 +286,8 @@ def test_a_faulty_camera_is_named(moving, tmp_path, fault):
     found = warnings_of(moving, tmp_path, change)
     name = names_of(moving)[3]
     assert any(words.format(name) in text and f"'{name}'" in text for text in found), found
+    others = [other for other in names_of(moving) if other != name and fault != "exchanged images"]
+    assert not any(f"camera '{other}'" in text for other in others for text in found), found
 
 
 def test_check_names_a_late_camera_as_mend_does(moving, tmp_path, capsys):

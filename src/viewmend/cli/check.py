@@ -55,6 +55,7 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
     from viewmend.cli.console import busy, say
     from viewmend.data.checks.calibration import check_calibration, draw_check
     from viewmend.data.checks.synchronisation import find_desynchronised_cameras
+    from viewmend.data.errors import without_consequences
     from viewmend.data.images import write_image
     from viewmend.data.native_capture import NativeCapture
     from viewmend.data.prepare import adjustments
@@ -69,7 +70,7 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
         good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
-        check = replace(check, issues=(*capture.issues, *check.issues, *late))
+        check = replace(check, issues=(*capture.issues, *without_consequences(check.issues, late), *late))
         changes = () if fatal or len(good.cameras) < 2 else adjustments(capture, good)
     if options.out is not None:
         remove_partial_file(options.out)

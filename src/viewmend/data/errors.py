@@ -1,5 +1,6 @@
 """Errors and issues of captures."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from viewmend.utils.untrusted_input import InputError
@@ -30,3 +31,10 @@ class Issue:
     """The camera to leave out; the other cameras are correct."""
     always: bool = False
     """Whether to leave the camera out of all frames, because its calibration is in doubt."""
+    timing: bool = False
+    """Whether a late camera, this one or another, would explain the fault."""
+
+
+def without_consequences(issues: Iterable[Issue], late: Iterable[Issue]) -> tuple[Issue, ...]:
+    """The issues, without those that the late cameras explain."""
+    return tuple(issue for issue in issues if not (issue.timing and any(late)))

@@ -12,7 +12,7 @@ from pathlib import Path
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
-from viewmend.data.errors import CaptureError, Issue
+from viewmend.data.errors import CaptureError, Issue, without_consequences
 from viewmend.data.native_capture import NativeCapture, open_capture
 from viewmend.data.source import CaptureSource, CaptureWrapper, limit_camera_size, limit_size
 from viewmend.geometry.alignment import Alignment, shared_offset
@@ -123,11 +123,13 @@ def prepare(
         return PreparedCapture(source, None, longest_px, names)
     reported: set[str] = set()
     issues = diagnose(frame, source.bounds)
-    _raise_or_warn(f"{_describe(source, names)}: frame '{source.frame_ids[frame.time]}'", issues, reported)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
+    fatal, where = any(issue.fatal for issue in issues), _describe(source, names)
+    at = f"{where}: frame '{source.frame_ids[frame.time]}'"
     frame = frame.without([issue.camera for issue in issues if issue.camera])
-    if align:
-        _raise_or_warn(_describe(source, names), find_desynchronised_cameras(source, frame, last), reported)
+    late = find_desynchronised_cameras(source, frame, last) if align and not fatal else ()
+    _raise_or_warn(at, without_consequences(issues, late), reported)
+    _raise_or_warn(where, late, reported)
     prepared = PreparedCapture(source, None, longest_px, names, left_out, None, reported)
     return _adjusted(prepared, frame, align, match_colours)
 

@@ -26,6 +26,9 @@ SUSPECT, FITS = 1.25, 0.65
 share is the explanation."""
 PALE, COLOURFUL = 0.4, 0.05
 """An image is grey if its saturation is below this share of the median, which must be at least the second value."""
+FLAT, DARK = 0.05, 1.0
+"""An image shows nothing if its pixel differences are below this share of the median, or its mean is below the
+second value."""
 BLURRED, NOISY = 0.45, 2.0
 """Ratio of pixel differences to the median: below the first an image is blurred, above the second noisy."""
 
@@ -47,10 +50,13 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     detail, saturation = _detail(small), _saturation(small)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
     far = (distance > FAR * typical) | ((distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike))
+    flat = (detail < FLAT * detail.nanmedian()) | (_brightness(small) < DARK)
     blurred, noisy = detail < BLURRED * detail.nanmedian(), detail > NOISY * detail.nanmedian()
     mismatch, texts = "its images do not match those of the other cameras", {}
     for view in range(len(small.cameras)):
-        if bool(grey[view]):
+        if bool(flat[view]):
+            texts[view] = "its images are of one colour, or black; check its exposure and its files"
+        elif bool(grey[view]):
             texts[view] = "its images are grey, but the others' are not; check its settings"
         elif view in better:
             texts[view] = f"{mismatch}, and fit much better {better[view]}; exchange or rotate its files"
@@ -93,6 +99,13 @@ def _find_better_fits(
         if distances[best] < FITS * float(distance[view]):
             found[view] = best
     return found
+
+
+def _brightness(frame: MultiViewFrame) -> Float[Tensor, "view"]:
+    """Mean of the subject's pixels in each camera, of 255; NaN without foreground."""
+    assert frame.mask is not None
+    grey, inside = frame.rgb.float().mean(1), frame.mask > FOREGROUND
+    return (grey * inside).sum((1, 2)) / inside.sum((1, 2))
 
 
 def _detail(frame: MultiViewFrame) -> Float[Tensor, "view"]:

@@ -4,7 +4,7 @@
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -24,8 +24,12 @@ from viewmend.types import MultiViewFrame
 
 INVERTED_BORDER = 0.75
 """A mask is inverted if a larger share of its border is foreground."""
+FULL = 0.99
+"""A mask with a larger share of foreground shows no subject."""
 EMPTY_SHARE = 0.25
 """An empty mask is wrong if the others' hull would cover this share of what a typical mask covers."""
+SAME_IOU = 0.02
+"""A turned mask fits if hull and masks agree as well, by this difference, as without its camera."""
 MIN_IMPROVEMENT = 0.1
 """A change of the calibration explains the fault if it improves the IoU of hull and masks by this much."""
 LONGEST_PX = 384
@@ -40,6 +44,8 @@ MIN_SIZE_M, MAX_SIZE_M = 0.05, 20.0
 """Subjects outside this range usually have the wrong unit."""
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 """Between OpenGL's and OpenCV's camera axes."""
+TURNED = {"mirrored": (1,), "upside down": (0,), "rotated by 180 degrees": (0, 1)}
+"""How masks may lie, and the axes to flip."""
 
 
 def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue, ...]:
@@ -79,7 +85,7 @@ def _find_outlier(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, 
         return by_hull
     names, factor = " or ".join(f"'{name}'" for name in by_outlines[0]), by_outlines[1]
     text = f"without camera {names} the outlines of the other cameras agree {factor:.2g} times better"
-    return (Issue(f"{text}; check its calibration, its mask and its synchronisation"),)
+    return (Issue(f"{text}; check its calibration, its mask and its synchronisation", timing=True),)
 
 
 def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds | None) -> tuple[Issue, ...]:
@@ -94,13 +100,19 @@ def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds 
     names = frame.cameras.names
     inverted = [name for view, name in enumerate(names) if _border_share(frame, view) > INVERTED_BORDER]
     bad = [name for name in inverted if name in inputs]
+    faults = [
+        ("full", "segment it again") if _is_full(frame, names.index(name)) else ("inverted", "write 255 - mask")
+        for name in inverted
+    ]
     if bad and 2 * len(bad) >= sum(name in inputs for name in names):
-        got = f"foreground along the image borders in {len(bad)} of {len(inputs)} cameras: they are inverted"
-        return (Issue(f"expected masks of 255 on the subject, got {got}; write 255 - mask", fatal=True),)
-    inputs_text = "camera '{}': its mask is inverted, so it is left out; write 255 - mask"
-    others_text = "camera '{}': its mask is inverted, so scores against it are meaningless; write 255 - mask"
-    issues = [Issue(inputs_text.format(name), camera=name) for name in bad]
-    issues += [Issue(others_text.format(name)) for name in inverted if name not in inputs]
+        what, next_step = faults[0]
+        got = f"foreground along the image borders in {len(bad)} of {len(inputs)} cameras: they are {what}"
+        return (Issue(f"expected masks of 255 on the subject, got {got}; {next_step}", fatal=True),)
+    issues = []
+    for name, (what, next_step) in zip(inverted, faults, strict=True):
+        effect = "it is left out" if name in inputs else "scores against it are meaningless"
+        text = f"camera '{name}': its mask is {what}, so {effect}; {next_step}"
+        issues.append(Issue(text, camera=name if name in inputs else None))
     good = [name for name in names if name in inputs and name not in inverted]
     return (*issues, *(_find_empty_masks(frame.select(good), bounds) if len(good) > 2 else ()))
 
@@ -110,6 +122,12 @@ def _border_share(frame: MultiViewFrame, view: int) -> float:
     width, height = frame.cameras.size_px[view].tolist()
     mask = frame.mask[view, :height, :width] > FOREGROUND
     return float(torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean())
+
+
+def _is_full(frame: MultiViewFrame, view: int) -> bool:
+    assert frame.mask is not None
+    width, height = frame.cameras.size_px[view].tolist()
+    return float((frame.mask[view, :height, :width] > FOREGROUND).float().mean()) > FULL
 
 
 def _find_empty_masks(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[Issue]:
@@ -161,6 +179,12 @@ def _explain(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Issue:
     if max((score for score, _ in tried), default=0.0) < LEAST_IOU and len(frame.cameras) <= MAX_CAMERAS_FOR_SWAPS:
         tried += list(_swaps(frame, bounds))
     best, issue = max(tried, key=lambda change: change[0], default=(0.0, Issue("")))
+    if issue.camera is not None:
+        view = frame.cameras.names.index(issue.camera)
+        for how in TURNED:
+            if _agreement(_turned(frame, [view], how), frame.cameras, bounds)[0] >= best - SAME_IOU:
+                text = f"the mask of camera '{issue.camera}' is {how}, so it is left out; turn it, or all of its files"
+                issue = replace(issue, text=text)
     agreement = f"hull and masks agree only to an IoU of {iou:.3f}"
     if best >= max(LEAST_IOU, iou + MIN_IMPROVEMENT):
         return replace(issue, text=f"{agreement}, but of {best:.3f} after a correction: {issue.text}")
@@ -179,6 +203,10 @@ def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[flo
         K = frame.cameras.K.clone()
         K[:, :2] /= factor
         yield _agreement(frame, replace(frame.cameras, K=K), bounds)[0], Issue(text, fatal=True)
+    for how in TURNED:
+        turned = _turned(frame, range(len(frame.cameras)), how)
+        text = f"all masks are {how}, by the calibration; turn them, and the images if they lie the same way"
+        yield _agreement(turned, frame.cameras, bounds)[0], Issue(text, fatal=True)
     if bounds is not None:
         iou, size_m = _agreement(frame, frame.cameras, None)
         text = f"the bounds do not contain the subject of {size_m:.3g} m; check metres_per_unit, t's unit and bounds"
@@ -188,6 +216,16 @@ def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[flo
             text = f"camera '{name}' disagrees with all others, so it is left out; check its calibration and mask"
             others = frame.without([name])
             yield _agreement(others, others.cameras, bounds)[0], Issue(text, camera=name, always=True)
+
+
+def _turned(frame: MultiViewFrame, views: Iterable[int], how: str) -> MultiViewFrame:
+    """The frame with the masks of these cameras turned back."""
+    assert frame.mask is not None
+    mask = frame.mask.clone()
+    for view in views:
+        width, height = frame.cameras.size_px[view].tolist()
+        mask[view, :height, :width] = frame.mask[view, :height, :width].flip(TURNED[how])
+    return replace(frame, mask=mask)
 
 
 def _swaps(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[float, Issue]]:

@@ -134,7 +134,7 @@ def _outlier(text: str, camera: str, leave_out: bool) -> Issue:
     advice = "check its mask, its calibration and its synchronisation"
     if leave_out:
         return Issue(f"{text}, so it is left out; {advice}", camera=camera, always=True)
-    return Issue(f"{text}; {advice}")
+    return Issue(f"{text}; {advice}", timing=True)
 
 
 def find_outlier_by_outlines(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[tuple[str, ...], float] | None:
