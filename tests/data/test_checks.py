@@ -298,6 +298,18 @@ def test_check_names_a_late_camera_as_mend_does(moving, tmp_path, capsys):
     assert "or raise its offset_ms in cameras.json by 200" in issue
 
 
+def test_a_late_camera_is_found_between_frames_that_others_lack(moving, tmp_path):
+    names = names_of(moving)
+
+    def change(folder):
+        delay("image", "mask")(folder)
+        for time, absent in ((0, names[:2]), (6, names[2:])):  # no camera has both
+            for name in absent:
+                sorted((folder / "image" / name).glob("*.png"))[time - 7].unlink()
+
+    assert any(f"camera '{names[3]}': late by" in text for text in warnings_of(moving, tmp_path, change))
+
+
 def test_frames_that_were_lost_on_the_way_are_found(moving, tmp_path, monkeypatch):
     monkeypatch.setattr(synchronisation, "MAX_DELAY", 2)
     folder = shutil.copytree(moving, tmp_path / "changed")

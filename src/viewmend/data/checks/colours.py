@@ -38,6 +38,12 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     small = limit_size(frame, LONGEST_PX)
     if small.mask is None or len(small.cameras) < 3:
         return ()
+    detail = _detail(small)
+    flat = (detail < FLAT * detail.nanmedian()) | (_brightness(small) < DARK)
+    if bool(flat.any()):  # these are not compared
+        names = [name for name, empty in zip(small.cameras.names, flat.tolist(), strict=True) if empty]
+        text = "camera '{}': its images are of one colour, or black; check its exposure and its files"
+        return (*(Issue(text.format(name)) for name in names), *find_odd_images(small.without(names), bounds))
     try:
         surface = SurfacePoints.from_proxy(small, reconstruct(small.mask, small.cameras, bounds, HULL))
     except ValueError:
@@ -47,16 +53,13 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     typical, alike = distance.nanmedian(), correlation.nanmedian()
     suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
     better = _find_better_fits(small, surface, colours, distance, suspects)
-    detail, saturation = _detail(small), _saturation(small)
+    saturation = _saturation(small)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
     far = (distance > FAR * typical) | ((distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike))
-    flat = (detail < FLAT * detail.nanmedian()) | (_brightness(small) < DARK)
     blurred, noisy = detail < BLURRED * detail.nanmedian(), detail > NOISY * detail.nanmedian()
     mismatch, texts = "its images do not match those of the other cameras", {}
     for view in range(len(small.cameras)):
-        if bool(flat[view]):
-            texts[view] = "its images are of one colour, or black; check its exposure and its files"
-        elif bool(grey[view]):
+        if bool(grey[view]):
             texts[view] = "its images are grey, but the others' are not; check its settings"
         elif view in better:
             texts[view] = f"{mismatch}, and fit much better {better[view]}; exchange or rotate its files"

@@ -60,10 +60,16 @@ def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> t
     """
     count = len(source.frame_ids)
     time = min(max(time, min(MAX_DELAY, count // 2)), max(count - 1 - MAX_DELAY, count // 2))
-    times = range(max(0, time - MAX_DELAY), min(count, time + MAX_DELAY + 1))
+    times = list(range(max(0, time - MAX_DELAY), min(count, time + MAX_DELAY + 1)))
     frames = [frame if other == frame.time else source.read(other) for other in times]
+    wanted, middle = set(frame.cameras.names), times.index(time)
+    while middle < len(frames) - 2 and not wanted <= set(frames[-1].cameras.names):  # where some cameras have ended
+        frames.pop()
+    while middle > 1 and not wanted <= set(frames[0].cameras.names):  # or have not begun
+        frames.pop(0)
+        middle -= 1
     names = [name for name in frame.cameras.names if all(name in other.cameras.names for other in frames)]
-    return [other.select(names) for other in frames], time - times[0]
+    return [other.select(names) for other in frames], middle
 
 
 def find_desynchronised_camera(
@@ -79,9 +85,10 @@ def find_desynchronised_camera(
         bounds: the bounds of the capture.
         fps: frames per second, to state delays in milliseconds.
     """
-    small = [limit_size(frame, LONGEST_PX) for frame in frames]
-    names = [name for name in small[middle].cameras.names if all(name in frame.cameras.names for frame in small)]
-    small = [frame.select(names) for frame in small]
+    names = [name for name in frames[middle].cameras.names if all(name in frame.cameras.names for frame in frames)]
+    if len(names) < MIN_CAMERAS:
+        return ()
+    small = [limit_size(frame.select(names), LONGEST_PX) for frame in frames]
     found = leave_one_out(small[middle], bounds)
     if found is None or len(frames) < 2:
         return ()
