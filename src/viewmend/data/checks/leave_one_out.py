@@ -27,9 +27,10 @@ MIN_CAMERAS = 4
 """With fewer cameras the faulty one cannot be determined."""
 MAX_PEERS = 10
 """Number of other cameras in which the effect of a camera on the hull is measured."""
-MAX_REMOVED, LEAVE_OUT_REMOVED = 0.004, 0.06
+MAX_REMOVED, LEAVE_OUT_REMOVED, LEAVE_OUT_OF_FEW = 0.004, 0.06, 0.2
 """A camera is an outlier if it alone removes this share of the others' masks, beyond 1.5 times the mean. From the
-larger share on it is left out: a smaller error costs less than a missing camera."""
+second share on, or the third in rigs of few cameras, it is left out: less costs less than a missing camera."""
+FEW_CAMERAS = 5
 MAX_OUTSIDE, LEAVE_OUT_OUTSIDE = 0.15, 0.3
 """It is also one if this share of its mask is outside the others' hull, beyond 3 times the median."""
 
@@ -115,7 +116,7 @@ def find_outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[
     found = leave_one_out(small, bounds)
     if found is None:
         return ()
-    names = small.cameras.names
+    names, few = small.cameras.names, len(small.cameras) <= FEW_CAMERAS
     view = int(found.outside.argmax())
     share = float(found.outside[view])
     if share > MAX_OUTSIDE + 3 * float(found.outside.median()):
@@ -126,7 +127,7 @@ def find_outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[
     typical = max(0.0, float((found.removed.sum() - found.removed[view]) / (len(names) - 1)))
     if share > MAX_REMOVED + 1.5 * typical:
         text = f"camera '{names[view]}' alone removes {100 * share:.1f} % of the subject that the others see"
-        return (_outlier(text, names[view], share > LEAVE_OUT_REMOVED),)
+        return (_outlier(text, names[view], share > (LEAVE_OUT_OF_FEW if few else LEAVE_OUT_REMOVED)),)
     return ()
 
 

@@ -22,8 +22,9 @@ MIN_DELAY_GAIN = 0.008
 """A camera may be delayed if the share of its mask outside the others' hull is this much lower in another frame."""
 MAX_DELAY_CANDIDATES = 3
 """The camera opposite a delayed one looks delayed too, so several are tried."""
-MIN_EXPLAINED = 0.002
-"""A camera is delayed if its mask of another frame lets the hull explain this much more of all masks."""
+MIN_EXPLAINED, MIN_EXPLAINED_SHARE = 0.002, 0.3
+"""A camera is delayed if its mask of another frame lets the hull explain this much more of all masks, and this share of
+what it did not explain: in a rig whose calibration is off, other frames fit a little better by chance."""
 SHARPER = 1.015
 """Images are delayed if those of another frame have this much stronger edges along the outlines of the masks."""
 MIN_OUTLINE_FRAMES = 3
@@ -104,7 +105,8 @@ def find_desynchronised_camera(
     }
     if unexplained:
         view = min(unexplained, key=lambda view: unexplained[view])
-        if unexplained[view] < _unexplained(small[middle], bounds) - MIN_EXPLAINED:
+        before = _unexplained(small[middle], bounds)
+        if unexplained[view] < min(before - MIN_EXPLAINED, before * (1 - MIN_EXPLAINED_SHARE)):
             frames_late = best[view] - middle
             shift = "shift its files in time"
             if fps is not None:
