@@ -366,7 +366,7 @@ def ball():
 
 
 def outliers(monkeypatch, ball, outside, removed):
-    found = LeaveOneOut(torch.zeros(8, 1, 1, dtype=torch.bool), torch.tensor(removed), torch.tensor(outside))
+    found = LeaveOneOut(torch.zeros(len(removed), 1, 1, dtype=torch.bool), torch.tensor(removed), torch.tensor(outside))
     monkeypatch.setattr(leave_one_out, "leave_one_out", lambda frame, bounds: found)
     return [(issue.text, issue.camera) for issue in find_outlier_by_hull(ball, None)]
 
@@ -389,6 +389,27 @@ def test_masks_outside_the_hull_are_compared_with_the_median(monkeypatch, ball, 
 def test_masks_that_remove_the_subject_are_compared_with_the_mean(monkeypatch, ball, typical, own, found):
     issues = outliers(monkeypatch, ball, [0.0] * 8, [typical] * 5 + [own] + [typical] * 2)
     assert len(issues) == found and all("'c5' alone removes" in text and camera is None for text, camera in issues)
+
+
+@pytest.mark.parametrize(("cameras", "own", "left_out"), [(8, 0.07, "c1"), (5, 0.07, None), (5, 0.21, "c1")])
+def test_rigs_of_few_cameras_keep_one_that_is_a_little_wrong(monkeypatch, ball, cameras, own, left_out):
+    ball = ball.select(ball.cameras.names[:cameras])
+    removed = [0.0, own] + [0.0] * (cameras - 2)
+    ((_, camera),) = outliers(monkeypatch, ball, [0.0] * cameras, removed)
+    assert camera == left_out
+
+
+def test_a_rough_rig_has_no_late_camera_by_chance(moving, monkeypatch):
+    capture = open_capture(moving)
+    frames, late = [capture.read(time) for time in range(7)], []
+    for time, frame in enumerate(frames):
+        mask, rgb, earlier = frame.mask.clone(), frame.rgb.clone(), frames[max(0, time - 2)]
+        mask[3], rgb[3] = earlier.mask[3], earlier.rgb[3]
+        late.append(replace(frame, mask=mask, rgb=rgb))
+    assert synchronisation.find_desynchronised_camera(late, 3, capture.bounds)
+    unexplained = synchronisation._unexplained
+    monkeypatch.setattr(synchronisation, "_unexplained", lambda *args: 0.08 + unexplained(*args))
+    assert synchronisation.find_desynchronised_camera(late, 3, capture.bounds) == ()
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 8])
