@@ -367,7 +367,7 @@ def ball():
 
 def outliers(monkeypatch, ball, outside, removed):
     found = LeaveOneOut(torch.zeros(len(removed), 1, 1, dtype=torch.bool), torch.tensor(removed), torch.tensor(outside))
-    monkeypatch.setattr(leave_one_out, "leave_one_out", lambda frame, bounds: found)
+    monkeypatch.setattr(leave_one_out, "leave_one_out", lambda frame, bounds, hull: found)
     return [(issue.text, issue.camera) for issue in find_outlier_by_hull(ball, None)]
 
 

@@ -19,10 +19,9 @@ from viewmend.geometry.line_of_sight import LinesOfSight, Rig
 from viewmend.geometry.proxy import reconstruct
 from viewmend.types import MultiViewFrame
 
-HULL = HullConfig(resolution=64)
-
-LONGEST_PX = 256
-"""Size of the images on which hulls are compared."""
+HULL, FINE_HULL = HullConfig(resolution=64), HullConfig(resolution=128)
+LONGEST_PX, FINE_PX = 256, 384
+"""Size of the images on which hulls are compared, first coarse, then fine: coarse hulls lose thin parts."""
 MIN_CAMERAS = 4
 """With fewer cameras the faulty one cannot be determined."""
 MAX_PEERS = 10
@@ -71,7 +70,7 @@ class LeaveOneOut:
     """The share of its own mask that lies outside the others' hull."""
 
 
-def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None) -> LeaveOneOut | None:
+def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig = HULL) -> LeaveOneOut | None:
     """Compute a small hull without each camera in turn; None if too few cameras have any foreground.
 
     The images should be small (`LONGEST_PX`).
@@ -81,12 +80,12 @@ def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None) -> LeaveOneOut |
         return None
     inside, step = mask > FOREGROUND, max(1, -(-len(names) // MAX_PEERS))
     try:
-        missed = missed_share(inside, reconstruct(mask, frame.cameras, bounds, HULL).depth(frame.cameras) > 0)
+        missed = missed_share(inside, reconstruct(mask, frame.cameras, bounds, hull).depth(frame.cameras) > 0)
         silhouettes, removed = [], []
         for view, name in enumerate(names):
             others, peers = frame.without([name]), [v for v in range(0, len(names), step) if v != view]
             assert others.mask is not None
-            proxy = reconstruct(others.mask, others.cameras, bounds, HULL)
+            proxy = reconstruct(others.mask, others.cameras, bounds, hull)
             covered = pad_like(proxy.depth(frame.cameras[[view, *peers]]) > 0, mask)
             removed.append((missed[peers] - missed_share(inside[peers], covered[1:])).nanmean())
             silhouettes.append(covered[0])
@@ -112,8 +111,15 @@ def pad_like(
 
 def find_outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue, ...]:
     """Find a camera whose mask is much larger than the others' hull, or removes what all others see."""
-    small = limit_size(frame, LONGEST_PX)
-    found = leave_one_out(small, bounds)
+    issues = _outlier_by_hull(frame, bounds, LONGEST_PX, HULL)
+    if any(issue.camera is None for issue in issues):
+        return _outlier_by_hull(frame, bounds, FINE_PX, FINE_HULL)
+    return issues
+
+
+def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull: HullConfig) -> tuple[Issue, ...]:
+    small = limit_size(frame, px)
+    found = leave_one_out(small, bounds, hull)
     if found is None:
         return ()
     names, few = small.cameras.names, len(small.cameras) <= FEW_CAMERAS
