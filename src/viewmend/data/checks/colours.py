@@ -21,9 +21,9 @@ FAR = 2.5
 """An image shows something else if its colour distance to the others is this many times the median."""
 FARTHER, LESS_ALIKE = 1.55, 0.72
 """It also does at this lower ratio if its best correlation is below this share of the median."""
-SUSPECT, FITS = 1.25, 0.65
-"""From this ratio on, mirrored, rotated and other cameras' images are tried. One that reduces the distance to this
-share is the explanation."""
+SUSPECT, FITS, GAINS = 1.25, 0.65, (0.5, 0.7, 1.4, 2.0)
+"""From this ratio on, mirrored, rotated, BGR, brighter, darker and other cameras' images are tried. One that reduces
+the distance to this share is the explanation."""
 PALE, COLOURFUL = 0.4, 0.05
 """An image is grey if its saturation is below this share of the median, which must be at least the second value."""
 FLAT, DARK = 0.05, 1.0
@@ -62,7 +62,7 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
         if bool(grey[view]):
             texts[view] = "its images are grey, but the others' are not; check its settings"
         elif view in better:
-            texts[view] = f"{mismatch}, and fit much better {better[view]}; exchange or rotate its files"
+            texts[view] = f"{mismatch}, and fit much better {better[view]}; correct its files"
         elif bool(far[view]):
             texts[view] = (
                 f"{mismatch} (colours differ by {100 * distance[view]:.0f} %, typically by {100 * typical:.0f} %); "
@@ -81,7 +81,7 @@ def _find_better_fits(
     distance: Float[Tensor, "view"],
     suspects: Sequence[int],
 ) -> dict[int, str]:
-    """The suspects whose images match the others much better mirrored, rotated, or as another camera's; and which."""
+    """The suspects whose images match the others much better when changed, or as another camera's; and how."""
     found, names = {}, frame.cameras.names
     for view in suspects:
         width, height = (int(side) for side in frame.cameras.size_px[view])
@@ -92,7 +92,9 @@ def _find_better_fits(
             for other, size in enumerate(frame.cameras.size_px.tolist())
             if other != view and size == [width, height]
         }
-        images = torch.stack(list(candidates.values())).float() / 255
+        candidates |= {"with red and blue exchanged": own.flip(0)}
+        candidates |= {f"at {gain:g} times their brightness": (own * gain).clamp(max=255) for gain in GAINS}
+        images = torch.stack([image.float() for image in candidates.values()]) / 255
         sampled = sample_bilinear(images, surface.uv_px[view].expand(len(candidates), -1, -1), "border")
         shared = surface.seen[view] & surface.seen
         distances = {
