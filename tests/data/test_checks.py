@@ -258,7 +258,6 @@ FAULTS = {
     "blurred": (spoil(lambda image: cv2.GaussianBlur(image, (0, 0), 4)), "'{}'"),
     "grey": (spoil(to_grey), "are grey"),
     "BGR": (spoil(lambda image: image[..., ::-1]), "fit much better with red and blue exchanged"),
-    "dark": (spoil(lambda image: image // 2), "fit much better at 2 times their brightness"),
     "black": (spoil(lambda image: 0 * image), "are of one colour, or black"),
     "white": (spoil(lambda image: 0 * image + 255), "are of one colour, or black"),
     "full mask": (spoil(lambda mask: 0 * mask + 255, "mask"), "mask is full, so it is left out"),

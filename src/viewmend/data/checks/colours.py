@@ -21,9 +21,9 @@ FAR = 2.5
 """An image shows something else if its colour distance to the others is this many times the median."""
 FARTHER, LESS_ALIKE = 1.55, 0.72
 """It also does at this lower ratio if its best correlation is below this share of the median."""
-SUSPECT, FITS, GAINS = 1.25, 0.65, (0.5, 0.7, 1.4, 2.0)
-"""From this ratio on, mirrored, rotated, BGR, brighter, darker and other cameras' images are tried. One that reduces
-the distance to this share is the explanation."""
+SUSPECT, FITS = 1.25, 0.65
+"""From this ratio on, mirrored, rotated, BGR and other cameras' images are tried. One that reduces the distance to this
+share is the explanation."""
 PALE, COLOURFUL = 0.4, 0.05
 """An image is grey if its saturation is below this share of the median, which must be at least the second value."""
 FLAT, DARK = 0.05, 1.0
@@ -93,8 +93,7 @@ def _find_better_fits(
             if other != view and size == [width, height]
         }
         candidates |= {"with red and blue exchanged": own.flip(0)}
-        candidates |= {f"at {gain:g} times their brightness": (own * gain).clamp(max=255) for gain in GAINS}
-        images = torch.stack([image.float() for image in candidates.values()]) / 255
+        images = torch.stack(list(candidates.values())).float() / 255
         sampled = sample_bilinear(images, surface.uv_px[view].expand(len(candidates), -1, -1), "border")
         shared = surface.seen[view] & surface.seen
         distances = {
