@@ -94,12 +94,12 @@ def test_rounded_rotations_become_exact(plain):
 def test_smaller_images_are_padded_right_and_below(plain):
     small = np.full((20, 30, 3), 77, np.uint8)
     plain.put("images/b_000.png", small)
-    plain.put("masks/b_000.png", small[..., 0])
+    plain.put("masks/b_000.png", np.full((20, 30), 255, np.uint8))
     update(plain, 1, width=30, height=20, image="images/b_000.png", mask="masks/b_000.png")
     frame = open_capture(plain.path).read(0)
     assert frame.cameras.size_px.tolist() == [[40, 32], [30, 20], [40, 32], [40, 32]]
     assert frame.rgb.shape == (4, 3, 32, 40)
-    assert (frame.rgb[1, :, :20, :30] == 77).all() and (frame.mask[1, :20, :30] == 77).all()
+    assert (frame.rgb[1, :, :20, :30] == 77).all() and (frame.mask[1, :20, :30] == 255).all()
     assert not frame.rgb[1, :, 20:].any() and not frame.rgb[1, :, :, 30:].any() and not frame.mask[1, 20:].any()
     alone = frame.select(["b"])
     assert alone.rgb.shape == (1, 3, 20, 30) and alone.mask.shape == (1, 20, 30)
