@@ -44,7 +44,6 @@ COMMANDS = {
     "calibrate": "calibrate ROUGH AREA/out --silhouettes --times 1",
     "splits": "splits CAPTURE SECOND --out AREA/splits.json",
     "convert": "convert CAPTURE AREA/out",
-    "convert to riftcast": "convert CAPTURE AREA/out --to riftcast",
     "export-scene": "export-scene CAPTURE AREA/out --views 2 --model telea",
     "check": "check CAPTURE --out AREA/check.png",
 }
