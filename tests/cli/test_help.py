@@ -44,6 +44,7 @@ def test_a_negative_flag_is_described_as_typed(command):
     flags = {name: text for name, text in options_of(command).items() if re.match(r"--([\w-]+\.)?no-", name)}
     wrong = {n: t for n, t in flags.items() if not (t.lower().startswith(NEGATIVE) or UNCHANGED.match(t.lower()))}
     assert wrong == {}, "begin with a verb that says what the flag switches off"
+    assert {n: t for n, t in flags.items() if "default: True" in t} == {}, "a flag that is not given is not the default"
 
 
 @pytest.mark.parametrize("command", [case for case in CASES if case.split()[0] in WITH_RECIPES])

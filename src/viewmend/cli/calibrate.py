@@ -1,4 +1,4 @@
-"""`viewmend calibrate`: cameras from a board that was moved about before them, or refined by silhouettes."""
+"""`viewmend calibrate`: calibrate cameras with a board, or refine them with silhouettes."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,33 +15,32 @@ if TYPE_CHECKING:
 class Options:
     """Find the cameras of a rig, or refine them, and write them as OUT/cameras.json.
 
-    With --board SOURCE holds a video or a folder of images for each camera, named after it, all begun at the same
-    moment, of a ChArUco board that is carried about; OUT/residuals.png shows what the calibration misses. With
-    --silhouettes SOURCE is a capture with masks; cameras that are left out in turn must agree better with the others
-    afterwards, or nothing is written. Files are named in OUT/cameras.json as in SOURCE: put it there, or next to
-    footage of the same names.
+    With --board, SOURCE holds a video or a folder of images for each camera, named after it, that shows a ChArUco board
+    being carried around; all begin at the same moment. OUT/residuals.png shows the reprojection errors. With
+    --silhouettes, SOURCE is a capture with masks, and nothing is written unless held-out cameras agree better with the
+    others afterwards. OUT/cameras.json has the file names of SOURCE: put it there, or next to footage of these names.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Footage of a board, or a capture."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    """Folder for what is written; it must not be in use."""
+    """New or empty folder for the results."""
     board: str | None = None
     """The board, as COLUMNSxROWS:SQUARE_M:MARKER_M, counted in squares: 8x6:0.06:0.045."""
     dictionary: str = "DICT_5X5_1000"
-    """OpenCV's name of the dictionary that the board's markers are of."""
+    """OpenCV's name of the board's marker dictionary."""
     every: int = 5
-    """The board is looked for in every so manieth frame."""
+    """Search every n-th frame for the board."""
     silhouettes: bool = False
-    """Refine the capture's poses and focal lengths by its masks."""
+    """Refine a capture's poses and focal lengths with its masks."""
     times: int = 12
-    """Number of frames of a capture to use, spread over the chosen ones."""
+    """With --silhouettes: number of frames to use, evenly spread."""
     frames: str | None = None
-    """Which frames, as FIRST:END by index; either may be left out."""
+    """Frames to use, as FIRST:END by index; either may be omitted."""
     format: str | None = None
-    """The capture's format, as docs/formats.md names it; by default it is recognised."""
+    """Format of the capture (docs/formats.md); recognised by default."""
     json: bool = False
-    """Write the figures as one JSON object to standard output, and nothing else there."""
+    """Write the figures to standard output as one JSON object, and nothing else."""
 
 
 def run(options: Options) -> int:

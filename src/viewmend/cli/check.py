@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 class Options:
     """Check and describe a capture.
 
-    Checks that all files exist, that masks, calibration and images of one frame agree, and that cameras and films are
-    in step.
+    Checks that all files exist, that masks, calibration and images of one frame agree, and that cameras and videos are
+    synchronised.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
     """A capture of any supported format."""
     format: str | None = None
-    """Format of the capture, see docs/formats.md; by default it is recognised."""
+    """Format of the capture (docs/formats.md); recognised by default."""
     out: Path | None = None
     """Write a picture of the calibration check to this file (.png or .jpg)."""
     time: int = 0

@@ -3,9 +3,10 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from viewmend.cli.console import say
+from viewmend.training.config import NEGATED
 
 if TYPE_CHECKING:
     from viewmend.data.prepare import PreparedCapture
@@ -18,15 +19,15 @@ class ViewOptions:
     """How views are rendered, and which of their pixels are inpainted."""
 
     num_source_views: int = 3
-    """Number of source cameras, which colour a view and are the inpainter's context: the closest to it."""
+    """Number of source cameras: the closest to the view, which colour it and are the inpainter's context."""
     view_selection: Literal["angle", "direction"] = "angle"
-    """Which source cameras are closest: 'angle' at the subject, or 'direction' of view, an alternative of RIFTCast."""
+    """What makes a source camera close: the 'angle' at the subject, or the 'direction' of view, as RIFTCast can."""
     error_rule: str | None = None
-    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that keep correct pixels
-    themselves; 'predicted', which a model predicts to be wrong; or your own rule, FILE.py:NAME. By default the rule
-    that each method is made for."""
+    """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that leave correct pixels
+    unchanged; 'predicted', which a model predicts to be wrong; or FILE.py:NAME, your own rule. By default, the rule
+    that the model is made for."""
     refine_fraction: float = 0.15
-    """Error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
+    """With the error rule 'predicted': largest fraction of the subject to inpaint in addition to the holes."""
 
     def config(self) -> "RenderConfig":
         """The renderer's configuration; ValueError for options that are out of range."""
@@ -48,12 +49,12 @@ class ViewOptions:
 class PreparationOptions:
     """What is corrected in a capture."""
 
-    align: bool = True
-    """Use the calibration as it is. By default, a common shift of all images (for example a different convention for
+    align: Annotated[bool, NEGATED] = True
+    """Use the calibration as it is. By default, a shift that all images share (for example from another convention for
     pixel centres) is estimated from the masks of one frame, and undone if the masks then agree better."""
-    match_colours: bool = True
+    match_colours: Annotated[bool, NEGATED] = True
     """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one frame, if they then
-    agree better on surface points that were not used for matching."""
+    agree better on held-out surface points."""
 
 
 def check_device(name: str) -> None:

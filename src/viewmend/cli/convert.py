@@ -10,18 +10,18 @@ import tyro
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Convert a capture of any supported format to our own: undistorted images, masks and cameras.json."""
+    """Convert a capture of any supported format to viewmend's own: undistorted images, masks and cameras.json."""
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
-    """Folder of the capture, or the file that stands for it (a .smc file of DNA-Rendering, a RIFTCast meta file)."""
+    """Folder of the capture, or its main file (a .smc file of DNA-Rendering, a RIFTCast meta file)."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Output folder; it must be new or empty."""
     format: str | None = None
-    """Format of the source, see docs/formats.md; by default it is recognised."""
+    """Format of the capture (docs/formats.md); recognised by default."""
     frames: str | None = None
     """Range of frame indices, FIRST:END; either may be omitted."""
     scale: float = 1.0
-    """Scale of the image sides, above 0 and at most 1. Below 1, depth is dropped."""
+    """Scale of image width and height, above 0 and at most 1. Below 1, depth is dropped."""
     cameras: tuple[str, ...] = ()
     """Names of the cameras to keep; by default all."""
     images: Literal["jpeg", "png"] = "png"

@@ -33,13 +33,13 @@ class Options:
     out: Path = Path("out/demo")
     """Folder for the results; created if needed."""
     seed: int = 10001
-    """Seed of the scene. Seeds from 10000 on were used for no training."""
+    """Seed of the scene. Seeds from 10000 on are never used for training."""
     frames: int = 24
     """Number of frames, at 15 per second."""
     size: int = 320
-    """Width and height of all images."""
+    """Width and height of all images, in pixels."""
     cameras: int = 6
-    """Cameras of the ring."""
+    """Number of cameras in the ring."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """Name of a shipped model, or a model's folder; 'telea' and 'nearest' are classical fills."""

@@ -31,32 +31,32 @@ class RunOptions:
     out: Path
     """Folder for the results."""
     weights: Path | None = None
-    """Folder of published weights, searched first; methods and metrics without weights are n/a (viewmend weights)."""
+    """Folder of published weights, searched first; without weights, methods and metrics are n/a (viewmend weights)."""
     performers: Path | None = None
-    """Folder of the people of set Q: glTF characters in it or in its test/, BVH motions in its motions/test/, motions/
-    or next to them."""
+    """Folder of the people of set Q: glTF characters in it or in test/; BVH motions in motions/test/, in motions/, or
+    next to the characters."""
     motions: Path | None = None
     """Folder of BVH motions, if they are elsewhere."""
     format: str | None = None
     """Format of the captures (docs/formats.md); recognised by default."""
     inputs: str = "all"
-    """Cameras of a capture to use: all, or a number, spread evenly around; several numbers separated by commas."""
+    """Input cameras of a capture: all, or a number of evenly spaced ones; several values are separated by commas."""
     protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
-    """What is known of the held-out camera: nothing ('strict'); its mask, by which the view is cut and composited
+    """What is known of the held-out camera: nothing ('strict'); its mask, which cuts and composites the view
     ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     frames: int | None = None
-    """Frames of each scene, from the first. By default 10 of P and Q, all of a capture. Long sets have 41, of which the
+    """Number of frames of each scene; by default 10 of P and Q, and all of a capture. Long sets have 41, of which the
     last 10 are scored."""
     every: int = 1
-    """Use only every n-th scene of each set: a quick look at all kinds of scenes."""
+    """Use only every n-th scene of each set, for a quick look at all kinds of scenes."""
     scenes: int | None = None
-    """Largest number of scenes of each set, after `every`."""
+    """Largest number of scenes of each set, after --every."""
     size: int = 512
-    """Width and height of the views of P, Q and the long sets."""
+    """Width and height of the views of P, Q and the long sets, in pixels."""
     background: Literal["black", "stage"] = "black"
-    """Background behind the people of P: a stage for models without masks."""
+    """What is behind the people of P; a stage is for models without masks."""
     score_background: Literal["black", "white"] = "black"
     """Background on which views and truth are scored. The paper uses white; whole-image scores on different
     backgrounds are not comparable."""
@@ -67,9 +67,9 @@ class RunOptions:
     ray: str | None = None
     """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
     device: str = "cpu"
-    """Device: cpu, or cuda."""
+    """Device to compute on: cpu or cuda."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Precision of our networks."""
+    """Number format of viewmend's own networks."""
     shown: int = 12
     """Scenes of each set with images in report.html; sheets/ has all of them."""
 
@@ -85,12 +85,12 @@ class Options(RunOptions):
 
     sets: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="P|Q|P-long|Q-long|P-turn|CAPTURE...")]
     """P: 30 procedural scenes. Q: photo-textured people (needs --performers). P-long, Q-long: the same with 41 frames,
-    of which the last ten are scored after a full window. P-turn: people who turn. CAPTURE: each camera of a capture is
+    of which the last ten are scored. P-turn: people who turn. CAPTURE: each camera of a capture is
     held out in turn; or a file of `viewmend splits`, whose test scenes are used."""
     methods: str = "all"
     """Names separated by commas: telea, navier-stokes, nearest, smooth, reprojection, unfilled, rgvi, a shipped model,
     a model's folder, a baseline such as dstt-o-def, FILE.py:NAME; 'all' for all shipped methods, 'baselines' for those
-    of the paper's first table."""
+    of the paper's Table 1."""
     json: bool = False
     """Also write the report as JSON to standard output."""
 

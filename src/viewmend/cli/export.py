@@ -21,7 +21,7 @@ class Options:
     format: Literal["pt2", "onnx"]
     """pt2 for libtorch and PyTorch, onnx for ONNX Runtime and others."""
     out: Path
-    """The file to write; its suffix must be the format."""
+    """File to write; its suffix must match the format."""
 
 
 def run(options: Options) -> int:

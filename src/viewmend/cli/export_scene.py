@@ -33,22 +33,22 @@ class Options:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder to write the scene to."""
     format: str | None = None
-    """The capture's format, as named in docs/formats.md; recognised by default."""
+    """Format of the capture (docs/formats.md); recognised by default."""
     views: int = 8
     """Number of views around the subject that are completed in every frame."""
     path: Path | None = None
     """A JSON file of views to use instead, as for `viewmend mend --path`; all are completed in every frame."""
     frames: str | None = None
-    """Frames to export, as FIRST:END by index; either may be left out."""
+    """Frames to export, as FIRST:END by index; either may be omitted."""
     longest_px: int | None = None
-    """Downscale images to at most this length of their longer side; views around the subject have the same size."""
+    """Downscale images to at most this longer side, in pixels; views around the subject get the same size."""
     model: str | None = None
     """Name of a shipped model, a model's folder, or any method of `viewmend evaluate`."""
     least_confidence: float = 0.5
-    """Pixels below this confidence, 0 to 1, make no points, if the model predicts a confidence."""
+    """Drop points below this confidence, 0 to 1, if the model predicts one."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     device: str = "cpu"
-    """Device to compute on: cpu, or cuda."""
+    """Device to compute on: cpu or cuda."""
 
 
 def run(options: Options) -> int:

@@ -34,11 +34,11 @@ class Options:
     network: Path | None = None
     """ONNX file for --method onnx: a matting network that takes an image, or an image and its clean plate."""
     no_clean: bool = False
-    """Do not correct the masks with the other cameras and the neighbouring frames."""
+    """Do not correct masks by those of other cameras and neighbouring frames."""
     no_despill: bool = False
-    """Do not remove green or blue light of the screen from the outline."""
+    """Do not remove green or blue spill from the outline."""
     format: str | None = None
-    """Format of the capture, as named in docs/formats.md; detected by default."""
+    """Format of the capture (docs/formats.md); recognised by default."""
     frames: str | None = None
     """Frames to keep, as FIRST:END by index. Either may be omitted."""
     cameras: tuple[str, ...] = ()

@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 class Options:
     """Render novel views of a capture and inpaint them.
 
-    OUT receives the inpainted views (mended.mp4, or mended/*.png for a single view), the views as
-    rendered (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be inpainted), the ground truth
-    of a held-out camera (truth/*.png), all of them side by side (compared.mp4), and contact_sheet.png.
+    OUT gets the inpainted views (mended.mp4, or mended/*.png for a single view), the views as rendered
+    (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be inpainted), the ground truth of a
+    held-out camera (truth/*.png), all of them side by side (compared.mp4), and contact_sheet.png.
 
-    With --leave-out, the view of that camera is rendered without its image and mask, and compared with them: PSNR in dB
-    of the whole image (also as rendered), of the subject (inside the true mask), of the pixels that a camera colours
-    (valid), and of the holes (fg: inside the true mask), the last two also for OpenCV's Telea fill; SSIM of the whole
-    image; LPIPS (AlexNet) of the whole image and of the subject; IoU of alpha and the true mask. PSNRs are means over
-    frames; in the holes, over frames with at least 50 such pixels, if there are any. hole_fraction is the fraction of
-    the hull's pixels that are holes, mended_fraction the fraction with E > 0.
+    With --leave-out, that camera's view is rendered without its image and mask, which then score it. PSNR in dB: of the
+    whole image (also as rendered), of the subject (inside the true mask), of the pixels that a camera colours
+    ("valid"), and of the holes ("fg": inside the true mask); the last two also for OpenCV's Telea fill. SSIM: of the
+    whole image. LPIPS (AlexNet): of the whole image and of the subject. IoU: of alpha and the true mask. PSNRs are
+    means over frames; in the holes, over frames with at least 50 such pixels, if any. hole_fraction is the fraction of
+    the hull's pixels that are holes, mended_fraction the fraction to be inpainted.
 
-    Images and scores are on black, or on white for a model trained on white (paper-small, as in the paper).
+    Images and scores are on a black background, or on white for a model trained on white (paper-small).
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE")]
@@ -40,34 +40,34 @@ class Options:
     out: Path
     """Folder for the results; created if missing. Results of an earlier run in it are replaced, other files kept."""
     leave_out: str | None = None
-    """Name of the camera to hold out, whose view is rendered. Give either this or --path."""
+    """Name of a camera to hold out and whose view to render. Give either this or --path."""
     path: str | None = None
-    """'orbit' circles the subject so that all of its motion is in view; options follow, as in
-    orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON file: a list of 4x4
-    world_from_camera matrices (metres, OpenCV axes), or an object with "world_from_camera" and optionally "K", "width"
-    and "height". One pose per frame, or one for all."""
+    """'orbit' circles the subject with its whole motion in view; options may follow, as in
+    orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON file with a list of 4x4
+    world_from_camera matrices (metres, OpenCV axes), or with an object of "world_from_camera" and optionally "K",
+    "width" and "height"; one pose per frame, or one for all."""
     use_cameras: str | None = None
     """Comma-separated names of the input cameras; all by default."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
-    """What is known of the camera of --leave-out: nothing ('strict'); its mask, by which the view is cut and composited
+    """What is known of the camera of --leave-out: nothing ('strict'); its mask, which cuts and composites the view
     ('target-mask', as in the paper); or its mask, which only carves the hull ('hull-with-target-mask')."""
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     model: str | None = None
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea', 'reprojection',
-    'dstt-o-mul', FILE.py:NAME)."""
+    'dstt-o-mul', FILE.py:NAME). By default 'views'."""
     top_k: int | None = None
-    """Number of context tokens kept by pruning: fewer is faster. All by default."""
+    """For the paper's model: number of context tokens kept by pruning. Fewer is faster; all by default."""
     frames: str | None = None
-    """Frames to use, first:end, counted from 0; all by default."""
+    """Frames to use, as FIRST:END by index; all by default."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     alpha: bool = False
     """Also write the subject as a cut-out: cutout/*.png with straight alpha, and cutout.webm (VP9 with alpha) if videos
-    are written. Alpha is the proxy's mask if the model predicts none."""
+    are written. Alpha is the hull's mask if the model predicts none."""
     depth: bool = False
     """Also write z-depth, depth/*.png: 16 bit, millimetres, 0 where there is no subject, 65535 for 65.535 m and more.
-    It is the proxy's depth if the model predicts none."""
+    It is the hull's depth if the model predicts none."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     json: bool = False

@@ -29,17 +29,17 @@ RAY_SETTINGS, SERVE_ON_RAY = "viewmend.contrib.ray.replicas:ManyViewers", "viewm
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Open a page on which a person moves around the subject, live: as rendered, with its holes, or inpainted.
+    """Serve a web page for moving around the subject, live: as rendered, with holes, or inpainted.
 
     The command prints the page's address. Only this machine can open it unless --host and --token are given. See
-    docs/live.md for the page, the budget, single images over HTTP and live rigs.
+    docs/live.md for the page, the time budget, single images over HTTP and live rigs.
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CAPTURE|rig.toml|studio|live")] = "studio"
     """A capture with masks; a TOML file that lists the cameras of a live rig (docs/guide/live-rig.md); 'studio' for a
     synthetic scene; or 'live' for a rig that pushes its frames."""
     format: str | None = None
-    """The capture's format, as named in docs/formats.md; by default it is recognised."""
+    """Format of the capture (docs/formats.md); recognised by default."""
     port: int = 8008
     """Port; 0 takes a free one."""
     host: str = "127.0.0.1"
@@ -59,7 +59,7 @@ class Options:
     fps: float | None = None
     """Frames per second; by default those of the capture."""
     budget_ms: float = 100.0
-    """Milliseconds that a view may take; quality is reduced to hold this time. 0: always full quality."""
+    """Milliseconds that a view may take; quality is reduced to stay within them. 0: always full quality."""
     max_image_size: int = 1024
     """Longest side of the cameras' images, in pixels; larger images are reduced when they are read."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
@@ -69,7 +69,7 @@ class Options:
     riftcast_port: int | None = None
     """Port on this machine for RIFTCast's own clients."""
     broadcast: str | None = None
-    """WIDTHxHEIGHT of a video for any number of people at /watch; one viewer controls the broadcast view."""
+    """Also broadcast one viewer's view to everyone at /watch, as a video of this size: WIDTHxHEIGHT."""
     ray: str | None = None
     """Address of a Ray cluster that renders: HOST:PORT, auto, or local (needs viewmend[ray])."""
     replicas: int = 2
@@ -77,13 +77,13 @@ class Options:
     max_replicas: int | None = None
     """With --ray: maximum number of rendering processes; by default --replicas."""
     cameras: int = 8
-    """Number of cameras of the studio."""
+    """With 'studio': number of cameras."""
     frames: int = 60
-    """Number of frames of the studio's scene."""
+    """With 'studio': number of frames."""
     size: int = 320
-    """Width and height of the studio's images, in pixels."""
+    """With 'studio': width and height of the images, in pixels."""
     seed: int | None = None
-    """Seed of the studio's scene; by default one that no model was trained with."""
+    """With 'studio': seed of the scene; by default one that no model was trained with."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
     memory_mb: float = 3000.0

@@ -21,13 +21,13 @@ class Options:
     """The JSON file; paths of captures in it are relative to its folder."""
     subject: str = "(.*)"
     """Regular expression whose first group in a capture's name is the subject: '^(.*)_' for DNA-Rendering's 0012_11.
-    By default every capture is a subject of its own."""
+    By default, each capture is a subject of its own."""
     test_fraction: float = 7 / 79
-    """Smallest fraction of the scenes for tests; by default the paper's, 7 of 79."""
+    """Fraction of the scenes for tests, at least; by default the paper's, 7 of 79."""
     scenes: int | None = None
     """Use only this many of the captures, drawn at random by the seed; all by default. The paper has 79."""
     seed: int = 0
-    """Chooses subjects and cameras."""
+    """Seed of the choice of subjects and cameras."""
     format: str | None = None
     """Format of the captures (docs/formats.md); recognised by default."""
 

@@ -20,7 +20,7 @@ class Options:
     frames: int = 30
     """Number of frames, at 30 per second."""
     size: int = 512
-    """Width and height of the images."""
+    """Width and height of the images, in pixels."""
     seed: int = 0
     """Seed of the first capture. The same seed generates the same capture."""
     rig: Literal["ring", "dome"] = "ring"

@@ -21,9 +21,8 @@ class Options:
 
     RECIPE is one of: views (the default model), rays (its ray fill), paper and paper_small (the paper's model),
     finetune CAPTURE (adapts a trained model to your own capture), or a published baseline: dstt, fuseformer, e2fgvi,
-    e2fgvi-hq. Defaults are the recipe's. DIR gets the averaged weights, a log, validation images and checkpoints; the
-    same command resumes a run that was stopped at any moment. torchrun distributes the same command over processes
-    and machines.
+    e2fgvi-hq. Each recipe has its own defaults. DIR gets the averaged weights, a log, validation images and
+    checkpoints; the same command resumes an interrupted run, and torchrun distributes it over processes and machines.
     """
 
     config: Annotated[TrainConfig, FLAT]

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 FLAT = tyro.conf.arg(name="")
 """Marks a nested config whose fields are options without a prefix."""
+NEGATED = tyro.conf.arg(help_behavior_hint="")
+"""Marks a field that is true unless --no-NAME is given: its help describes that flag, not the field's default."""
 HIDDEN = tyro.conf.Suppress
 """Marks a field that a recipe sets and the command line does not offer."""
 Item = TypeVar("Item", covariant=True)
@@ -51,12 +53,12 @@ class SceneConfig:
     captures: tuple[Path, ...] = ()
     """Folders of your own captures, or files written by `viewmend splits`, of which only the training part is used."""
     hold_out: str | None = None
-    """Camera of the captures that training never sees, nor their last tenth of frames: the run is validated on both,
-    and keeps the best weights. 'auto' chooses a camera, in rigs of five or more."""
+    """Camera of the captures that is never trained on, nor is their last tenth of frames. The run is validated on both
+    and keeps the best weights. 'auto' chooses a camera in rigs of five or more."""
     protocols: tuple[Literal["strict", "target-mask", "hull-with-target-mask"], ...] = ("strict",)
-    """What is known of the mask of a held-out camera (docs/evaluation.md); each camera draws one of several."""
+    """What is known of a held-out camera's mask (docs/evaluation.md); of several, one is drawn for each camera."""
     captures_fraction: float = 0.75
-    """Fraction of the scenes that come from the captures, if any are given; the rest comes from the studio."""
+    """Fraction of the scenes that come from the captures, if any are given; the rest come from the studio."""
     data_device: str = "cpu"
     """Device that renders studio scenes and training views and computes hulls."""
     hull_resolution: Annotated[int, HIDDEN] = 96
@@ -140,7 +142,7 @@ class TrainConfig:
     steps: int
     """Optimisation steps."""
     minutes: float | None = None
-    """End the run after this time even if fewer steps are done; the learning rate follows whichever is further."""
+    """End the run after this time, if --steps are not done earlier; the learning rate follows whichever is closer."""
     batch: int = 8
     """Samples per step, and per process under torchrun."""
     learning_rate: float = 8e-4

@@ -75,7 +75,7 @@ class ViewsLossWeights:
     colour: Annotated[float, HIDDEN] = 1.0
     """L1 of colours on black."""
     perceptual: float = 0.7
-    """Weight of LPIPS (AlexNet) of a crop, which keeps views as sharp as photographs."""
+    """Weight of LPIPS (AlexNet) on a crop, which keeps views sharp."""
     damage: Annotated[float, HIDDEN] = 1.0
     """Weight of errors beyond `DAMAGED` where the rendered colour was right."""
     holes: Annotated[float, HIDDEN] = 4.0
