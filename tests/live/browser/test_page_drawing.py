@@ -1,6 +1,7 @@
 """The page draws moving views by itself; the server's picture of a view at rest appears over it."""
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -174,6 +175,23 @@ def test_the_server_draws_where_asked_to_and_where_assets_are_missing(browser, b
     with opened(browser, balls, route=refuse) as view:
         view.until(lambda: view.data("frame") is not None, SCREENSHOT_S)
         assert requested and view.data("drawn") is None
+
+
+def test_assets_are_fetched_again_where_the_server_was_too_busy(browser, balls):
+    tries = Counter()
+
+    def busy(route):
+        tries[route.request.url] += 1
+        if tries[route.request.url] == 1:
+            route.abort("connectionreset")
+        elif tries[route.request.url] == 2:
+            route.fulfill(status=503, body="{}")
+        else:
+            route.continue_()
+
+    with opened(browser, balls, route=busy) as view:
+        view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
+    assert max(tries.values()) >= 3
 
 
 @pytest.mark.slow

@@ -3,6 +3,8 @@
 import { parseFrame } from "./frames.js";
 import { decodeJpeg } from "./pictures.js";
 
+const RETRY_MS = 100;
+
 /**
  * @typedef {object} Shape
  * @property {any} header
@@ -76,10 +78,19 @@ async function readImage(content, camera) {
   return { picture, mask };
 }
 
+/** Tries again a little later where the server is too busy to answer. @param {string} url @returns {Promise<Response>} */
+async function fetchPatiently(url) {
+  for (let retries = 3; ; retries--) {
+    const answer = await fetch(url).catch((error) => (retries > 0 ? null : Promise.reject(error)));
+    if (answer?.ok) return answer;
+    if (answer && (answer.status !== 503 || retries === 0)) throw new Error(`the server answered ${answer.status}`);
+    await new Promise((resolve) => setTimeout(resolve, (1 + Math.random()) * RETRY_MS * 2 ** (3 - retries)));
+  }
+}
+
 /** @param {Order} order @returns {Promise<{news: News, transfer: Transferable[]}>} */
 async function carryOut({ key, url, camera }) {
-  const answer = await fetch(url);
-  if (!answer.ok) throw new Error(`the server answered ${answer.status}`);
+  const answer = await fetchPatiently(url);
   const content = await answer.arrayBuffer();
   const bytes = content.byteLength;
   if (camera) {
