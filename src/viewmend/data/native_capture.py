@@ -194,11 +194,13 @@ class NativeCapture:
         highest = frame.mask.flatten(1).amax(1)
         self._masks_are_opaque = self._masks_are_opaque or int(highest.max()) >= OPAQUE
         if self._masks_are_opaque:
-            least = LEAST_LABELLED * frame.mask[0].numel()
+            size = frame.mask[0].numel()
+            least, most = LEAST_LABELLED * size, (1 - LEAST_LABELLED) * size
             low = [(view, top) for view, top in enumerate(highest.tolist()) if top < OPAQUE]
             inside = {view: int(frame.mask[view].count_nonzero()) for view, _ in low}
             labelled = {view: int((frame.mask[view] == top).sum()) for view, top in low}
-            views = [view for view, _ in low if labelled[view] >= ONE_LEVEL * inside[view] > least]
+            there = [view for view, _ in low if least < inside[view] < most]
+            views = [view for view in there if labelled[view] >= max(least, ONE_LEVEL * inside[view])]
             whose = f"masks of {', '.join(frame.cameras.names[view] for view in views)}"
         else:
             few = len(torch.bincount(frame.mask.flatten(), minlength=256).nonzero()) <= MAX_LABELS
