@@ -71,7 +71,7 @@ def test_failures_and_missing_methods_are_in_every_format(evaluated):
 
 def test_tables_have_columns_with_values_and_mark_the_best(make_cell, make_frame):
     def cells(method, scores):
-        frames = [make_frame(psnr_holes=score, psnr_whole=30.0) for score in scores]
+        frames = [make_frame(psnr_holes=score, psnr_whole=30.0, lpips_alex_whole=1 / score) for score in scores]
         return [make_cell(f"s{n}", method, "A", [frame]) for n, frame in enumerate(frames)]
 
     found = [*cells("telea", (20.0, 22.0, 24.0)), *cells("views", (25.0, 25.0, 26.5)), *cells("rgvi", (30.0,) * 3)]
@@ -83,6 +83,7 @@ def test_tables_have_columns_with_values_and_mark_the_best(make_cell, make_frame
     assert [row[column] for row in grid.rows[:2]] == ["22.00 ± 2.0", "**25.50 ± 0.9**"]
     assert grid.rows[2][column] == "30.00 ± 0.0", "is given the truth"
     assert not any("**" in row[grid.heads.index("whole, dB")] for row in grid.rows), "all are equal"
+    assert ["**" in row[grid.heads.index("LPIPS whole")] for row in grid.rows] == [False, True, False]
 
 
 def test_the_page_is_self_contained_and_has_all_images(evaluated):

@@ -78,7 +78,7 @@ COLUMNS = (
     ("still", "change", "still", 255, 2),
 )
 """Columns of the main table: heading, metric, region, factor, decimals."""
-HIGHER, LOWER = ("psnr", "ssim", "alpha_iou"), ("flicker",)
+HIGHER, LOWER = ("psnr", "ssim", "alpha_iou"), ("flicker", "lpips_alex")
 """Metrics whose largest, or smallest, mean is the best."""
 SPREAD = (("psnr", "holes"), ("psnr", "whole"), ("psnr", "subject"))
 """Columns that show the standard deviation over scenes, too."""
