@@ -13,6 +13,7 @@ from reference.ball import BallCapture, photograph, ring
 
 from viewmend.cli import main
 from viewmend.data.checks import diagnosis, leave_one_out, synchronisation
+from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.leave_one_out import LeaveOneOut, find_outlier_by_hull, find_outlier_by_outlines
 from viewmend.data.checks.synchronisation import (
@@ -558,3 +559,9 @@ def test_a_displaced_camera_is_diagnosed_once(studio, step_m, words):
     """A large step shows in the hull; a small one only in the outlines."""
     issues = diagnose(displace(studio.read(0), "cam03", (step_m, 0.0, 0.0)), studio.bounds)
     assert len(issues) == 1 and "'cam03'" in issues[0].text and words in issues[0].text
+
+
+@pytest.mark.parametrize("held", ["cam2", "cam4"])
+def test_three_cameras_of_a_rough_rig_do_not_outvote_one(shared, held):
+    capture = open_capture(shared / "captures/utrecht")
+    assert not find_odd_images(capture.read(0).without([held]), capture.bounds)

@@ -19,8 +19,9 @@ LONGEST_PX = 256
 HULL = HullConfig(resolution=64)
 FAR = 2.5
 """An image shows something else if its colour distance to the others is this many times the median."""
-FARTHER, LESS_ALIKE = 1.55, 0.72
-"""It also does at this lower ratio if its best correlation is below this share of the median."""
+FARTHER, LESS_ALIKE, MANY = 1.55, 0.72, 5
+"""It also does at this lower ratio if its best correlation is below this share of the median, in rigs of at least
+this number of cameras: medians of fewer say little."""
 SUSPECT, FITS = 1.25, 0.65
 """From this ratio on, mirrored, rotated, BGR and other cameras' images are tried. One that reduces the distance to this
 share is the explanation."""
@@ -55,7 +56,8 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     better = _find_better_fits(small, surface, colours, distance, suspects)
     saturation = _saturation(small)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
-    far = (distance > FAR * typical) | ((distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike))
+    farther = (distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike)
+    far = (distance > FAR * typical) | (farther & (len(distance) >= MANY))
     blurred, noisy = detail < BLURRED * detail.nanmedian(), detail > NOISY * detail.nanmedian()
     mismatch, texts = "its images do not match those of the other cameras", {}
     for view in range(len(small.cameras)):
