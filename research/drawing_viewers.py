@@ -1,8 +1,9 @@
 """Server cost of viewers whose pages draw: python research/drawing_viewers.py --source CAPTURE [--playing].
 
 Scripted clients do what the page does while a view orbits or a recording plays: each holds a WebSocket, fetches the
-shape and the closest cameras' images of the frames it needs over up to six connections, and keeps what may be cached
-for good, as browsers do. Prints processor time and bytes of the server, for the first seconds and after that.
+shape and the closest cameras' images of the frames it needs over up to six connections, keeps what may be cached for
+good, and tries again where a connection breaks, as browsers do. Viewers arrive over five seconds. Prints processor
+time and bytes of the server, for the first seconds and after that.
 `--idle N` adds viewers that ask for views and assets and read nothing.
 """
 
@@ -21,6 +22,7 @@ import numpy as np
 import websockets
 
 CONNECTIONS, FILLERS = 6, 3
+ARRIVAL_S = 5.0
 
 
 class Viewer:
@@ -34,15 +36,27 @@ class Viewer:
         self.ranks: dict[int, tuple[np.ndarray, int]] = {}
         self.state: dict = {}
         self.heard_at = 0.0
-        self.http_bytes = self.ws_bytes = self.requests = self.refused = self.frames = 0
+        self.http_bytes = self.ws_bytes = self.requests = self.refused = self.broken = self.frames = 0
         self.waits_ms: list[float] = []
 
-    async def run(self, end: float) -> None:
+    async def run(self, begin: float, end: float) -> None:
+        await asyncio.sleep(begin)
+        while time.monotonic() < end:
+            try:
+                await self.visit(end)
+            except (OSError, EOFError, TimeoutError, websockets.WebSocketException):
+                self.broken += 1
+                await asyncio.sleep(0.5)
+
+    async def visit(self, end: float) -> None:
         async with websockets.connect(f"ws://{self.host}:{self.port}/ws", compression=None, open_timeout=60) as socket:
             await socket.send(json.dumps({"type": "hello", "version": 1, "codecs": ["jpeg"]}))
             self.rig: dict = {}
             listener = asyncio.create_task(self.listen(socket))
             while not (self.rig and self.state):
+                if listener.done():
+                    listener.result()
+                    raise ConnectionError("closed before the rig was known")
                 await asyncio.sleep(0.01)
             if not self.playing:
                 await socket.send(json.dumps({"type": "clock", "playing": False, "seek": 0}))
@@ -50,7 +64,7 @@ class Viewer:
             for _ in range(CONNECTIONS):
                 self.free.put_nowait(None)
             try:
-                await self.draw(end)
+                await self.draw(end, listener)
             finally:
                 listener.cancel()
                 while not self.free.empty():
@@ -66,11 +80,13 @@ class Viewer:
             elif content["type"] == "state":
                 self.state, self.heard_at = content, time.monotonic()
 
-    async def draw(self, end: float) -> None:
+    async def draw(self, end: float, listener: asyncio.Task[None]) -> None:
         begun = time.monotonic()
         fps = (self.rig["fps"] or 0.0) * self.playing
         forgotten = begun
         while (now := time.monotonic()) < end:
+            if listener.done():
+                raise ConnectionError("the socket was closed")
             if now - forgotten > self.forget_s:
                 forgotten = now
                 self.cached.clear()
@@ -110,12 +126,22 @@ class Viewer:
             return self.cached[path]
         pair = await self.free.get()
         try:
-            try:
-                pair, head = await self.ask(pair, path)
-            except (asyncio.IncompleteReadError, ConnectionError):  # closed because it was idle
-                pair, head = await self.ask(None, path)
-            size = int(head.lower().split(b"content-length: ")[1].split(b"\r")[0])
-            body = await pair[0].readexactly(size)
+            for attempt in range(4):
+                try:
+                    pair, head = await self.ask(pair, path)
+                    size = int(head.lower().split(b"content-length: ")[1].split(b"\r")[0])
+                    body = await pair[0].readexactly(size)
+                    break
+                except (
+                    asyncio.IncompleteReadError,
+                    OSError,
+                ):  # idle connections are closed, and so are too many new ones
+                    broken, pair = pair, None
+                    if broken is None:
+                        self.broken += 1
+                        await asyncio.sleep(0.1 * 2**attempt)
+            else:
+                raise ConnectionError(f"no answer to {path}")
         finally:
             self.free.put_nowait(pair)
         self.requests += 1
@@ -162,10 +188,10 @@ async def measure(address: str, pid: int, viewers: int, options: argparse.Namesp
     begun = time.monotonic()
     end = begun + options.first + options.seconds
     crowd = [Viewer(address, 360 * n / max(1, viewers), options.playing, options.forget) for n in range(viewers)]
-    tasks = [asyncio.create_task(viewer.run(end)) for viewer in crowd]
+    tasks = [asyncio.create_task(viewer.run(n * ARRIVAL_S / viewers, end)) for n, viewer in enumerate(crowd)]
     tasks += [asyncio.create_task(stall(address, end)) for _ in range(options.idle)]
     total = lambda name: sum(getattr(viewer, name) for viewer in crowd)  # noqa: E731
-    names = ("http_bytes", "ws_bytes", "requests", "refused", "frames")
+    names = ("http_bytes", "ws_bytes", "requests", "refused", "broken", "frames")
     last = (processor_s(pid), dict.fromkeys(names, 0), begun)
     windows = [options.first] + [options.window or options.seconds] * round(
         options.seconds / (options.window or options.seconds)

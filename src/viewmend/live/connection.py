@@ -39,7 +39,7 @@ ACK_S = 30.0
 FAULTS = (1.0, 19.0)
 """Malformed messages per second, and at once, that do not end a connection."""
 TICK_S, LIVE_TICK_S = 0.25, 0.1
-"""Seconds between checks of what viewers have to know, also while a rig announces its frames."""
+"""Seconds between checks of what viewers have to know; while a rig pushes frames, it is also checked after each."""
 STATE_S = 60.0
 """Time after which a state is sent again though nothing has changed; pages continue its clock by themselves."""
 
@@ -93,8 +93,8 @@ class SessionRegistry:
     """Fields of the message `welcome` that are the same for all viewers."""
     extensions: Sequence[Extension] = ()
     sessions: list[ViewerSession] = field(default_factory=list)
-    connections: "list[ViewerConnection]" = field(default_factory=list)
-    """Those that have said hello."""
+    connections: "dict[ViewerConnection, float]" = field(default_factory=dict)
+    """Those that have said hello, each with the time before which nothing is due on it unless something changes."""
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
     shown: dict[str, Any] | None = None
     """The message `show` that moved all pages last."""
@@ -103,23 +103,33 @@ class SessionRegistry:
 
     def join(self, connection: "ViewerConnection") -> None:
         """Inform a viewer from now on."""
-        self.connections.append(connection)
-        connection.inform(self.common())
+        self.connections[connection] = connection.inform(self.common())
         if self._informer is None or self._informer.done():
             self._informer = asyncio.create_task(self._inform())
 
     async def _inform(self) -> None:
         """Let all connections send what is due, while there are any."""
-        common = self.common()
+        common, news, loop = self.common(), asyncio.Event(), asyncio.get_running_loop()
+
+        def note() -> None:
+            with contextlib.suppress(RuntimeError):  # the event loop has ended
+                loop.call_soon_threadsafe(news.set)
+
+        self.service.changed = note
         while self.connections:
-            now = self.common()
-            common = common if now == common else now
-            for connection in list(self.connections):
+            news.clear()
+            is_new, now = (newest := self.common()) != common, self.service.now()
+            common = newest if is_new else common
+            for connection in [each for each, due_s in self.connections.items() if is_new or due_s <= now]:
                 try:
-                    connection.inform(common)
+                    self.connections[connection] = connection.inform(common)
                 except Exception as error:  # ends this connection only
                     connection.fail(error)
-            await asyncio.sleep(LIVE_TICK_S if self.service.source.span.live else TICK_S)
+            if self.service.source.span.live:  # a rig's frames are announced at once
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(news.wait(), LIVE_TICK_S)
+            else:
+                await asyncio.sleep(TICK_S)
 
     def common(self) -> Common:
         """What is the same for all viewers: their part of `state`, the messages `show` and `rig`, and their number."""
@@ -175,7 +185,6 @@ class ViewerConnection:
         self._seen: tuple[Any, ...] = ()
         self._state: tuple[Any, ...] = ()
         self._state_at = self._stats_at = -STATE_S
-        self._quiet_until = 0.0
         self._viewers = 0
         """Viewers in the last statistics."""
         ladder = registry.service.renderer.ladder
@@ -237,7 +246,7 @@ class ViewerConnection:
         try:
             done, _ = await asyncio.wait([*tasks, self._failed], return_when=asyncio.FIRST_COMPLETED)
         finally:
-            self._registry.connections.remove(self)
+            del self._registry.connections[self]
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -298,6 +307,7 @@ class ViewerConnection:
             self._service.lock.notify_all()
         if isinstance(message, ClockChange):
             self.inform(self._registry.common())
+        self._registry.connections[self] = 0.0
 
     async def _write(self) -> None:
         while True:
@@ -310,19 +320,18 @@ class ViewerConnection:
                     frame, self._frame = self._frame, None
                     await self._socket.send_bytes(frame)
 
-    def inform(self, common: Common) -> None:
+    def inform(self, common: Common) -> float:
         """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
 
-        `common` is the same object while it is equal.
+        `common` is the same object while it is equal. Returns the time before which this need not be called again,
+        unless `common` changes or the viewer sends something.
         """
         session, (shared, shown, _, viewers) = self._session, common
-        wants_views = session.wants_views or session.in_flight is not None
-        seen = (common, session.clock_changes, session.buffering)
-        now = self._now()
-        if seen == self._seen and now < self._quiet_until and not wants_views:
-            return
+        span, now = self._service.source.span, self._now()
         self._send_new_rig()
-        changing = self._registry.extensions or self._service.source.span.live  # at any time
+        catches_up = span.live and session.clock.playing and not session.clock.live
+        changing = bool(self._registry.extensions) or catches_up  # at any time
+        seen = (common, session.clock_changes, session.buffering)
         if seen != self._seen or changing or now - self._state_at >= STATE_S:
             self._seen = seen
             self._send_state(shared)
@@ -334,8 +343,9 @@ class ViewerConnection:
             self._send_soon(session.stats_json(viewers))
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
-        is_steady = self._viewers == viewers and not changing and not session.sent_since(now - 2)
-        self._quiet_until = self._state_at + STATE_S if is_steady else now
+        gets_views = session.wants_views or session.in_flight is not None or session.sent_since(now - 2)
+        is_steady = self._viewers == viewers and not changing and not gets_views
+        return self._state_at + STATE_S if is_steady else now
 
     def fail(self, error: Exception) -> None:
         """End the connection."""

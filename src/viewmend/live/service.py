@@ -29,6 +29,8 @@ class RenderService:
     def __init__(self, renderer: Renderer, source: FrameSource, now: Callable[[], float] = time.monotonic) -> None:
         self.renderer, self.source, self.now = renderer, source, now
         self.lock = threading.Condition()
+        self.changed: Callable[[], None] = lambda: None
+        """Called, on any thread, when the source has changed."""
         self.error: str | None = None
         """The error of the last view, or of the rig's first frame."""
         self.counts = Counter(frames=0, shared=0, errors=0, cancelled=0)
@@ -59,6 +61,7 @@ class RenderService:
         """Check at once whether a session needs a view."""
         with self.lock:
             self.lock.notify_all()
+        self.changed()
 
     def join(self, session: Session) -> None:
         """Begin to serve a session."""

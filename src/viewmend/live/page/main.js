@@ -48,6 +48,8 @@ class Page {
     this.limits = LIMITS;
     this.painted = 0;
     this.scheduled = false;
+    /** Whether the next refresh has to paint, though it shows no other frame or pose. */
+    this.stale = true;
     this.connection = new Connection(token, ["jpeg"]);
     this.link = new ViewerLink(this.connection);
     this.assets = new Assets(token, this.stage.scene.fillers);
@@ -170,10 +172,10 @@ class Page {
     });
     on(this.link, "state", (state) => {
       this.notices.source(state);
-      this.wake();
+      this.wake(!this.drawing || !state.playing);
     });
     on(this.link, "show", (view) => this.show(view));
-    on(this.assets, "change", () => this.wake());
+    on(this.assets, "change", (frame) => this.wake(frame === this.drawn));
     on(this.assets, "dropped", (frame) => {
       if (this.drawn === frame) this.drawn = null;
       this.stage.scene.drop(frame);
@@ -367,8 +369,9 @@ class Page {
     showScale(settings, this.stage.header);
   }
 
-  /** Repaint at the display's next refresh, and on while something moves. */
-  wake() {
+  /** Repaint at the display's next refresh, and on while something moves. @param {boolean} [changed] false: only if another frame is there */
+  wake(changed = true) {
+    this.stale ||= changed;
     if (this.scheduled) return;
     this.scheduled = true;
     requestAnimationFrame((now) => this.refresh(now));
@@ -378,7 +381,7 @@ class Page {
   refresh(now) {
     this.scheduled = false;
     if (!this.pace.due(now)) {
-      this.wake();
+      this.wake(false);
       return;
     }
     const elapsed = Math.min(100, Math.max(1, now - this.painted));
@@ -386,13 +389,17 @@ class Page {
     const held = this.keys.step(elapsed);
     const busy = this.paths.step(now);
     const stepped = this.motion.step(elapsed);
-    const moving = this.motion.moving;
+    const last = this.drawn;
     this.choose(now);
-    const drawsOn = this.drawing && (this.transport.playing || this.stage.fading);
+    const changes = held || busy || stepped || this.motion.moving || (this.drawn !== null && this.stage.fading);
     this.resolution.refreshed(elapsed, stepped || busy);
     this.ask();
-    this.paint();
-    if (held || busy || stepped || moving || drawsOn || this.link.late || (this.drawn && this.stage.fading)) this.wake();
+    if (this.stale || changes || this.drawn !== last) {
+      this.stale = false;
+      this.paint();
+    }
+    const plays = this.drawing && this.transport.playing && this.transport.state?.kind !== "live"; // whose frames are announced
+    if (changes || plays || this.link.late) this.wake(false);
   }
 
   async start() {

@@ -33,7 +33,7 @@ export function rankedCameras({ header: { cameras, center } }, eye) {
 /** Whether as many images are there as the blending rule needs. @param {Frame} frame */
 const complete = ({ shape, images }) => shape !== null && images.size >= Math.min(shape.header.blend.cameras, shape.header.cameras.length);
 
-/** Dispatches "change" when something has arrived, and "dropped" (detail: the frame) when a frame is let go. */
+/** Dispatches "change" (detail: the frame) when something has arrived, and "dropped" (detail: the frame) when a frame is let go. */
 export class Assets extends EventTarget {
   /** @param {string | null} token @param {number} fillers cameras of a playing frame beyond the blending rule's */
   constructor(token, fillers) {
@@ -128,7 +128,7 @@ export class Assets extends EventTarget {
       if (useful && !frame.failed && !this.#load(frame, eye, playing)) loading += 1;
       else if (!useful && !complete(frame)) this.#forget(frame);
     }
-    for (let step = 0; step <= ahead && loading < (playing ? LOADING : 1); step++) {
+    for (let step = 0; step <= ahead && loading < (playing && !live ? LOADING : 1); step++) {
       const index = first + ((time - first + step) % count);
       if (this.frames.has(index) || (ahead && step < late && loading > 0)) continue; // known, or it would come too late
       this.#load(this.#add(index), eye, playing);
@@ -211,7 +211,7 @@ export class Assets extends EventTarget {
         this.latency += 0.2 * (performance.now() - frame.since - this.latency);
       }
     }
-    this.dispatchEvent(new CustomEvent("change"));
+    this.dispatchEvent(new CustomEvent("change", { detail: frame }));
   }
 
   /** It is tried again when it is wanted the next time round. @param {Frame} frame */
