@@ -17,7 +17,8 @@ from viewmend.utils.heap import HeapTrimmer
 
 TICK_S = 0.004
 """Seconds between checks of the sessions' clocks."""
-IDLE_S = 0.05
+LOADING_S, IDLE_S = 0.05, 0.5
+"""The same before the first frame, and while no session wants a view; the first that does wakes the thread."""
 AFTER_ERROR_S = 0.5
 
 log = logging.getLogger("viewmend.live")
@@ -106,7 +107,7 @@ class RenderService:
             trimmer.trim_if_due(idle=not worked)
             with self.lock:
                 if not worked and not self._stopped:
-                    self.lock.wait(TICK_S if self._is_wanted else IDLE_S)
+                    self.lock.wait(TICK_S if self._is_wanted else IDLE_S if self.is_ready else LOADING_S)
 
     def _prepare(self) -> bool:
         """Prepare the renderer for a new rig."""

@@ -68,6 +68,8 @@ class HeapTrimmer:
         self._trimmed_at = now()
         self._baseline_bytes = 0
         """Resident memory after the last trim: mostly memory in use."""
+        self._grew = False
+        """Whether the last trim followed growth: what was in use then may be free by the next."""
 
     def trim_if_due(self, idle: bool) -> bool:
         """Trim if it is due; True if memory was returned. Call it between views, as it takes hundredths of a second."""
@@ -76,7 +78,10 @@ class HeapTrimmer:
             return False
         self._trimmed_at = now
         library, resident = _glibc(), resident_bytes()
-        if library is None or resident is None or resident - self._baseline_bytes < MIN_GROWTH_BYTES:
+        if library is None or resident is None:
+            return False
+        grew_before, self._grew = self._grew, resident - self._baseline_bytes >= MIN_GROWTH_BYTES
+        if not (self._grew or grew_before):
             return False
         gc.collect()  # closed connections are reference cycles, which Python collects after 100,000 more objects
         library.malloc_trim(0)

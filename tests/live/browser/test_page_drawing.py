@@ -7,24 +7,33 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from live.browser.conftest import SIZES, View
-from live.live_servers import Running, running, wait_until
+from live.live_servers import CAMERAS, Running, running, wait_until
+from reference.ball import photograph
 
 from viewmend.cli import serve
+from viewmend.live.client import Publisher
 from viewmend.live.encoding import draw_mode
 from viewmend.live.poses import view_camera
+from viewmend.live.push import PushSource
 from viewmend.live.renderer import RenderRequest
 from viewmend.models.base import RenderQuality
 
 MIN_DB, MIN_BALL_DB = 35.0, 32.0
 """Of a real scene; and of the ball, whose texture is as fine as its images of 48 pixels, which JPEG costs more."""
 SCREENSHOT_S = 60.0
+COUNT_PAINTS = """() => {
+  window.paints = 0;
+  const clear = WebGL2RenderingContext.prototype.clear;
+  WebGL2RenderingContext.prototype.clear = function (mask) { window.paints += 1; clear.call(this, mask); };
+}"""
 STUDIO = {"source": "studio", "size": 256, "frames": 2, "cameras": 8}
 
 
 @contextlib.contextmanager
 def opened(browser, server: Running, query: str = "", size: str = "desktop", route=None) -> Iterator[View]:
     width, height = SIZES[size]
-    page = browser.new_page(viewport={"width": width, "height": height})
+    touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
+    page = browser.new_page(viewport={"width": width, "height": height}, **touch)
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("console", lambda m: errors.append(m.text) if m.type == "error" and route is None else None)
@@ -160,6 +169,22 @@ def test_playing_costs_the_server_no_views(browser, balls):
         view.page.keyboard.press("Space")
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         assert view.data("time") == view.data("drawn"), "it pauses at the frame that is shown"
+
+
+def test_a_rigs_frames_are_drawn_as_they_come_and_painted_once(browser):
+    with running(PushSource(), ready=False) as server, Publisher(CAMERAS, server.ws, fps=10.0) as rig:
+        rig.push(photograph(CAMERAS))
+        with opened(browser, server) as view:
+            for number in range(4):
+                view.until(lambda: view.data("drawn") == str(number), SCREENSHOT_S)  # noqa: B023
+                rig.push(photograph(CAMERAS))
+            view.until(lambda: view.data("drawn") == "4", SCREENSHOT_S)
+            view.page.wait_for_timeout(500)
+            view.page.evaluate(COUNT_PAINTS)
+            view.page.wait_for_timeout(500)
+            assert view.page.evaluate("window.paints") == 0, "nothing is new"
+            rig.push(photograph(CAMERAS))
+            view.until("window.paints > 0", SCREENSHOT_S)
 
 
 def test_the_server_draws_where_asked_to_and_where_assets_are_missing(browser, balls):

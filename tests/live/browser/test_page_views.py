@@ -1,6 +1,8 @@
 """The views of a path: a turntable, their order and moments; a link; a double-click; the cameras' images."""
 
 import numpy as np
+import pytest
+from live.browser.conftest import SIZES
 from live.browser.test_page_drawing import SCREENSHOT_S, opened
 from live.live_servers import running
 
@@ -54,11 +56,16 @@ def test_a_link_is_copied(desktop):
     assert link.startswith(desktop.server.url) and "pose=" in link
 
 
-def test_a_double_click_turns_about_the_surface(browser):
-    with running() as server, opened(browser, server, "time=0") as view:
+@pytest.mark.parametrize("size", SIZES)
+def test_a_double_click_or_tap_turns_about_the_surface(browser, size):
+    with running() as server, opened(browser, server, "time=0", size) as view:
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         x, y = view.middle()
-        view.page.mouse.dblclick(x + 40, y - 30)
+        if size == "phone":
+            view.page.touchscreen.tap(x + 20, y - 20)
+            view.page.touchscreen.tap(x + 20, y - 20)
+        else:
+            view.page.mouse.dblclick(x + 40, y - 30)
         view.until(lambda: "pose=" in view.page.url, SCREENSHOT_S)
         distance, target = (
             np.array([float(value) for value in view.page.url.split("pose=")[1].split("&")[0].split(",")])[part]
