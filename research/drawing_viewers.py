@@ -49,7 +49,8 @@ class Viewer:
                 await asyncio.sleep(0.5)
 
     async def visit(self, end: float) -> None:
-        async with websockets.connect(f"ws://{self.host}:{self.port}/ws", compression=None, open_timeout=60) as socket:
+        options = {"compression": None, "ping_interval": None, "open_timeout": 60}  # browsers send no pings
+        async with websockets.connect(f"ws://{self.host}:{self.port}/ws", **options) as socket:
             await socket.send(json.dumps({"type": "hello", "version": 1, "codecs": ["jpeg"]}))
             self.rig: dict = {}
             listener = asyncio.create_task(self.listen(socket))

@@ -40,7 +40,7 @@ FAULTS = (1.0, 19.0)
 """Malformed messages per second, and at once, that do not end a connection."""
 TICK_S, LIVE_TICK_S = 0.25, 0.1
 """Seconds between checks of what viewers have to know; while a rig pushes frames, it is also checked after each."""
-STATE_S = 60.0
+STATE_S = 300.0
 """Time after which a state is sent again though nothing has changed; pages continue its clock by themselves."""
 
 
