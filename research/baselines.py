@@ -53,8 +53,8 @@ from viewmend.types import ContextViews, IncompleteView
 SEED, CAMERAS, STEP, NOW = 10008, 8, 4, 13
 """Distance of the earlier frames, instead of 10, so that a short scene has a full past."""
 SIZES = ((320, 320), (512, 612), (1024, 1224))
-RANDOM = {"paper_small": paper_small, "paper": paper}
-OURS = ("paper_small", "paper", *STREAMED)
+RANDOM = {"paper-small": paper_small, "paper": paper}
+OURS = ("paper-small", "paper", *STREAMED)
 FRAMINGS = ("def", "win", "mul")
 RIVAL = ("dstt", "def")
 """The fastest baseline, which is part of every run."""

@@ -7,7 +7,7 @@ In ten minutes and in this order, each step in a process of its own so that a fa
 3. timings: geometry and live;
 4. a profile of a view: where the device's time goes, and how often a view waits for it;
 5. training for the rest of the time: windows by all CPU cores, then an autoencoder and the recipe, first of
-   `paper_small`, then of `paper`. A second run with the same DIR goes on where each of them stopped.
+   `paper-small`, then of `paper`. A second run with the same DIR goes on where each of them stopped.
 
 Writes DIR/gpu_first_hour.json after each step (exit codes, seconds, figures, last lines), DIR/windows, a folder of each
 run, and DIR/pieces: the weights and checkpoints of all runs in files of at most 16 MiB, to be joined by `cat`.
@@ -45,7 +45,7 @@ LARGEST_DB_BELOW = 50.0
 GRACE_S = 60.0
 """Seconds that a step has to end after its time is over."""
 PIECE_BYTES = 16 * 2**20
-SHARES = {"windows": 0.2, "autoencoder-small": 0.08, "paper_small": 0.27, "autoencoder": 0.1, "paper": 0.35}
+SHARES = {"windows": 0.2, "autoencoder-small": 0.08, "paper-small": 0.27, "autoencoder": 0.1, "paper": 0.35}
 """Fractions of the time for training."""
 SAID = 3000
 """Characters of a step's output that are kept."""
@@ -128,10 +128,10 @@ def training(out: Path, minutes: float) -> dict[str, list[str]]:
 
     workers = ("--workers", str(os.cpu_count() or 1), "--count", "100000")
     return {
-        "windows": [*viewmend, "make-dataset", "paper_small", *workers, "--out", windows],
+        "windows": [*viewmend, "make-dataset", "paper-small", *workers, "--out", windows],
         "autoencoder-small": learn("autoencoder-small", pretrain),
-        "paper_small": learn(
-            "paper_small", [*viewmend, "train", "paper_small"], "--from", str(out / "autoencoder-small")
+        "paper-small": learn(
+            "paper-small", [*viewmend, "train", "paper-small"], "--from", str(out / "autoencoder-small")
         ),
         "autoencoder": learn("autoencoder", pretrain, "--size", "paper"),
         "paper": learn("paper", [*viewmend, "train", "paper"], "--from", str(out / "autoencoder")),

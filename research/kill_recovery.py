@@ -41,7 +41,7 @@ COMMANDS = {
     "evaluate": "evaluate P --out AREA/out --methods telea --scenes 1 --frames 2 --size 96 --jobs 1",
     "evaluate paper-table": "evaluate paper-table 1 P --ours telea --out AREA/out --scenes 1 --frames 1 --size 96",
     "masks": "masks CAPTURE AREA/out --method chroma --dark --no-clean",
-    "calibrate": "calibrate ROUGH AREA/out --silhouettes --times 1",
+    "calibrate": "calibrate ROUGH AREA/out --silhouettes --num-frames 1",
     "splits": "splits CAPTURE SECOND --out AREA/splits.json",
     "convert": "convert CAPTURE AREA/out",
     "export-scene": "export-scene CAPTURE AREA/out --views 2 --model telea",

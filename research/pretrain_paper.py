@@ -1,8 +1,8 @@
 """The patch autoencoder from which the shipped `paper-small` starts.
 
-    viewmend make-dataset paper_small --count 4000 --out SHARDS
+    viewmend make-dataset paper-small --count 4000 --out SHARDS
     python research/pretrain_paper.py --shards SHARDS --out AUTOENCODER
-    viewmend train paper_small --from AUTOENCODER --shards SHARDS --out RUN
+    viewmend train paper-small --from AUTOENCODER --shards SHARDS --out RUN
 
 Encoder and decoder learn to reproduce patches of camera images, each through its own token, without the transformer.
 Small crops instead of whole images make five times as many steps in the same time.
@@ -66,7 +66,7 @@ class AutoencoderConfig(ObjectiveConfig):
     item = Sample
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[Sample]:
-        """The samples of `paper_small`."""
+        """The samples of `paper-small`."""
         return sample_scenes(scenes, self.sampling, seed)
 
 
@@ -112,7 +112,7 @@ RECIPE = TrainConfig(
 Config = Annotated[TrainConfig, tyro.conf.arg(name="")]
 
 
-def main(out: Path, config: Config = RECIPE, size: Literal["paper_small", "paper"] = "paper_small") -> None:
+def main(out: Path, config: Config = RECIPE, size: Literal["paper-small", "paper"] = "paper-small") -> None:
     """Train the autoencoder.
 
     Args:

@@ -16,7 +16,7 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.models.base import Memory
 from viewmend.types import ContextViews, MultiViewFrame, Silhouettes
-from viewmend.utils.mmap_tensors import size_bytes, to_mmap
+from viewmend.utils.tensors import size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 WINDOW = 33

@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
+from viewmend.utils.tensors import OnDevice
 
 RIM_PX = 2
 """How far the subject may extend beyond the proxy, pixels: silhouettes and grids cut off up to this much."""
@@ -66,7 +67,7 @@ class _LazyStacks:
 
 
 @dataclass(frozen=True)
-class MultiViewFrame(_LazyStacks):
+class MultiViewFrame(_LazyStacks, OnDevice):
     """The images of all cameras of a rig in one frame: I[i,t] and M[i,t] of section 1.
 
     Images are undistorted, 8 bit, and padded with zeros at the right and bottom to the largest one;
@@ -114,19 +115,9 @@ class MultiViewFrame(_LazyStacks):
         """The same frame without these cameras; names that are not in the frame are ignored."""
         return self.select([n for n in self.cameras.names if n not in names])
 
-    def to(self, device: torch.device | str) -> "MultiViewFrame":
-        """The same frame on `device`."""
-        return replace(
-            self,
-            cameras=self.cameras.to(device),
-            rgb=self.rgb.to(device),
-            mask=None if self.mask is None else self.mask.to(device),
-            depth=None if self.depth is None else self.depth.to(device),
-        )
-
 
 @dataclass(frozen=True)
-class ContextViews(_LazyStacks):
+class ContextViews(_LazyStacks, OnDevice):
     """Camera images of one frame, with the geometry proxy's depth in each: everything an inpainter knows about a rig.
 
     Examples:
@@ -147,10 +138,6 @@ class ContextViews(_LazyStacks):
         height, width = frame.per_camera("rgb")[0].shape[1:]
         return cls._of_parts({"depth": [depth[:height, :width] for depth in depths]}, frame=frame)
 
-    def to(self, device: torch.device | str) -> "ContextViews":
-        """The same on `device`."""
-        return replace(self, frame=self.frame.to(device), depth=self.depth.to(device))
-
     def select(self, names: Sequence[str]) -> "ContextViews":
         """Those of these cameras that are present, in the order of `names`, without copying."""
         own = self.frame.cameras.names
@@ -162,7 +149,7 @@ class ContextViews(_LazyStacks):
 
 
 @dataclass(frozen=True)
-class Silhouettes:
+class Silhouettes(OnDevice):
     """The masks of a rig in one frame, without its images.
 
     Examples:
@@ -180,10 +167,6 @@ class Silhouettes:
         """The masks of these cameras, in this order; ValueError for an unknown name."""
         index = [self.cameras.names.index(name) for name in names]
         return Silhouettes(self.mask[index], self.cameras.select(names))
-
-    def to(self, device: torch.device | str) -> "Silhouettes":
-        """The same on `device`."""
-        return Silhouettes(self.mask.to(device), self.cameras.to(device))
 
 
 @dataclass(frozen=True)

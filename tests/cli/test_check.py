@@ -19,8 +19,8 @@ def described(capsys, *arguments):
 
 def test_real_capture_in_figures_and_in_words(shared, capsys, tmp_path):
     folder = shared / "captures" / "utrecht"
-    capture = described(capsys, folder, "--time", 3, "--out", tmp_path / "check.jpg")
-    assert (capture["kind"], capture["name"], capture["frames"], capture["fps"]) == ("capture", "utrecht", 426, 50)
+    capture = described(capsys, folder, "--frame", 3, "--out", tmp_path / "check.jpg")
+    assert (capture["name"], capture["frames"], capture["fps"]) == ("utrecht", 426, 50)
     assert [c["name"] for c in capture["cameras"]] == ["cam1", "cam2", "cam3", "cam4"]
     assert capture["checked_frame"] == "003" and capture["metres_per_unit"] == 0.001
     assert capture["hull_iou_min"] == min(c["hull_iou"] for c in capture["cameras"]) > 0.8

@@ -155,13 +155,13 @@ def test_unsure_pixels_are_no_points(folder, tmp_path, capsys):
     model = f"{tells_all.__file__}:TellsAll"
     counts = []
     for least in ("0", "1"):
-        given = ["--views", "1", "--frames", "0:1", "--model", model, "--least-confidence", least]
+        given = ["--views", "1", "--frames", "0:1", "--model", model, "--min-confidence", least]
         assert main(["export-scene", str(folder), str(tmp_path / least), *given]) == 0
         counts.append((tmp_path / least / "points/000000.ply").stat().st_size)
     assert counts[0] > counts[1] + 1000
 
 
-@pytest.mark.parametrize("wrong", [["--views", "0"], ["--least-confidence", "2"], ["--frames", "5:"]])
+@pytest.mark.parametrize("wrong", [["--views", "0"], ["--min-confidence", "2"], ["--frames", "5:"]])
 def test_what_cannot_be_is_said(folder, tmp_path, capsys, wrong):
     assert main(["export-scene", str(folder), str(tmp_path / "out"), *wrong]) == 2
     assert "expected --" in capsys.readouterr().err and not (tmp_path / "out").exists()

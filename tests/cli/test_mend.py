@@ -160,8 +160,8 @@ def test_what_the_camera_left_out_saw_changes_scores_alone(folder, tmp_path, men
 
 
 def test_cameras_that_are_not_used_leave_no_trace(folder, tmp_path, mend):
-    chosen = "c0,c1,c3,c5,held"
-    _, report, _ = mend(folder, tmp_path / "out", "--leave-out", "held", "--use-cameras", chosen)
+    chosen = ["c0", "c1", "c3", "c5", "held"]
+    _, report, _ = mend(folder, tmp_path / "out", "--leave-out", "held", "--cameras", *chosen)
     assert list(report["hull_iou"]) == ["c0", "c1", "c3", "c5", "held"]
 
 

@@ -18,8 +18,8 @@ from viewmend.data.prepare import adjustments
     ("arguments", "message"),
     [
         (["--leave-out", "nobody"], "expected --leave-out among"),
-        (["--leave-out", "held", "--use-cameras", "c0,nobody"], "nobody"),
-        (["--leave-out", "held", "--use-cameras", "c0"], "at least 2 input cameras, got 1"),
+        (["--leave-out", "held", "--cameras", "c0", "nobody"], "nobody"),
+        (["--leave-out", "held", "--cameras", "c0"], "at least 2 input cameras, got 1"),
         ([], "either --leave-out CAMERA or --path"),
         (["--leave-out", "held", "--path", "orbit"], "either --leave-out CAMERA or --path"),
         (["--leave-out", "held", "--frames", "5:9"], "--frames FIRST:END within 0:2"),

@@ -168,14 +168,14 @@ def test_a_video_that_ends_too_soon(plain, capfd):
     for name in "abcd":
         for kind in ("images", "masks"):
             plain.put(f"{kind}/{name}_002.png", plain.get(f"{kind}/{name}_001.png"))
-    assert main(["check", str(plain.path), "--time", "2", "--json"]) == 0
+    assert main(["check", str(plain.path), "--frame", "2", "--json"]) == 0
     description = json.loads(capfd.readouterr().out)
     assert description["gaps"] == [["b", "002"]]
     assert "the images of camera 'b' end 0.04 s before the others'" in description["findings"][0]
 
 
 def test_a_time_that_is_not_there(plain, capfd):
-    assert main(["check", str(plain.path), "--time", "2"]) == 2
+    assert main(["check", str(plain.path), "--frame", "2"]) == 2
     assert "0 to 1, got 2" in capfd.readouterr().err
 
 

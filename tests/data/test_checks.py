@@ -288,7 +288,7 @@ def test_a_faulty_camera_is_named(moving, tmp_path, fault):
 
 def test_check_names_a_late_camera_as_mend_does(moving, tmp_path, capsys):
     found = warnings_of(moving, tmp_path, delay("image", "mask"))
-    assert main(["check", str(tmp_path / "changed"), "--time", "3"]) == 0
+    assert main(["check", str(tmp_path / "changed"), "--frame", "3"]) == 0
     issue = capsys.readouterr().out.splitlines()[-1].removeprefix("  - ")
     assert "late by about 2 frames" in issue and any(text.endswith(issue) for text in found)
     assert "or raise its offset_ms in cameras.json by 200" in issue

@@ -110,7 +110,7 @@ def test_a_camera_that_is_left_out_is_not_looked_at_and_stays(studio):
 
 
 def test_reduced_images_are_matched_alike(studio):
-    small = prepare(Tinted(studio), longest_px=64, align=False)
+    small = prepare(Tinted(studio), max_image_size=64, align=False)
     assert torch.equal(small.colours.maps, prepare(Tinted(studio), align=False).colours.maps)
     full = torch.nn.functional.avg_pool2d(prepare(Tinted(studio), align=False).read(0).rgb.float(), 3)
     assert (small.read(0).rgb.float() - full).abs().mean() < 1.0

@@ -55,7 +55,7 @@ def test_colours_are_matched_where_the_moved_cameras_look(monkeypatch):
     looked = []
     monkeypatch.setattr(preparing, "match_colours", lambda frame, bounds: looked.append(frame))
     capture = Shifted()
-    prepared = prepare(capture, capture.cameras.names[1:], longest_px=48)
+    prepared = prepare(capture, capture.cameras.names[1:], max_image_size=48)
     [frame] = looked
     assert prepared.colours is None and frame.cameras.names == capture.cameras.names[1:]
     x_px, y_px = prepared.alignment.offset_px
@@ -78,7 +78,7 @@ def test_images_are_reduced_with_their_cameras_and_never_enlarged():
 
 
 def test_a_reduced_capture_states_the_cameras_of_its_frames():
-    prepared = prepare(BallCapture(ring(6)), longest_px=32, align=False)
+    prepared = prepare(BallCapture(ring(6)), max_image_size=32, align=False)
     frame = prepared.read(0)
     assert frame.rgb.shape == (6, 3, 32, 32) and prepared.cameras.max_size_px == (32, 32)
     assert torch.equal(frame.cameras.K, prepared.cameras.K)

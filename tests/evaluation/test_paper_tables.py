@@ -102,14 +102,14 @@ def test_only_a_model_of_the_papers_recipe_has_the_papers_row(tmp_path):
     card = "# m\n\nTrained by `viewmend train {}` from {}: 9 steps of 4 samples\nx 1 streams in 81 minutes, seed 0.\n"
     net = build(replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, blocks=1))
     expected = {
-        ("paper_small", "random weights"): "the paper's model",
+        ("paper-small", "random weights"): "the paper's model",
         ("paper", "`masked`"): "the paper's model, pre-trained (masked)",
         ("finetune", "random weights"): "the paper's architecture, trained otherwise",
     }
     for number, ((recipe, start), label) in enumerate(expected.items()):
         save_inpainter(net, tmp_path / str(number), card.format(recipe, start))
         assert row_label(str(tmp_path / str(number))) == label
-    assert training_of(tmp_path / "0") == Training("paper_small", None, 81)
+    assert training_of(tmp_path / "0") == Training("paper-small", None, 81)
     labels = {name: row_label(name) for name in ("paper-small", "views", "rays", "telea")}
     assert labels == {
         "paper-small": "the paper's model, pre-trained (a patch autoencoder)", "views": "ours, not the paper's",

@@ -110,7 +110,7 @@ def test_impossible_sizes_are_refused(values):
 def test_cuda_predicts_what_the_cpu_predicts(scene):
     import copy
 
-    from viewmend.training.samples import to_device
+    from viewmend.utils.tensors import to_device
 
     stream, view, sources = scene
     on_gpu = to_device(view, "cuda")

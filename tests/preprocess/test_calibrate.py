@@ -89,7 +89,7 @@ WRONG = {
     "markers": (["--board", "8x6:0.1:0.2"], "markers smaller than squares"),
     "dictionary": (["--board", BOARD, "--dictionary", "5X5"], "a dictionary of OpenCV"),
     "another dictionary": (["--board", BOARD, "--dictionary", "DICT_4X4_50"], "in 5 images or more, found it in 0"),
-    "every": (["--board", BOARD, "--every", "0"], "--every and --times of at least 1"),
+    "every": (["--board", BOARD, "--every", "0"], "--every and --num-frames of at least 1"),
     "nothing": ([], "either --board or --silhouettes"),
 }
 
@@ -169,7 +169,7 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
         "refine_by_silhouettes",
         lambda frames, *_: Refinement(cameras.select(frames[0].cameras.names), 0.9, 0.1),
     )
-    assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--times", "1", "--json"]) == 0
+    assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["outlines"] == {"missed_px": 0.9, "refined_px": 0.1} and len(figures) == 4
     shutil.copy(tmp_path / "out" / "cameras.json", folder / "cameras.json")
@@ -182,7 +182,7 @@ def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, caps
     monkeypatch.setattr(
         held_out, "refine_by_silhouettes", lambda frames, *_: replace(nothing, cameras=frames[0].cameras)
     )
-    arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--times", "1"]
+    arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]
     assert main(arguments) == 2
     assert "keep the calibration" in capsys.readouterr().err and not (tmp_path / "out").exists()
 

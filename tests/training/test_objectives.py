@@ -44,7 +44,7 @@ def test_views_and_rays_train_on_subjects_of_every_size():
         assert len(sizes) == 4 and all(1 < step < 1.5 for step in steps), sizes
 
 
-@pytest.mark.parametrize(("name", "model"), [("paper", paper), ("paper_small", paper_small)])
+@pytest.mark.parametrize(("name", "model"), [("paper", paper), ("paper-small", paper_small)])
 def test_the_recipes_of_the_paper_are_the_papers(name, model):
     config = make_recipe(name)
     objective, sampling = config.objective, config.objective.sampling

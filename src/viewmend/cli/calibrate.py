@@ -33,7 +33,7 @@ class Options:
     """Search every n-th frame for the board."""
     silhouettes: bool = False
     """Refine a capture's poses and focal lengths with its masks."""
-    times: int = 12
+    num_frames: int = 12
     """With --silhouettes: number of frames to use, evenly spread."""
     frames: str | None = None
     """Frames to use, as FIRST:END by index; either may be omitted."""
@@ -50,8 +50,10 @@ def run(options: Options) -> int:
 
     if (options.board is not None) == options.silhouettes:
         raise ValueError("expected either --board or --silhouettes, got both or neither; choose one of them")
-    if options.every < 1 or options.times < 1:
-        raise ValueError(f"expected --every and --times of at least 1, got {options.every} and {options.times}")
+    if options.every < 1 or options.num_frames < 1:
+        raise ValueError(
+            f"expected --every and --num-frames of at least 1, got {options.every} and {options.num_frames}"
+        )
     with atomic_folder(options.out) as unfinished:
         figures = (_by_silhouettes if options.silhouettes else _by_board)(options, unfinished)
     if options.json:
@@ -120,7 +122,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
     if after <= before:
         raise ValueError(
             "expected cameras that were left out to agree better with the others when these are refined, got an IoU "
-            f"of {after:.4f} for {before:.4f}; keep the calibration, use more frames (--times), or better masks"
+            f"of {after:.4f} for {before:.4f}; keep the calibration, use more frames (--num-frames), or better masks"
         )
     with busy("refining all cameras"):
         refined = refined_all(frames, bounds, hold)
@@ -139,7 +141,7 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
 
     capture = open_masked(options.source, format=options.format)
     times = chosen_times(options.frames, len(capture.frame_ids))
-    count = min(options.times, len(times))
+    count = min(options.num_frames, len(times))
     prepared = prepare(capture, match_colours=False, first=times[0])
     read = [prepared.read(times[len(times) * number // count]) for number in range(count)]
     most = max((frame.cameras.names for frame in read), key=len)

@@ -27,7 +27,7 @@ class Options:
     """Format of the capture (docs/formats.md); recognised by default."""
     out: Path | None = None
     """Write a picture of the calibration check to this file (.png or .jpg)."""
-    time: int = 0
+    frame: int = 0
     """Index of the frame to check."""
     json: bool = False
     """Write one JSON object to standard output."""
@@ -62,11 +62,11 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
     from viewmend.utils.atomic_writes import remove_partial_file
 
     capture = NativeCapture(options.capture, format=options.format)
-    if not 0 <= options.time < len(capture.frame_ids):
+    if not 0 <= options.frame < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
-        raise ValueError(f"{options.capture}: expected --time of 0 to {last}, got {options.time}; choose again")
+        raise ValueError(f"{options.capture}: expected --frame of 0 to {last}, got {options.frame}; choose again")
     with busy("computing the hull"):
-        check = check_calibration(capture.read(options.time), capture.bounds)
+        check = check_calibration(capture.read(options.frame), capture.bounds)
         good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
@@ -88,7 +88,6 @@ def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dic
     apart = (directions @ directions.mT).clamp(-1, 1).fill_diagonal_(-1).acos().amin(1).median().rad2deg()
     hull = None if check.proxy is None or not len(check.proxy.mesh.vertices) else check.proxy.mesh.vertices
     return {
-        "kind": "capture",
         "name": capture.name,
         "path": str(capture.folder),
         "frames": len(capture.frame_ids),

@@ -40,11 +40,11 @@ class Options:
     """A JSON file of views to use instead, as for `viewmend mend --path`; all are completed in every frame."""
     frames: str | None = None
     """Frames to export, as FIRST:END by index; either may be omitted."""
-    longest_px: int | None = None
+    max_image_size: int | None = None
     """Downscale images to at most this longer side, in pixels; views around the subject get the same size."""
     model: str | None = None
     """Name of a shipped model, a model's folder, or any method of `viewmend evaluate`."""
-    least_confidence: float = 0.5
+    min_confidence: float = 0.5
     """Drop points below this confidence, 0 to 1, if the model predicts one."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     device: str = "cpu"
@@ -53,10 +53,10 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; the exit code."""
-    if options.views < 1 or not 0 <= options.least_confidence <= 1:
+    if options.views < 1 or not 0 <= options.min_confidence <= 1:
         raise ValueError(
-            f"expected --views of at least 1 and --least-confidence from 0 to 1, got {options.views} and "
-            f"{options.least_confidence}; choose again"
+            f"expected --views of at least 1 and --min-confidence from 0 to 1, got {options.views} and "
+            f"{options.min_confidence}; choose again"
         )
     from viewmend.cli.checks import chosen_times, load_named
     from viewmend.cli.console import say, track
@@ -85,7 +85,7 @@ def run(options: Options) -> int:
             folder.draft,
             up=capture.up,
             fps=capture.fps,
-            least_confidence=options.least_confidence,
+            min_confidence=options.min_confidence,
         )
         folder.publish(*RESULTS)
     say(
@@ -99,7 +99,7 @@ def _prepared(options: Options, opened: "CaptureSource", first: int) -> "Prepare
     from viewmend.cli.checks import log_preparation
     from viewmend.data.prepare import prepare
 
-    capture = prepare(opened, longest_px=options.longest_px, **asdict(options.preparation), first=first)
+    capture = prepare(opened, max_image_size=options.max_image_size, **asdict(options.preparation), first=first)
     log_preparation(capture)
     return capture
 

@@ -46,8 +46,8 @@ class Options:
     orbit:arc=180,seconds=6,fps=30,size=1280x720,loop=repeat,background=white. Or a JSON file with a list of 4x4
     world_from_camera matrices (metres, OpenCV axes), or with an object of "world_from_camera" and optionally "K",
     "width" and "height"; one pose per frame, or one for all."""
-    use_cameras: str | None = None
-    """Comma-separated names of the input cameras; all by default."""
+    cameras: tuple[str, ...] = ()
+    """Names of the input cameras; all by default."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     protocol: Literal["strict", "target-mask", "hull-with-target-mask"] = "strict"
@@ -140,10 +140,7 @@ def _open(options: Options, held: tuple[str, ...]) -> "NativeCapture":
     from viewmend.data.errors import CaptureError
     from viewmend.data.prepare import open_masked
 
-    names = None
-    if options.use_cameras is not None:
-        names = [name.strip() for name in options.use_cameras.split(",") if name.strip()]
-        names = list(dict.fromkeys([*names, *held]))
+    names = list(dict.fromkeys([*options.cameras, *held])) if options.cameras else None
     capture = open_masked(options.capture, names, held=len(held), format=options.format)
     if not set(held) <= set(capture.cameras.names):
         known, got = list(capture.cameras.names), options.leave_out

@@ -31,7 +31,7 @@ class Options(RunOptions):
     """Sets as for viewmend evaluate; by default P, and Q with --performers. Table 2 needs captures."""
     ours: str = "paper-small"
     """Models to add, by name or folder, separated by commas. The first that was trained by the recipe paper or
-    paper_small takes the row of the paper's model; all others have rows of their own."""
+    paper-small takes the row of the paper's model; all others have rows of their own."""
     models: Path | None = None
     """Table 3: a folder of models named full, no-rope, no-past, single-camera, single-camera-no-masks; with -s0, -s1
     ... appended for several seeds, as research/ablation.py leaves them in OUT/models."""

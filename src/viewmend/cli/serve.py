@@ -220,7 +220,7 @@ def open_source(options: Options) -> "FrameSource":
 
     # Prepared before the address is printed, so that an unusable capture is an error of the command.
     capture = open_masked(options.source, format=options.format)
-    source = prepare(capture, longest_px=size_px, **prepared)
+    source = prepare(capture, max_image_size=size_px, **prepared)
     log_preparation(source)
     return RecordedSource(lambda: source, options.fps, memory_mb=memory_mb)
 
@@ -233,7 +233,7 @@ def _make_studio(options: Options) -> "CaptureSource":
 
     seed = PROCEDURAL_SEEDS["test"][1] if options.seed is None else options.seed
     config = StudioConfig(seed=seed, cameras=options.cameras, frames=options.frames, size_px=options.size, fps=15.0)
-    return prepare(Studio(config), longest_px=options.max_image_size, align=False, match_colours=False)
+    return prepare(Studio(config), max_image_size=options.max_image_size, align=False, match_colours=False)
 
 
 def _serve_on_ray(options: Options, address: str) -> NoReturn:

@@ -58,7 +58,7 @@ def run(options: Options) -> int:
         test_fraction=options.test_fraction,
         scenes=options.scenes,
         subject=options.subject,
-        kind=options.format,
+        format=options.format,
     )
     text = splits_json(splits)
     if options.out.exists() and options.out.read_text("utf-8", "replace") != text:

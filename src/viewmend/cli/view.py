@@ -33,7 +33,7 @@ def run(options: Options) -> int:
 
     if options.max_image_size < 1:
         raise ValueError(f"--max-image-size must be positive, got {options.max_image_size}")
-    capture = prepare(open_masked(options.capture), longest_px=options.max_image_size)
+    capture = prepare(open_masked(options.capture), max_image_size=options.max_image_size)
     log_preparation(capture)
     with serve(capture, load_named(options.model, options.device), device=options.device) as viewer:
         opened = webbrowser.open(viewer.address)

@@ -30,7 +30,7 @@ class PreparedCapture(CaptureWrapper):
     source: CaptureSource
     alignment: Alignment | None = None
     """The shift of all images that was found in the masks of the input cameras; None if alignment was off."""
-    longest_px: int | None = None
+    max_image_size: int | None = None
     """Maximum length of the longer image side; None for full size."""
     inputs: tuple[str, ...] | None = None
     """The input cameras; None for all."""
@@ -57,7 +57,7 @@ class PreparedCapture(CaptureWrapper):
     def cameras(self) -> Cameras:
         """All cameras including those that are not inputs, shifted by the alignment and resized with their images."""
         x_px, y_px = self.alignment.offset_px if self.alignment else (0.0, 0.0)
-        return limit_camera_size(self.source.cameras.moved(x_px, y_px), self.longest_px)
+        return limit_camera_size(self.source.cameras.moved(x_px, y_px), self.max_image_size)
 
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` with the calibration of `cameras`.
@@ -78,7 +78,7 @@ class PreparedCapture(CaptureWrapper):
             raise CaptureError(
                 f"{self.name}: frame '{self.frame_ids[time]}': expected at least one correct mask, got none; redo them"
             )
-        frame = limit_size(frame.without(bad), self.longest_px)
+        frame = limit_size(frame.without(bad), self.max_image_size)
         frame = replace(frame, cameras=self.cameras.select(frame.cameras.names))
         return frame if self.colours is None else self.colours.apply(frame)
 
@@ -87,7 +87,7 @@ def prepare(
     source: CaptureSource,
     inputs: Sequence[str] | None = None,
     *,
-    longest_px: int | None = None,
+    max_image_size: int | None = None,
     align: bool = True,
     match_colours: bool = True,
     first: int = 0,
@@ -98,7 +98,7 @@ def prepare(
     Args:
         source: the capture.
         inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras have no effect.
-        longest_px: images are reduced to at most this length of their longer side.
+        max_image_size: images are reduced to at most this length of their longer side.
         align: find a shift that all images share, in the masks of one frame at full size, and look for a camera that
             is out of sync, around it. It is the first frame from `first` on in which two input cameras see anything.
         match_colours: match the input cameras' colours in the same frame, if that improves their agreement on parts
@@ -113,14 +113,14 @@ def prepare(
     Examples:
         >>> from viewmend import prepare
         >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
-        >>> capture = prepare(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), longest_px=32, align=False)
+        >>> capture = prepare(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), max_image_size=32, align=False)
         >>> capture.read(0).rgb.shape
         torch.Size([4, 3, 32, 32])
     """
     names = None if inputs is None else tuple(inputs)
     frame = _first_masked(source, names, first)
     if frame is None:
-        return PreparedCapture(source, None, longest_px, names)
+        return PreparedCapture(source, None, max_image_size, names)
     reported: set[str] = set()
     issues = diagnose(frame, source.bounds)
     left_out = tuple(issue.camera for issue in issues if issue.camera and issue.always)
@@ -130,7 +130,7 @@ def prepare(
     late = find_desynchronised_cameras(source, frame, last) if align and not fatal else ()
     _raise_or_warn(at, without_consequences(issues, late), reported)
     _raise_or_warn(where, late, reported)
-    prepared = PreparedCapture(source, None, longest_px, names, left_out, None, reported)
+    prepared = PreparedCapture(source, None, max_image_size, names, left_out, None, reported)
     return _adjusted(prepared, frame, align, match_colours)
 
 
@@ -146,7 +146,7 @@ def _adjusted(prepared: PreparedCapture, frame: MultiViewFrame, align: bool, col
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         prepared = replace(prepared, alignment=shared_offset(frame.mask, frame.cameras, prepared.bounds))
     if colours:
-        cameras = replace(prepared, longest_px=None).cameras.select(frame.cameras.names)
+        cameras = replace(prepared, max_image_size=None).cameras.select(frame.cameras.names)
         found = match_colours(replace(frame, cameras=cameras), prepared.bounds)
         prepared = replace(prepared, colours=found if found is not None and found.helps else None)
     return prepared

@@ -152,18 +152,18 @@ def prefetch(source: CaptureSource, times: Iterable[int] | None = None) -> Itera
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def limit_size(frame: MultiViewFrame, longest_px: int | None) -> MultiViewFrame:
+def limit_size(frame: MultiViewFrame, max_image_size: int | None) -> MultiViewFrame:
     """Reduce each image of a frame to at most this length of its longer side; see `resize_frame`."""
-    return resize_frame(frame, limit_camera_size(frame.cameras, longest_px))
+    return resize_frame(frame, limit_camera_size(frame.cameras, max_image_size))
 
 
-def limit_camera_size(cameras: Cameras, longest_px: int | None) -> Cameras:
+def limit_camera_size(cameras: Cameras, max_image_size: int | None) -> Cameras:
     """Reduce each camera to at most this length of its longer side; returns `cameras` if none is larger."""
-    if longest_px is None or int(cameras.size_px.max()) <= longest_px:
+    if max_image_size is None or int(cameras.size_px.max()) <= max_image_size:
         return cameras
     resized = []
     for view, size in enumerate(cameras.size_px.tolist()):
-        scale = min(1.0, longest_px / max(size))
+        scale = min(1.0, max_image_size / max(size))
         resized.append(cameras[view].resized(*(max(1, round(side * scale)) for side in size)))
     return concatenate_cameras(resized)
 

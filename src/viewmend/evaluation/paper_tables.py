@@ -90,7 +90,7 @@ def row_label(name: str) -> str:
     if not isinstance(make_method(name), PatchTransformer):
         return "ours, not the paper's"
     training = training_of(folder)
-    if training is None or training.recipe not in ("paper", "paper_small"):
+    if training is None or training.recipe not in ("paper", "paper-small"):
         return "the paper's architecture, trained otherwise"
     return PAPERS_MODEL if training.start is None else f"{PAPERS_MODEL}, pre-trained ({training.start})"
 

@@ -289,7 +289,7 @@ def export_scene(
     *,
     up: Float[Tensor, "3"] | None = None,
     fps: float | None = None,
-    least_confidence: float = 0.5,
+    min_confidence: float = 0.5,
 ) -> SceneCounts:
     """Writes each frame's hull, and novel views of it, into the folder `out`.
 
@@ -303,7 +303,7 @@ def export_scene(
         out: the folder.
         up: the capture's up direction; None to estimate it from the rig.
         fps: frames per second.
-        least_confidence: pixels below this confidence make no points, if the model predicts a confidence.
+        min_confidence: pixels below this confidence make no points, if the model predicts a confidence.
 
     Raises:
         ValueError: a frame has no masks, or no foreground.
@@ -320,7 +320,7 @@ def export_scene(
             states[name] = seen.viewer
             write_image(out / "rgba" / name / f"{number:06d}.png", cutout(seen.completed))
             write_exr_depth(out / "depth" / name / f"{number:06d}.exr", seen.completed.surface_depth)
-            clouds.append(extract_points(seen.completed, frame, least_confidence))
+            clouds.append(extract_points(seen.completed, frame, min_confidence))
         cloud = torch.cat(clouds)
         write_ply(out / "points" / f"{number:06d}.ply", cloud[:, :3] @ rotation.mT, cloud[:, 3:])
         count, points = count + 1, points + len(cloud)
@@ -336,9 +336,7 @@ def cutout(completed: CompletedView) -> UInt8[np.ndarray, "height width 4"]:
     return np.dstack([picture(completed.straight_rgb), picture(completed.opacity[None])[..., 0]])
 
 
-def extract_points(
-    completed: CompletedView, frame: MultiViewFrame, least_confidence: float
-) -> Float[Tensor, "point 6"]:
+def extract_points(completed: CompletedView, frame: MultiViewFrame, min_confidence: float) -> Float[Tensor, "point 6"]:
     """World positions, metres, and RGB in [0, 1] of pixels that show the subject, on the CPU.
 
     Such a pixel has depth, an opacity above a half and at least this confidence; at least two cameras have its point in
@@ -347,7 +345,7 @@ def extract_points(
     depth = completed.surface_depth
     kept = (depth > 0) & (completed.opacity > 0.5)
     if completed.confidence is not None:
-        kept &= completed.confidence >= least_confidence
+        kept &= completed.confidence >= min_confidence
     height, width = depth.shape
     uv = pixel_centers(width, height, depth.device)[kept]
     world = unproject(uv[None], depth[kept][None], completed.view.camera)[0]

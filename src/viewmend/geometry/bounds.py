@@ -1,14 +1,16 @@
 """Axis-aligned boxes in the world."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from viewmend.utils.tensors import OnDevice
+
 
 @dataclass(frozen=True)
-class Bounds:
+class Bounds(OnDevice):
     """The box between two corners, world coordinates, metres; `low` < `high` on every axis.
 
     Examples:
@@ -36,7 +38,3 @@ class Bounds:
         """All eight corners."""
         axes = [torch.stack([low, high]) for low, high in zip(self.low, self.high, strict=True)]
         return torch.cartesian_prod(*axes)
-
-    def to(self, device: torch.device | str) -> "Bounds":
-        """The same box on `device`."""
-        return replace(self, low=self.low.to(device), high=self.high.to(device))

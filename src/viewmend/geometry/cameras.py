@@ -8,10 +8,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from viewmend.geometry.rigid import invert_rigid
+from viewmend.utils.tensors import OnDevice
 
 
 @dataclass(frozen=True)
-class Cameras:
+class Cameras(OnDevice):
     """Calibrated pinhole cameras (with skew, without distortion: captures are undistorted when read).
 
     Axes are OpenCV's: x right, y down, z forward. K is in pixels of an image whose top-left pixel has its centre
@@ -70,15 +71,6 @@ class Cameras:
         """Width and height that hold every view."""
         width, height = self.size_px.amax(0).tolist()
         return int(width), int(height)
-
-    def to(self, device: torch.device | str) -> "Cameras":
-        """The same cameras with their tensors on `device`."""
-        return replace(
-            self,
-            K=self.K.to(device),
-            camera_from_world=self.camera_from_world.to(device),
-            size_px=self.size_px.to(device),
-        )
 
     def resized(self, width: int, height: int) -> "Cameras":
         """Cameras whose images are resampled to width x height pixels (field of view unchanged)."""

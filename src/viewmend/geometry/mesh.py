@@ -1,22 +1,20 @@
 """A triangle mesh."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from viewmend.utils.tensors import OnDevice
+
 
 @dataclass(frozen=True)
-class Mesh:
+class Mesh(OnDevice):
     """Triangles in world coordinates (metres); seen from outside, their corners run counter-clockwise."""
 
     vertices: Float[Tensor, "vertex 3"]
     faces: Int[Tensor, "face 3"]
-
-    def to(self, device: torch.device | str) -> "Mesh":
-        """The same mesh on `device`."""
-        return replace(self, vertices=self.vertices.to(device), faces=self.faces.to(device))
 
 
 def vertex_normals(mesh: Mesh) -> Float[Tensor, "vertex 3"]:

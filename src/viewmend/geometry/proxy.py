@@ -21,6 +21,7 @@ from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.surface import extract_surface, occupied_box
 from viewmend.geometry.threads import light_operations
+from viewmend.utils.tensors import OnDevice
 
 WORTH_RECARVING = 0.85
 """A subject smaller than this fraction of the carved box is carved again in its own box."""
@@ -30,7 +31,7 @@ RECARVINGS = 3
 
 
 @dataclass(frozen=True)
-class GeometryProxy:
+class GeometryProxy(OnDevice):
     """The subject's approximate surface in one frame."""
 
     mesh: Mesh
@@ -46,10 +47,6 @@ class GeometryProxy:
         Back faces are culled: a camera inside the surface does not see it.
         """
         return rasterize(self.mesh, cameras, cull="back").depth
-
-    def to(self, device: torch.device | str) -> "GeometryProxy":
-        """The same proxy on `device`."""
-        return GeometryProxy(self.mesh.to(device), self.normals.to(device), self.bounds.to(device))
 
 
 @light_operations()

@@ -17,7 +17,7 @@ from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.live.protocol import ClockChange
 from viewmend.types import MultiViewFrame
-from viewmend.utils.mmap_tensors import to_mmap
+from viewmend.utils.tensors import to_mmap
 
 RETRY_S = 1.0
 """A source that failed is tried again after this long."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from viewmend.models.compositing import Background, cut, from_background, to_background
 from viewmend.types import CompletedView, ContextViews, IncompleteView
-from viewmend.utils.mmap_tensors import to_mmap
+from viewmend.utils.tensors import to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]

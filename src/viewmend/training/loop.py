@@ -27,10 +27,10 @@ from viewmend.training.run_files import (
     model_card,
     save_run,
 )
-from viewmend.training.samples import to_device
 from viewmend.training.shards import sample_to_bytes
 from viewmend.utils.atomic_writes import write_atomically
 from viewmend.utils.output_folder import OutputFolder
+from viewmend.utils.tensors import to_device
 
 WRITTEN = (
     *("model.safetensors", "config.json", "README.md", "log.jsonl"),

@@ -21,8 +21,9 @@ from viewmend.models.compositing import Background, composite
 from viewmend.models.network import set_compute_dtype
 from viewmend.training.adversarial import Adversary, Judged
 from viewmend.training.config import SceneSource, TrainConfig
-from viewmend.training.samples import Sample, to_device, true_image
+from viewmend.training.samples import Sample, true_image
 from viewmend.training.shards import ShardScenes
+from viewmend.utils.tensors import to_device
 
 MIN_SQUARE = 1e-4
 """Added to squared errors before the logarithm: no gain beyond 40 dB."""

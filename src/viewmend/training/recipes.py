@@ -88,7 +88,7 @@ def paper_small() -> TrainConfig:
     """
     sampling = replace(PaperObjectiveConfig().sampling, window_fraction=0.1)
     return TrainConfig(
-        name="paper_small",
+        name="paper-small",
         objective=PaperObjectiveConfig(model=paper_small_model(), sampling=sampling),
         scenes=SceneConfig(
             sizes_px=(224, 320, 416),
@@ -145,7 +145,7 @@ RECIPES: dict[str, str] = {
     "views": "viewmend.training.recipes:views",
     "rays": "viewmend.training.recipes:rays",
     "paper": "viewmend.training.recipes:paper",
-    "paper_small": "viewmend.training.recipes:paper_small",
+    "paper-small": "viewmend.training.recipes:paper_small",
     "finetune": "viewmend.training.recipes:finetune",
     **dict.fromkeys(BASELINES, "viewmend.contrib.baselines.training:recipe"),
 }

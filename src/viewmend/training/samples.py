@@ -1,9 +1,8 @@
 """Training samples: a view rendered without one camera of a rig, and what that camera saw (section 8)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from random import Random
-from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
@@ -59,17 +58,6 @@ def true_image(sample: Sample, background: Background) -> Float[Tensor, "3 heigh
             "again with `viewmend make-dataset`"
         )
     return composite(background, rgb, sample.alpha.float() / 255)
-
-
-def to_device(value: Any, device: torch.device | str) -> Any:
-    """The tensor, or the tuple or dataclass with all of its tensors, on `device`; other values as they are."""
-    if isinstance(value, Tensor):
-        return value.to(device)
-    if isinstance(value, tuple):
-        return tuple(to_device(item, device) for item in value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return replace(value, **{f.name: to_device(getattr(value, f.name), device) for f in fields(value)})
-    return value
 
 
 class HeldOutCamera:

@@ -143,7 +143,7 @@ class CaptureRigs:
             if (which, held) not in self._prepared:  # aligned when this camera is first held out
                 others = [n for n in capture.cameras.names if n != held and (own is None or n != own.camera)]
                 self._prepared[which, held] = prepare(capture, others, match_colours=False)
-            return replace(self._prepared[which, held], longest_px=size_px).cameras.to(device)
+            return replace(self._prepared[which, held], max_image_size=size_px).cameras.to(device)
 
         return Scene(LeaveOneOut(frames, capture.bounds, cameras), random, held_out)
 

@@ -33,11 +33,12 @@ from viewmend.rendering.crop import Crop, subject_crop
 from viewmend.rendering.error_mask import attenuate_background
 from viewmend.training.config import HIDDEN, ObjectiveConfig, SamplingConfig, SceneConfig, SceneSource, TrainConfig
 from viewmend.training.objective import MIN_SQUARE, ImageLoss, Objective, StepOutput, load_start, write_rows
-from viewmend.training.samples import Sample, to_device
+from viewmend.training.samples import Sample
 from viewmend.training.scenes import rig_source, validation_scenes
 from viewmend.training.shards import storable
 from viewmend.training.stored_scenes import StoredSamples, StoredScene, StoredSceneMaker
 from viewmend.types import IncompleteView
+from viewmend.utils.tensors import to_device
 
 CROP_PX = 112
 """Side of the square crops of a view that are trained on."""

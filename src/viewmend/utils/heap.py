@@ -1,6 +1,6 @@
 """Returning free memory to the system.
 
-The frame caches are bounded and use memory pages of their own (`utils/mmap_tensors.py`). But glibc keeps the free
+The frame caches are bounded and use memory pages of their own (`utils/tensors.py`). But glibc keeps the free
 memory between small long-lived objects, where the buffers of earlier views were. It would exceed the caches.
 """
 

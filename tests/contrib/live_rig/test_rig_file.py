@@ -27,9 +27,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def read(folder: Path, text: str, longest_px: int | None = None):
+def read(folder: Path, text: str, max_image_size: int | None = None):
     (folder / "rig.toml").write_text(text)
-    return read_rig(folder / "rig.toml", longest_px)
+    return read_rig(folder / "rig.toml", max_image_size)
 
 
 def test_a_rig_is_read(folder):
@@ -59,7 +59,7 @@ def test_a_rig_is_read(folder):
 
 
 def test_files_lie_beside_the_rig_and_pictures_are_made_smaller(folder):
-    rig = read(folder, rig_text(NAMES), longest_px=320)
+    rig = read(folder, rig_text(NAMES), max_image_size=320)
     camera = rig.cameras[0]
     assert camera.url == str(folder / "take/video/left.mp4") and camera.is_file
     assert camera.plate == folder / "plates/left.png"

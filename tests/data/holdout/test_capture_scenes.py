@@ -181,7 +181,7 @@ def test_what_cannot_be_split_is_refused(captures, tmp_path, capsys):
 
 
 def test_by_default_7_of_79_are_for_tests_and_scenes_are_a_random_subset(captures, monkeypatch):
-    def scene(path, base, seed, subject, kind):
+    def scene(path, base, seed, subject, format):
         return SplitScene(
             name=path.name, path=path.name, subject=path.name, split="training", left_out="a", closest=(),
             calibration_sha256="",

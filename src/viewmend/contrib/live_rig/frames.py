@@ -185,7 +185,7 @@ class RigSource(LiveSource):
         path: Path,
         fps: float | None = None,
         memory_mb: float = 500.0,
-        longest_px: int | None = None,
+        max_image_size: int | None = None,
         align: bool = True,
         match_colours: bool = True,
     ) -> None:
@@ -196,7 +196,7 @@ class RigSource(LiveSource):
         """
         super().__init__(fps, memory_mb)
         self.status = SourceStatus(error="waiting for the cameras")
-        self._path, self._longest_px, self._align, self._match = path, longest_px, align, match_colours
+        self._path, self._max_image_size, self._align, self._match = path, max_image_size, align, match_colours
         self._lock_cameras = threading.Condition()
         self._playback = Playback()
         self._aligner = Aligner((), 1.0, 1.0, 1.0)
@@ -206,7 +206,7 @@ class RigSource(LiveSource):
         self._file = _stamp(path)
         self._said: dict[str, dict[str, int]] = {}
         self._prepared: PreparedCapture | None = None
-        self._take_on(read_rig(path, longest_px))
+        self._take_on(read_rig(path, max_image_size))
         self._thread = threading.Thread(target=self._run, name="rig", daemon=True)
 
     def start(self) -> None:
@@ -334,7 +334,7 @@ class RigSource(LiveSource):
             return
         self._file = stamp
         try:
-            self._take_on(read_rig(self._path, self._longest_px))
+            self._take_on(read_rig(self._path, self._max_image_size))
         except ValueError as error:
             log.warning("the rig stays as it was: %s", error)
             return

@@ -59,7 +59,7 @@ class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All of the file."""
 
     calibration: Text
-    kind: Text | None = None
+    format: Text | None = None
     name: Text | None = None
     fps: Annotated[float, Meta(ge=0.1, le=240)] = 15.0
     tolerance_ms: Milliseconds | None = None
@@ -124,8 +124,8 @@ class LiveRig:
     bounds_m: Float64[np.ndarray, "2 3"] | None
 
 
-def read_rig(path: Path, longest_px: int | None = None) -> LiveRig:
-    """Read a `rig.toml` and its calibration; images are reduced to `longest_px` on their longer side.
+def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
+    """Read a `rig.toml` and its calibration; images are reduced to `max_image_size` on their longer side.
 
     Raises:
         CaptureError: the file or the calibration cannot be read, or a camera is not in the calibration.
@@ -140,7 +140,7 @@ def read_rig(path: Path, longest_px: int | None = None) -> LiveRig:
         what = f"expected TOML, got something else: {error}" if isinstance(error, UnicodeError) else str(error)
         raise CaptureError(f"{path}: {what.rstrip('.')}") from None
     folder = path.resolve().parent
-    calibration = _calibration(folder / rig.calibration, rig.kind)
+    calibration = _calibration(folder / rig.calibration, rig.format)
     known = {camera.name: camera for camera in calibration.cameras}
     if unknown := [camera.name for camera in rig.cameras if camera.name not in known]:
         names = ", ".join(known)
@@ -149,7 +149,7 @@ def read_rig(path: Path, longest_px: int | None = None) -> LiveRig:
         )
     return LiveRig(
         name=rig.name or folder.name,
-        cameras=tuple(_camera(entry, known[entry.name], rig.mask, folder, longest_px) for entry in rig.cameras),
+        cameras=tuple(_camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras),
         fps=rig.fps,
         tolerance_s=(rig.tolerance_ms or 500 / rig.fps) / 1000,
         wait_s=rig.wait_ms / 1000,
@@ -158,27 +158,27 @@ def read_rig(path: Path, longest_px: int | None = None) -> LiveRig:
     )
 
 
-def _calibration(place: Path, kind: str | None) -> NativeCalibration:
-    """The calibration of a folder of any kind, or of a file in one.
+def _calibration(place: Path, format: str | None) -> NativeCalibration:
+    """The calibration of a folder of any format, or of a file in one.
 
     Raises:
         CaptureError: there is none, or another file of the folder would be read.
     """
     if not place.is_file():
-        return read_any_calibration(place, kind)
-    found = read_any_calibration(place.parent, kind)
-    if found.file.resolve() != place.resolve() and place.suffix == found.file.suffix and kind is None:
-        raise CaptureError(f"{place}: expected the folder's calibration, which is {found.file.name}; name the kind")
+        return read_any_calibration(place, format)
+    found = read_any_calibration(place.parent, format)
+    if found.file.resolve() != place.resolve() and place.suffix == found.file.suffix and format is None:
+        raise CaptureError(f"{place}: expected the folder's calibration, which is {found.file.name}; name the format")
     return found
 
 
 def _camera(
-    entry: RigCameraEntry, calibration: NativeCamera, mask: MaskEntry, folder: Path, longest_px: int | None
+    entry: RigCameraEntry, calibration: NativeCamera, mask: MaskEntry, folder: Path, max_image_size: int | None
 ) -> LiveCamera:
     on_disk = "://" not in entry.url
     device = on_disk and DEVICE.fullmatch(entry.url)
     return LiveCamera(
-        calibration=_reduced(calibration, longest_px),
+        calibration=_reduced(calibration, max_image_size),
         taken_px=(calibration.width, calibration.height),
         url=str(folder / entry.url) if on_disk and not device and entry.format is None else entry.url,
         format="v4l2" if device and entry.format is None else entry.format,
@@ -190,11 +190,11 @@ def _camera(
     )
 
 
-def _reduced(camera: NativeCamera, longest_px: int | None) -> NativeCamera:
+def _reduced(camera: NativeCamera, max_image_size: int | None) -> NativeCamera:
     """The camera of images reduced to at most this length; distortion does not change."""
     longest = max(camera.width, camera.height)
-    if longest_px is None or longest <= longest_px:
+    if max_image_size is None or longest <= max_image_size:
         return camera
-    width, height = (max(1, round(side * longest_px / longest)) for side in (camera.width, camera.height))
+    width, height = (max(1, round(side * max_image_size / longest)) for side in (camera.width, camera.height))
     scale = np.diag([width / camera.width, height / camera.height, 1.0])
     return replace(camera, width=width, height=height, K=scale @ camera.K)

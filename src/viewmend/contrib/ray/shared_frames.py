@@ -25,7 +25,7 @@ from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
 from viewmend.models.base import ContextProvider, Inpainter
 from viewmend.types import MultiViewFrame
 from viewmend.utils.heap import HeapTrimmer
-from viewmend.utils.mmap_tensors import size_bytes
+from viewmend.utils.tensors import size_bytes
 
 
 @dataclass(frozen=True)

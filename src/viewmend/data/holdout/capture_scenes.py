@@ -35,7 +35,7 @@ class CaptureScene(LeaveOneOutScene):
     """Frames from the first."""
     fingerprint: str
     """Hash of the capture's files."""
-    kind: str | None = None
+    format: str | None = None
     """The capture's format, None to recognise it."""
     align: bool = True
     """Whether a common shift of all images is undone (`prepare`)."""
@@ -50,7 +50,7 @@ class CaptureScene(LeaveOneOutScene):
 
     def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
         """Frames in which the camera that was left out, and at least two of the inputs, have images."""
-        opened = open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.kind)
+        opened = open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.format)
         capture = prepare(opened, self.inputs, align=self.align, match_colours=self.match_colours)
         bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):
@@ -60,7 +60,7 @@ class CaptureScene(LeaveOneOutScene):
 
 
 def capture_set(
-    folder: Path, inputs: str = "all", frames: int | None = None, kind: str | None = None
+    folder: Path, inputs: str = "all", frames: int | None = None, format: str | None = None
 ) -> tuple[CaptureScene, ...]:
     """Every camera of a capture left out in turn.
 
@@ -68,20 +68,20 @@ def capture_set(
         folder: of the capture.
         inputs: "all" others, or a number of cameras, chosen by `evenly_around`, without the held-out one.
         frames: how many from the first; None for all.
-        kind: the capture's format, None to recognise it.
+        format: the capture's format, None to recognise it.
 
     Raises:
         CaptureError: the capture cannot be read, has no masks, or too few cameras.
         ValueError: `inputs` or `frames` is no such number.
     """
-    capture = open_masked(folder, held=1, format=kind)
+    capture = open_masked(folder, held=1, format=format)
     names = capture.cameras.names
     if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
         raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
     if frames is not None and frames < 1:
         raise ValueError(f"expected --frames of at least 1, got {frames}; leave it away for all")
     looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
-    fingerprint, count = _fingerprint(folder, kind), min(frames or len(capture.frame_ids), len(capture.frame_ids))
+    fingerprint, count = _fingerprint(folder, format), min(frames or len(capture.frame_ids), len(capture.frame_ids))
     return tuple(
         CaptureScene(
             name=f"{capture.name}-{held}-from-{inputs}",
@@ -93,7 +93,7 @@ def capture_set(
             inputs=tuple(name for name in looking if name != held),
             count=count,
             fingerprint=fingerprint,
-            kind=kind,
+            format=format,
         )
         for held in names
     )
@@ -115,10 +115,10 @@ def evenly_around(cameras: Cameras, count: int) -> tuple[str, ...]:
     return tuple(cameras.names[order[i * len(order) // count]] for i in range(count))
 
 
-def _fingerprint(folder: Path, kind: str | None) -> str:
+def _fingerprint(folder: Path, format: str | None) -> str:
     """Changes when the calibration does, or size or time of a file that it names: too many to read them all."""
     is_file = folder.name == CALIBRATION and folder.is_file()
-    plain = read_any_calibration(folder.parent if is_file else folder, kind)
+    plain = read_any_calibration(folder.parent if is_file else folder, format)
     folder = plain.folder
     named = {c.file(stream, frame) for c in plain.cameras for stream in c.file_kinds for frame in plain.frames}
     files = sorted({container_of(folder / name) for name in named})
@@ -140,7 +140,7 @@ class SplitScene(Struct, frozen=True, kw_only=True):
     name: str
     path: Annotated[str, Meta(min_length=1)]
     """Where the capture is, relative to the file's folder."""
-    kind: str | None = None
+    format: str | None = None
     subject: str
     split: Literal["training", "test"]
     left_out: str
@@ -166,7 +166,7 @@ def make_splits(
     test_fraction: float = 7 / 79,
     scenes: int | None = None,
     subject: str = "(.*)",
-    kind: str | None = None,
+    format: str | None = None,
 ) -> SplitFile:
     """Split captures so that no subject is in both parts, and choose the camera that each leaves out.
 
@@ -176,7 +176,7 @@ def make_splits(
     Raises:
         ValueError: fewer than two subjects, a name without a subject, two scenes of one name, or fewer than 4 cameras.
     """
-    made = [_scene(path, base, seed, subject, kind) for path in captures]
+    made = [_scene(path, base, seed, subject, format) for path in captures]
     names = [scene.name for scene in made]
     twice = sorted({name for name in names if names.count(name) > 1})
     if scenes is not None and scenes > len(made):
@@ -230,7 +230,7 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
     """
     found = []
     for scene, path in _scenes_of(file, "test"):
-        held = next(one for one in capture_set(path, frames=frames, kind=scene.kind) if one.held == scene.left_out)
+        held = next(one for one in capture_set(path, frames=frames, format=scene.format) if one.held == scene.left_out)
         found.append(replace(held, name=f"{scene.name}-{scene.left_out}", set=file.stem))
     return tuple(found)
 
@@ -242,7 +242,7 @@ def training_captures(file: Path) -> tuple[tuple[NativeCapture, str], ...]:
         ValueError: it is none, or a capture is absent, cannot be used, or was recalibrated.
     """
     scenes = _scenes_of(file, "training")
-    return tuple((open_masked(path, held=1, format=scene.kind), scene.left_out) for scene, path in scenes)
+    return tuple((open_masked(path, held=1, format=scene.format), scene.left_out) for scene, path in scenes)
 
 
 def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple[SplitScene, Path]]:
@@ -254,7 +254,7 @@ def _scenes_of(file: Path, split: Literal["training", "test"]) -> Iterator[tuple
         path = file.parent / scene.path
         if not path.exists():
             raise ValueError(f"{file}: expected the capture {path}, got none; put the file where its paths hold")
-        if (now := _calibration_sha256(path, scene.kind)) != scene.calibration_sha256:
+        if (now := _calibration_sha256(path, scene.format)) != scene.calibration_sha256:
             raise ValueError(
                 f"{path}: expected the calibration that {file.name} was made with, {scene.calibration_sha256[:12]}, "
                 f"got another, {now[:12]}; take that version of the data, or make splits of your own"
@@ -268,8 +268,8 @@ _PROTOCOL = (
 )
 
 
-def _scene(path: Path, base: Path, seed: int, subject: str, kind: str | None) -> SplitScene:
-    capture = open_capture(path, format=kind)
+def _scene(path: Path, base: Path, seed: int, subject: str, format: str | None) -> SplitScene:
+    capture = open_capture(path, format=format)
     names = capture.cameras.names
     matched = re.search(subject, capture.name)
     if matched is None or not matched.groups() or not matched[1]:
@@ -284,12 +284,12 @@ def _scene(path: Path, base: Path, seed: int, subject: str, kind: str | None) ->
     return SplitScene(
         name=capture.name,
         path=os.path.relpath(path.resolve(), base.resolve()),
-        kind=kind,
+        format=format,
         subject=matched[1],
         split="training",
         left_out=held,
         closest=closest,
-        calibration_sha256=_calibration_sha256(path, kind),
+        calibration_sha256=_calibration_sha256(path, format),
     )
 
 
@@ -305,7 +305,7 @@ def _looked_at(cameras: Cameras) -> torch.Tensor:
     return point[:, 0].float()
 
 
-def _calibration_sha256(path: Path, kind: str | None) -> str:
-    cameras = read_any_calibration(path, kind).cameras
+def _calibration_sha256(path: Path, format: str | None) -> str:
+    cameras = read_any_calibration(path, format).cameras
     values = [[c.name, c.width, c.height, *(n.round(6).tolist() for n in (c.K, c.R, c.t_m, c.dist))] for c in cameras]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()

@@ -1,7 +1,7 @@
 """Who stands on the studio's stage: a textured mesh at each moment; and its textures, ready for drawing."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
+from viewmend.utils.tensors import OnDevice
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def skin_with_normals(
 
 
 @dataclass(frozen=True)
-class TexturePyramid:
+class TexturePyramid(OnDevice):
     """Several textures, each in halving sizes: level l of texture t is `size[t, l]` texels from `first[t, l]` on."""
 
     texels: Float[Tensor, "texel 3"]
@@ -103,10 +104,6 @@ class TexturePyramid:
     first: Int[Tensor, "texture level"]
     size: Int[Tensor, "texture level 2"]
     """Width and height. A texture with fewer levels repeats its last."""
-
-    def to(self, device: torch.device | str) -> "TexturePyramid":
-        """The same pyramid on `device`."""
-        return replace(self, texels=self.texels.to(device), first=self.first.to(device), size=self.size.to(device))
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:

@@ -22,6 +22,7 @@ from viewmend.geometry.rasterize import Raster, barycentric, rasterize
 from viewmend.geometry.rigid import look_at
 from viewmend.geometry.threads import parallel_for
 from viewmend.types import MultiViewFrame
+from viewmend.utils.tensors import OnDevice
 
 _WALLS = ((0.05, 0.35, 0.08), (0.22, 0.22, 0.23), (0.04, 0.04, 0.05), (0.6, 0.6, 0.58), (0.06, 0.12, 0.4))
 """Linear light: green screen, grey, dark, white, blue screen."""
@@ -34,7 +35,7 @@ GLOSS_DOUBLINGS = 4
 
 
 @dataclass(frozen=True)
-class Lights:
+class Lights(OnDevice):
     """Light from a sphere of directions (diffuse, with shadows), and lamps that make highlights. Linear light."""
 
     toward: Float[Tensor, "light 3"]
@@ -45,10 +46,6 @@ class Lights:
     """Unit vectors to the lamps."""
     gloss: Float[Tensor, "lamp 3"]
     """The colour of each lamp's highlight at its middle."""
-
-    def to(self, device: torch.device | str) -> "Lights":
-        """The same lights on `device`."""
-        return Lights(*(t.to(device) for t in (self.toward, self.strength, self.lamps, self.gloss)))
 
 
 def stage_lights(seed: int, directions: int = 16, evenness: float = 0.65) -> Lights:

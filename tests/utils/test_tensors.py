@@ -10,7 +10,7 @@ import torch
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.utils.mmap_tensors import LARGE_BYTES, to_mmap
+from viewmend.utils.tensors import LARGE_BYTES, to_mmap
 
 
 def proxy(vertices: int) -> GeometryProxy:

@@ -1,0 +1,70 @@
+"""Tensors in dataclasses and tuples: moved to a device, copied to memory of their own, counted.
+
+Long-lived tensors between short-lived ones keep the C library from returning memory: a server that runs for hours
+would occupy several times what it stores. So they are copied to their own memory mappings.
+"""
+
+import mmap
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+LARGE_BYTES = 1 << 16
+"""Smaller tensors are not copied."""
+PRIVATE = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_PRIVATE") else {}
+"""Private mappings, so that a forked process gets a copy; not needed on Windows."""
+
+T = TypeVar("T")
+
+
+class OnDevice:
+    """Base class of dataclasses of tensors."""
+
+    def to(self, device: torch.device | str) -> Self:
+        """The same with all tensors on `device`."""
+        return to_device(self, device)
+
+
+def to_device(value: T, device: torch.device | str) -> T:
+    """A tensor, or the tuple or dataclass with all of its tensors, on `device`; other values as they are."""
+    return _changed(value, lambda tensor: tensor.to(device))
+
+
+def to_mmap(value: T) -> T:
+    """Copy the large CPU tensors of a tensor, dataclass or tuple to their own memory mappings.
+
+    The memory returns to the system when the copy is freed. Costs about a millisecond for 3 MB.
+    """
+    return _changed(value, _copied)
+
+
+def _copied(tensor: Tensor) -> Tensor:
+    size = tensor.numel() * tensor.element_size()
+    if tensor.device.type != "cpu" or size < LARGE_BYTES:
+        return tensor
+    pages = mmap.mmap(-1, size, **PRIVATE)
+    return torch.frombuffer(pages, dtype=tensor.dtype).view(tensor.shape).copy_(tensor)
+
+
+def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        return change(value)
+    if type(value) is tuple:
+        return tuple(_changed(item, change) for item in value)
+    if not is_dataclass(value) or isinstance(value, type):
+        return value
+    parts = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+    changed = {name: new for name, part in parts.items() if (new := _changed(part, change)) is not part}
+    return replace(value, **changed) if changed else value
+
+
+def size_bytes(value: Any) -> int:
+    """Bytes of all tensors in a tensor, dataclass, tuple or list."""
+    if isinstance(value, Tensor):
+        return value.numel() * value.element_size()
+    if is_dataclass(value) and not isinstance(value, type):
+        value = [getattr(value, f.name) for f in fields(value)]
+    return sum(map(size_bytes, value)) if isinstance(value, (tuple, list)) else 0
