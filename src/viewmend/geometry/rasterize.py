@@ -46,14 +46,6 @@ def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front
     return Raster(*rasterize_torch(mesh, cameras, NEAR_M, side))
 
 
-def barycentric(mesh: Mesh, cameras: Cameras, raster: Raster) -> Float[Tensor, "view height width 3"]:
-    """Each pixel's perspective-correct weights of its triangle's three corners; zeros where there is no surface."""
-    weights = mesh.vertices.new_zeros(*raster.triangle.shape, 3)
-    where, _, values = _visible_corners(mesh, cameras, raster)
-    weights[where] = values
-    return weights
-
-
 def interpolate(
     attributes: Float[Tensor, "vertex channel"], mesh: Mesh, cameras: Cameras, raster: Raster
 ) -> Float[Tensor, "view height width channel"]:

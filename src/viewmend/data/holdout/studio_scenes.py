@@ -77,14 +77,14 @@ class StudioScene(LeaveOneOutScene):
             frame = LeaveOneOut({time: drawn}, true_view=true_view).frame(self.held, time)
             scored = time >= self.scored_from
             if self.scored_from:
-                mesh = studio.scene(time).mesh
+                mesh = studio.scene(time).mesh.to(device)
                 surfaces[time] = TrueSurface.of(drawn.without((self.held,)), mesh)
                 surfaces.pop(time - paper().window - 1, None)
                 if scored:
                     seen = surface_seen(surfaces, window_times(time, paper()), mesh, frame.truth.cameras)
                     frame = replace(frame, seen=seen)
             if scored and before is not None and before.depth is not None:
-                now, then = (studio.scene(t).mesh for t in (time, time - 1))
+                now, then = (studio.scene(t).mesh.to(device) for t in (time, time - 1))
                 flow_px = backward_flow(now, then, before.depth[0], frame.truth.cameras)
                 frame = replace(frame, backward_flow_px=flow_px)
             yield frame

@@ -43,7 +43,7 @@ class View(NamedTuple):
 
 @kernel
 def shade_band(scene, view, first_row, end_row, rgb, mask):
-    """Fill rows [first_row, end_row) of one view's rgb (3, h, w) and mask (h, w); see `render.shade_torch`."""
+    """Fill rows [first_row, end_row) of one view's rgb (3, h, w) and mask (h, w); see `render.render`."""
     n = view.ids.shape[0] // mask.shape[0]
     sums, color, at = np.zeros(3, np.float32), np.zeros(3, np.float32), np.zeros(11, np.float32)
     whole = np.float32(n * n)
@@ -164,7 +164,7 @@ def encode(linear, steps, guesses):
 
 @kernel
 def unshadowed(pixels, z, depth, bias, seen):
-    """One light of `shading.unshadowed_torch`."""
+    """One light of `render.visibility`."""
     last_row, last_column = depth.shape[0] - 1, depth.shape[1] - 1
     for i in range(z.shape[0]):
         u, v = pixels[i, 0] - np.float32(0.5), pixels[i, 1] - np.float32(0.5)

@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from viewmend.geometry.cameras import Cameras, project
 from viewmend.geometry.mesh import Mesh
-from viewmend.utils.tensors import OnDevice
 
 
 @dataclass(frozen=True)
@@ -25,11 +23,6 @@ class TexturedMesh:
     texture_of_face: Int[Tensor, "face"]
     textures: tuple[Float[Tensor, "3 _ _"], ...]
     """sRGB colours in [0, 1]; the sizes may differ."""
-
-    def to(self, device: torch.device | str) -> "TexturedMesh":
-        """The same mesh on `device`; its textures stay where they are, since their pyramid moves."""
-        normals, uv, texture = (t.to(device) for t in (self.normals, self.uv, self.texture_of_face))
-        return TexturedMesh(self.mesh.to(device), normals, uv, texture, self.textures)
 
 
 @runtime_checkable
@@ -96,7 +89,7 @@ def skin_with_normals(
 
 
 @dataclass(frozen=True)
-class TexturePyramid(OnDevice):
+class TexturePyramid:
     """Several textures, each in halving sizes: level l of texture t is `size[t, l]` texels from `first[t, l]` on."""
 
     texels: Float[Tensor, "texel 3"]
@@ -138,55 +131,8 @@ def texture_pyramid(textures: Sequence[Float[Tensor, "3 _ _"]]) -> TexturePyrami
                 level, (max(1, level.shape[1] // 2), max(1, level.shape[2] // 2))
             )
     depth = max(len(f) for f in first)
-    device = textures[0].device
     return TexturePyramid(
         torch.cat(texels).contiguous(),
-        torch.tensor([f + f[-1:] * (depth - len(f)) for f in first], device=device),
-        torch.tensor([s + s[-1:] * (depth - len(s)) for s in size], device=device),
+        torch.tensor([f + f[-1:] * (depth - len(f)) for f in first]),
+        torch.tensor([s + s[-1:] * (depth - len(s)) for s in size]),
     )
-
-
-def face_levels(scene: TexturedMesh, cameras: Cameras, pyramid: TexturePyramid) -> Float[Tensor, "view face"]:
-    """The pyramid level, with fraction, at which a texel of each face is about as large as a pixel of each view."""
-    faces = scene.mesh.faces.long()
-    corners = scene.uv[faces] * pyramid.size[scene.texture_of_face.long(), 0][:, None]
-    pixels, z = project(scene.mesh.vertices, cameras)
-    shown = pixels[:, faces]
-    # A face across the camera plane has no meaningful area: it is too near to need a smaller texture.
-    behind = (z[:, faces] <= 0).any(-1)
-    ratio = _area(corners)[None] / _area(shown).clamp(min=1e-6)
-    level = 0.5 * torch.log2(ratio.clamp(min=1e-6))
-    return torch.where(behind, torch.zeros_like(level), level).clamp(0, pyramid.first.shape[1] - 1)
-
-
-def _area(triangles: Float[Tensor, "*batch 3 2"]) -> Float[Tensor, "*batch"]:
-    a, b = triangles[..., 1, :] - triangles[..., 0, :], triangles[..., 2, :] - triangles[..., 0, :]
-    return (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]).abs() / 2
-
-
-def sample_texture(
-    pyramid: TexturePyramid,
-    texture: Int[Tensor, "sample"],
-    uv: Float[Tensor, "sample 2"],
-    level: Float[Tensor, "sample"],
-) -> Float[Tensor, "sample 3"]:
-    """Trilinear look-up, clamped at the textures' edges; linear light."""
-    low = level.floor().long()
-    high = (low + 1).clamp(max=pyramid.first.shape[1] - 1)
-    below, above = (_bilinear(pyramid, texture, uv, at) for at in (low, high))
-    return torch.lerp(below, above, (level - low)[:, None])
-
-
-def _bilinear(
-    pyramid: TexturePyramid, texture: Int[Tensor, "sample"], uv: Float[Tensor, "sample 2"], level: Int[Tensor, "sample"]
-) -> Float[Tensor, "sample 3"]:
-    size, first = pyramid.size[texture, level], pyramid.first[texture, level]
-    place = (uv * size - 0.5).clamp(min=0).minimum(size - 1)
-    corner = place.floor().long()
-    fraction = place - corner
-    beyond = (corner + 1).minimum(size - 1)
-    blended = torch.zeros(len(uv), 3, device=uv.device)
-    for x, wx in ((corner[:, 0], 1 - fraction[:, 0]), (beyond[:, 0], fraction[:, 0])):
-        for y, wy in ((corner[:, 1], 1 - fraction[:, 1]), (beyond[:, 1], fraction[:, 1])):
-            blended += (wx * wy)[:, None] * pyramid.texels[first + y * size[:, 0] + x]
-    return blended

@@ -4,25 +4,17 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from einops import reduce
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from viewmend.data.synthetic import _shade_numba as kernels
-from viewmend.data.synthetic.performer import (
-    TexturedMesh,
-    TexturePyramid,
-    face_levels,
-    sample_texture,
-    srgb_from_linear,
-)
+from viewmend.data.synthetic.performer import TexturedMesh, TexturePyramid
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers, project
 from viewmend.geometry.mesh import Mesh
-from viewmend.geometry.rasterize import Raster, barycentric, rasterize
+from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.rigid import look_at
 from viewmend.geometry.threads import parallel_for
 from viewmend.types import MultiViewFrame
-from viewmend.utils.tensors import OnDevice
 
 _WALLS = ((0.05, 0.35, 0.08), (0.22, 0.22, 0.23), (0.04, 0.04, 0.05), (0.6, 0.6, 0.58), (0.06, 0.12, 0.4))
 """Linear light: green screen, grey, dark, white, blue screen."""
@@ -35,7 +27,7 @@ GLOSS_DOUBLINGS = 4
 
 
 @dataclass(frozen=True)
-class Lights(OnDevice):
+class Lights:
     """Light from a sphere of directions (diffuse, with shadows), and lamps that make highlights. Linear light."""
 
     toward: Float[Tensor, "light 3"]
@@ -96,33 +88,13 @@ def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -
     depth = rasterize(mesh, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
     pixels, z = project(mesh.vertices + SHADOW_BIAS_M * normals, cameras)
-    if z.device.type == "cpu":
-        seen = torch.empty_like(z)
+    seen = torch.empty_like(z)
 
-        def look(n: int) -> None:
-            kernels.unshadowed(pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
+    def look(n: int) -> None:
+        kernels.unshadowed(pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())
 
-        parallel_for(look, len(cameras))
-        return seen.T
-    return unshadowed_torch(pixels, z, depth).T
-
-
-def unshadowed_torch(
-    pixels: Float[Tensor, "light vertex 2"],
-    z: Float[Tensor, "light vertex"],
-    depth: Float[Tensor, "light shadow shadow"],
-) -> Float[Tensor, "light vertex"]:
-    """Share of the four nearest texels of each shadow map that lie no nearer to the light than the vertex."""
-    corner = (pixels - 0.5).floor()
-    fraction = pixels - 0.5 - corner
-    seen = torch.zeros_like(z)
-    view = torch.arange(len(z), device=z.device)[:, None]
-    for x, wx in ((0, 1 - fraction[..., 0]), (1, fraction[..., 0])):
-        for y, wy in ((0, 1 - fraction[..., 1]), (1, fraction[..., 1])):
-            column = (corner[..., 0].long() + x).clamp(0, depth.shape[2] - 1)
-            row = (corner[..., 1].long() + y).clamp(0, depth.shape[1] - 1)
-            seen += wx * wy * (z < depth[view, row, column] + SHADOW_BIAS_M)
-    return seen
+    parallel_for(look, len(cameras))
+    return seen.T
 
 
 def _light_cameras(mesh: Mesh, lights: Lights) -> Cameras:
@@ -174,7 +146,7 @@ class Surface:
 
 
 def light(scene: TexturedMesh, lights: Lights, pyramid: TexturePyramid) -> Surface:
-    """Light a scene once, for any number of cameras; all arguments on one device."""
+    """Light a scene once, for any number of cameras."""
     return Surface(scene, irradiance(scene.mesh, scene.normals, lights), lights, pyramid)
 
 
@@ -187,11 +159,11 @@ def render(
     """Draw a lit scene into every camera, as the frame of time 0.
 
     Each pixel is shaded at samples_per_side x samples_per_side points, which gives its colour and coverage; the depth
-    is that of its centre. On the CPU numba shades, elsewhere torch does.
+    is that of its centre. All arguments are on the CPU.
 
     Args:
         surface: what `light` made.
-        cameras: on the surface's device.
+        cameras: of any sizes.
         background: what stands behind, linear light; black if None.
         samples_per_side: 2 gives masks in steps of a quarter.
     """
@@ -199,80 +171,24 @@ def render(
         raise ValueError(f"expected samples_per_side of at least 1, got {samples_per_side}; 2 is usual")
     fine = replace(
         cameras,
-        K=cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0], device=cameras.K.device)[:, None],
+        K=cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None],
         size_px=cameras.size_px * samples_per_side,
     )
     mesh = surface.scene.mesh
     triangle = rasterize(mesh, fine).triangle
     depth = rasterize(mesh, cameras).depth
     if background is None:
-        background = torch.zeros(len(cameras), 3, *depth.shape[1:], device=depth.device)
-    if depth.device.type == "cpu":
-        return MultiViewFrame(cameras, *_shade_cpu(surface, fine, triangle, background), 0, depth)
-    return MultiViewFrame(cameras, *shade_torch(surface, fine, triangle, background), 0, depth)
+        background = torch.zeros(len(cameras), 3, *depth.shape[1:])
+    return MultiViewFrame(cameras, *_shade(surface, fine, triangle, background), 0, depth)
 
 
-def shade_torch(
+def _shade(
     surface: Surface,
     fine: Cameras,
     triangle: Int[Tensor, "view fine_height fine_width"],
     background: Float[Tensor, "view 3 height width"],
 ) -> tuple[UInt8[Tensor, "view 3 height width"], UInt8[Tensor, "view height width"]]:
-    """Colour and coverage of each pixel from the triangles that its samples see."""
-    n = triangle.shape[1] // background.shape[2]
-    images, masks = [], []
-    for view in range(len(fine)):
-        seen = triangle[view] >= 0
-        color = torch.zeros(*seen.shape, 3, device=seen.device)
-        color[seen] = _sample_colors(surface, fine[view], triangle[view : view + 1])
-        cover = reduce(seen.float(), "(h a) (w b) -> h w", "mean", a=n, b=n)
-        linear = reduce(color, "(h a) (w b) c -> c h w", "mean", a=n, b=n) + (1 - cover) * background[view]
-        images.append((srgb_from_linear(linear) * 255).round().to(torch.uint8))
-        masks.append((cover * 255).round().to(torch.uint8))
-    return torch.stack(images), torch.stack(masks)
-
-
-def _sample_colors(
-    surface: Surface, camera: Cameras, triangle: Int[Tensor, "1 fine_height fine_width"]
-) -> Float[Tensor, "sample 3"]:
-    """Linear light of the covered samples of one view."""
-    scene, lights = surface.scene, surface.lights
-    levels = face_levels(scene, camera, surface.pyramid)[0]
-    weights = barycentric(scene.mesh, camera, Raster(torch.zeros(triangle.shape, device=levels.device), triangle))
-    face = triangle[triangle >= 0].long()
-    weights = weights[triangle >= 0][:, :, None]
-    corners = scene.mesh.faces.long()[face]
-    uv, normal, lit, place = (
-        (values[corners] * weights).sum(1)
-        for values in (scene.uv, scene.normals, surface.irradiance, scene.mesh.vertices)
-    )
-    albedo = sample_texture(surface.pyramid, scene.texture_of_face.long()[face], uv, levels[face])
-    return albedo * lit + lit * _highlight(normal, camera.centers[0] - place, lights)
-
-
-def _highlight(
-    normal: Float[Tensor, "sample 3"], toward_camera: Float[Tensor, "sample 3"], lights: Lights
-) -> Float[Tensor, "sample 3"]:
-    """Blinn-Phong highlights of all lamps."""
-    normal = torch.nn.functional.normalize(normal, dim=-1)
-    eye = torch.nn.functional.normalize(toward_camera, dim=-1)
-    total = torch.zeros_like(normal)
-    for lamp, gloss in zip(lights.lamps, lights.gloss, strict=True):
-        half = torch.nn.functional.normalize(eye + lamp, dim=-1)
-        power = (half * normal).sum(-1).clamp(min=0)
-        for _ in range(GLOSS_DOUBLINGS):
-            power = power * power
-        total += power[:, None] * gloss
-    return total
-
-
-def _shade_cpu(
-    surface: Surface,
-    fine: Cameras,
-    triangle: Int[Tensor, "view fine_height fine_width"],
-    background: Float[Tensor, "view 3 height width"],
-) -> tuple[UInt8[Tensor, "view 3 height width"], UInt8[Tensor, "view height width"]]:
-    """`shade_torch` by numba: bands of rows, shared among threads."""
+    """Colour and coverage of each pixel from the triangles that its samples see: bands of rows, shared by threads."""
     scene, lights, pyramid = surface.scene, surface.lights, surface.pyramid
     views, _, height, width = background.shape
     P = fine.K.double() @ fine.camera_from_world[:, :3].double()

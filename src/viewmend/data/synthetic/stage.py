@@ -60,7 +60,7 @@ class StudioConfig:
     imperfections: Imperfections = field(default_factory=Imperfections)
     """Imperfections of the capture; none by default."""
     device: str = "cpu"
-    """Device for rendering and for frames."""
+    """Device of the frames; they are drawn on the CPU."""
 
 
 class Studio:
@@ -95,7 +95,7 @@ class Studio:
         """True poses of the cameras; `cameras` has the calibration errors of the capture."""
         self.cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
         """The calibration of the capture, including its errors."""
-        self._lights = stage_lights(light_seed).to(config.device)
+        self._lights = stage_lights(light_seed)
         self._backdrop = None
         if config.background == "stage":
             self._backdrop = stage_backdrop(self.true_cameras, self._backdrop_seed)
@@ -118,7 +118,7 @@ class Studio:
 
     def scene(self, time: int) -> TexturedMesh:
         """The performers' surface at index `time`, which may lie beyond the capture's frames."""
-        return self.performer.pose(time / self.config.fps).to(self.config.device)
+        return self.performer.pose(time / self.config.fps)
 
     def read(self, time: int) -> MultiViewFrame:
         """All cameras at index `time`: images and masks with the imperfections, and the true depth.
@@ -150,7 +150,9 @@ class Studio:
     def _draw(
         self, cameras: Cameras, time: int, backdrop: Float[Tensor, "view 3 height width"] | None
     ) -> MultiViewFrame:
-        return replace(render(self._surface(time), cameras, backdrop, self.config.samples_per_side), time=time)
+        behind, samples = None if backdrop is None else backdrop.cpu(), self.config.samples_per_side
+        drawn = render(self._surface(time), cameras.to("cpu"), behind, samples)
+        return replace(drawn, time=time).to(self.config.device)
 
     def _surface(self, time: int) -> Surface:
         last = self._last_surface
@@ -165,7 +167,7 @@ class Studio:
         last = self._last_pyramid
         if last is not None and [*map(id, last[0])] == [*map(id, textures)]:
             return last[1]
-        pyramid = texture_pyramid(textures).to(self.config.device)
+        pyramid = texture_pyramid(textures)
         self._last_pyramid = (textures, pyramid)
         return pyramid
 
