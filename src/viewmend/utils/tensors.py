@@ -7,7 +7,7 @@ would occupy several times what it stores. So they are copied to their own memor
 import mmap
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ T = TypeVar("T")
 class OnDevice:
     """Base class of dataclasses of tensors."""
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self: T, device: torch.device | str) -> T:
         """The same with all tensors on `device`."""
         return to_device(self, device)
 
