@@ -163,7 +163,7 @@ def completed_views(
     scene: LeaveOneOutScene, options: argparse.Namespace, number: int
 ) -> Iterator[tuple[str, CompletedView, TrueView]]:
     """The first frame of a scene by each model, and the truth."""
-    frame = next(iter(scene.frames("cpu")))
+    frame = next(iter(scene.frames()))
     truth, target = true_view(frame.truth, options.background), frame.truth.cameras
     geometry = None if options.proxy == "hull" else other_geometry(scene, frame.inputs, target, options.proxy, number)
     for model in options.models:

@@ -90,7 +90,6 @@ def test_fine_tuning_refuses_captures_reserved_for_tests(capture, models, tmp_pa
         (["views", "--minutes", "nan"], "minutes of nan"),
         (["views", "--batch", "0"], "batch of 0"),
         (["views", "--cameras", "3", "80"], "--cameras MIN MAX of 4 to 60"),
-        (["views", "--data-device", "abacus"], "abacus"),
         (["views", "--performers", "nowhere", "--motions", "nowhere"], "nowhere: expected"),
         (["dstt", "--from", "absent.pth"], "absent.pth: expected a file of weights, found none"),
         (["fuseformer", "--size-px", "64", "108"], "frames of 432x240"),

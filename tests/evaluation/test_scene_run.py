@@ -45,7 +45,7 @@ class Precomputed(LeaveOneOutScene):
     made: list
     definition = "precomputed"
 
-    def frames(self, device):
+    def frames(self):
         yield from self.made
 
 
@@ -56,7 +56,7 @@ def turning() -> Precomputed:
     config = replace(scene.config, cameras=4, frames=5, samples_per_side=1, fps=6)
     scene = replace(scene, config=config, held="cam00", scored_from=3)
     kind = {name: getattr(scene, name) for name in ("name", "set", "rig", "style", "held", "scored_from")}
-    return Precomputed(made=list(scene.frames("cpu")), **kind)
+    return Precomputed(made=list(scene.frames()), **kind)
 
 
 def test_long_sets_are_the_same_scenes_with_a_full_window_before_the_scored_frames():
@@ -70,7 +70,7 @@ def test_long_sets_are_the_same_scenes_with_a_full_window_before_the_scored_fram
 
 
 def test_surface_visible_only_in_the_past_is_known(turning):
-    frames = list(turning.frames("cpu"))
+    frames = list(turning.frames())
     assert [f.seen is not None for f in frames] == [False, False, False, True, True]
     last = frames[-1]
     names = last.inputs.cameras.names
@@ -182,7 +182,7 @@ def test_the_truth_of_past_frames_is_revealed(small_scenes, scored, monkeypatch)
 
 
 def test_classical_fills_get_white_views_and_keep_known_pixels(small_scenes):
-    frame = next(small_scenes[0].frames("cpu"))
+    frame = next(small_scenes[0].frames())
     stream = Stream(Telea())
     stream.add_frame(frame.inputs)
     view, nothing = stream.render(frame.truth.cameras), ContextProvider(lambda *_: None)

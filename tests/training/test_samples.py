@@ -92,7 +92,7 @@ def test_training_views_equal_evaluated_views():
         true_view=lambda held, time: studio.truth(studio.true_cameras.select([held]), time),
     )
     camera, stream = HeldOutCamera(rig, scene.held, HullConfig()), Stream(Unfilled())
-    for frame in scene.frames("cpu"):
+    for frame in scene.frames():
         cached, time = stream.add_frame(frame.inputs), frame.inputs.time
         sample = camera.sample(time, (time,), RenderConfig(), replace(SAMPLING, num_ray_views=4))
         assert sample is not None and sample.truth.any()

@@ -64,12 +64,11 @@ def split_recipe(arguments: Sequence[str]) -> tuple[str, Sequence[str]]:
 
 def check_scenes(scenes: SceneConfig) -> None:
     """Raise ValueError if such scenes cannot be made on this machine."""
-    from viewmend.cli.checks import check_device, check_people
+    from viewmend.cli.checks import check_people
 
     if not 4 <= scenes.cameras[0] <= scenes.cameras[1] <= 60:
         raise ValueError(f"expected --cameras MIN MAX of 4 to 60, got {scenes.cameras}; for example 6 8")
     check_people(scenes.performers, scenes.motions)
-    check_device(scenes.data_device)
 
 
 def run(options: Options) -> int:

@@ -28,6 +28,7 @@ from viewmend.models.registry import error_model_for, make_method
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import Picture, picture
+from viewmend.utils.tensors import to_device
 
 __all__ = ["SLOW_MS", "MethodRun", "RunSettings", "SceneRun", "evaluate_scene"]
 
@@ -132,7 +133,7 @@ def evaluate_scene(
 def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
     most, last = -1, None
     config = replace(settings.stream, render=replace(settings.stream.render, error_rule="holes"))
-    for frame in scene.frames(settings.device):
+    for frame in (to_device(own, settings.device) for own in scene.frames()):
         stream = Stream(Unfilled(), config, frame.bounds)
         target_mask, carving = revealed(settings.protocol, frame.truth)
         cached = stream.add_frame(frame.inputs, carving=carving)

@@ -59,8 +59,6 @@ class SceneConfig:
     """What is known of a held-out camera's mask (docs/evaluation.md); of several, one is drawn for each camera."""
     captures_fraction: float = 0.75
     """Fraction of the scenes that come from the captures, if any are given; the rest come from the studio."""
-    data_device: str = "cpu"
-    """Device that renders studio scenes and training views and computes hulls."""
     hull_resolution: Annotated[int, HIDDEN] = 96
     """Voxels along the longest side of the hull; lower than at run time, as each held-out camera needs its own hull."""
 

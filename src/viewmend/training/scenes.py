@@ -96,7 +96,6 @@ def random_studio(config: SceneConfig, frames: int, random: Random, split: Split
             calibration_m=0.003 * strength * random.random(),
             jpeg_quality=random.randint(70, 95) if flawed and random.random() < 0.5 else None,
         ),
-        device=config.data_device,
     )
     if config.hard_fraction and random.random() < config.hard_fraction:
         it, factor = studio.imperfections, random.uniform(1, HARD_CALIBRATION)
@@ -130,9 +129,9 @@ class CaptureRigs:
         own = self.held_back[which] if self.held_back else None
         last = (len(capture.frame_ids) if own is None else own.first_frame) - 1
         first = random.randint(0, max(0, last - max(self.frames)))
-        size_px, device = random.choice(self.config.sizes_px), self.config.data_device
+        size_px = random.choice(self.config.sizes_px)
         times = sorted({min(first + offset, last) for offset in self.frames})
-        frames = {time: limit_size(capture.read(time), size_px).to(device) for time in times}
+        frames = {time: limit_size(capture.read(time), size_px) for time in times}
         if own is not None and own.camera is not None:
             frames = {time: frame.without([own.camera]) for time, frame in frames.items()}
         # A camera without an image at some of these frames cannot be held out there.
@@ -143,7 +142,7 @@ class CaptureRigs:
             if (which, held) not in self._prepared:  # aligned when this camera is first held out
                 others = [n for n in capture.cameras.names if n != held and (own is None or n != own.camera)]
                 self._prepared[which, held] = prepare(capture, others, match_colours=False)
-            return replace(self._prepared[which, held], max_image_size=size_px).cameras.to(device)
+            return replace(self._prepared[which, held], max_image_size=size_px).cameras
 
         return Scene(LeaveOneOut(frames, capture.bounds, cameras), random, held_out)
 
@@ -216,5 +215,5 @@ def sample_scenes(config: SceneConfig, sampling: SamplingConfig, seed: str) -> S
 
 def validation_scenes(config: SceneConfig, sampling: SamplingConfig) -> SampleScenes:
     """The samples of procedural people reserved for validation, one held-out view per scene."""
-    config = replace(config, num_holdout_views=1, performers=None, motions=None, data_device="cpu")
+    config = replace(config, num_holdout_views=1, performers=None, motions=None)
     return SampleScenes(StudioRigs(config, sampling.frames, "validation", "validation"), config, sampling)

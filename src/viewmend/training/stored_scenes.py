@@ -132,7 +132,7 @@ def _check(frame: MultiViewFrame, cameras: Cameras) -> None:
 def store_scene(scene: Scene, config: SceneConfig) -> StoredScene:
     """The first frame of a rig, with `num_holdout_views` of its cameras held out in turn."""
     rig, time = scene.rig, min(scene.rig.frames)
-    frame = rig.frames[time].to("cpu")
+    frame = rig.frames[time]
     names = [name for name in frame.cameras.names if scene.held_out in (None, name)]
     held = scene.random.sample(names, min(config.num_holdout_views, len(names)))
     depth = StoredDepth.of(None if frame.depth is None else frame.depth[:, ::2, ::2])
@@ -141,14 +141,14 @@ def store_scene(scene: Scene, config: SceneConfig) -> StoredScene:
 
 
 def _store_view(scene: Scene, name: str, time: int, hull: HullConfig) -> StoredView:
-    proxy, truth = HeldOutCamera(scene.rig, name, hull).frame(time).proxy, scene.rig.truth(name, time).to("cpu")
+    proxy, truth = HeldOutCamera(scene.rig, name, hull).frame(time).proxy, scene.rig.truth(name, time)
     assert isinstance(proxy, GeometryProxy), "the proxy of a held-out camera is a hull"
-    mesh, bounds = proxy.mesh.to("cpu"), proxy.bounds.to("cpu")
+    mesh, bounds = proxy.mesh, proxy.bounds
     vertices = (STEPS * (mesh.vertices - bounds.low) / bounds.size_m).round().clamp(0, STEPS).to(torch.uint16)
     indices = mesh.faces.flatten().int()
     return StoredView(
         name,
-        scene.rig.calibration(name, time).to("cpu"),
+        scene.rig.calibration(name, time),
         _on_black(truth),
         StoredDepth.of(truth.depth),
         vertices,

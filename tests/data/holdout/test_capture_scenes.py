@@ -43,7 +43,7 @@ def folders(tmp_path_factory):
 
 
 def test_what_the_camera_left_out_saw_changes_the_truth_alone(folders):
-    exact, other = (list(capture_set(folder)[2].frames("cpu")) for folder in folders)
+    exact, other = (list(capture_set(folder)[2].frames()) for folder in folders)
     assert [frame.truth.cameras.names for frame in exact] == [("c2",)] * 2
     for one, two in zip(exact, other, strict=True):
         assert one.inputs.cameras.names == two.inputs.cameras.names == ("c0", "c1", "c3", "c4", "c5")
@@ -56,7 +56,7 @@ def test_what_the_camera_left_out_saw_changes_the_truth_alone(folders):
 
 def test_it_is_aligned_by_those_that_are_looked_at(folders):
     """The camera that lies beside pulls all others with it, where it is not left out."""
-    pulled, clean = (next(capture_set(folders[1])[held].frames("cpu")).inputs.cameras for held in (0, 2))
+    pulled, clean = (next(capture_set(folders[1])[held].frames()).inputs.cameras for held in (0, 2))
     assert float((pulled.select(["c3"]).K - clean.select(["c3"]).K).abs().max()) > 0.3
 
 
@@ -140,7 +140,7 @@ def test_the_command_writes_what_evaluate_takes(captures, tmp_path, capsys):
         assert [scene.held for scene in scenes] == [scene.left_out for scene in test]
         assert all(len(scene.inputs) == 4 and scene.held not in scene.inputs for scene in scenes)
         assert scenes_of(str(out), RunOptions(out=tmp_path)) == list(scenes)
-        frame = next(iter(scenes[0].frames("cpu")))
+        frame = next(iter(scenes[0].frames()))
         assert frame.truth.cameras.names == (scenes[0].held,) and len(frame.inputs.cameras) == 4
         assert main(["splits", *everything, "--out", str(out)]) == 2
         assert "published splits must not change" in capsys.readouterr().err

@@ -41,7 +41,7 @@ def test_every_rig_meets_every_tempo_equally_often():
 def test_a_stage_behind_p_changes_the_images_and_neither_people_nor_rig():
     plain, staged = (procedural_set(1, 64, background)[0] for background in ("black", "stage"))
     assert (staged.name, staged.set, staged.held) == ("P-stage-10000", "P-stage", plain.held)
-    black, behind = (next(scene.frames("cpu")).inputs for scene in (plain, staged))
+    black, behind = (next(scene.frames()).inputs for scene in (plain, staged))
     assert torch.equal(black.mask, behind.mask)
     outside = (black.mask == 0)[:, None].expand_as(black.rgb)
     assert not black.rgb[outside].any() and float(behind.rgb[outside].float().mean()) > 20
@@ -69,7 +69,7 @@ def test_no_people_is_an_error_that_names_the_places(tmp_path):
 def test_the_left_out_camera_is_none_of_the_inputs_and_true_motion_explains_the_truth():
     config = StudioConfig(seed=1, cameras=5, frames=2, size_px=96)
     scene = StudioScene(name="s", set="A", rig="", style="", config=config, held="cam02", tempo="calm")
-    first, second = scene.frames("cpu")
+    first, second = scene.frames()
     for frame in (first, second):
         assert frame.truth.cameras.names == (scene.held,) and scene.held not in frame.inputs.cameras.names
         assert frame.inputs.depth is None, "methods may not see true geometry"

@@ -48,15 +48,14 @@ class CaptureScene(LeaveOneOutScene):
         raw = [name for name in ("align", "match_colours") if not getattr(self, name)]
         return repr((self.fingerprint, self.held, self.inputs, self.count, *raw))
 
-    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
+    def frames(self) -> Iterator[LeaveOneOutFrame]:
         """Frames in which the camera that was left out, and at least two of the inputs, have images."""
         opened = open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.format)
         capture = prepare(opened, self.inputs, align=self.align, match_colours=self.match_colours)
-        bounds = None if capture.bounds is None else capture.bounds.to(device)
         for time in range(self.count):
-            frame = capture.read(time).to(device)
+            frame = capture.read(time)
             if self.held in frame.cameras.names and len(frame.cameras) >= 3:
-                yield LeaveOneOut({time: frame}, bounds).frame(self.held, time)
+                yield LeaveOneOut({time: frame}, capture.bounds).frame(self.held, time)
 
 
 def capture_set(

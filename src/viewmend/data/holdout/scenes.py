@@ -131,5 +131,5 @@ class LeaveOneOutScene(ABC):
         """All that its frames depend on, in words that are the same on every machine."""
 
     @abstractmethod
-    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
-        """The scene's frames in order of time, on a device."""
+    def frames(self) -> Iterator[LeaveOneOutFrame]:
+        """The scene's frames in order of time."""

@@ -50,22 +50,22 @@ class StudioScene(LeaveOneOutScene):
 
     @property
     def definition(self) -> str:
-        """The studio's config without paths and device, and what else matters."""
-        config = replace(self.config, performers=None, motions=None, device="cpu")
+        """The studio's config without paths, and what else matters."""
+        config = replace(self.config, performers=None, motions=None)
         longer = (self.scored_from, self.motion) if self.scored_from or self.motion else ()
         return repr((config, self.held, self.tempo, self.files_sha256, *longer))
 
-    def studio(self, device: str = "cpu") -> Studio:
+    def studio(self) -> Studio:
         """The studio with its people: frames of all cameras, the one that is left out among them."""
-        config = replace(self.config, device=device)
+        config = self.config
         if self.tempo is None:
             return Studio(config)
         alone = {} if self.motion is None else {"motion": self.motion, "people": 1, "furniture": False}
         return Studio(config, procedural_scene(config.seed, style=PerformerStyle(tempo=self.tempo, **alone)))
 
-    def frames(self, device: str) -> Iterator[LeaveOneOutFrame]:
+    def frames(self) -> Iterator[LeaveOneOutFrame]:
         """Renders them, one at a time. Of those before the first that is scored, only what a context needs is made."""
-        studio = self.studio(device)
+        studio = self.studio()
 
         def true_view(held: str, time: int) -> MultiViewFrame:
             return studio.truth(studio.true_cameras.select([held]), time)
@@ -77,14 +77,14 @@ class StudioScene(LeaveOneOutScene):
             frame = LeaveOneOut({time: drawn}, true_view=true_view).frame(self.held, time)
             scored = time >= self.scored_from
             if self.scored_from:
-                mesh = studio.scene(time).mesh.to(device)
+                mesh = studio.scene(time).mesh
                 surfaces[time] = TrueSurface.of(drawn.without((self.held,)), mesh)
                 surfaces.pop(time - paper().window - 1, None)
                 if scored:
                     seen = surface_seen(surfaces, window_times(time, paper()), mesh, frame.truth.cameras)
                     frame = replace(frame, seen=seen)
             if scored and before is not None and before.depth is not None:
-                now, then = (studio.scene(t).mesh.to(device) for t in (time, time - 1))
+                now, then = (studio.scene(t).mesh for t in (time, time - 1))
                 flow_px = backward_flow(now, then, before.depth[0], frame.truth.cameras)
                 frame = replace(frame, backward_flow_px=flow_px)
             yield frame

@@ -59,8 +59,6 @@ class StudioConfig:
     """Each pixel is the mean of this many samples squared."""
     imperfections: Imperfections = field(default_factory=Imperfections)
     """Imperfections of the capture; none by default."""
-    device: str = "cpu"
-    """Device of the frames; they are drawn on the CPU."""
 
 
 class Studio:
@@ -90,8 +88,8 @@ class Studio:
         """Six digits each, from 000000."""
         self.fps = float(config.fps) if config.frames > 1 else None
         """Frames per second, None for a single frame."""
-        self.up = torch.tensor([0.0, 1.0, 0.0], device=config.device)
-        self.true_cameras = cameras.to(config.device)
+        self.up = torch.tensor([0.0, 1.0, 0.0])
+        self.true_cameras = cameras
         """True poses of the cameras; `cameras` has the calibration errors of the capture."""
         self.cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
         """The calibration of the capture, including its errors."""
@@ -113,7 +111,7 @@ class Studio:
             corners = [self.performer.pose(int(t) / self.config.fps).mesh.vertices.aminmax(dim=0) for t in times]
             low = torch.stack([c.min for c in corners]).amin(0) - BOUNDS_MARGIN_M
             high = torch.stack([c.max for c in corners]).amax(0) + BOUNDS_MARGIN_M
-            self._bounds = Bounds(low, high).to(self.config.device)
+            self._bounds = Bounds(low, high)
         return self._bounds
 
     def scene(self, time: int) -> TexturedMesh:
@@ -138,7 +136,6 @@ class Studio:
         Colours are the subject's own, not darkened where the mask is soft: times the mask, they are the view on black.
         With `on_stage`, and a stage, they include what is behind soft pixels, as in the images of real cameras.
         """
-        cameras = cameras.to(self.config.device)
         if on_stage and self._backdrop is not None:
             return self._draw(cameras, time, stage_backdrop(cameras, self._backdrop_seed))
         frame = self._draw(cameras, time, None)
@@ -150,9 +147,7 @@ class Studio:
     def _draw(
         self, cameras: Cameras, time: int, backdrop: Float[Tensor, "view 3 height width"] | None
     ) -> MultiViewFrame:
-        behind, samples = None if backdrop is None else backdrop.cpu(), self.config.samples_per_side
-        drawn = render(self._surface(time), cameras.to("cpu"), behind, samples)
-        return replace(drawn, time=time).to(self.config.device)
+        return replace(render(self._surface(time), cameras, backdrop, self.config.samples_per_side), time=time)
 
     def _surface(self, time: int) -> Surface:
         last = self._last_surface
