@@ -215,19 +215,10 @@ def _digest(parts: list[Any]) -> str:
 
 
 def _cell(values: dict[str, Any]) -> Cell:
-    values = dict(values)
-    if set(values) != set(STORED):
-        raise ValueError(f"expected a cell with {sorted(STORED)}, got {sorted(values)}")
-    values["key"] = typed(values["key"], CellKey)
-    values["frames"] = tuple(typed(values["frames"], list[ViewScores]))
-    values["step_ms"] = tuple(typed(values["step_ms"], list[float]))
-    values["provenance"] = typed(values["provenance"], Provenance)
-    for name in ("set", "rig", "style", "identity"):
-        typed(values[name], str)
-    typed(values["error"], str | None)
-    numbers = [n for frame in values["frames"] for n in asdict(frame).values() if n is not None]
-    if len(values["step_ms"]) != len(values["frames"]) or not all(map(math.isfinite, [*numbers, *values["step_ms"]])):
+    cell: Cell = typed(values, Cell)
+    numbers = [n for frame in cell.frames for n in asdict(frame).values() if n is not None]
+    if len(cell.step_ms) != len(cell.frames) or not all(map(math.isfinite, [*numbers, *cell.step_ms])):
         raise ValueError("expected finite scores and a duration for each frame")
-    if any(frame.image_px < 1 for frame in values["frames"]):
+    if any(frame.image_px < 1 for frame in cell.frames):
         raise ValueError("expected scores of at least one pixel")
-    return Cell(**values)
+    return cell
