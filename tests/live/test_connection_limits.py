@@ -132,14 +132,15 @@ class Timers:
 
 
 def test_turns_are_taken_one_at_a_time_with_pauses_and_new_connections_first():
-    clock, taken = FakeClock(), []
+    clock, spent, taken = FakeClock(), FakeClock(), []
     timers = Timers(clock)
-    scheduler = FairScheduler(clock, timers.call_later)
+    scheduler = FairScheduler(clock, timers.call_later, spent)
 
-    def turn(name, takes_s=0.0):
+    def turn(name, takes_s=0.0, elsewhere_s=0.0):
         def callback():
             taken.append((name, clock()))
-            clock.advance(takes_s)
+            clock.advance(takes_s + elsewhere_s)
+            spent.advance(takes_s)
 
         return callback
 
@@ -158,6 +159,12 @@ def test_turns_are_taken_one_at_a_time_with_pauses_and_new_connections_first():
     pause_s = 0.03 * (1 + limits.PAUSE_FACTOR)
     assert starts[1] - starts[0] == pytest.approx(pause_s)
     assert starts[2] - starts[1] == starts[3] - starts[2] == pytest.approx(limits.MIN_PAUSE_S)
+    clock.advance(1.0)
+    for name in ("interrupted", "next"):
+        scheduler.submit(turn(name, elsewhere_s=0.5), False)
+    while timers.planned:
+        timers.run_next()
+    assert taken[-1][1] - taken[-2][1] == pytest.approx(0.5 + limits.MIN_PAUSE_S), "other programs prolong no pause"
     clock.advance(1.0)
     for callback in (lambda: 1 / 0, turn("alone")):
         scheduler.submit(callback, False)

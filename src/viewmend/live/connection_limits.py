@@ -35,7 +35,7 @@ UNREAD_S, UNREAD_BYTES = 20.0, 64_000
 PIECE_BYTES = 4096
 """Unauthenticated input is handed to uvicorn in pieces of at most this size."""
 PAUSE_FACTOR, MIN_PAUSE_S = 4.0, 0.005
-"""After a turn, unauthenticated clients wait for this multiple of its duration, and at least for this long."""
+"""After a turn, unauthenticated clients wait for this multiple of its processor time, and at least for this long."""
 TOO_LARGE = b"\x88\x02\x03\xf1"
 """A WebSocket close frame with code 1009, message too large."""
 STATE_KEY = "connection"
@@ -51,10 +51,16 @@ class FairScheduler:
     """
 
     def __init__(
-        self, now: Callable[[], float], call_later: Callable[[float, Callable[[], None]], object] | None = None
+        self,
+        now: Callable[[], float],
+        call_later: Callable[[float, Callable[[], None]], object] | None = None,
+        spent: Callable[[], float] = time.thread_time,
     ) -> None:
-        """Set up a scheduler; `call_later` is the running event loop's by default."""
-        self._now, self._call_later = now, call_later
+        """Set up a scheduler; `call_later` is the running event loop's by default.
+
+        `spent` is the thread's processor time: other programs must not prolong the pauses.
+        """
+        self._now, self._call_later, self._spent = now, call_later, spent
         self._waiting: deque[Callable[[], None]] = deque()
         self._free_at_s = 0.0
         self._is_planned = False
@@ -76,13 +82,13 @@ class FairScheduler:
             call_later(max(0.0, self._free_at_s - self._now()), self._run_next)
 
     def _run_next(self) -> None:
-        start_s = self._now()
+        start_s = self._spent()
         try:
             if self._waiting:
                 self._waiting.popleft()()
         finally:
-            end_s = self._now()
-            self._free_at_s = end_s + max(MIN_PAUSE_S, PAUSE_FACTOR * (end_s - start_s))
+            pause_s = max(MIN_PAUSE_S, PAUSE_FACTOR * (self._spent() - start_s))
+            self._free_at_s = self._now() + pause_s
             self._is_planned = False
             self._plan()
 
