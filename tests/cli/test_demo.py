@@ -55,7 +55,7 @@ def test_the_same_seed_gives_the_same_picture(tmp_path, capsys):
 
 def test_counts_must_be_positive(tmp_path, capsys):
     assert main(["demo", "--out", str(tmp_path / "a"), "--frames", "0"]) == 2
-    assert "positive --frames" in capsys.readouterr().err
+    assert "--frames of at least 1, got 0" in capsys.readouterr().err
     assert not (tmp_path / "a").exists()
 
 

@@ -34,8 +34,8 @@ def test_a_report_is_written_in_every_format_and_repeated_exactly(tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["P", "--scenes", "0"], "positive numbers, got --scenes 0"),
-        (["P", "--every", "0"], "positive numbers, got --every 0"),
+        (["P", "--scenes", "0"], "--scenes of at least 1, got 0"),
+        (["P", "--every", "0"], "--every of at least 1, got 0"),
         (["P", "--num-source-views", "0"], "expected --num-source-views of at least 1, got 0"),
         ([], "got no set"),
         (["Q"], "expected --performers DIR"),

@@ -58,7 +58,7 @@ def test_other_shards_are_not_overwritten(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--count", "0"], "a positive --count"), (["--shards", "x"], "Unrecognized"), (["tokens"], "a recipe among")],
+    [(["--count", "0"], "--count of at least 1"), (["--shards", "x"], "Unrecognized"), (["tokens"], "a recipe among")],
 )
 def test_mistakes_are_reported(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

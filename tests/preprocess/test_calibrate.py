@@ -89,7 +89,7 @@ WRONG = {
     "markers": (["--board", "8x6:0.1:0.2"], "markers smaller than squares"),
     "dictionary": (["--board", BOARD, "--dictionary", "5X5"], "a dictionary of OpenCV"),
     "another dictionary": (["--board", BOARD, "--dictionary", "DICT_4X4_50"], "in 5 images or more, found it in 0"),
-    "every": (["--board", BOARD, "--every", "0"], "--every and --num-frames of at least 1"),
+    "every": (["--board", BOARD, "--every", "0"], "--every of at least 1"),
     "nothing": ([], "either --board or --silhouettes"),
 }
 

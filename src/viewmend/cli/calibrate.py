@@ -45,15 +45,13 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; the exit code."""
+    from viewmend.cli.checks import check_least
     from viewmend.cli.console import print_json, say, show
     from viewmend.data.native_writer import atomic_folder
 
     if (options.board is not None) == options.silhouettes:
         raise ValueError("expected either --board or --silhouettes, got both or neither; choose one of them")
-    if options.every < 1 or options.num_frames < 1:
-        raise ValueError(
-            f"expected --every and --num-frames of at least 1, got {options.every} and {options.num_frames}"
-        )
+    check_least(options, every=1, num_frames=1)
     with atomic_folder(options.out) as unfinished:
         figures = (_by_silhouettes if options.silhouettes else _by_board)(options, unfinished)
     if options.json:

@@ -33,10 +33,7 @@ class ViewOptions:
         """The renderer's configuration; ValueError for options that are out of range."""
         from viewmend.rendering.view import RenderConfig
 
-        if self.num_source_views < 1:
-            raise ValueError(
-                f"expected --num-source-views of at least 1, got {self.num_source_views}; the paper uses 3"
-            )
+        check_least(self, num_source_views=1)
         return RenderConfig(
             cameras=self.num_source_views,
             selection=self.view_selection,
@@ -55,6 +52,14 @@ class PreparationOptions:
     match_colours: Annotated[bool, NEGATED] = True
     """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one frame, if they then
     agree better on held-out surface points."""
+
+
+def check_least(options: object, **least: float) -> None:
+    """Raise a ValueError for an option below its least value; options without a value are skipped."""
+    for name, low in least.items():
+        value = getattr(options, name)
+        if value is not None and not value >= low:
+            raise ValueError(f"expected --{name.replace('_', '-')} of at least {low}, got {value}; see --help")
 
 
 def check_device(name: str) -> None:

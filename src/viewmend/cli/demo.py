@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from viewmend.cli.checks import ViewOptions
+from viewmend.cli.checks import ViewOptions, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -49,9 +49,7 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; the exit code."""
-    wrong = [name for name in ("frames", "size", "cameras") if getattr(options, name) < 1]
-    if wrong:
-        raise ValueError(f"expected a positive --{wrong[0]}, got {getattr(options, wrong[0])}; see --help")
+    check_least(options, frames=1, size=1, cameras=1)
     from viewmend.cli.checks import load_named
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import in_words

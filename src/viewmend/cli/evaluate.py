@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, ViewOptions, check_device
+from viewmend.cli.checks import PreparationOptions, ViewOptions, check_device, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
 """Files in OUT besides cells, models and samples."""
 LONG_SETS = ("P-long", "Q-long", "P-turn")
-POSITIVE = ("frames", "every", "scenes", "size", "jobs", "shown")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,10 +239,9 @@ def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
 
 
 def _check(options: RunOptions, sets: tuple[str, ...]) -> None:
-    wrong = [n for n in POSITIVE if (v := getattr(options, n)) is not None and v < 1]
-    if wrong or not sets:
-        got = f"--{wrong[0].replace('_', '-')} {getattr(options, wrong[0])}" if wrong else "no set"
-        raise ValueError(f"expected at least one set, and positive numbers, got {got}; P needs nothing")
+    check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1)
+    if not sets:
+        raise ValueError("expected at least one set, got no set; P needs nothing")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     check_device(options.device)

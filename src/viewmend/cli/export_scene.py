@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions
+from viewmend.cli.checks import PreparationOptions, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -53,11 +53,9 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command; the exit code."""
-    if options.views < 1 or not 0 <= options.min_confidence <= 1:
-        raise ValueError(
-            f"expected --views of at least 1 and --min-confidence from 0 to 1, got {options.views} and "
-            f"{options.min_confidence}; choose again"
-        )
+    check_least(options, views=1)
+    if not 0 <= options.min_confidence <= 1:
+        raise ValueError(f"expected --min-confidence from 0 to 1, got {options.min_confidence}; choose again")
     from viewmend.cli.checks import chosen_times, load_named
     from viewmend.cli.console import say, track
     from viewmend.data.prepare import open_masked

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, TypeVar
 
+from viewmend.cli.checks import check_least
 from viewmend.cli.train import check_scenes, split_recipe
 from viewmend.training.config import FLAT, HIDDEN, ObjectiveConfig, SceneConfig
 
@@ -51,8 +52,7 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
     default = Options(recipe=name, objective=config.objective, scenes=config.scenes, workers=config.workers)
     flags = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
     options = tyro.cli(Options, args=list(rest), default=default, prog=f"{prog} {name}", config=flags)
-    if options.count < 1 or options.workers < 0:
-        raise ValueError(f"expected a positive --count and --workers, got {options.count} and {options.workers}")
+    check_least(options, count=1, workers=0)
     check_scenes(options.scenes)
     return options
 

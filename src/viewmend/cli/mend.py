@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, ViewOptions
+from viewmend.cli.checks import PreparationOptions, ViewOptions, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -132,8 +132,7 @@ def _check(options: Options) -> None:
         raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path: no camera has its mask")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
-    if options.top_k is not None and options.top_k < 1:
-        raise ValueError(f"expected --top-k of at least 1 token, got {options.top_k}; omit it to keep all")
+    check_least(options, top_k=1)
 
 
 def _open(options: Options, held: tuple[str, ...]) -> "NativeCapture":

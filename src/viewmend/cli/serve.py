@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, ViewOptions
+from viewmend.cli.checks import PreparationOptions, ViewOptions, check_least
 from viewmend.training.config import FLAT
 from viewmend.utils.plugins import import_object
 
@@ -128,13 +128,10 @@ def run(options: Options) -> int:
 
 def _check(options: Options) -> None:
     """Raise a ValueError for an option that is out of range, before anything heavy is imported."""
-    positive = ("max_image_size", "viewers", "cameras", "frames", "size", "memory_mb", "replicas")
-    checks = [(name, getattr(options, name) > 0, "positive") for name in positive]
-    checks += [
-        ("cameras", options.source != "studio" or options.cameras >= 4, "at least 4"),
+    at_least_1 = ("max_image_size", "viewers", "frames", "size", "memory_mb", "replicas")
+    check_least(options, **dict.fromkeys(at_least_1, 1), cameras=4, budget_ms=0, max_replicas=options.replicas)
+    checks = [
         ("fps", options.fps is None or 0 < options.fps <= 240, "above 0 and at most 240"),
-        ("budget_ms", options.budget_ms >= 0, "0 or more"),
-        ("max_replicas", (options.max_replicas or options.replicas) >= options.replicas, "at least --replicas"),
         ("port", 0 <= options.port <= 65535, "from 0 to 65535"),
         ("riftcast_port", 0 <= (options.riftcast_port or 0) <= 65535, "from 0 to 65535"),
     ]

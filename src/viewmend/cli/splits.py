@@ -36,6 +36,7 @@ def run(options: Options) -> int:
     """Run the command; the exit code."""
     import re
 
+    from viewmend.cli.checks import check_least
     from viewmend.cli.console import say, show
     from viewmend.data.holdout.capture_scenes import make_splits, splits_json
     from viewmend.utils.atomic_writes import remove_partial_file, write_text
@@ -48,8 +49,7 @@ def run(options: Options) -> int:
         raise ValueError(
             f"expected --test-fraction between 0 and 1, got {options.test_fraction}; the paper has 7 of 79"
         )
-    if options.scenes is not None and options.scenes < 2:
-        raise ValueError(f"expected --scenes of at least 2, got {options.scenes}; leave it out for all captures")
+    check_least(options, scenes=2)
     remove_partial_file(options.out)
     splits = make_splits(
         options.captures,

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from viewmend.cli.checks import check_least
+
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
@@ -41,9 +43,7 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command and return the exit code."""
-    for name, low in {"scenes": 1, "cameras": 4, "frames": 1, "size": 1, "seed": 0}.items():
-        if getattr(options, name) < low:
-            raise ValueError(f"expected --{name} of at least {low}, got {getattr(options, name)}; see --help")
+    check_least(options, scenes=1, cameras=4, frames=1, size=1, seed=0)
     from viewmend.cli.console import print_json, say, track
     from viewmend.data.errors import CaptureError
     from viewmend.data.native_writer import remove_unfinished, write_capture

@@ -26,13 +26,12 @@ class Options:
 def run(options: Options) -> int:
     """Serve on a free port until interrupted."""
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported: the browser needs cores, too
-    from viewmend.cli.checks import load_named, log_preparation
+    from viewmend.cli.checks import check_least, load_named, log_preparation
     from viewmend.cli.console import say
     from viewmend.data.prepare import open_masked, prepare
     from viewmend.live.viewer import serve
 
-    if options.max_image_size < 1:
-        raise ValueError(f"--max-image-size must be positive, got {options.max_image_size}")
+    check_least(options, max_image_size=1)
     capture = prepare(open_masked(options.capture), max_image_size=options.max_image_size)
     log_preparation(capture)
     with serve(capture, load_named(options.model, options.device), device=options.device) as viewer:
