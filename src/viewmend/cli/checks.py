@@ -54,7 +54,7 @@ class PreparationOptions:
     agree better on held-out surface points."""
 
 
-def check_least(options: object, **least: float) -> None:
+def check_least(options: object, **least: int) -> None:
     """Raise a ValueError for an option below its least value; options without a value are skipped."""
     for name, low in least.items():
         value = getattr(options, name)
