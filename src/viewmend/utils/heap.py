@@ -23,6 +23,8 @@ ARENAS = 1
 LARGE_BYTES = 8_000_000
 """Larger buffers are mapped separately and unmapped after use; no moving view needs one. By default, glibc raises this
 threshold up to 32 MB."""
+KERNELS = 64
+"""Compiled convolutions that oneDNN keeps, each for one size of image. By default 1024, which fill 150 MB and more."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 
 
@@ -39,7 +41,8 @@ def _glibc() -> ctypes.CDLL | None:
 
 
 def configure_allocator() -> bool:
-    """Set the allocator's options, before threads are started; True on success."""
+    """Set the allocator's options and oneDNN's, before threads are started and images processed; True on success."""
+    os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", str(KERNELS))
     library = _glibc()
     options = ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE_BYTES), (_M_TRIM_THRESHOLD, TOP_BYTES))
     return library is not None and all(library.mallopt(*option) == 1 for option in options)
