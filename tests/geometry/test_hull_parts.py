@@ -68,6 +68,24 @@ def test_a_part_that_covers_a_strip_by_chance_is_dropped(rows_covered, stays):
     assert torch.equal(after[20:], values[20:]) and bool(after[:20].any()) == stays
 
 
+@pytest.mark.parametrize(("side", "stays"), [(2, False), (6, True)])
+def test_a_speck_is_dropped_and_a_small_ball_stays(side, stays):
+    values = torch.zeros(40, 40, 40)
+    values[5:25, 5:25, 5:25] = 1.0
+    values[32 : 32 + side, 32 : 32 + side, 32 : 32 + side] = 1.0
+    grid = OccupancyGrid(values, torch.full((3,), -0.5), 0.025)
+    after = without_floating_parts(grid, dome(5, width=800, height=800)).values
+    assert torch.equal(after[:30], values[:30]) and bool(after[30:].any()) == stays
+
+
+def test_the_largest_part_stays_even_if_it_is_a_speck():
+    values = torch.zeros(40, 40, 40)
+    values[10, 10, 10] = values[20:22, 20, 20] = 1.0
+    grid = OccupancyGrid(values, torch.full((3,), -0.5), 0.025)
+    after = without_floating_parts(grid, dome(5, width=800, height=800)).values
+    assert after.nonzero().tolist() == [[20, 20, 20], [21, 20, 20]]
+
+
 def kept(before, after, ball, radius):
     """Whether all within this distance is as it was."""
     index = torch.stack(torch.meshgrid(*map(torch.arange, before.values.shape), indexing="ij"), -1)

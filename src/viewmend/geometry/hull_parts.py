@@ -19,14 +19,17 @@ CELL = 1.25
 COVERED = 0.75
 """A part is not needed if the others cover this share of its image in every camera. Masks of real cameras disagree by
 strips at the outline, which a part can cover by chance."""
+SPECK = 4
+"""Nor is a part needed that covers no more than this many cells of any image on its own: a speck next to a hand. The
+largest part stays unless the others cover it."""
 MANY = 2000
 """From this count on, distinct numbers are found by marking them instead of by sorting."""
 
 
 def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGrid:
-    """The hull without the parts whose image other parts mostly cover in every camera, the smallest first.
+    """The hull without specks and without parts whose image others mostly cover in every camera, the smallest first.
 
-    What a camera sees on its own, such as a second person or a ball in the air, stays.
+    What a camera sees on its own, such as a second person or a ball in the air, stays unless it is a few voxels small.
     """
     inside = grid.values >= 0.5
     occupied = _any_in_blocks(inside)
@@ -105,7 +108,8 @@ def _unneeded(
             views.append(_Cells.of(part[own], y, x))
     dropped = []
     for candidate in sizes.argsort(kind="stable")[(sizes == 0).sum() :].tolist():
-        if all(cells.covered_by_others(candidate) >= COVERED for cells in views):
+        speck = SPECK if candidate != sizes.argmax() else 0
+        if all(cells.can_go(candidate, speck) for cells in views):
             dropped.append(candidate)
             for cells in views:
                 cells.drop(candidate)
@@ -137,9 +141,12 @@ class _Cells:
             of_part[number] = own, near
         return cls(count, of_part)
 
-    def covered_by_others(self, number: int) -> float:
-        """The share of a part's image that others cover too; 1 for one that is not in it."""
-        return float((self.count[self.of_part[number][0]] > 1).mean()) if number in self.of_part else 1.0
+    def can_go(self, number: int, speck: int) -> bool:
+        """Whether others cover all of a part's image but a small share or `speck` cells, or it is not in the image."""
+        if number not in self.of_part:
+            return True
+        own = self.of_part[number][0]
+        return int((self.count[own] <= 1).sum()) <= max(speck, (1 - COVERED) * len(own))
 
     def drop(self, number: int) -> None:
         """Take a part away."""
