@@ -17,8 +17,9 @@ from viewmend.types import MultiViewFrame
 
 LONGEST_PX = 256
 HULL = HullConfig(resolution=64)
-FAR = 2.5
-"""An image shows something else if its colour distance to the others is this many times the median."""
+FAR, FAR_AT_LEAST = 2.5, 0.09
+"""An image shows something else if its colour distance to the others is this many times the median, and at least the
+second value: where colours agree to 2 %, shadows and noise alone make a distance of three times as much."""
 FARTHER, LESS_ALIKE, MANY = 1.55, 0.72, 5
 """It also does at this lower ratio if its best correlation is below this share of the median, in rigs of at least
 this number of cameras: medians of fewer say little."""
@@ -57,7 +58,7 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     saturation = _saturation(small)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
     farther = (distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike)
-    far = (distance > FAR * typical) | (farther & (len(distance) >= MANY))
+    far = ((distance > FAR * typical) | (farther & (len(distance) >= MANY))) & (distance > FAR_AT_LEAST)
     blurred, noisy = detail < BLURRED * detail.nanmedian(), detail > NOISY * detail.nanmedian()
     mismatch, texts = "its images do not match those of the other cameras", {}
     for view in range(len(small.cameras)):
