@@ -11,9 +11,11 @@ from viewmend.models.views import pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import rim_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
+from viewmend.models.views.prediction import without_remains
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.rendering.crop import Crop
 from viewmend.stream import Stream
+from viewmend.types import CompletedView
 
 
 def context_of(stream, quality=None):
@@ -167,3 +169,28 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
     own = image_of(net(holed, sources, guess=guess, where=where), view)
     found = net.step(holed, context_of(stream, RenderQuality(refine_fraction=0.5)), State())[0].rgb
     torch.testing.assert_close(found[:, where], own[:, where], atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("side", "alpha", "rendered", "stays"),
+    [
+        (2, 1.0, False, False),
+        (6, 0.4, False, False),
+        (6, 1.0, False, True),
+        (12, 0.4, False, True),
+        (2, 1.0, True, True),
+    ],
+)
+def test_remains_of_phantoms_are_removed(scene, side, alpha, rendered, stays):
+    """Tiny islands, and small faint ones; not those of which any pixel was rendered."""
+    view = scene[1]
+    coverage, predicted = torch.zeros_like(view.mask), torch.ones_like(view.mask, dtype=torch.bool)
+    coverage[:60, :80] = 1.0
+    coverage[64 : 64 + side, 64 : 64 + side] = alpha
+    predicted[64, 64] = not rendered
+    completed = CompletedView(view, coverage.expand(3, -1, -1), coverage, coverage, 2 * coverage)
+    cleaned = without_remains(completed, predicted)
+    assert bool((cleaned.alpha[64:] > 0).any()) == stays
+    for name, image in cleaned.images.items():
+        assert torch.equal(image * (cleaned.alpha > 0), image), name
+        assert torch.equal(image[..., :64, :], completed.images[name][..., :64, :]), name

@@ -1,7 +1,10 @@
 """The depth distribution and the prediction of `ViewSynthNet`."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,6 +19,12 @@ LEAST_MASK = 0.1
 """Lower bound of the mask by which colours on black are divided."""
 HOLE_GUESS = 0.7
 """Weight of `RayFill` in holes; `ViewSynthNet`, which saw few holes in training, has the rest."""
+
+VISIBLE = 1 / 16
+"""Alpha from which pixels belong to an island."""
+TINY, SMALL, FAINT = 0.001, 0.01, 0.5
+"""Islands below the first share of the largest one's area are removed, and those below the second if their mean alpha
+is below the third: remains of a phantom of the hull that was mostly recognised as one."""
 
 
 class DepthDistribution(NamedTuple):
@@ -92,6 +101,24 @@ class ViewPrediction(NamedTuple):
             torch.where(predicted, E * confidence[0] + (1 - E), view.mask),
             torch.where(predicted, depth[0] * (alpha[0] > 0.5), view.depth),
         )
+
+
+def without_remains(completed: CompletedView, predicted: Bool[Tensor, "height width"]) -> CompletedView:
+    """The view without small islands around the subject, if all their pixels are in `predicted`."""
+    assert completed.alpha is not None and completed.confidence is not None and completed.depth is not None
+    alpha = completed.alpha.float().cpu().numpy()
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((alpha > VISIBLE).astype(np.uint8))
+    if count <= 2:
+        return completed
+    area = stats[:, cv2.CC_STAT_AREA]
+    faint = np.bincount(labels.ravel(), alpha.ravel()) < FAINT * area
+    rendered = np.bincount(labels[~predicted.cpu().numpy()], minlength=count) > 0
+    share = area / area[1:].max()
+    remains = ((share < TINY) | ((share < SMALL) & faint)) & ~rendered
+    remains[0] = False
+    keep = torch.from_numpy(~remains[labels]).to(completed.rgb.device)
+    changed = {name: image * keep for name, image in completed.images.items()}
+    return replace(completed, **changed)
 
 
 def unpremultiply(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
