@@ -177,7 +177,7 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
         (2, 1.0, False, False),
         (6, 0.4, False, False),
         (6, 1.0, False, True),
-        (12, 0.4, False, True),
+        (16, 0.4, False, True),
         (2, 1.0, True, True),
     ],
 )

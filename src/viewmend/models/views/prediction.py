@@ -21,8 +21,8 @@ HOLE_GUESS = 0.7
 """Weight of `RayFill` in holes; `ViewSynthNet`, which saw few holes in training, has the rest."""
 
 VISIBLE = 1 / 16
-"""Alpha from which pixels belong to an island."""
-TINY, SMALL, FAINT = 0.001, 0.01, 0.5
+"""Alpha or colour from which pixels belong to an island."""
+TINY, SMALL, FAINT = 0.001, 0.05, 0.6
 """Islands below the first share of the largest one's area are removed, and those below the second if their mean alpha
 is below the third: remains of a phantom of the hull that was mostly recognised as one."""
 
@@ -107,7 +107,8 @@ def without_remains(completed: CompletedView, predicted: Bool[Tensor, "height wi
     """The view without small islands around the subject, if all their pixels are in `predicted`."""
     assert completed.alpha is not None and completed.confidence is not None and completed.depth is not None
     alpha = completed.alpha.float().cpu().numpy()
-    count, labels, stats, _ = cv2.connectedComponentsWithStats((alpha > VISIBLE).astype(np.uint8))
+    visible = torch.maximum(completed.rgb.amax(0), completed.alpha).cpu().numpy() > VISIBLE
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
     if count <= 2:
         return completed
     area = stats[:, cv2.CC_STAT_AREA]
