@@ -7,15 +7,14 @@ import torch
 
 from viewmend.models.base import ContextProvider, RenderQuality, State
 from viewmend.models.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
-from viewmend.models.views import pyramids
+from viewmend.models.views import prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import rim_depth, scatter_to_image
 from viewmend.models.views.model import ViewSynthNet
-from viewmend.models.views.prediction import without_remains
+from viewmend.models.views.prediction import remains_of_phantoms
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.rendering.crop import Crop
 from viewmend.stream import Stream
-from viewmend.types import CompletedView
 
 
 def context_of(stream, quality=None):
@@ -181,16 +180,23 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
         (2, 1.0, True, True),
     ],
 )
-def test_remains_of_phantoms_are_removed(scene, side, alpha, rendered, stays):
-    """Tiny islands, and small faint ones; not those of which any pixel was rendered."""
-    view = scene[1]
-    coverage, predicted = torch.zeros_like(view.mask), torch.ones_like(view.mask, dtype=torch.bool)
+def test_remains_of_phantoms_are_small(side, alpha, rendered, stays):
+    """Tiny islands are, and small faint ones; not those of which any pixel was rendered."""
+    coverage, predicted = torch.zeros(83, 96), torch.ones(83, 96, dtype=torch.bool)
     coverage[:60, :80] = 1.0
     coverage[64 : 64 + side, 64 : 64 + side] = alpha
     predicted[64, 64] = not rendered
-    completed = CompletedView(view, coverage.expand(3, -1, -1), coverage, coverage, 2 * coverage)
-    cleaned = without_remains(completed, predicted)
-    assert bool((cleaned.alpha[64:] > 0).any()) == stays
-    for name, image in cleaned.images.items():
-        assert torch.equal(image * (cleaned.alpha > 0), image), name
-        assert torch.equal(image[..., :64, :], completed.images[name][..., :64, :]), name
+    remains = remains_of_phantoms(0.5 * coverage, coverage, predicted)
+    assert torch.equal(
+        remains, torch.zeros_like(predicted) if stays else (coverage > 0) & (torch.arange(83) > 60)[:, None]
+    )
+
+
+def test_remains_of_phantoms_are_removed_from_all_images(scene, monkeypatch):
+    stream, view, _ = scene
+    before, there = stream.mend(view).completed, torch.zeros_like(view.mask, dtype=torch.bool)
+    there[30:40, 30:40] = True
+    monkeypatch.setattr(prediction, "remains_of_phantoms", lambda colour, alpha, predicted: there & predicted)
+    after, gone = stream.mend(view).completed, there & (view.error > 0)
+    assert bool(gone.any()) and all(float(image[..., gone].abs().max()) == 0 for image in after.images.values())
+    assert all(torch.equal(image[..., ~gone], before.images[name][..., ~gone]) for name, image in after.images.items())

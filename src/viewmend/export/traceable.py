@@ -134,7 +134,7 @@ FILL_LEVELS, FILL_CONSTANT = 12, 3
 
 
 class ExportedModel(nn.Module):
-    """`ViewSynthNet.step` of one view."""
+    """`ViewSynthNet.step` of one view, without removing `remains_of_phantoms`."""
 
     def __init__(self, net: ViewSynthNet) -> None:
         super().__init__()
@@ -148,7 +148,7 @@ class ExportedModel(nn.Module):
         guess = self._guess(view, sources)
         prediction = self.net(view, sources, where=where, guess=guess)
         fill = None if self.net.coarse is None else guess
-        completed = prediction.composite_into(view, where, torch.zeros_like(where), fill)
+        completed = prediction.composite_into(view, where, torch.zeros_like(where), fill, keep_remains=True)
         assert completed.confidence is not None, "the model predicts it"
         return tuple(ViewOutputs(completed.rgb, completed.opacity, completed.confidence, completed.surface_depth))
 

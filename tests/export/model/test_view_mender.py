@@ -8,6 +8,7 @@ from reference.random_views import holed, images, mended, random_view
 
 from viewmend.export.traceable import ExportedModel, ViewInputs, ViewOutputs, fill_any_size, pull_push_any_size
 from viewmend.models.smooth_fill import fill, pull_push
+from viewmend.models.views import prediction
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
 
@@ -18,6 +19,12 @@ CONFIG = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_f
 def net():
     torch.manual_seed(0)
     return ViewSynthNet(CONFIG).eval().requires_grad_(False)
+
+
+@pytest.fixture(autouse=True)
+def remains_stay(monkeypatch):
+    """As in the exported model."""
+    monkeypatch.setattr(prediction, "remains_of_phantoms", lambda colour, alpha, predicted: torch.zeros_like(predicted))
 
 
 def given_and_wanted(net, view, context):

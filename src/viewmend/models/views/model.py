@@ -36,7 +36,7 @@ from viewmend.models.views.grid import (
     run_tiled,
     scatter_to_image,
 )
-from viewmend.models.views.prediction import DepthDistribution, ViewPrediction, unpremultiply, without_remains
+from viewmend.models.views.prediction import DepthDistribution, ViewPrediction, unpremultiply
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.ray_fill import RayFill
 from viewmend.models.views.sampler import Rays, sample_rays
@@ -162,7 +162,7 @@ class ViewSynthNet(Network):
         guess = self.coarse_guess(view, sources, quick)
         prediction = self(view, sources, where=where, guess=guess)
         ray_fill = guess if not quick and self.coarse is not None else None
-        return without_remains(prediction.composite_into(view, where, fades, ray_fill), where), state
+        return prediction.composite_into(view, where, fades, ray_fill), state
 
     def _depth_distribution(
         self,

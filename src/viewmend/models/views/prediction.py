@@ -1,6 +1,5 @@
 """The depth distribution and the prediction of `ViewSynthNet`."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -78,6 +77,7 @@ class ViewPrediction(NamedTuple):
         predicted: Bool[Tensor, "height width"],
         fades: Bool[Tensor, "height width"],
         fill: Float[Tensor, "3 height width"] | None = None,
+        keep_remains: bool = False,
     ) -> CompletedView:
         """The view with this prediction: Fhat = E Ftilde + (1 - E) F.
 
@@ -86,6 +86,7 @@ class ViewPrediction(NamedTuple):
             predicted: pixels of this prediction.
             fades: pixels that are background in part; they are attenuated by E.
             fill: the output of `RayFill`, to blend into holes; None without.
+            keep_remains: leave `remains_of_phantoms` in the view.
         """
         E = view.error
         rgb, alpha, confidence, depth = (
@@ -94,6 +95,10 @@ class ViewPrediction(NamedTuple):
         )
         if fill is not None:
             rgb = torch.where(predicted & view.holes, HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb, rgb)
+        if not keep_remains:
+            colour = torch.where(predicted, rgb.amax(0), view.rgb.amax(0))
+            keep = ~remains_of_phantoms(colour, torch.where(predicted, alpha[0], view.mask), predicted)
+            rgb, alpha, confidence, depth = rgb * keep, alpha * keep, confidence * keep, depth * keep
         return CompletedView(
             view,
             blend(view.rgb, E, rgb, (predicted | fades).to(E)),
@@ -103,23 +108,26 @@ class ViewPrediction(NamedTuple):
         )
 
 
-def without_remains(completed: CompletedView, predicted: Bool[Tensor, "height width"]) -> CompletedView:
-    """The view without small islands around the subject, if all their pixels are in `predicted`."""
-    assert completed.alpha is not None and completed.confidence is not None and completed.depth is not None
-    alpha = completed.alpha.float().cpu().numpy()
-    visible = torch.maximum(completed.rgb.amax(0), completed.alpha).cpu().numpy() > VISIBLE
+def remains_of_phantoms(
+    colour: Float[Tensor, "height width"], alpha: Float[Tensor, "height width"], predicted: Bool[Tensor, "height width"]
+) -> Bool[Tensor, "height width"]:
+    """Small islands around the subject all of whose pixels are in `predicted`.
+
+    Args:
+        colour: the largest channel of each pixel, on black.
+        alpha: coverage by the subject.
+        predicted: pixels of which the model decides.
+    """
+    visible, opacity = (torch.maximum(colour, alpha) > VISIBLE).cpu().numpy(), alpha.float().cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
     if count <= 2:
-        return completed
+        return torch.zeros_like(predicted)
     area = stats[:, cv2.CC_STAT_AREA]
-    faint = np.bincount(labels.ravel(), alpha.ravel()) < FAINT * area
+    share, faint = area / area[1:].max(), np.bincount(labels.ravel(), opacity.ravel()) < FAINT * area
     rendered = np.bincount(labels[~predicted.cpu().numpy()], minlength=count) > 0
-    share = area / area[1:].max()
-    remains = ((share < TINY) | ((share < SMALL) & faint)) & ~rendered
-    remains[0] = False
-    keep = torch.from_numpy(~remains[labels]).to(completed.rgb.device)
-    changed = {name: image * keep for name, image in completed.images.items()}
-    return replace(completed, **changed)
+    small = ((share < TINY) | ((share < SMALL) & faint)) & ~rendered
+    small[0] = False
+    return torch.from_numpy(small[labels]).to(predicted.device)
 
 
 def unpremultiply(colour: Float[Tensor, "pixel 3"], mask: Float[Tensor, "pixel 1"]) -> Float[Tensor, "pixel 3"]:
