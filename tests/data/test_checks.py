@@ -380,7 +380,7 @@ def test_masks_outside_the_hull_are_compared_with_the_median(monkeypatch, ball, 
 
 
 @pytest.mark.parametrize(
-    ("typical", "own", "found"), [(0.02, 0.052, False), (0.02, 0.056, True), (0.0, 0.026, True), (-0.02, 0.026, True)]
+    ("typical", "own", "found"), [(0.02, 0.037, False), (0.02, 0.039, True), (0.0, 0.009, True), (-0.02, 0.009, True)]
 )
 def test_masks_that_remove_the_subject_are_compared_with_the_mean(monkeypatch, ball, typical, own, found):
     issues = outliers(monkeypatch, ball, [0.0] * 8, [typical] * 5 + [own] + [typical] * 2)

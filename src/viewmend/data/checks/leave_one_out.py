@@ -29,7 +29,7 @@ MAX_PEERS = 10
 MAX_REMOVED, LEAVE_OUT_REMOVED, LEAVE_OUT_OF_FEW = 0.004, 0.06, 0.2
 """A camera is an outlier if it alone removes this share of the others' masks, beyond 1.5 times the mean. From the
 second share on, or the third in rigs of few cameras, it is left out: less costs less than a missing camera. The first
-share is of images of `FINE_PX` or more; smaller ones lose thin parts, so it grows with the size of a pixel."""
+share is of images of `FINE_PX` or more; smaller ones lose thin parts, so it grows with the size of a pixel, up to twice."""
 FEW_CAMERAS = 5
 MAX_OUTSIDE, LEAVE_OUT_OUTSIDE = 0.15, 0.3
 """It is also one if this share of its mask is outside the others' hull, beyond 3 times the median."""
@@ -132,7 +132,7 @@ def _outlier_by_hull(frame: MultiViewFrame, bounds: Bounds | None, px: int, hull
     view = int(found.removed.argmax())
     share = float(found.removed[view])
     typical = max(0.0, float((found.removed.sum() - found.removed[view]) / (len(names) - 1)))
-    coarser = FINE_PX / min(FINE_PX, int(frame.cameras.size_px.amax()))
+    coarser = min(2.0, FINE_PX / min(FINE_PX, int(frame.cameras.size_px.amax())))
     if share > MAX_REMOVED * coarser + 1.5 * typical:
         text = f"camera '{names[view]}' alone removes {100 * share:.1f} % of the subject that the others see"
         return (_outlier(text, names[view], share > (LEAVE_OUT_OF_FEW if few else LEAVE_OUT_REMOVED)),)
