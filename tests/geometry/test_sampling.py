@@ -7,7 +7,7 @@ import torch
 from reference.ball import ring
 
 from viewmend.geometry.cameras import project
-from viewmend.geometry.sampling import in_view, sample_bilinear
+from viewmend.geometry.sampling import bilinear_taps, in_view, sample_bilinear
 
 
 def sample_twin(image, u, v, padding):
@@ -38,6 +38,11 @@ def test_samples_equal_their_twin(rng, padding):
         for point, (u, v) in enumerate(uv[view].tolist()):
             twin = [sample_twin(channel, u, v, padding) for channel in images[view]]
             assert found[view, point].tolist() == pytest.approx(twin, abs=1e-5)
+    view = torch.arange(2)[:, None]
+    taps = list(bilinear_taps(uv, 7, 5))
+    weights = [tap.weight * (tap.inside if padding == "zeros" else 1) for tap in taps]
+    read = [w[..., None] * images[view, :, t.row, t.column] for w, t in zip(weights, taps, strict=True)]
+    assert torch.allclose(torch.stack(read).sum(0), found, atol=1e-5)
 
 
 @pytest.mark.parametrize("far", [1e9, -1e9, 3e38, -3e38])
@@ -45,6 +50,7 @@ def test_what_is_far_outside_stays_outside(far):
     images, uv = torch.ones(1, 1, 4, 6), torch.tensor([[[far, 2.0], [3.0, far], [far, far]]])
     assert not sample_bilinear(images, uv).any()
     assert bool((sample_bilinear(images, uv, "border") == 1).all())
+    assert sum(int((tap.inside & (tap.weight > 0)).sum()) for tap in bilinear_taps(uv, 6, 4)) == 0
 
 
 def test_in_view_is_before_the_camera_and_inside_its_own_image(rng):

@@ -10,7 +10,7 @@ from reference.blend_twin import blend_twin
 
 from viewmend.geometry.cameras import unproject
 from viewmend.geometry.rasterize import interpolate, rasterize
-from viewmend.rendering.blending import BlendConfig, blend
+from viewmend.rendering.blending import BlendConfig, blend, blend_numba, blend_torch
 from viewmend.types import ContextViews, MultiViewFrame
 
 BIAS_M = 0.01
@@ -48,10 +48,11 @@ def hard():
     return target, depth, normals, ContextViews(frame, sources.depth * noise * holes)
 
 
+@pytest.mark.parametrize("fast", [blend_torch, blend_numba])
 @pytest.mark.parametrize("config", [BlendConfig(), BlendConfig(normal_power=1, view_power=4, slope_px=3.0)])
-def test_equals_the_reference(hard, config):
+def test_both_implementations_equal_the_reference(hard, fast, config):
     expected = blend_twin(*hard, BIAS_M, config)
-    result = blend(*hard, BIAS_M, config)
+    result = fast(*hard, BIAS_M, config)
     for got, want in zip((result.rgb, result.weights, result.disagreement), expected, strict=True):
         # A depth test that float32 decides the other way is a flip: rare, and all else is tight.
         off = np.abs(got.numpy() - want) > 2e-4
@@ -59,12 +60,22 @@ def test_equals_the_reference(hard, config):
     assert (expected[1].sum(0) > 0).sum() > 100
 
 
-def test_equals_the_reference_without_masks(hard):
+def test_both_implementations_equal_the_reference_without_masks(hard):
     target, depth, normals, sources = hard
     sources = ContextViews(replace(sources.frame, mask=None), sources.depth)
     expected = blend_twin(target, depth, normals, sources, BIAS_M, BlendConfig())
-    got = blend(target, depth, normals, sources, BIAS_M, BlendConfig())
-    assert (np.abs(got.weights.numpy() - expected[1]) > 2e-4).mean() < 0.002
+    for fast in (blend_torch, blend_numba):
+        got = fast(target, depth, normals, sources, BIAS_M, BlendConfig())
+        assert (np.abs(got.weights.numpy() - expected[1]) > 2e-4).mean() < 0.002
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu(hard):
+    target, depth, normals, sources = hard
+    expected = blend(*hard, BIAS_M, BlendConfig())
+    on_gpu = ContextViews(sources.frame.to("cuda"), sources.depth.cuda())
+    got = blend(target.to("cuda"), depth.cuda(), normals.cuda(), on_gpu, BIAS_M, BlendConfig())
+    assert ((got.rgb.cpu() - expected.rgb).abs() > 2e-4).float().mean() < 0.002
 
 
 def test_a_camera_at_the_target_gives_its_own_image_back():
@@ -150,7 +161,8 @@ def test_disagreement_is_the_spread_of_the_samples():
     assert float(spread[24, 24]) == pytest.approx(25 / 255, abs=1e-4)
 
 
-def test_a_surface_that_faces_a_camera_counts_in_every_pixel():
+@pytest.mark.parametrize("fast", [blend_torch, blend_numba])
+def test_a_surface_that_faces_a_camera_counts_in_every_pixel(fast):
     """Where the cosine is 1, rounding may exceed it, and the slope would be NaN."""
     target, depth, _, sources = scene(camera_at(0, "t"), camera_at(0, "c"))
     row, column = (depth > 0).nonzero(as_tuple=True)
@@ -158,6 +170,6 @@ def test_a_surface_that_faces_a_camera_counts_in_every_pixel():
     normals = torch.zeros(*depth.shape, 3)
     normals[row, column] = torch.nn.functional.normalize(target.centers[0] - points, dim=-1)
     frame = replace(sources.frame, mask=EVERYWHERE)
-    weights = blend(target, depth, normals, ContextViews(frame, sources.depth), BIAS_M, BlendConfig()).weights[0]
+    weights = fast(target, depth, normals, ContextViews(frame, sources.depth), BIAS_M, BlendConfig()).weights[0]
     inner = depth[row, column] < depth[depth > 0].quantile(0.5)
     assert len(row) > 500 and float(weights[row, column][inner].min()) > 0.99

@@ -6,11 +6,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.cameras import Cameras, project, unproject
+from viewmend.geometry.sampling import bilinear_taps, in_view
 from viewmend.geometry.threads import parallel_for
 from viewmend.types import ContextViews
-from viewmend.utils.tensors import OnDevice
 
 GRAZING = 0.1
 """Cosine below which the slope term of the depth test stays constant."""
@@ -38,7 +39,7 @@ class BlendConfig:
 
 
 @dataclass(frozen=True)
-class Blend(OnDevice):
+class Blend:
     """Blended colour, weights and disagreement of the source cameras in each pixel of a novel view."""
 
     rgb: Float[Tensor, "3 height width"]
@@ -67,14 +68,25 @@ def blend(
         camera: the novel view (one).
         depth: z-depth of its surface, metres, 0 where there is none.
         normals: outward, of any length, world axes.
-        sources: the source cameras, with the proxy's depth in each. Blended on the CPU, on whatever device they are.
+        sources: the source cameras, with the proxy's depth in each.
         bias_m: tolerance of the depth test, metres.
         config: exponents and tolerances.
     """
+    implementation = blend_numba if depth.device.type == "cpu" else blend_torch
+    return implementation(camera, depth, normals, sources, bias_m, config)
+
+
+def blend_numba(
+    camera: Cameras,
+    depth: Float[Tensor, "height width"],
+    normals: Float[Tensor, "height width 3"],
+    sources: ContextViews,
+    bias_m: float,
+    config: BlendConfig,
+) -> Blend:
+    """`blend` in numba, for the CPU."""
     from viewmend.rendering._blend_numba import blend_rows
 
-    device, camera, depth, normals = depth.device, camera.to("cpu"), depth.cpu(), normals.cpu()
-    sources = sources.to("cpu")
     frame, rig = sources.frame, sources.frame.cameras
     height, width = depth.shape
     rgb = torch.zeros(3, height, width)
@@ -98,4 +110,71 @@ def blend(
         blend_rows(band * ROWS, min(height, (band + 1) * ROWS), *inputs, *outputs)
 
     parallel_for(work, -(-height // ROWS))
-    return Blend(rgb, weights, disagreement).to(device)
+    return Blend(rgb, weights, disagreement)
+
+
+def blend_torch(
+    camera: Cameras,
+    depth: Float[Tensor, "height width"],
+    normals: Float[Tensor, "height width 3"],
+    sources: ContextViews,
+    bias_m: float,
+    config: BlendConfig,
+) -> Blend:
+    """`blend` in torch, for any device."""
+    row, column = (depth > 0).nonzero(as_tuple=True)
+    pixels = torch.stack([column, row], -1) + 0.5
+    points = unproject(pixels[None].to(depth), depth[row, column][None], camera)[0]
+    normal = normalize(normals[row, column], dim=-1)
+    to_viewer = normalize(camera.centers[0] - points, dim=-1)
+
+    weights, colours = [], []
+    for view in range(len(sources.frame.cameras)):
+        weight, colour = _sample(points, normal, to_viewer, sources, view, bias_m, config)
+        weights.append(weight)
+        colours.append(colour)
+    weight, colour = torch.stack(weights), torch.stack(colours)
+
+    total = weight.sum(0).clamp(min=torch.finfo(weight.dtype).tiny)
+    mean = (weight[:, None] * colour).sum(0) / total
+    variance = (weight * (colour - mean).square().mean(1)).sum(0) / total
+    height, width = depth.shape
+    rgb = depth.new_zeros(3, height, width)
+    raw = depth.new_zeros(len(weights), height, width)
+    disagreement = torch.zeros_like(depth)
+    rgb[:, row, column] = mean
+    raw[:, row, column] = weight
+    disagreement[row, column] = variance.sqrt()
+    return Blend(rgb, raw, disagreement)
+
+
+def _sample(
+    points: Float[Tensor, "point 3"],
+    normal: Float[Tensor, "point 3"],
+    to_viewer: Float[Tensor, "point 3"],
+    sources: ContextViews,
+    view: int,
+    bias_m: float,
+    config: BlendConfig,
+) -> tuple[Float[Tensor, "point"], Float[Tensor, "3 point"]]:
+    """Weight and colour of one camera at each surface point."""
+    frame, camera = sources.frame, sources.frame.cameras[view]
+    uv, z = (values[0] for values in project(points, camera))
+    width, height = camera.size_px[0].tolist()
+    to_camera = normalize(camera.centers[0] - points, dim=-1)
+    facing = (normal * to_camera).sum(-1).clamp(0, 1)
+    agreeing = (to_viewer * to_camera).sum(-1).clamp(0, 1)
+
+    # Change of depth of a surface at this angle from one pixel of the camera to the next.
+    per_pixel = z / camera.K[0, 0, 0] * (1 - facing.square()).sqrt() / facing.clamp(min=GRAZING)
+    usable, colour = torch.zeros_like(z), z.new_zeros(3, len(z))
+    for row, column, weight, _ in bilinear_taps(uv, width, height):
+        depth = sources.depth[view, row, column]
+        weight = weight * ((depth == 0) | (z - depth <= bias_m + config.slope_px * per_pixel))
+        if frame.mask is not None:
+            weight = weight * (frame.mask[view, row, column] / 255)
+        usable = usable + weight
+        colour = colour + weight * frame.rgb[view, :, row, column]
+    seen = in_view(uv[None], z[None], camera)[0]
+    weight = seen * usable * facing**config.normal_power * agreeing**config.view_power
+    return weight, colour / (255 * usable).clamp(min=1e-6)
