@@ -1,4 +1,4 @@
-"""The visual hull: the slow twin, the search for the subject's box, and bounds from nothing."""
+"""The visual hull: the slow twin, both fast paths, the search for the subject's box, and bounds from nothing."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import torch
 from geometry.solids import around, ball_masks, camera_at, dome
 from reference.hull_twin import hull_twin
 
+from viewmend.geometry import hull as _hull_torch
 from viewmend.geometry import hull as hull_module
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import concatenate_cameras
@@ -20,6 +21,14 @@ from viewmend.geometry.hull import (
 )
 
 SMALL = HullConfig(resolution=16)
+
+
+@pytest.fixture(params=["numba", "torch"])
+def path(request, monkeypatch) -> str:
+    """Run a test on the numba path and on the torch path."""
+    if request.param == "torch":
+        monkeypatch.setattr(hull_module, "_kernels", lambda mask: None)
+    return request.param
 
 
 def mixed_rig():
@@ -39,7 +48,7 @@ def mixed_rig():
 
 
 @pytest.mark.parametrize("pixels_per_voxel", [1.0, 30.0])
-def test_equals_the_twin(pixels_per_voxel):
+def test_equals_the_twin(path, pixels_per_voxel):
     cameras, masks = mixed_rig()
     config = replace(SMALL, pixels_per_voxel=pixels_per_voxel)
     bounds = Bounds(torch.tensor([-0.7, -0.6, -0.5]), torch.tensor([0.6, 0.7, 0.6]))
@@ -53,7 +62,31 @@ def test_equals_the_twin(pixels_per_voxel):
     assert 0.05 < (grid.values > 0.5).float().mean() < 0.95
 
 
-def test_points_behind_a_camera_never_count():
+def test_numba_equals_torch(monkeypatch):
+    cameras = dome(9, width=200, height=160)
+    masks = ball_masks(cameras)
+    fast = visual_hull(masks, cameras, around(0.9), HullConfig(resolution=70))
+    monkeypatch.setattr(hull_module, "_kernels", lambda mask: None)
+    slow = visual_hull(masks, cameras, around(0.9), HullConfig(resolution=70))
+    assert (fast.values - slow.values).abs().max() < 1e-3
+
+
+def test_numba_softens_like_torch():
+    from viewmend.geometry import _hull_numba
+
+    masks = torch.randint(0, 256, (1, 23, 37), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    size = torch.tensor([[35, 20]])
+    for pool in (1, 2, 3, 7):
+        slow = _hull_torch.soften(masks, size, pool)
+        fast = torch.empty(slow.shape[1] + 1, slow.shape[2] + 1, dtype=torch.uint8)
+        _hull_numba.soften(masks[0].numpy(), 20, 35, pool, fast.numpy())
+        # Rounding may go either way on a tie.
+        assert (fast[:-1, :-1].int() - slow[0].int()).abs().max() <= 1
+        assert torch.equal(fast[-1, :-1], fast[-2, :-1])
+        assert torch.equal(fast[:, -1], fast[:, -2])
+
+
+def test_points_behind_a_camera_never_count(path):
     """The mirror image of the subject behind a camera is neither kept nor carved."""
     cameras = concatenate_cameras([dome(4), camera_at((0.0, 0.0, 1.0), target=(0.0, 0.0, 3.0), name="away")])
     masks = ball_masks(cameras)
@@ -64,7 +97,7 @@ def test_points_behind_a_camera_never_count():
     assert torch.equal(with_it.values, without.values)
 
 
-def test_space_that_too_few_cameras_see_is_empty():
+def test_space_that_too_few_cameras_see_is_empty(path):
     """Bounds much larger than what the rig sees do not fill up at their corners."""
     cameras = dome(8)
     grid = visual_hull(ball_masks(cameras), cameras, around(4.0), HullConfig(resolution=64))
@@ -78,7 +111,7 @@ def test_half_of_the_cameras_must_see_a_point(views, expected):
     assert needed_views(views, HullConfig()) == expected
 
 
-def test_cropped_subjects_keep_what_some_cameras_do_not_see():
+def test_cropped_subjects_keep_what_some_cameras_do_not_see(path):
     """A camera that sees the lower half only says nothing about the upper one."""
     cameras = dome(6)
     low_view = camera_at((0.0, -0.5, 2.5), target=(0.0, -0.9, 0.0), name="low")
@@ -92,7 +125,7 @@ def test_cropped_subjects_keep_what_some_cameras_do_not_see():
     assert (without.values[:, top:] > 0.5).any()
 
 
-def test_the_search_keeps_all_of_the_hull():
+def test_the_search_keeps_all_of_the_hull(path):
     cameras = dome(7, fov=1.4)
     masks = ball_masks(cameras, center=(0.3, -0.1, 0.2), radius=0.3)
     box = occupied_bounds(masks, cameras, around(1.6), HullConfig())
@@ -104,7 +137,17 @@ def test_the_search_keeps_all_of_the_hull():
     assert (filled.amax(0) <= box.high).all()
 
 
-def test_the_search_finds_nothing_where_masks_contradict():
+def test_both_searches_find_the_same_box(monkeypatch):
+    cameras, masks = mixed_rig()
+    fast = occupied_bounds(masks, cameras, around(1.5), HullConfig())
+    monkeypatch.setattr(hull_module, "_kernels", lambda mask: None)
+    slow = occupied_bounds(masks, cameras, around(1.5), HullConfig())
+    assert fast is not None and slow is not None
+    torch.testing.assert_close(fast.low, slow.low)
+    torch.testing.assert_close(fast.high, slow.high)
+
+
+def test_the_search_finds_nothing_where_masks_contradict(path):
     cameras = dome(4)
     masks = ball_masks(cameras, radius=0.3)
     masks[2] = 0
@@ -147,3 +190,11 @@ def test_one_camera_or_no_foreground_is_an_error():
         visual_hull(torch.zeros_like(masks), cameras, around(1.0), SMALL)
     with pytest.raises(ValueError, match="foreground"):
         bounds_from_masks(torch.zeros_like(masks), cameras)
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu():
+    cameras, masks = mixed_rig()
+    here = visual_hull(masks, cameras, around(0.7), SMALL)
+    there = visual_hull(masks.cuda(), cameras.to("cuda"), around(0.7).to("cuda"), SMALL)
+    assert ((here.values - there.values.cpu()).abs() > 0.01).float().mean() < 1e-3

@@ -1,13 +1,20 @@
-"""Drawing meshes: the slow twin, and the cases where rasterisers go wrong."""
+"""Drawing meshes: the slow twin, both fast paths, and the cases where rasterisers go wrong."""
 
 import pytest
 import torch
 from geometry.solids import ball_mesh, camera_at, dome
+from reference.ball import proxy, ring
 from reference.raster_twin import raster_twin
 
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pixel_centers, unproject
 from viewmend.geometry.mesh import Mesh
-from viewmend.geometry.rasterize import interpolate, rasterize
+from viewmend.geometry.rasterize import NEAR_M, Raster, interpolate, rasterize, rasterize_torch
+
+SIDE = {"none": 0, "back": 1, "front": -1}
+
+
+def in_torch(mesh: Mesh, cameras: Cameras, cull: str = "none") -> Raster:
+    return Raster(*rasterize_torch(mesh, cameras, NEAR_M, SIDE[cull]))
 
 
 def skewed(cameras: Cameras) -> Cameras:
@@ -29,10 +36,11 @@ def ball_scene() -> tuple[Mesh, Cameras]:
 
 
 @pytest.mark.parametrize("cull", ["none", "back", "front"])
-def test_equals_the_twin(ball_scene, cull):
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_equals_the_twin(ball_scene, draw, cull):
     mesh, cameras = ball_scene
     depth, triangle, margin = raster_twin(mesh, cameras, cull)
-    raster = rasterize(mesh, cameras, cull)
+    raster = draw(mesh, cameras, cull)
     # Single precision decides otherwise only where a pixel's centre is all but on an edge.
     clear = torch.from_numpy(margin > 1e-4)
     assert clear.float().mean() > 0.97
@@ -41,42 +49,62 @@ def test_equals_the_twin(ball_scene, cull):
     assert (raster.triangle >= 0).any(-1).any(-1).all()
 
 
-def test_a_closed_surface_has_no_cracks():
+@pytest.mark.parametrize("cull", ["none", "back", "front"])
+def test_numba_equals_torch(cull):
+    mesh, cameras = ball_mesh(40, 60), dome(5, width=120, height=90)
+    fast, slow = rasterize(mesh, cameras, cull), in_torch(mesh, cameras, cull)
+    assert (fast.triangle != slow.triangle).float().mean() < 1e-4
+    torch.testing.assert_close(fast.depth, slow.depth, rtol=2e-6, atol=0)
+
+
+def test_many_chunks_draw_what_one_does(ball_scene, monkeypatch):
+    mesh, cameras = ball_scene
+    whole = in_torch(mesh, cameras)
+    monkeypatch.setattr("viewmend.geometry.rasterize.CANDIDATES", 100)
+    assert torch.equal(in_torch(mesh, cameras).depth, whole.depth)
+
+
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_a_closed_surface_has_no_cracks(draw):
     """Seen from inside, a closed mesh covers every pixel, shared edges and corners included."""
     inside = camera_at((0.01, 0.02, 0.03), target=(1.0, 0.0, 0.0), width=64, height=64, fov=2.0)
-    assert (rasterize(ball_mesh(40, 60), inside).triangle >= 0).all()
+    assert (draw(ball_mesh(40, 60), inside).triangle >= 0).all()
 
 
-def test_what_is_behind_a_camera_draws_nothing():
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_what_is_behind_a_camera_draws_nothing(draw):
     away = camera_at((2.0, 0.0, 0.0), target=(4.0, 0.0, 0.0))
-    raster = rasterize(ball_mesh(), away)
+    raster = draw(ball_mesh(), away)
     assert (raster.triangle == -1).all()
     assert (raster.depth == 0).all()
 
 
-def test_back_faces_are_those_turned_away():
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_back_faces_are_those_turned_away(draw):
     mesh, camera = ball_mesh(), camera_at((2.0, 0.3, 0.0))
-    front, back = rasterize(mesh, camera, "back"), rasterize(mesh, camera, "front")
+    front, back = draw(mesh, camera, "back"), draw(mesh, camera, "front")
     covered = front.triangle >= 0
-    assert torch.equal(front.depth, rasterize(mesh, camera).depth)
+    assert torch.equal(front.depth, draw(mesh, camera).depth)
     assert (front.depth < back.depth)[covered & (back.triangle >= 0)].all()
     assert float(front.depth[covered].min()) == pytest.approx((4 + 0.09) ** 0.5 - 0.5, abs=0.02)
 
 
-def test_nothing_is_drawn_beyond_a_views_own_size():
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_nothing_is_drawn_beyond_a_views_own_size(draw):
     near = concatenate_cameras(
         [camera_at((0.9, 0, 0), width=40, height=30), camera_at((0, 0, 0.9), width=20, height=50)]
     )
-    raster = rasterize(ball_mesh(), near)
+    raster = draw(ball_mesh(), near)
     assert raster.depth.shape == (2, 50, 40)
     assert (raster.triangle[0, 30:] == -1).all()
     assert (raster.triangle[1, :, 20:] == -1).all()
     assert (raster.triangle[1, :, 19] >= 0).any()
 
 
-def test_an_empty_mesh_draws_nothing():
+@pytest.mark.parametrize("draw", [rasterize, in_torch])
+def test_an_empty_mesh_draws_nothing(draw):
     empty = Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int32))
-    raster = rasterize(empty, dome(2))
+    raster = draw(empty, dome(2))
     assert (raster.triangle == -1).all()
     assert interpolate(torch.zeros(0, 2), empty, dome(2), raster).shape == (2, 80, 96, 2)
 
@@ -92,3 +120,33 @@ def test_interpolation_is_perspective_correct(ball_scene):
     positions = interpolate(mesh.vertices, mesh, cameras, raster)
     torch.testing.assert_close(positions[covered], world[covered], atol=2e-6, rtol=1e-5)
     assert (positions[~covered] == 0).all()
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu():
+    mesh, cameras = ball_mesh(40, 60), dome(5, width=120, height=90)
+    there = rasterize(mesh.to("cuda"), cameras.to("cuda"))
+    here = rasterize(mesh, cameras)
+    assert (there.triangle.cpu() != here.triangle).float().mean() < 1e-4
+
+
+# The CPU's fast path of `interpolate` against the path for any device, which gradients take.
+
+
+def test_the_fast_path_equals_the_other():
+    ball, cameras = proxy(16), ring(3, 40).cropped(-4, 6, 50, 40)
+    raster = rasterize(ball.mesh, cameras)
+    attributes = torch.randn(len(ball.mesh.vertices), 5, generator=torch.Generator().manual_seed(0))
+    fast = interpolate(attributes, ball.mesh, cameras, raster)
+    slow = interpolate(attributes.clone().requires_grad_(), ball.mesh, cameras, raster)
+    assert slow.requires_grad and (raster.triangle >= 0).float().mean() > 0.2
+    torch.testing.assert_close(fast, slow.detach(), atol=1e-4, rtol=1e-4)
+
+
+def test_gradients_reach_the_attributes():
+    ball, cameras = proxy(8), ring(1, 20)
+    attributes = torch.ones(len(ball.mesh.vertices), 1, requires_grad=True)
+    raster = rasterize(ball.mesh, cameras)
+    interpolate(attributes, ball.mesh, cameras, raster).sum().backward()
+    assert attributes.grad is not None
+    torch.testing.assert_close(attributes.grad.sum(), (raster.triangle >= 0).sum().float())

@@ -2,16 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+from torch.nn.functional import conv2d, pad
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, project
+from viewmend.geometry.sampling import in_view, sample_bilinear
 from viewmend.geometry.threads import parallel_for
-from viewmend.utils.tensors import OnDevice
 
 FOREGROUND = 127
 """Threshold for binary foreground."""
@@ -20,7 +22,7 @@ TILES = 32
 """Tiles across a mask's shorter side, by which the search for the subject's box judges blocks of space."""
 
 BLOCK = 4
-"""Side in voxels of the blocks, and in (pooled) pixels of the mask tiles, that are judged whole."""
+"""Side in voxels of the blocks, and in (pooled) pixels of the mask tiles, that the fast path judges whole."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +50,7 @@ class HullConfig:
 
 
 @dataclass(frozen=True)
-class OccupancyGrid(OnDevice):
+class OccupancyGrid:
     """Soft occupancy of cubic voxels: 1 inside, 0 outside, the surface where it is one half."""
 
     values: Float[Tensor, "x y z"]
@@ -73,6 +75,14 @@ class Cubes:
         x, y, z = (max(1, math.ceil(side / side_m - 1e-3)) for side in sides)
         return cls(bounds.low, side_m, (x, y, z))
 
+    @property
+    def centers(self) -> Float[Tensor, "cube 3"]:
+        """The cubes' middles, the last axis first."""
+        axes = [
+            self.low[a] + (torch.arange(self.shape[a], device=self.low.device) + 0.5) * self.side_m for a in range(3)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)
+
 
 def visual_hull(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
@@ -86,28 +96,35 @@ def visual_hull(
         ValueError: there is one camera only, or no mask has any foreground.
     """
     check_masks(mask, cameras)
-    device, mask, cameras, bounds = mask.device, mask.cpu(), cameras.to("cpu"), bounds.to("cpu")
     voxels, needed = Cubes.of(bounds, config.resolution), needed_views(len(cameras), config)
     pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
-    return OccupancyGrid(_carve(mask, pool, cameras, voxels, needed), bounds.low, voxels.side_m).to(device)
+    if (kernels := _kernels(mask)) is None:
+        values = carve(soften(mask, cameras.size_px, pool), pool, cameras, voxels, needed)
+    else:
+        values = _carve_cpu(kernels, mask, pool, cameras, voxels, needed)
+    return OccupancyGrid(values, bounds.low, voxels.side_m)
 
 
 def occupied_bounds(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> Bounds | None:
     """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it."""
-    device, mask, cameras, bounds = mask.device, mask.cpu(), cameras.to("cpu"), bounds.to("cpu")
     needed = needed_views(len(cameras), config)
     tile = max(1, min(mask.shape[1:]) // TILES)
-    tiles = _count_tiles(mask, tile)
+    kernels = _kernels(mask)
+    tiles = None if kernels is None else _count_tiles(kernels, mask, tile)
     for _ in range(config.coarse_passes):
         blocks = Cubes.of(bounds, config.coarse_resolution)
-        index = _occupied(tiles, tile, cameras, blocks, needed).nonzero()
+        if kernels is None or tiles is None:
+            occupied = occupied_blocks(mask, tile, cameras, blocks, needed)
+        else:
+            occupied = _occupied_cpu(kernels, tiles, tile, cameras, blocks, needed)
+        index = occupied.nonzero()
         if not len(index):
             return None
         low = bounds.low + index.amin(0) * blocks.side_m
         bounds = Bounds(low, torch.minimum(bounds.low + (index.amax(0) + 1) * blocks.side_m, bounds.high))
-    return bounds.to(device)
+    return bounds
 
 
 def needed_views(views: int, config: HullConfig) -> int:
@@ -122,6 +139,15 @@ def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
     return float(size.median()) if len(size) else 1.0
 
 
+def _kernels(mask: Tensor) -> ModuleType | None:
+    """The fast path for CPU tensors."""
+    if mask.device.type != "cpu":
+        return None
+    from viewmend.geometry import _hull_numba
+
+    return _hull_numba
+
+
 def _kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
     """What the kernels take: P = K [R t], the lenses, the images' sizes, and the corner of the cubes."""
     K = cameras.K.double()
@@ -134,12 +160,14 @@ def _tile_sums(views: int, height: int, width: int, tile: int) -> Int[Tensor, "v
     return torch.empty(views, -(-height // tile) + 1, -(-width // tile) + 1, 2, dtype=torch.int32)
 
 
-def _carve(
-    mask: UInt8[Tensor, "view height width"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
+def _carve_cpu(
+    kernels: ModuleType,
+    mask: UInt8[Tensor, "view height width"],
+    pool: int,
+    cameras: Cameras,
+    voxels: Cubes,
+    needed: int,
 ) -> Float[Tensor, "x y z"]:
-    """The smallest mask value over the cameras that see each voxel's middle; 0 where fewer than `needed` do."""
-    from viewmend.geometry import _hull_numba as kernels
-
     views, height, width = mask.shape
     soft_rows, soft_columns = -(-height // pool), -(-width // pool)
     soft = torch.empty(views, soft_rows + 1, soft_columns + 1, dtype=torch.uint8)
@@ -163,9 +191,9 @@ def _carve(
     return values
 
 
-def _count_tiles(mask: UInt8[Tensor, "view height width"], tile: int) -> Int[Tensor, "view row column 2"]:
-    from viewmend.geometry import _hull_numba as kernels
-
+def _count_tiles(
+    kernels: ModuleType, mask: UInt8[Tensor, "view height width"], tile: int
+) -> Int[Tensor, "view row column 2"]:
     views, height, width = mask.shape
     sums = _tile_sums(views, height, width, tile)
     masks, out = mask.numpy(), sums.numpy()
@@ -173,12 +201,14 @@ def _count_tiles(mask: UInt8[Tensor, "view height width"], tile: int) -> Int[Ten
     return sums
 
 
-def _occupied(
-    tiles: Int[Tensor, "view row column 2"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
+def _occupied_cpu(
+    kernels: ModuleType,
+    tiles: Int[Tensor, "view row column 2"],
+    tile: int,
+    cameras: Cameras,
+    blocks: Cubes,
+    needed: int,
 ) -> Bool[Tensor, "x y z"]:
-    """Blocks that project to some foreground in all cameras and are visible to enough cameras."""
-    from viewmend.geometry import _hull_numba as kernels
-
     occupied = torch.empty(blocks.shape, dtype=torch.bool)
     sums, out = tiles.numpy(), occupied.numpy()
     P, lens, size, low = _kernel_arrays(cameras, blocks)
@@ -259,3 +289,82 @@ def _cube_around(
     reach = (half_at_1 * distance)[distance > 0]
     half = reach.amax() if largest else reach.median()
     return Bounds(middle - half, middle + half)
+
+
+NEAR_M = 1e-6
+
+
+def soften(
+    mask: UInt8[Tensor, "view height width"], size_px: Int[Tensor, "view 2"], pool: int
+) -> UInt8[Tensor, "view row column"]:
+    """Average squares of pool x pool pixels and smooth the averages by (1 2 1)/4 along both axes, rounded to 8 bits.
+
+    Beyond each image's own size its border continues.
+    """
+    views, height, width = mask.shape
+    rows, columns = -(-height // pool), -(-width // pool)
+    y = torch.arange(rows * pool, device=mask.device).clamp(max=height - 1)
+    x = torch.arange(columns * pool, device=mask.device).clamp(max=width - 1)
+    own_y, own_x = y.minimum(size_px[:, 1:] - 1), x.minimum(size_px[:, :1] - 1)
+    view = torch.arange(views, device=mask.device)[:, None, None]
+    full = mask[view, own_y[:, :, None], own_x[:, None, :]].float()
+    sums = full.view(views, rows, pool, columns, pool).sum((2, 4))
+    kernel = torch.tensor([1.0, 2.0, 1.0], device=mask.device)
+    border = pad(sums[:, None], (1, 1, 1, 1), mode="replicate")
+    smooth = conv2d(border, (kernel[:, None] * kernel)[None, None])[:, 0]
+    return (smooth * (1.0 / (16 * pool * pool)) + 0.5).floor().to(torch.uint8)
+
+
+def carve(
+    soft: UInt8[Tensor, "view row column"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
+) -> Float[Tensor, "x y z"]:
+    """The smallest mask value over the cameras that see each voxel's middle; 0 where fewer than `needed` do."""
+    points = voxels.centers
+    values = torch.ones_like(points[:, 0])
+    seen = torch.zeros_like(values, dtype=torch.int32)
+    for view in range(len(cameras)):
+        uv, z = project(points, cameras[view])
+        sees = in_view(uv, z, cameras[view])[0]
+        value = sample_bilinear(soft[view].float()[None, None] / 255, uv / pool, "border")[0, :, 0]
+        values = torch.where(sees, values.minimum(value), values)
+        seen += sees
+    return torch.where(seen >= needed, values, 0.0).view(voxels.shape)
+
+
+def occupied_blocks(
+    mask: UInt8[Tensor, "view height width"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
+) -> Bool[Tensor, "x y z"]:
+    """Blocks that project to some foreground in all cameras and are visible to enough cameras."""
+    centers, radius = blocks.centers, blocks.side_m * 3**0.5 / 2
+    P = cameras.K @ cameras.camera_from_world[:, :3]
+    empty = torch.zeros_like(centers[:, 0], dtype=torch.bool)
+    seen = torch.zeros_like(centers[:, 0], dtype=torch.int32)
+    for view in range(len(cameras)):
+        uv, z = project(centers, cameras[view])
+        uv, z, size = uv[0], z[0], cameras.size_px[view]
+        # How far from its centre's image the image of the ball around a block can reach.
+        slope = (P[view, None, :2, :3] - uv[:, :, None] * P[view, 2, :3]).norm(dim=-1)
+        reach = slope * (radius / (z - radius).clamp(min=NEAR_M))[:, None]
+        first, last = uv - reach, uv + reach
+        in_front = z - radius > NEAR_M
+        outside = ((last < 0) | (first >= size)).any(-1)
+        inside = ((first >= 0) & (last < size)).all(-1)
+        empty |= in_front & inside & (_foreground_tiles(mask[view], tile, first, last) == 0)
+        seen += (z + radius > NEAR_M) & ~(in_front & outside)
+    return (~empty & (seen >= needed)).view(blocks.shape)
+
+
+def _foreground_tiles(
+    mask: UInt8[Tensor, "height width"], tile: int, first: Float[Tensor, "block 2"], last: Float[Tensor, "block 2"]
+) -> Int[Tensor, "block"]:
+    """How many tiles with any foreground each window of pixels, and one and a half pixels around it, touches."""
+    height, width = mask.shape
+    rows, columns = -(-height // tile), -(-width // tile)
+    padded = pad(mask, (0, columns * tile - width, 0, rows * tile - height))
+    some = padded.view(rows, tile, columns, tile).amax((1, 3)) > 0
+    sums = pad(some.int().cumsum(0).cumsum(1), (1, 0, 1, 0))
+    end = torch.tensor([columns, rows], device=mask.device) - 1
+    from_tile = ((first - 1.5).clamp(0, max(width, height)) / tile).long().minimum(end)
+    to_tile = ((last + 1.5).clamp(0, max(width, height)) / tile).long().minimum(end) + 1
+    (left, top), (right, bottom) = from_tile.unbind(-1), to_tile.unbind(-1)
+    return sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]

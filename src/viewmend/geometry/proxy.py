@@ -59,20 +59,19 @@ def reconstruct(
     """The visual hull's surface from the masks of all cameras, without floating parts that no mask needs.
 
     A search over `bounds` (estimated from the masks where None) finds the box that the subject fills; all voxels are
-    spent there, on the CPU. So bounds much larger than the subject cost no detail. Where the masks agree on no
+    spent there. So bounds much larger than the subject cost no detail. Where the masks agree on no
     point of space, the proxy is empty.
 
     Raises:
         ValueError: there is one camera only, or no mask has any foreground.
     """
-    config, device = config or HullConfig(), mask.device
+    config = config or HullConfig()
     check_masks(mask, cameras)
-    mask, cameras = mask.cpu(), cameras.to("cpu")
-    bounds = bounds_from_masks(mask, cameras) if bounds is None else bounds.to("cpu")
+    bounds = bounds or bounds_from_masks(mask, cameras)
     box = occupied_bounds(mask, cameras, bounds, config)
     if box is None:
-        nothing = torch.zeros(0, 3)
-        return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds).to(device)
+        nothing = torch.zeros(0, 3, device=mask.device)
+        return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds)
     grid = without_floating_parts(visual_hull(mask, cameras, box, config), cameras)
     # Where images end, the search cannot tell empty from unknown until its blocks are as small as voxels.
     for _ in range(RECARVINGS):
@@ -81,7 +80,7 @@ def reconstruct(
             break
         box, grid = tight, without_floating_parts(visual_hull(mask, cameras, tight, config), cameras)
     mesh = extract_surface(grid)
-    return GeometryProxy(mesh, vertex_normals(mesh), box).to(device)
+    return GeometryProxy(mesh, vertex_normals(mesh), box)
 
 
 def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
