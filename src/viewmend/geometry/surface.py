@@ -26,13 +26,13 @@ def extract_surface(grid: OccupancyGrid) -> Mesh:
         return Mesh(empty, torch.zeros(0, 3, dtype=torch.int32, device=device))
     values = torch.nn.functional.pad(grid.values[box], (1, 1, 1, 1, 1, 1))
     first = torch.tensor([side.start for side in box], device=device)
-    vertices, faces = (part.to(device) for part in _march(values.cpu()))
+    vertices, faces = (march_numba if values.device.type == "cpu" else march_torch)(values)
     # Padding moved the origin by one voxel, values sit in the middle of theirs.
     return Mesh((vertices + first - 0.5) * grid.voxel_m + grid.low, faces)
 
 
-def _march(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
-    """Vertices, in voxels, and triangles."""
+def march_numba(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """Vertices, in voxels, and triangles, on the CPU."""
     from viewmend.geometry import _surface_numba as kernels
 
     grid = values.contiguous().numpy()
@@ -47,6 +47,12 @@ def _march(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], I
     return vertices, faces[:count].clone()  # half of it: the rest would stay as long as the mesh
 
 
+def march_torch(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
+    """The same on any device."""
+    vertices, vertex_of_edge = _crossings(values)
+    return vertices, _triangles(values > ISO, vertex_of_edge)
+
+
 def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
     """The box of inside voxels and one voxel around them, where the grid has it."""
     over_x = inside.any(0)
@@ -57,6 +63,45 @@ def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
             return None
         sides.append(slice(max(index[0] - 1, 0), min(index[-1] + 2, len(line))))
     return tuple(sides)
+
+
+def _crossings(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "axis=3 x y z"]]:
+    """Where the surface crosses grid edges, in voxels, and which vertex is on the edge from (x, y, z) along axis."""
+    inside = values > ISO
+    parts, vertex_of_edge = [], torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)
+    count = 0
+    for axis in range(3):
+        steps = values.shape[axis] - 1
+        changes = inside.narrow(axis, 0, steps) != inside.narrow(axis, 1, steps)
+        x, y, z = changes.nonzero(as_tuple=True)
+        position = torch.stack([x, y, z], -1).to(values)
+        near = values[x, y, z]
+        far = values.narrow(axis, 1, steps)[x, y, z]
+        position[:, axis] += (ISO - near) / (far - near)
+        vertex_of_edge[axis, x, y, z] = torch.arange(count, count + len(x), dtype=torch.int32, device=x.device)
+        parts.append(position)
+        count += len(x)
+    return torch.cat(parts), vertex_of_edge
+
+
+def _triangles(inside: Tensor, vertex_of_edge: Int[Tensor, "axis=3 x y z"]) -> Int[Tensor, "face 3"]:
+    """The triangles of all cells, as vertices."""
+    device = inside.device
+    size_x, size_y, size_z = inside.shape
+    case = torch.zeros(size_x - 1, size_y - 1, size_z - 1, dtype=torch.uint8, device=device)
+    for k in range(8):
+        x, y, z = k & 1, k >> 1 & 1, k >> 2 & 1
+        corner = inside[x : size_x - 1 + x, y : size_y - 1 + y, z : size_z - 1 + z]
+        case |= corner.to(torch.uint8) << k
+    cell = ((case > 0) & (case < 255)).nonzero(as_tuple=True)
+    edges = triangle_table().to(device)[case[cell].long()]
+    stride = torch.tensor([size_y * size_z, size_z, 1], device=device)
+    # Where each edge starts, relative to its cell, in the flat (axis, x, y, z) order of `vertex_of_edge`.
+    start = torch.tensor([[k & 1, k >> 1 & 1, k >> 2 & 1] for k, _ in EDGES], device=device) @ stride
+    start += torch.arange(3, device=device).repeat_interleave(4) * inside.numel()
+    owner, slot = (edges[..., 0] >= 0).nonzero(as_tuple=True)
+    flat = (torch.stack(cell, -1) @ stride)[owner]
+    return vertex_of_edge.flatten()[flat[:, None] + start[edges[owner, slot]]]
 
 
 EDGES = tuple((k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1)
