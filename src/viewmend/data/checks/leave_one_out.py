@@ -29,7 +29,7 @@ MAX_PEERS = 10
 MAX_REMOVED, LEAVE_OUT_REMOVED, LEAVE_OUT_OF_FEW = 0.004, 0.06, 0.2
 """A camera is an outlier if it alone removes this share of the others' masks, beyond 1.5 times the mean. From the
 second share on, or the third in rigs of few cameras, it is left out: less costs less than a missing camera. The first
-share is of images of `FINE_PX` or more; it grows with the size of a pixel, up to twice, as small ones lose thin parts."""
+share is of images of `FINE_PX` or more. It grows with the size of a pixel, up to twice: small ones lose thin parts."""
 FEW_CAMERAS = 5
 MAX_OUTSIDE, LEAVE_OUT_OUTSIDE = 0.15, 0.3
 """It is also one if this share of its mask is outside the others' hull, beyond 3 times the median."""
