@@ -1,5 +1,6 @@
 """Pickles of numbers, strings, lists, dicts and arrays are read as by unpickling; everything else is rejected."""
 
+import codecs
 import pickle
 
 import numpy as np
@@ -93,6 +94,19 @@ def test_recursive_lists_are_bounded(read):
     for nested in (value, endless):
         with pytest.raises(ValueError, match="expected 9 numbers, got"):
             numbers(read(pickle.dumps(nested)), 3, 3)
+
+
+@pytest.mark.parametrize("function", [codecs.encode, np.dtype])
+def test_nested_lists_do_not_become_text(read, function):
+    class Named:
+        def __reduce__(self):
+            value: list = ["f8"]
+            for _ in range(60):
+                value = [value, value]
+            return function, (value,)
+
+    with pytest.raises(ValueError, match="got text of type list"):
+        read(pickle.dumps(Named()))
 
 
 @pytest.mark.parametrize("value", [np.array(["a"]), np.array([1j]), np.array([(1, 2.0)], [("a", int), ("b", float)])])

@@ -35,7 +35,7 @@ class Stored:
         if self.dtype is None:
             _, shape, dtype, fortran, data = state
             self.value = _make_array(data, dtype, shape, "F" if fortran else "C")
-        elif (order := str(state[1])) in "<>":
+        elif (order := _text(state[1])) in "<>":
             self.dtype = self.dtype.newbyteorder(order)  # pyright: ignore[reportArgumentType]
 
 
@@ -129,8 +129,15 @@ class _StandIn:
         raise ValueError("the state of a function")
 
 
+def _text(value: Any) -> str:
+    """The value if it is text: nested lists that share their items would be endless as text."""
+    if not isinstance(value, str):
+        raise ValueError(f"text of type {type(value).__name__}")
+    return value
+
+
 def _dtype(text: Any, *_: Any) -> Stored:
-    dtype = np.dtype("O") if text in ("O", "O8") else np.dtype(str(text))
+    dtype = np.dtype("O" if _text(text) == "O8" else text)
     if dtype.kind not in KINDS + "O" or dtype.shape:
         raise ValueError(f"an array of {dtype}")
     return Stored(dtype)
@@ -155,7 +162,7 @@ _STAND_INS: dict[str, Callable[..., Any]] = {
     "numpy.core.numeric._frombuffer": lambda data, dtype, shape, order: Stored(
         value=_make_array(data, dtype, shape, order)
     ),
-    "_codecs.encode": lambda text, *_: str(text).encode("latin-1"),
+    "_codecs.encode": lambda text, *_: _text(text).encode("latin-1"),
     "collections.OrderedDict": dict,
     "builtins.bytes": lambda: b"",
     "__builtin__.bytes": lambda: b"",
