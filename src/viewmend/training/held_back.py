@@ -35,6 +35,8 @@ MAX_TABLE = 8
 """Cameras of the final table."""
 LPIPS_DB = 40.0
 """Decibels that one unit of LPIPS is worth when weights are compared: 0.01 counts as much as 0.4 dB."""
+MIN_GAIN_DB = 0.1
+"""Better weights have a score that is higher by at least this: smaller gains are chance on a few views."""
 PATIENCE = 6
 """Validations without a new best score after which a run ends."""
 PADDING_PX = 8

@@ -13,7 +13,7 @@ from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel
 
 from viewmend.training.config import TrainConfig
-from viewmend.training.held_back import PATIENCE, HeldBackValidation
+from viewmend.training.held_back import MIN_GAIN_DB, PATIENCE, HeldBackValidation
 from viewmend.training.objective import StepOutput
 from viewmend.training.replay import ReplayPosition, SampleReplay
 from viewmend.training.run_files import (
@@ -277,8 +277,8 @@ class Run:
         assert self.validation is not None, "the caller checked"
         scores = self.validation(self.averaged, self._image(step))
         log.add_validation(step, scores)
-        score = scores.get("score")
-        if self.keeps_best and score is not None and (self.state.best_score is None or score > self.state.best_score):
+        score, best = scores.get("score"), self.state.best_score
+        if self.keeps_best and score is not None and (best is None or score >= best + MIN_GAIN_DB):
             self.state = replace(self.state, best_score=score, best_step=step)
             self._write_model(step)
 
