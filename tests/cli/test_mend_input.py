@@ -17,8 +17,8 @@ from viewmend.data.prepare import adjustments
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--leave-out", "nobody"], "expected --leave-out among"),
-        (["--leave-out", "held", "--cameras", "c0", "nobody"], "nobody"),
+        (["--leave-out", "absent"], "expected --leave-out among"),
+        (["--leave-out", "held", "--cameras", "c0", "absent"], "absent"),
         (["--leave-out", "held", "--cameras", "c0"], "at least 2 input cameras, got 1"),
         ([], "either --leave-out CAMERA or --path"),
         (["--leave-out", "held", "--path", "orbit"], "either --leave-out CAMERA or --path"),
