@@ -76,6 +76,22 @@ def rendered(server: Running, time: int, mode: str = "rendered") -> tuple[np.nda
     return picture.astype(int), view.holes.numpy(), view.mask.numpy() > 0
 
 
+def mean_around(picture: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What `draw/fill.js` takes from around a pixel: the mean of the subject's pixels among 9 x 9 taps, and their weight."""
+    height, width = known.shape
+    stride = max(2, round(2 * height / 768))
+    total, weight = np.zeros(picture.shape), np.zeros(known.shape)
+    for y in range(-4, 5):
+        for x in range(-4, 5):
+            rows, columns = np.arange(height) + stride * y, np.arange(width) + stride * x
+            inside = ((rows >= 0) & (rows < height))[:, None] & (columns >= 0) & (columns < width)
+            at = np.ix_(rows.clip(0, height - 1), columns.clip(0, width - 1))
+            share = np.exp(-(x * x + y * y) / 8) * (inside & known[at])
+            total += share[..., None] * picture[at]
+            weight += share
+    return total / np.maximum(weight, 1e-9)[..., None], weight
+
+
 def psnr_in_box(page: np.ndarray, server: np.ndarray, mask: np.ndarray, ignored: np.ndarray) -> float:
     rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
@@ -113,7 +129,7 @@ def test_the_page_draws_what_the_server_renders(browser, balls):
 
 def test_holes_are_filled_marked_or_black(browser, balls):
     rig = balls.service.renderer.rig_json
-    pose = pose_text(rig["home"], rig["center"], 300, 60)
+    pose = pose_text(rig["home"], rig["center"], 300, 40)
     shown = {}
     for mode in ("mended", "holes", "rendered"):
         with silent(balls), opened(browser, balls, f"mode={mode}&time=0&pose={pose}") as view:
@@ -125,6 +141,10 @@ def test_holes_are_filled_marked_or_black(browser, balls):
     assert np.abs(shown["holes"][inner] - np.array([255, 38, 140])).mean() < 8
     assert (shown["mended"][inner].max(-1) < 20).mean() < 0.01, "no black holes"
     assert np.abs(shown["mended"] - shown["rendered"])[~holes].mean() < 0.5
+    around, weight = mean_around(shown["rendered"], mask & (shown["rendered"] == shown["holes"]).all(-1))
+    among = inner & (weight > 8)
+    assert among.sum() > 20
+    assert np.abs(shown["mended"] - around)[among].mean() < 6, "holes continue what is around them"
 
 
 def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, balls):

@@ -1,5 +1,6 @@
 // Views of a frame, drawn from its mesh and the cameras' images by the rule of the server's rendering/blending.py.
 
+import { HoleFill } from "./fill.js";
 import { buildProgram } from "./program.js";
 import { clipFromWorld } from "./projection.js";
 import { rankedCameras } from "../link/assets.js";
@@ -49,7 +50,7 @@ uniform vec3 eye;
 uniform float bias, slope, grazing, least;
 uniform vec2 powers;
 uniform bool leaves;   // holes to the next pass
-uniform vec4 hole;    // colour of holes; that of the vertices where its alpha is 0
+uniform vec4 hole;    // colour of holes; that of the vertices where its alpha is 0, which then stays 0
 uniform mat4 pixels[${count}];   // (u z, v z, z) of a point
 uniform vec3 centers[${count}];
 uniform vec3 lenses[${count}];   // focal length, and depth = y (1 - z / metres)
@@ -96,7 +97,7 @@ ${Array.from(
   (_, n) => `  sum += weigh(picture${n}, depth${n}, pixels[${n}], centers[${n}], lenses[${n}], outward, toViewer);`,
 ).join("\n")}
   if (leaves && sum.a < least) discard;
-  colour = vec4(sum.a >= least ? sum.rgb / sum.a : mix(tint, hole.rgb, hole.a), 1.0);
+  colour = sum.a >= least ? vec4(sum.rgb / sum.a, 1.0) : vec4(mix(tint, hole.rgb, hole.a), hole.a);
 }`;
 
 const QUAD = `#version 300 es
@@ -129,6 +130,7 @@ export class Scene {
     this.blends = new Map();
     /** @type {Map<Frame, any>} meshes and textures, the ones used last at the end */
     this.kept = new Map();
+    this.fill = new HoleFill(gl);
     this.empty = gl.createVertexArray();
     /** Of the last view. */
     this.cost = { draws: 0, triangles: 0, textureBytes: 0 };
@@ -172,8 +174,8 @@ export class Scene {
     return [...own.sources].map(([n, source]) => ({ camera: cameras[n], picture: source.picture }));
   }
 
-  /** Draw into the current viewport and scissor. @param {Frame} frame @param {any[]} sources @param {Viewpoint} viewer @param {number[]} eye @param {string} mode */
-  draw(frame, sources, viewer, eye, mode) {
+  /** Draw into a viewport, within the current scissor. @param {Frame} frame @param {any[]} sources @param {Viewpoint} viewer @param {number[]} eye @param {string} mode @param {number[]} viewport x, y, width, height in pixels, y up @param {number[]} ground colour of the background */
+  draw(frame, sources, viewer, eye, mode, viewport, ground) {
     const { gl } = this;
     const own = this.kept.get(frame);
     const { blend } = /** @type {any} */ (frame.shape).header;
@@ -199,9 +201,10 @@ export class Scene {
     gl.depthFunc(gl.LEQUAL);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindVertexArray(null);
+    if (!hole[3]) this.fill.draw(own.box, viewer, viewport, ground);
     const textureBytes = sources.reduce((sum, { size }) => sum + 8 * size[0] * size[1], 0);
     const draws = passes.length > 1 ? 1 + passes.length : 1;
-    this.cost = { draws, triangles: (draws * own.count) / 3, textureBytes };
+    this.cost = { draws: draws + Number(!hole[3]), triangles: (draws * own.count) / 3, textureBytes };
   }
 
   /** @param {any} own @param {any[]} sources @param {{matrix: Float32Array, eye: number[], blend: any, hole: number[], leaves: boolean}} view */

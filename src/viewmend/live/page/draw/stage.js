@@ -66,7 +66,7 @@ export class Stage {
     this.software = software();
     // Smooth outlines of drawn views, where that is cheap and pixels are large enough to see.
     const antialias = !this.software && window.devicePixelRatio < 2;
-    const options = { alpha: false, antialias, stencil: true, powerPreference: "high-performance" };
+    const options = { antialias, stencil: true, powerPreference: "high-performance" };
     const gl = /** @type {WebGL2RenderingContext | null} */ (canvas.getContext("webgl2", options));
     if (!gl) throw new Error("This page needs WebGL 2, which this browser does not offer.");
     this.gl = gl;
@@ -201,7 +201,7 @@ export class Stage {
         this.#photo(viewer, mode);
         continue;
       }
-      if (over < 1 || wish.rig) this.scene.draw(frame, sources, viewer, place, mode);
+      if (over < 1 || wish.rig) this.scene.draw(frame, sources, viewer, place, mode, [x, y, width, height], this.ground);
       if (over > 0) this.#overlay(kept, kept.textures[mode], over);
     }
     gl.scissor(x, y, width, height);
@@ -249,7 +249,7 @@ export class Stage {
     const header = /** @type {Header} */ (this.header);
     gl.disable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
-    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
     this.#image(header, picture, kept.quad, clipFromPixels(header.width, header.height), opacity);
     gl.disable(gl.BLEND);
     gl.enable(gl.DEPTH_TEST);
