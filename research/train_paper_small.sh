@@ -1,0 +1,13 @@
+#!/bin/sh
+# paper-small from random weights, on one CPU core and a worker: samples, patch autoencoder, the paper's objective.
+#
+#     research/train_paper_small.sh OUT PEOPLE MOTIONS
+#
+# PEOPLE and MOTIONS are folders of glTF characters and BVH motions. Repeat the command to resume. COUNT,
+# PRETRAIN_MINUTES and MINUTES may be set; the weights are in OUT/model.
+set -eu
+out=$1 people=$2 motions=$3
+
+viewmend make-dataset paper-small --count "${COUNT:-6000}" --performers "$people" --motions "$motions" --out "$out/samples"
+python "$(dirname "$0")/pretrain_paper.py" --shards "$out/samples" --minutes "${PRETRAIN_MINUTES:-20}" --out "$out/autoencoder"
+viewmend train paper-small --from "$out/autoencoder" --shards "$out/samples" --minutes "${MINUTES:-240}" --out "$out/model"
