@@ -153,12 +153,6 @@ def test_splatted_points_keep_some_depths_and_show_gaps_or_what_is_behind():
     assert 0.4 < float((gaps[5:35, 5:35] > 0).float().mean()) < 0.8
 
 
-def test_stored_hulls_have_the_configured_resolution(studio):
-    scenes = [replace(VIEWS_SCENES, hull_resolution=n) for n in (16, 48)]
-    sizes = [sum(len(view.faces) for view in store_scene(scene_of(studio), s).held) for s in scenes]
-    assert 4 * sizes[0] < sizes[1]
-
-
 def test_a_crop_is_a_part_of_the_view_and_of_its_truth(view):
     torch.manual_seed(1)
     num_cameras = set()
