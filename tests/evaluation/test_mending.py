@@ -29,14 +29,6 @@ def test_each_view_shows_its_own_frame():
     assert means[2] < 0.9 * means[0]
 
 
-def test_the_truth_outside_of_its_mask_does_not_matter():
-    source = BallCapture(ring(6), 1)
-    truth = BallCapture(TARGET, 1).read(0)
-    bright = replace(truth, rgb=torch.where(truth.mask[:, None] > 127, truth.rgb, 255).to(torch.uint8))
-    steps = [Mender(SmoothFill()).mend(source.read(0), TARGET, seen) for seen in (truth, bright)]
-    assert steps[0].scores == steps[1].scores and float(steps[1].truth[:, 0, 0].max()) == 0
-
-
 class Snow(SmoothFill):
     """Paints all of E white."""
 

@@ -10,7 +10,6 @@ from viewmend.models.paper.tokenizer import (
     Encoder,
     Tokeniser,
     build_context_input,
-    find_crop,
     relative_depth,
 )
 
@@ -50,14 +49,6 @@ def test_encoding_a_crop_equals_encoding_the_whole_image():
             whole.append(tokeniser.linear(patches.flatten(1)))
     assert torch.allclose(tokens, torch.cat(whole), atol=1e-4)
     assert not bool(stacks[1].kept.all()), "the crop must be smaller than the image"
-
-
-def test_a_crop_contains_every_kept_patch_with_its_margin():
-    kept = torch.zeros(5, 6, dtype=torch.bool)
-    kept[1, 2] = kept[3, 4] = True
-    # 3 patches and a margin of 2 on both sides, rounded up to 8.
-    assert find_crop(kept) == ((-1, 0), (7 * 16 + 28, 7 * 16 + 28))
-    assert find_crop(torch.zeros_like(kept)) == ((-2, -2), (7 * 16 + 28, 7 * 16 + 28))
 
 
 def test_relative_depth_is_independent_of_scale(rng):

@@ -135,22 +135,6 @@ def test_a_view_without_a_hole_contributes_zero(loss, rng):
     assert all(p.grad is not None and not p.grad.any() for p in net.parameters())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_images_of_a_batch_do_not_mix_and_only_training_iterates(kind, rng):
-    net = tiny(kind, 3)
-    first, second = random_images(kind, rng, sizes=LARGER)
-    third = torch.rand(first.shape, generator=rng)
-    u = next(b for n, b in net.named_buffers() if n.endswith("_u"))
-    before = u.clone()
-    net([first])
-    assert not torch.equal(u, before)
-    net.eval()
-    before = u.clone()
-    for logits, image in zip(net([first, second, third]), (first, second, third), strict=True):
-        torch.testing.assert_close(logits, net([image])[0], atol=1e-6, rtol=1e-5)
-    assert torch.equal(u, before)
-
-
 def test_t_patchgan_is_the_published_network():
     net = Discriminator("clip", 32, 6)
     assert sum(p.numel() for p in net.parameters()) == 4_461_728
