@@ -1,6 +1,7 @@
 """Pull and push, pixel by pixel."""
 
 import torch
+from torch.nn.functional import interpolate
 
 
 def pull_push_twin(rgb, known):
@@ -16,16 +17,5 @@ def pull_push_twin(rgb, known):
             if known[block].any():
                 seen[r, c] = True
                 coarse[:, r, c] = rgb[:, *block][:, known[block]].mean(1)
-    filled = pull_push_twin(coarse, seen)
-    out = rgb.clone()
-    for y in range(height):
-        for x in range(width):
-            if not known[y, x]:
-                v = max((y + 0.5) * rows / height - 0.5, 0)
-                u = max((x + 0.5) * cols / width - 0.5, 0)
-                r, c = int(v), int(u)
-                r2, c2 = min(r + 1, rows - 1), min(c + 1, cols - 1)
-                top = filled[:, r, c] * (1 - (u - c)) + filled[:, r, c2] * (u - c)
-                bottom = filled[:, r2, c] * (1 - (u - c)) + filled[:, r2, c2] * (u - c)
-                out[:, y, x] = top * (1 - (v - r)) + bottom * (v - r)
-    return out
+    filled = interpolate(pull_push_twin(coarse, seen)[None], (height, width), mode="bilinear")[0]
+    return torch.where(known, rgb, filled)
