@@ -13,7 +13,7 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.models.checkpoint import build
 from viewmend.models.classical import Telea
 from viewmend.models.paper.config import paper, paper_small
-from viewmend.models.paper.tokenizer import build_target_input
+from viewmend.models.paper.tokenizer import build_context_input, build_target_input
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.view import RenderConfig, select_closest
 from viewmend.stream import Stream
@@ -94,6 +94,18 @@ def test_the_papers_model_sees_m_t_white_where_it_is_0_and_black_where_it_is_mis
     )
     shown = net([given], [[context(5)]])[0].composited
     assert (shown[:, :, :40] == 1).all(), "training sees what is scored"
+
+
+def test_without_masks_nothing_is_cut_and_no_patch_is_dropped():
+    config = replace(paper_small(), use_mask=False)
+    views, incomplete = context(5), view(5)
+    frame = replace(views.frame, mask=torch.zeros_like(views.frame.mask))
+    made = build_context_input(replace(views, frame=frame), config)
+    assert torch.equal(made.channels[:, :3], views.frame.rgb.float() / 255) and bool(made.kept.all())
+    given = replace(incomplete, mask=torch.zeros_like(incomplete.mask), target_mask=torch.zeros_like(incomplete.mask))
+    target = build_target_input(given, config)
+    assert torch.equal(target.channels[0, :3], incomplete.rgb) and bool(target.kept.all())
+    assert made.channels.shape[1] == 4, "RGB and depth"
 
 
 def test_a_wrong_target_mask_is_refused():

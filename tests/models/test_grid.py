@@ -9,8 +9,10 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import project
 from viewmend.models.views.grid import (
+    AT_ONCE,
     BAND_PX,
     CELL_PX,
+    TILE_PX,
     UNet,
     detail_bands,
     downsample2x,
