@@ -1,10 +1,11 @@
-"""The four real captures that developers keep beside the repository: their units, masks, lenses and videos."""
+"""Real captures that developers keep beside the repository: their units, masks, lenses and videos."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from viewmend.data.native_capture import open_capture
+from viewmend.data.source import prefetch
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.types import MultiViewFrame
 
@@ -32,3 +33,12 @@ def test_calibration_masks_and_lenses_agree(shared, name, cameras, mean, lowest,
     up = torch.tensor([0.0, 1.0, 0.0]) if capture.up is None else capture.up
     along = proxy.mesh.vertices @ up
     assert height_m[0] < float(along.max() - along.min()) < height_m[1]  # metres, whatever the folder's unit
+
+
+def test_utrecht_is_a_stream(shared):
+    capture = open_capture(shared / "captures" / "utrecht")
+    assert (len(capture.frame_ids), capture.fps, capture.gaps) == (426, 50.0, ())
+    frames = list(prefetch(capture, [0, 40, 41]))
+    assert [frame.time for frame in frames] == [0, 40, 41]
+    near, far = ((frames[i].rgb.float() - frames[1].rgb.float()).abs().mean() for i in (2, 0))
+    assert 0 < near < far  # videos advance
