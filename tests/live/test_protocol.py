@@ -58,6 +58,7 @@ def test_every_message_is_parsed():
         ),
         ({"type": "look", "error_rule": "some"}, 'error_rule: expected .*, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),
+        ({"type": "look", "modes": ["compared"]}, "expected 'model' for the mode 'compared'"),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, -1], "T": [0, 0, 0]}}, "expected 'R' as a rotation"),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}, "'T'"),
         ({"type": "look", "camera": {"distance": -1}}, "camera: distance: expected a number >= 0.02, got -1"),
