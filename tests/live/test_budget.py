@@ -120,6 +120,12 @@ def test_a_model_that_predicts_errors_refines_a_part_instead_of_using_less_conte
     assert all(0 <= level.refine_fraction < 1 for level in REFINE_LADDER.levels[:-1])
 
 
+def test_invalid_budgets_are_refused():
+    for target_ms in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="expected a positive budget"):
+            Budget(target_ms)
+
+
 def test_the_predicted_time_grows_with_the_pixels():
     half = QualityLevel(0.5, 7, None)
     budget = Budget(100.0, (half, FULL))
@@ -140,6 +146,18 @@ def test_a_level_that_never_holds_is_tried_less_and_less_often_but_never_given_u
         # By the images of half the size, the full one would take 40 ms.
         budget.record(level, FrameTimes(rendering=10.0 if level == half else 300.0))
     assert waits[-1] > 20 * waits[1] and max(waits) <= MAX_UP_AFTER_FRAMES + MEMORY_FRAMES and len(waits) > 15
+
+
+def test_it_goes_up_only_where_the_next_level_has_room():
+    levels = (QualityLevel(0.5, 7, None), FULL)
+    budget = Budget(100.0, levels)
+    budget.record(FULL, FrameTimes(inpainting=400.0))
+    for _ in range(30):
+        assert budget.index == 0
+        budget.record(levels[0], FrameTimes(inpainting=80.0))  # this level has room, but the full one would take 320 ms
+    for _ in range(30):
+        budget.record(budget.level, FrameTimes(inpainting=80.0 * budget.level.scale**2))
+    assert budget.level == FULL
 
 
 LARGEST = Limits().max_pixels

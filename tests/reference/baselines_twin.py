@@ -35,6 +35,37 @@ def deformable_twin(x, offsets, masks, weight, bias):
     return out
 
 
+def patches_twin(features, patch=7, step=3, margin=3):
+    """Features [channel height width] -> patches [rows cols channel * patch * patch], zeros around."""
+    height, width = features.shape[1:]
+    rows, cols = (height - 1) // step + 1, (width - 1) // step + 1
+    patches = torch.zeros(rows, cols, features.shape[0], patch, patch)
+    for r in range(rows):
+        for c in range(cols):
+            for i in range(patch):
+                for j in range(patch):
+                    y, x = r * step - margin + i, c * step - margin + j
+                    if 0 <= y < height and 0 <= x < width:
+                        patches[r, c, :, i, j] = features[:, y, x]
+    return patches.flatten(2)
+
+
+def added_up_twin(patches, size, patch=7, step=3, margin=3):
+    """Patches [rows cols channel * patch * patch] -> (sum, count of patches) of each cell of a map of this size."""
+    rows, cols, length = patches.shape
+    parts = patches.view(rows, cols, length // patch**2, patch, patch)
+    total, count = torch.zeros(parts.shape[2], *size), torch.zeros(size)
+    for r in range(rows):
+        for c in range(cols):
+            for i in range(patch):
+                for j in range(patch):
+                    y, x = r * step - margin + i, c * step - margin + j
+                    if 0 <= y < size[0] and 0 <= x < size[1]:
+                        total[:, y, x] += parts[r, c, :, i, j]
+                        count[y, x] += 1
+    return total, count
+
+
 def window_keys_twin(grid, row, col, window=(5, 9)):
     """The fine places, as (row, column), that window (row, col) of a grid of windows looks at in each frame.
 
