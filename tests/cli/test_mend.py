@@ -17,6 +17,7 @@ from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.live.renderer import Renderer, RenderRequest
+from viewmend.metrics.image_quality import psnr, ssim_map
 from viewmend.models.classical import Telea
 from viewmend.stream import RenderQuality
 from viewmend.types import CompletedView, IncompleteView
@@ -77,6 +78,19 @@ def test_the_whole_subject_may_be_mended(folder, tmp_path, mend):
     assert whole["psnr_valid"] < unseen["psnr_valid"]
     asked = [cv2.imread(str(tmp_path / out / "holes" / "000000.png"), 0) > 0 for out in "ab"]
     assert asked[1][asked[0]].all() and asked[1].sum() > 2 * asked[0].sum()
+
+
+def test_the_whole_view_is_scored(folder, tmp_path, mend):
+    _, report, _ = mend(folder, tmp_path / "out", "--leave-out", "held", "--frames", "1:2")
+    prepared = prepare(open_masked(folder), [f"c{n}" for n in range(6)])
+    truth = prepared.read(1).select(["held"])
+    image, mask = truth.rgb[0] / 255 * (truth.mask[0] / 255), truth.mask[0] > 127
+    seen = torch.from_numpy(cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1] / 255).movedim(-1, 0)
+    assert report["psnr_whole"] == pytest.approx(psnr(seen, image), abs=0.02)
+    assert report["psnr_subject"] == pytest.approx(psnr(seen, image, mask), abs=0.02)
+    assert report["ssim_whole"] == pytest.approx(float(ssim_map(seen, image).nanmean()), abs=1e-3)
+    assert report["alpha_iou"] == pytest.approx(report["hull_iou"]["held"], abs=1e-9)
+    assert report["psnr_whole_rendered"] < report["psnr_whole"]
 
 
 def pictures(folder, flags=cv2.IMREAD_COLOR_RGB):
@@ -156,6 +170,16 @@ def test_an_orbit_shows_the_whole_motion(folder, tmp_path, mend):
         assert film.streams.video[0].average_rate == 12
     assert report["psnr_whole"] is None and report["psnr_holes_telea"] is None
     assert report["hole_fraction"] < 0.9 and min(report["hull_iou"].values()) > 0.9
+
+
+def test_poses_come_from_a_file(folder, tmp_path, mend):
+    poses = [camera_at(angle, "t").world_from_camera[0].tolist() for angle in (30, 60, 80)]
+    file = tmp_path / "path.json"
+    K = [[60, 0, 20], [0, 60, 10], [0, 0, 1]]
+    file.write_text(json.dumps({"world_from_camera": poses, "K": K, "width": 40, "height": 20}))
+    code, report, _ = mend(folder, tmp_path / "out", "--path", file, "--frames", "0:1")
+    assert code == 0 and report["frames"] == 3
+    assert cv2.imread(str(tmp_path / "out" / "holes" / "000002.png"), 0).shape == (20, 40)
 
 
 def test_the_page_shows_the_same_pixels(shifted, tmp_path, mend):

@@ -17,7 +17,7 @@ SHIFT_PX = 0.8
 
 
 class Shifted(BallCapture):
-    """A rig that states principal points beside the true ones."""
+    """A rig that states principal points next to the true ones."""
 
     def __init__(self):
         heights = (0.3, 0.0, 1.2, -0.8, 0.6, 1.4, -1.0)

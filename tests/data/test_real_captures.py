@@ -1,4 +1,4 @@
-"""Real captures that developers keep beside the repository: their units, masks, lenses and videos."""
+"""Real captures that developers keep next to the repository: their units, masks, lenses and videos."""
 
 import pytest
 import torch
