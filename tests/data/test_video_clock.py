@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from reference.ball import BallCapture, photograph, ring
-from reference.capture_folder import edit_description
 from reference.films import write_film, write_film_capture
 
 from viewmend.cli import main
@@ -28,9 +27,37 @@ def said(clock):
     return [issue.text for issue in clock.issues(("a", "b", "c", "d"))]
 
 
+def test_films_in_step_are_matched_one_to_one():
+    clock = match_tracks(tracks(a=range(9), b=range(9), c=range(9)))
+    assert (len(clock.times_s), clock.end, clock.fps, said(clock)) == (9, 9, 30.0, [])
+    assert all(index.tolist() == list(range(9)) for index in clock.frames.values())
+
+
+def test_a_camera_is_absent_where_it_lost_frames_and_in_step_afterwards():
+    lost = [0, 1, 2, 3, 7, 8]
+    clock = match_tracks(tracks(a=range(9), b=lost, c=range(9)))
+    assert clock.frames["b", "images"].tolist() == [0, 1, 2, 3, ABSENT, ABSENT, ABSENT, 4, 5]
+    assert said(clock) == [
+        "the images of camera 'b' lack 3 frames from 0.13 s on, by the film's own times; the camera is absent there"
+    ]
+
+
 def test_frames_that_the_reference_lost_are_kept():
     clock = match_tracks(tracks(a=[0, 1, 2, 6, 7, 8], b=[0, 1, 2, 3, 4, 7, 8], c=[0, 1, 4, 5, 6, 7, 8]))
     assert np.rint(30 * clock.times_s).tolist() == [0, 1, 2, 4, 6, 7, 8]  # 3 and 5: one camera alone
+
+
+@pytest.mark.parametrize("rate", [15, 10])
+def test_a_slower_camera_is_absent_in_between(rate):
+    step = 30 // rate
+    clock = match_tracks(tracks(a=range(12), b=range(12), c=(range(12 // step), rate)))
+    assert clock.frames["c", "images"].tolist() == [n // step if n % step == 0 else ABSENT for n in range(12)]
+    assert clock.end == 12 and f"have {rate} frames per second, not the others' 30" in said(clock)[0]
+
+
+def test_one_fast_camera_does_not_set_the_pace():
+    clock = match_tracks(tracks(a=(range(48), 120), b=range(12), c=range(12)))
+    assert clock.frames["a", "images"].tolist() == list(range(0, 48, 4)) and clock.fps == 30.0 and not said(clock)
 
 
 def test_half_of_the_cameras_being_slow_is_said():
@@ -63,12 +90,22 @@ def test_masks_are_matched_by_time_or_one_to_one():
     assert "masks of camera 'a' have other times than the images, but as many frames" in said(numbered)[1]
 
 
+def test_the_shortest_film_ends_the_capture():
+    clock = match_tracks(tracks(a=range(24), b=range(24), a_masks=range(24), b_masks=range(20)))
+    assert clock.end == 20 and "the masks of camera 'b' end 0.13 s before the images'" in said(clock)[0]
+
+
 def test_films_without_a_common_time_start_together_and_this_is_said():
     clock = match_tracks(tracks(a=range(9), b=range(9), c=range(9000, 9009)))
     assert clock.frames["c", "images"].tolist() == list(range(9))
     assert said(clock) == [
         "the images of camera 'c' have no time in common with the others'; they are taken to start together"
     ]
+
+
+def test_faults_of_several_cameras_are_one_issue():
+    clock = match_tracks(tracks(a=range(9), b=range(9), a_masks=(range(5), 15), b_masks=(range(5), 15)))
+    assert len(said(clock)) == 1 and "cameras 'a', 'b'" in said(clock)[0]
 
 
 # Captures.
@@ -96,6 +133,12 @@ def rewrite(ball, camera, shown, **how):
     images = [frames[time].rgb[NAMES.index(camera)].permute(1, 2, 0).numpy() for time in shown]
     how = {"fps": 10, "pix_fmt": "yuv444p", "options": {"crf": "8"}} | how
     write_film(path / f"video/{camera}.mp4", images, **how)
+
+
+def edit(path, change):
+    content = json.loads((path / "cameras.json").read_text())
+    change(content)
+    (path / "cameras.json").write_text(json.dumps(content))
 
 
 def shown(capture):
@@ -129,13 +172,13 @@ def test_masks_may_be_numbered_like_the_frames_of_their_film(ball):
 def test_an_offset_is_subtracted_from_the_times_of_a_camera(ball):
     path, _ = ball
     rewrite(ball, "c3", [0, 0, *range(6)])  # two frames late
-    edit_description(path, lambda content: content["cameras"][3].update(offset_ms=200))
+    edit(path, lambda content: content["cameras"][3].update(offset_ms=200))
     capture = open_capture(path)
     assert all(set(seen.values()) == {time} for time, seen in enumerate(shown(capture)))
     assert "c3" not in capture.read(7).cameras.names and capture.clock.describe("c3")[0]["offset_ms"] == 200
     images = path.parent / "images"
     write_capture(BallCapture(ring(4), 8), images, images="png")
-    edit_description(images, lambda content: content["cameras"][0].update(offset_ms=-100))
+    edit(images, lambda content: content["cameras"][0].update(offset_ms=-100))
     assert [seen.get("c0") for seen in shown(open_capture(images))] == [None, 0, 1, 2, 3, 4, 5, 6]
 
 
@@ -144,7 +187,7 @@ def test_masks_may_be_films_of_another_rate(ball):
     white = [np.full((48, 48, 3), 20 + 25 * time, np.uint8) for time in range(8)]
     for name, step in (("c0", 1), ("c1", 2)):
         write_film(path / f"mask/{name}.mp4", white[::step], fps=10 // step, options={"crf": "4"})
-    edit_description(path, lambda content: [content["cameras"][n].update(mask=f"mask/c{n}.mp4") for n in (0, 1)])
+    edit(path, lambda content: [content["cameras"][n].update(mask=f"mask/c{n}.mp4") for n in (0, 1)])
     capture = open_capture(path)
     assert "the masks of camera 'c1' have 5 frames per second, not the images' 10" in capture.issues[0].text
     for time in range(8):
