@@ -13,12 +13,12 @@ def cover(view) -> str:
 
 def test_loading_is_said_until_the_first_picture(browser, server):
     server.hold, server.source = True, "loading"
-    with opened(browser, server, "phone") as view:
-        view.until(lambda: "Loading" in cover(view))
+    for view in opened(browser, server, "phone"):
+        view.until(lambda view=view: "Loading" in cover(view))
         server.source = "ready"
-        view.until(lambda: "Rendering" in cover(view))
+        view.until(lambda view=view: "Rendering" in cover(view))
         server.hold = False
-        view.until(lambda: cover(view) == "")
+        view.until(lambda view=view: cover(view) == "")
 
 
 def test_a_lost_connection_comes_back_with_view_and_time(desktop):
@@ -63,15 +63,15 @@ def test_while_it_is_lost_there_is_a_button(desktop):
 @pytest.mark.parametrize(("code", "words"), [(4401, "needs a token"), (4426, "Reload the page")])
 def test_a_final_refusal_says_what_to_do(browser, server, code, words):
     server.refuse = code
-    with opened(browser, server, "phone") as view:
-        view.until(lambda: words in cover(view))
+    for view in opened(browser, server, "phone"):
+        view.until(lambda view=view: words in cover(view))
         view.page.wait_for_timeout(700)
         assert not server.viewers
 
 
 def test_the_token_of_the_address_is_passed_on(browser, server):
     asked = []
-    with opened(browser, server, "desktop", "?token=a%20b") as view:
+    for view in opened(browser, server, "desktop", "?token=a%20b"):
         view.settle()
         view.page.on("request", lambda request: asked.append(request.url))
         for _ in range(2):
@@ -123,7 +123,7 @@ def test_broken_video_falls_back_to_jpeg(desktop):
 
 
 def test_who_wants_no_motion_gets_none(browser, server):
-    with opened(browser, server, "desktop", reduced_motion="reduce") as view:
+    for view in opened(browser, server, "desktop", reduced_motion="reduce"):
         view.settle()
         count = len(server.looks)
         view.page.locator("#cameras").get_by_role("button", name="cam03").click()

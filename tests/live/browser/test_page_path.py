@@ -168,26 +168,3 @@ def test_a_file_that_is_no_path_is_said_and_changes_nothing(desktop, tmp_path, t
     desktop.page.locator("#path-file").set_input_files(file)
     desktop.until(lambda: "none.json is not a camera path" in desktop.page.locator("#toasts").inner_text())
     assert "2 views" in desktop.page.locator("#path-text").inner_text()
-
-
-def test_a_film_for_headsets_has_two_eyes_in_the_size_that_was_chosen(desktop, tmp_path):
-    pytest.importorskip("av")
-    page = desktop.page
-    for _ in range(2):
-        page.get_by_role("button", name="Add view").click()
-    page.locator("#path-stereo").check()
-    films = []
-    for expected in ("viewmend-path_SBS.mp4", "viewmend-path.mp4"):
-        with page.expect_download(timeout=60_000) as waiting:
-            page.get_by_role("button", name="Export MP4").click()
-        assert waiting.value.suggested_filename == expected
-        waiting.value.save_as(tmp_path / expected)
-        films.append(cv2.VideoCapture(str(tmp_path / expected)).read()[1])
-        page.locator("#path-stereo").uncheck()
-    two, one = desktop.server.paths[-2:]
-    assert two["stereo_m"] == pytest.approx(0.064) and one["stereo_m"] is None
-    assert (two["width"], two["height"]) == (240, 480) and (one["width"], one["height"]) == (480, 480)
-    assert two["poses"][0]["cx"] == 120 and two["poses"][0]["fy"] < one["poses"][0]["fy"], (
-        "narrower, but nothing is cut"
-    )
-    assert films[0].shape == films[1].shape == (480, 480, 3)

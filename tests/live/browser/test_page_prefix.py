@@ -5,7 +5,8 @@ import socket
 import threading
 from collections.abc import Iterator
 
-from live.browser.conftest import SCREENSHOT_S, View
+from live.browser.conftest import View
+from live.browser.test_page_drawing import SCREENSHOT_S
 from live.live_servers import running
 
 PREFIX, TOKEN = "/some/rig", "a-token-of-a-test-long-enough"

@@ -75,6 +75,20 @@ def test_what_was_hidden_is_dim_and_not_torn(desktop):
     assert (shown[~inside].max(-1) > 60).mean() < 0.03
 
 
+def test_the_page_repaints_faster_than_pictures_come(desktop):
+    desktop.server.hold = True
+    count = "document.querySelector('#figure-repaints').textContent"
+    desktop.page.mouse.move(*desktop.middle())
+    desktop.page.mouse.down()
+    for n in range(60):
+        desktop.page.mouse.move(400 + 3 * n, 300)
+        desktop.page.wait_for_timeout(16)
+    desktop.page.wait_for_timeout(400)
+    rate = float(desktop.page.evaluate(count))
+    desktop.page.mouse.up()
+    assert rate > 8, "of repaints a second on a machine that may be busy"
+
+
 HEADSET = """
 (() => {
   const eye = x => ({
@@ -125,3 +139,13 @@ def test_a_headset_gets_two_eyes_of_one_state(browser, server):
 
 def test_without_a_headset_there_is_no_button(desktop):
     assert desktop.page.locator("#tool-headset").is_hidden()
+
+
+def test_where_the_processor_draws_some_refreshes_are_left_out(desktop):
+    counts = desktop.page.evaluate(
+        "import('/page/draw/resolution.js').then(({ Pace }) => [false, true].map((software) => {"
+        "  const pace = new Pace(software);"
+        "  return Array.from({ length: 60 }, (_, n) => pace.due((1000 / 60) * n)).filter(Boolean).length; }))"
+    )
+    assert counts[0] == 60
+    assert 38 <= counts[1] <= 41

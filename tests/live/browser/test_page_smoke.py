@@ -9,9 +9,10 @@ from live.browser.stand_in import StandIn, depth_part
 
 @pytest.fixture(scope="module")
 def page(browser):
-    with StandIn() as server, opened(browser, server, "desktop") as view:
-        view.settle()
-        yield view
+    with StandIn() as server:
+        for view in opened(browser, server, "desktop"):
+            view.settle()
+            yield view
 
 
 def call(page, module: str, body: str, argument: object = None):
@@ -78,6 +79,22 @@ def test_depth_is_unpacked(page, rng):
     assert (np.reshape(got, (height, width)) == 0).sum() == (expected == 0).sum() > 0
 
 
+def test_the_size_asked_for_keeps_the_shape_and_the_limits(page):
+    def size(width: int, height: int, side: int, limits: dict) -> tuple[int, int]:
+        box = {"left": 0, "top": 0, "width": width, "height": height}
+        got = call(page, "view/lens.js", "return m.sizeFor(...x)", [box, side, limits])
+        return got["width"], got["height"]
+
+    wide = {"max_side_px": 4096, "max_pixels": 10**7}
+    assert size(800, 800, 320, wide) == (320, 320)
+    width, height = size(1280, 800, 320, wide)
+    assert abs(width / height - 1.6) < 0.03
+    assert abs(width * height - 320**2) < 0.04 * 320**2
+    assert max(size(1280, 200, 1024, wide | {"max_side_px": 1000})) <= 1000
+    width, height = size(1280, 800, 1024, wide | {"max_pixels": 90_000})
+    assert width * height <= 90_000
+
+
 def test_a_track_passes_its_views_and_takes_the_short_way_round(page):
     pose = {"target": [0, 1, 0], "azimuth": 350, "elevation": 5, "roll": 0, "distance": 3, "fov": 45}
     poses = [pose, pose | {"azimuth": 10, "distance": 2}, pose | {"azimuth": 40}]
@@ -96,3 +113,23 @@ def test_a_track_through_high_views_does_not_tip_over(page):
     poses = [pose, pose | {"elevation": 89}, pose | {"elevation": 89, "azimuth": 40}]
     body = "const t = new m.Track(); for (const p of x) t.add(p, 7); return t.moments.map((s) => t.at(s).elevation)"
     assert max(call(page, "view/camera_path.js", body, poses)) <= 89
+
+
+def test_a_surface_is_cut_at_jumps_in_depth_and_whole_elsewhere(page):
+    z = np.full((6, 8), 3.0)
+    z[:, 4:] = 4.0
+    z[0] = 0
+    depth = {"width": 8, "height": 6, "stride": 2, "z": z.ravel().tolist()}
+    body = """const s = m.surfaceOf({...x, z: Float32Array.from(x.z)}, 16, 12);
+              return [[...s.vertices], [...s.solid], [...s.stretched]]"""
+    vertices, solid, stretched = call(page, "draw/surface.js", body, depth)
+    vertices = np.reshape(vertices, (-1, 5))
+    triangles = vertices[np.reshape(solid, (-1, 3))]
+    assert (triangles[..., 2] > 0).all()
+    assert (triangles[..., 2].max(1) / triangles[..., 2].min(1) < 1.03).all()
+    assert len(stretched) == 6 * 4  # the jump, one cell wide
+    assert (vertices[stretched, 3] >= 9).all()  # in the farther surface's colours
+    sides = triangles[:, 1:, :2] - triangles[:, :1, :2]
+    area = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum() / 2
+    two_layers = 12 * 2.0  # cells across the jump are covered by both surfaces
+    assert area == pytest.approx(16 * 12 + two_layers, rel=1e-6)

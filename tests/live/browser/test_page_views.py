@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from live.browser.conftest import SCREENSHOT_S, SIZES, opened
+from live.browser.conftest import SIZES
+from live.browser.test_page_drawing import SCREENSHOT_S, opened
 from live.live_servers import running
 
 
@@ -57,7 +58,7 @@ def test_a_link_is_copied(desktop):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_double_click_or_tap_turns_about_the_surface(browser, size):
-    with running() as server, opened(browser, server, size, "?time=0") as view:
+    with running() as server, opened(browser, server, "time=0", size) as view:
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         x, y = view.middle()
         if size == "phone":
@@ -78,7 +79,7 @@ def test_a_double_click_or_tap_turns_about_the_surface(browser, size):
 
 
 def test_the_cameras_show_their_images(browser):
-    with running() as server, opened(browser, server, query="?time=0&pose=20,20,0,9,45,0,0,0") as view:
+    with running() as server, opened(browser, server, "time=0&pose=20,20,0,9,45,0,0,0") as view:
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         before = view.picture()
         view.page.keyboard.press("g")
