@@ -77,7 +77,7 @@ def rendered(server: Running, time: int, mode: str = "rendered") -> tuple[np.nda
 
 
 def mean_around(picture: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What `draw/fill.js` takes from around a pixel: the mean of the subject's pixels among 9 x 9 taps, and their weight."""
+    """The mean of the known pixels among the 9 x 9 taps of `draw/fill.js`, and their weight."""
     height, width = known.shape
     stride = max(2, round(2 * height / 768))
     total, weight = np.zeros(picture.shape), np.zeros(known.shape)
