@@ -1,6 +1,6 @@
 // Holes of a drawn view: pixels whose alpha is 0 get the mean of what is drawn around them.
 
-import { buildProgram } from "./program.js";
+import { QUAD, buildProgram } from "./program.js";
 import { project } from "./projection.js";
 
 /** Taps to each side, and pixels between taps in a view of up to `TALL_PX` rows. */
@@ -8,10 +8,6 @@ const [TAPS, STEP_PX, TALL_PX] = [4, 2, 768];
 /** Weight of a hole's own colour, and the background's limit as a multiple of the rest, lest holes be black. */
 const [OWN, MOST_EMPTY] = [0.5, 3];
 
-const VERTEX = `#version 300 es
-void main() {
-  gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
-}`;
 const FRAGMENT = `#version 300 es
 precision highp float;
 uniform sampler2D drawn;
@@ -48,7 +44,7 @@ export class HoleFill {
   /** @param {WebGL2RenderingContext} gl */
   constructor(gl) {
     this.gl = gl;
-    this.painter = buildProgram(gl, VERTEX, FRAGMENT, ["drawn", "corner", "size", "stride", "ground"]);
+    this.painter = buildProgram(gl, QUAD, FRAGMENT, ["drawn", "corner", "size", "stride", "ground"]);
     this.copy = gl.createTexture();
     this.array = gl.createVertexArray();
     this.size = [0, 0];

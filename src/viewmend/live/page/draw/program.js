@@ -1,5 +1,11 @@
 // Compiling shaders.
 
+/** Covers the viewport by one triangle, of three vertices without attributes. */
+export const QUAD = `#version 300 es
+void main() {
+  gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
+}`;
+
 /** @param {WebGL2RenderingContext} gl @param {number} kind @param {string} source */
 function compile(gl, kind, source) {
   const shader = /** @type {WebGLShader} */ (gl.createShader(kind));

@@ -1,7 +1,7 @@
 // Views of a frame, drawn from its mesh and the cameras' images by the rule of the server's rendering/blending.py.
 
 import { HoleFill } from "./fill.js";
-import { buildProgram } from "./program.js";
+import { QUAD, buildProgram } from "./program.js";
 import { clipFromWorld } from "./projection.js";
 import { rankedCameras } from "../link/assets.js";
 import { add, apply, multiply } from "../view/matrix.js";
@@ -100,10 +100,6 @@ ${Array.from(
   colour = sum.a >= least ? vec4(sum.rgb / sum.a, 1.0) : vec4(mix(tint, hole.rgb, hole.a), hole.a);
 }`;
 
-const QUAD = `#version 300 es
-void main() {
-  gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
-}`;
 /** Multiplied by the mask, so that bilinear samples weigh each pixel by it. */
 const CUT_OUT = `#version 300 es
 precision highp float;
