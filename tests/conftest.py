@@ -45,6 +45,13 @@ def rng() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 
 
+@pytest.fixture
+def no_weights(tmp_path, monkeypatch) -> None:
+    """No published weights, whatever this machine has."""
+    for name in ("VIEWMEND_WEIGHTS", "XDG_CACHE_HOME", "TORCH_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "nowhere"))
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The developers' folder of real captures and performers; tests that need it are skipped where it is absent."""

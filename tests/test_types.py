@@ -7,7 +7,6 @@ import pytest
 import torch
 from reference.ball import photograph, ring
 
-from viewmend import Stream, make_method
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 
 
@@ -51,19 +50,3 @@ def test_all_cameras_of_a_frame_are_the_frame_itself():
     turned = frame.select(frame.cameras.names[::-1])
     assert turned.cameras.names == ("c2", "c1", "c0") and torch.equal(turned.rgb[0], frame.rgb[2])
     assert len(frame.select([]).cameras) == 0 == len(frame.select([]).rgb)
-
-
-def test_a_context_refers_to_the_cached_depths(frame):
-    cached = Stream(make_method("telea")).add_frame(frame)
-    first, second, third = (frame.cameras.names[n] for n in (2, 0, 1))
-    context = cached.context((first, second, "unknown"))
-    assert context.frame.cameras.names == (first, second)
-    assert [depth.data_ptr() for depth in context.per_camera("depth")] == [
-        cached.depths[name].data_ptr() for name in (first, second)
-    ]
-    one = context.select(("unknown", second))
-    assert one.per_camera("depth")[0].data_ptr() == cached.depths[second].data_ptr()
-    assert torch.equal(context.depth, cached.depth((first, second)))
-    assert torch.equal(context.frame.rgb, frame.select((first, second)).rgb)
-    assert one.frame.cameras.names == (second,) and torch.equal(one.depth, cached.depth((second,)))
-    assert cached.context(("unknown",)) is None and third not in cached.depths, "only what was requested is rendered"

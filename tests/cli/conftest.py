@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from reference.ball import BallCapture, camera_at
+from reference.capture_folder import edit_description
 
 from viewmend.cli import main
 from viewmend.data.native_writer import write_capture
@@ -30,10 +31,12 @@ def shifted(folder, tmp_path):
     """The same capture, whose calibration says that all images are a pixel further right."""
     path = tmp_path / "shifted"
     shutil.copytree(folder, path)
-    capture = json.loads((path / "cameras.json").read_text())
-    for camera in capture["cameras"]:
-        camera["K"][0][2] += 1.0
-    (path / "cameras.json").write_text(json.dumps(capture))
+
+    def change(content):
+        for camera in content["cameras"]:
+            camera["K"][0][2] += 1.0
+
+    edit_description(path, change)
     return path
 
 

@@ -12,10 +12,7 @@ from viewmend.metrics.weights import FOLDERS_VARIABLE
 QUICK = ("--frames", "1", "--scenes", "1", "--size", "128", "--methods", "nearest,unfilled")
 
 
-@pytest.fixture(autouse=True)
-def nowhere(tmp_path, monkeypatch):
-    for name in (FOLDERS_VARIABLE, "XDG_CACHE_HOME", "TORCH_HOME"):
-        monkeypatch.setenv(name, str(tmp_path / "nowhere"))
+pytestmark = pytest.mark.usefixtures("no_weights")
 
 
 def test_a_report_is_written_in_every_format_and_repeated_exactly(tmp_path, capsys):
@@ -29,27 +26,6 @@ def test_a_report_is_written_in_every_format_and_repeated_exactly(tmp_path, caps
     assert json.loads(capsys.readouterr().out) == first
     assert set(first["missing_networks"]) == {"lpips-vgg", "i3d"}
     assert [row["method"] for row in first["tables"][0]["rows"]] == ["nearest", "unfilled"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["P", "--scenes", "0"], "--scenes of at least 1, got 0"),
-        (["P", "--every", "0"], "--every of at least 1, got 0"),
-        (["P", "--num-source-views", "0"], "expected --num-source-views of at least 1, got 0"),
-        ([], "got no set"),
-        (["Q"], "expected --performers DIR"),
-        (["P", "--methods", "magic"], "got 'magic'"),
-        (["P", "--device", "tpu"], "expected an available device"),
-        (["P", "--weights", "nowhere"], "expected a folder of weights"),
-        (["no-such-capture"], "no-such-capture"),
-        (["no-such-capture", "--inputs", ","], "expected --inputs all or a number"),
-    ],
-)
-def test_invalid_options_are_one_clear_error(tmp_path, capsys, arguments, message):
-    assert cli.main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert message in error and len(error.strip().splitlines()) == 1
 
 
 def test_every_n_th_scene_covers_all_kinds(tmp_path):

@@ -161,38 +161,10 @@ def test_unsure_pixels_are_no_points(folder, tmp_path, capsys):
     assert counts[0] > counts[1] + 1000
 
 
-@pytest.mark.parametrize("wrong", [["--views", "0"], ["--min-confidence", "2"], ["--frames", "5:"]])
-def test_what_cannot_be_is_said(folder, tmp_path, capsys, wrong):
-    assert main(["export-scene", str(folder), str(tmp_path / "out"), *wrong]) == 2
-    assert "expected --" in capsys.readouterr().err and not (tmp_path / "out").exists()
-
-
 def test_without_openexr_it_says_what_to_install(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     assert main(["export-scene", str(folder), str(tmp_path / "out")]) == 2
     assert "viewmend[all]" in capsys.readouterr().err
-
-
-# `viewmend export` says in one line what it cannot write.
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (
-            ["paper-small", "--format", "onnx", "--out", "{}/m.onnx"],
-            "got 'paper-small', a PatchTransformer; export 'views'",
-        ),
-        (["views", "--format", "pt2", "--out", "{}/m.onnx"], "expected --out to end in .pt2, got"),
-        (["views", "--format", "onnx", "--out", "{}/none/m.onnx"], "expected a folder to write to, found none"),
-        (["no-such-model", "--format", "onnx", "--out", "{}/m.onnx"], "one of the shipped models"),
-    ],
-)
-def test_what_cannot_be_exported_is_said(tmp_path, capsys, arguments, said):
-    assert main(["export", *(word.format(tmp_path) for word in arguments)]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_compiler_is_said(tmp_path, capsys, monkeypatch):

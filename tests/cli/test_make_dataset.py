@@ -6,7 +6,6 @@ from viewmend.cli import main
 from viewmend.training.rays import RayBatch
 from viewmend.training.shards import read_shard
 from viewmend.training.stored_scenes import StoredScene
-from viewmend.utils.output_folder import OutputFolder
 
 BRIEF = ["--sizes-px", "96", "--cameras", "5", "5", "--num-holdout-views", "1", "--workers", "0"]
 
@@ -42,25 +41,8 @@ def test_an_interrupted_data_set_is_completed_exactly(recipe, kind, views, tmp_p
     assert make(parts, 6, *more, recipe=recipe) == 2 and "without next.json" in capsys.readouterr().err
 
 
-def test_one_process_at_a_time_writes_to_a_folder(tmp_path, capsys):
-    with OutputFolder(tmp_path / "out"):
-        assert make(tmp_path / "out", 1) == 2
-    assert "expected a folder that no other run" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
 def test_other_shards_are_not_overwritten(tmp_path, capsys):
     (tmp_path / "shard-00001.tar").write_bytes(b"mine")
     assert make(tmp_path, 99) == 2
     assert "expected shard-00000.tar before shard-00001.tar, found none" in capsys.readouterr().err
     assert (tmp_path / "shard-00001.tar").read_bytes() == b"mine"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [(["--count", "0"], "--count of at least 1"), (["--shards", "x"], "Unrecognized"), (["tokens"], "a recipe among")],
-)
-def test_mistakes_are_reported(arguments, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["make-dataset", *arguments]) == 2
-    assert message in capsys.readouterr().err

@@ -67,42 +67,6 @@ def test_a_model_is_fine_tuned_on_a_capture_and_resumed(kind, capture, models, t
     assert "differs in seed" in capsys.readouterr().err
 
 
-def test_fine_tuning_refuses_captures_reserved_for_tests(capture, models, tmp_path, capsys):
-    kept = tmp_path / "test" / "mine"
-    shutil.copytree(capture, kept)
-    assert finetune(kept, models / "views", tmp_path / "out") == 2
-    assert "got a folder named 'test'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["smal"], "expected a recipe among"),
-        (["finetune"], "expected viewmend train finetune CAPTURE"),
-        (["finetune", "--captures", "here", "--from=nothing"], "one of the shipped models"),
-        (["views", "--performers", "people"], "both --performers and --motions"),
-        (["views", "--shards", "nowhere", *BRIEF], "expected tar files, found none"),
-        (["views", "--from", "nothing"], "one of the shipped models"),
-        (["views", "--train-params", "errors", *BRIEF], "give --from MODEL"),
-        (["paper", "--from", "views", *BRIEF], "expected a PatchTransformer of the recipe's sizes"),
-        (["views", "--steps", "0"], "steps of 0"),
-        (["views", "--checkpoint-minutes", "-1"], "checkpoint_minutes of -1"),
-        (["views", "--minutes", "nan"], "minutes of nan"),
-        (["views", "--batch", "0"], "batch of 0"),
-        (["views", "--cameras", "3", "80"], "--cameras MIN MAX of 4 to 60"),
-        (["views", "--performers", "nowhere", "--motions", "nowhere"], "nowhere: expected"),
-        (["dstt", "--from", "absent.pth"], "absent.pth: expected a file of weights, found none"),
-        (["fuseformer", "--size-px", "64", "108"], "frames of 432x240"),
-        (["e2fgvi", "--clip-length", "6", *BRIEF], "expected --clip-length of 1 to 5"),
-    ],
-)
-def test_mistakes_are_one_line(arguments, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["train", *arguments]) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and message in lines[0], lines
-
-
 def test_a_model_in_the_folder_is_not_overwritten(capture, models, tmp_path, capsys):
     out = tmp_path / "mine"
     shutil.copytree(models / "views", out)

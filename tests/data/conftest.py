@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from reference.ball import photograph
 
-from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers, unproject
+from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
 from viewmend.geometry.rigid import look_at
 
 WIDTH, HEIGHT, NAMES, FRAMES = 40, 32, ("a", "b", "c", "d"), ("000", "001")
@@ -27,21 +28,13 @@ def ring() -> Cameras:
     return concatenate_cameras(poses)
 
 
-def ball_mask(camera: Cameras) -> np.ndarray:
-    """Pixels whose ray passes within 0.5 m of the origin."""
-    uv = pixel_centers(*camera.max_size_px).reshape(1, -1, 2)
-    far = unproject(uv, torch.full(uv.shape[:2], 5.0), camera)[0]
-    ray = torch.nn.functional.normalize(far - camera.centers, dim=-1)
-    across = camera.centers - (camera.centers * ray).sum(-1, keepdim=True) * ray
-    return (across.norm(dim=-1).view(*camera.max_size_px[::-1]) < 0.5).byte().numpy() * 255
-
-
 class PlainFolder:
     """A valid capture on disk and the means to spoil it."""
 
     def __init__(self, path: Path):
         self.path = path
         cameras = ring()
+        masks = photograph(cameras).mask.numpy()
         rng = np.random.default_rng(0)
         self.description = {
             "format": "plain-capture/1",
@@ -67,7 +60,7 @@ class PlainFolder:
         for view, name in enumerate(NAMES):
             for frame in FRAMES:
                 self.put(f"images/{name}_{frame}.png", rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-                self.put(f"masks/{name}_{frame}.png", ball_mask(cameras[view]))
+                self.put(f"masks/{name}_{frame}.png", masks[view])
         self.save()
 
     def put(self, file: str, image: np.ndarray) -> None:

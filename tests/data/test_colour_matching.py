@@ -54,11 +54,7 @@ def test_known_gains_are_recovered(studio):
     assert match.helps and match.after < 0.5 * match.before
     off, given = ((gains - 1).abs() for gains in (gains_left(match, tinted), tinted.gains))
     assert given.mean() > 0.08 and off.mean() < PRECISION and off.max() < WORST
-
-
-def test_the_mean_camera_stays(studio):
-    match = match_colours(Tinted(studio).read(0), studio.bounds)
-    assert torch.allclose(match.maps.mean(0), torch.eye(3, 4), atol=1e-4)
+    assert torch.allclose(match.maps.mean(0), torch.eye(3, 4), atol=1e-4), "the mean camera stays"
 
 
 def test_cameras_that_agree_stay_as_they_are(studio):
@@ -107,13 +103,6 @@ def test_a_camera_that_is_left_out_is_not_looked_at_and_stays(studio):
     assert torch.equal(raw.rgb[0], matched.rgb[0]) and not torch.equal(raw.rgb[1:], matched.rgb[1:])
     assert torch.equal(raw.mask, matched.mask)
     assert torch.equal(prepare(Tinted(studio), inputs, align=False, match_colours=False).read(0).rgb, raw.rgb)
-
-
-def test_reduced_images_are_matched_alike(studio):
-    small = prepare(Tinted(studio), max_image_size=64, align=False)
-    assert torch.equal(small.colours.maps, prepare(Tinted(studio), align=False).colours.maps)
-    full = torch.nn.functional.avg_pool2d(prepare(Tinted(studio), align=False).read(0).rgb.float(), 3)
-    assert (small.read(0).rgb.float() - full).abs().mean() < 1.0
 
 
 def test_mend_says_that_colours_are_matched(studio, tmp_path, capsys):

@@ -3,6 +3,7 @@
 import json
 import pickle
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -48,6 +49,14 @@ META = """{ // comments are allowed
 }"""
 
 
+@contextmanager
+def random_folder(seed, count, name, frame, distorted=5):
+    """A new folder, a random rig whose cameras have such names, and frames and gaps of a take with such ids."""
+    rig = named(random_rig(seed, count, distorted), name)
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder), rig, *random_take(seed, rig, frame)
+
+
 def check_rig(folder, rig, frames, gaps, ids=None):
     capture = open_capture(folder)
     assert_same(capture, rig)
@@ -58,45 +67,37 @@ def check_rig(folder, rig, frames, gaps, ids=None):
 @TAKES
 @given(SEEDS, COUNTS, st.booleans(), st.booleans(), st.sampled_from([2, 3, 4, 5]))
 def test_zju_mocap_round_trip(seed, count, stamps, arrays, protocol):
-    rig = named(random_rig(seed, count), "Camera_B{}")
-    frames, gaps = random_take(seed, rig, "{:06d}")
-    with tempfile.TemporaryDirectory() as name:
-        write_zju(Path(name), opencv(rig), frames, gaps, stamps, arrays, protocol)
+    with random_folder(seed, count, "Camera_B{}", "{:06d}") as (folder, rig, frames, gaps):
+        write_zju(folder, opencv(rig), frames, gaps, stamps, arrays, protocol)
         ids = [f"{f}_2019-08-23_16-08-{int(f[-4:]):02d}.592" for f in frames] if stamps else frames
-        check_rig(name, rig, frames, gaps, ids if len(frames) > 1 else ["0"])
+        check_rig(folder, rig, frames, gaps, ids if len(frames) > 1 else ["0"])
 
 
 @TAKES
 @given(SEEDS, COUNTS, st.sampled_from([2, 4, 5]))
 def test_genebody_round_trip(seed, count, protocol):
-    rig = named(random_rig(seed, count), "{:02d}")
-    frames, gaps = random_take(seed, rig, "{:04d}")
-    with tempfile.TemporaryDirectory() as name:
-        write_genebody(Path(name), opencv(rig), frames, gaps, protocol)
-        check_rig(name, rig, frames, gaps)
+    with random_folder(seed, count, "{:02d}", "{:04d}") as (folder, rig, frames, gaps):
+        write_genebody(folder, opencv(rig), frames, gaps, protocol)
+        check_rig(folder, rig, frames, gaps)
 
 
 @TAKES
 @given(SEEDS, COUNTS, st.sampled_from([(120 / 65, (4096, 3000), (512, 375)), (2.5, (2448, 2048), (153, 128))]))
 def test_mvhumannet_round_trip(seed, count, sizes):
     scale, full, size = sizes
-    rig = named(random_rig(seed, count, 0), "CC32871A0{:02d}")
-    rig = [c | {"width": size[0], "height": size[1], "K": rig[0]["K"]} for c in rig]
-    frames, gaps = random_take(seed, rig, "{:04d}")
-    with tempfile.TemporaryDirectory() as name:
-        write_mvhumannet(Path(name), rig, frames, gaps, scale, full)
-        check_rig(name, rig, frames, gaps)
+    with random_folder(seed, count, "CC32871A0{:02d}", "{:04d}", 0) as (folder, rig, frames, gaps):
+        rig = [c | {"width": size[0], "height": size[1], "K": rig[0]["K"]} for c in rig]
+        write_mvhumannet(folder, rig, frames, gaps, scale, full)
+        check_rig(folder, rig, frames, gaps)
 
 
 @TAKES
 @given(SEEDS, COUNTS, st.sampled_from(["1x", "4x"]), st.booleans())
 def test_actorshq_round_trip(seed, count, scale, inside):
-    rig = named(random_rig(seed, count, 0), "Cam{:03d}")
-    frames, gaps = random_take(seed, rig, "{:06d}")
     boxes = np.sort(np.random.default_rng(seed).uniform(-2, 2, (3, 2, 3)), 1)
-    with tempfile.TemporaryDirectory() as name:
-        write_actorshq(Path(name), rig, frames, gaps, scale, boxes.reshape(3, 6))
-        capture = check_rig(Path(name) / scale if inside else name, rig, frames, gaps)
+    with random_folder(seed, count, "Cam{:03d}", "{:06d}", 0) as (folder, rig, frames, gaps):
+        write_actorshq(folder, rig, frames, gaps, scale, boxes.reshape(3, 6))
+        capture = check_rig(folder / scale if inside else folder, rig, frames, gaps)
         np.testing.assert_allclose(capture.bounds.low, boxes[:, 0].min(0), rtol=1e-6)
         np.testing.assert_allclose(capture.bounds.high, boxes[:, 1].max(0), rtol=1e-6)
 
@@ -105,42 +106,34 @@ def test_actorshq_round_trip(seed, count, scale, inside):
 @given(SEEDS, COUNTS, st.sampled_from([("hd", "00_{:02d}", 29.97), ("vga", "01_{:02d}", 25.0)]))
 def test_panoptic_round_trip(seed, count, type_):
     kind, pattern, fps = type_
-    rig = named(random_rig(seed, count), pattern)
-    frames, gaps = random_take(seed, rig, "{:08d}")
-    with tempfile.TemporaryDirectory() as name:
-        write_panoptic(Path(name), opencv(rig), frames, gaps, kind)
-        assert check_rig(name, rig, frames, gaps).fps == fps
+    with random_folder(seed, count, pattern, "{:08d}") as (folder, rig, frames, gaps):
+        write_panoptic(folder, opencv(rig), frames, gaps, kind)
+        assert check_rig(folder, rig, frames, gaps).fps == fps
 
 
 @TAKES
 @given(SEEDS, COUNTS, st.booleans())
 def test_easyvolcap_round_trip(seed, count, quoted):
-    rig = named(random_rig(seed, count), "{:02d}")
-    frames, gaps = random_take(seed, rig, "{:06d}")
     bounds = [[-1.0, -2.0, 0.0], [1.0, 2.0, 3.5]]
-    with tempfile.TemporaryDirectory() as name:
-        write_easyvolcap(Path(name), opencv(rig), frames, gaps, bounds, quoted)
-        assert check_rig(name, rig, frames, gaps).bounds.high.tolist() == bounds[1]
+    with random_folder(seed, count, "{:02d}", "{:06d}") as (folder, rig, frames, gaps):
+        write_easyvolcap(folder, opencv(rig), frames, gaps, bounds, quoted)
+        assert check_rig(folder, rig, frames, gaps).bounds.high.tolist() == bounds[1]
 
 
 @TAKES
 @given(SEEDS, COUNTS, st.booleans(), st.booleans())
 def test_dna_rendering_round_trip(seed, count, apart, opened_as_file):
-    rig = named(random_rig(seed, count), "{:02d}")
-    frames, gaps = random_take(seed, rig, "{}")
-    with tempfile.TemporaryDirectory() as name:
-        main = write_dna(Path(name), opencv(rig), frames, gaps, apart)
-        check_rig(main if opened_as_file else name, rig, frames, gaps)
+    with random_folder(seed, count, "{:02d}", "{}") as (folder, rig, frames, gaps):
+        main = write_dna(folder, opencv(rig), frames, gaps, apart)
+        check_rig(main if opened_as_file else folder, rig, frames, gaps)
 
 
 @TAKES
 @given(SEEDS, COUNTS)
 def test_riftcast_round_trip(seed, count):
-    rig = named(random_rig(seed, count, 0), "{}")
-    frames, gaps = random_take(seed, rig, "{:05d}")
-    with tempfile.TemporaryDirectory() as name:
-        write_riftcast(Path(name), rig, frames, gaps)
-        check_rig(name, rig, frames, gaps)
+    with random_folder(seed, count, "{}", "{:05d}", 0) as (folder, rig, frames, gaps):
+        write_riftcast(folder, rig, frames, gaps)
+        check_rig(folder, rig, frames, gaps)
 
 
 def test_only_cameras_with_footage_are_used(tmp_path):

@@ -156,15 +156,6 @@ def test_scenes_of_other_formats_have_fingerprints(tmp_path):
     assert capture_set(tmp_path)[0].fingerprint != before  # only the second file changed
 
 
-@pytest.mark.parametrize("name", ["middlebury", "agisoft False None"])
-def test_images_and_masks_are_found(tmp_path, name):
-    rig = random_rig(3, 3, 0)
-    write_images(tmp_path, rig)
-    FORMATS[name][0](tmp_path, rig)
-    frame = open_capture(tmp_path).read(0)
-    assert frame.mask is not None and int(frame.rgb[0, 0, 0, 0]) == 90 and len(frame.cameras) == 3
-
-
 def test_formats_are_recognised_or_selected(tmp_path):
     rig = random_rig(5, 2, 4)
     write_images(tmp_path, rig)

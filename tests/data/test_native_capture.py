@@ -11,7 +11,6 @@ import torch
 from viewmend.data.errors import CaptureError
 from viewmend.data.native_capture import open_capture
 from viewmend.data.videos import VideoFile, VideoWriter
-from viewmend.geometry.proxy import reconstruct
 
 
 def rgb_of(plain, file):
@@ -40,13 +39,6 @@ def test_frames_are_read(plain):
     for time in (-1, 2):
         with pytest.raises(IndexError, match=f"0 to 1, got {time}"):
             capture.read(time)
-
-
-def test_the_hull_fills_the_masks(plain):
-    frame = open_capture(plain.path).read(0)
-    covered = reconstruct(frame.mask, frame.cameras).depth(frame.cameras) > 0
-    foreground = frame.mask > 127
-    assert float((covered & foreground).sum() / (covered | foreground).sum()) > 0.8
 
 
 def test_cameras_can_be_selected(plain):
@@ -229,15 +221,6 @@ def test_depths_are_not_interpolated(plain):
     assert set(open_capture(plain.path).read(0).depth[0].unique().tolist()) <= {0.0, 1.0, 3.0}
 
 
-def test_undistortion_agrees_with_opencv(plain):
-    K = np.array(plain.description["cameras"][0]["K"])
-    update(plain, 0, dist=BARREL)
-    K_opencv = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    expected = cv2.undistort(plain.get("images/a_000.png"), K_opencv, np.array(BARREL))[..., ::-1].copy()
-    difference = open_capture(plain.path).read(0).rgb[0].float() - torch.from_numpy(expected).permute(2, 0, 1).float()
-    assert difference[:, 2:-2, 2:-2].abs().mean() < 3
-
-
 # Videos.
 
 GREYS = [20 * index for index in range(12)]
@@ -251,12 +234,6 @@ def video(plain):
 
 def grey_at(video, index):
     return round(float(video.read(index, "here").mean()))
-
-
-@pytest.mark.parametrize("order", [range(12), [5, 5, 6, 2, 0, 11, 3], reversed(range(12))])
-def test_frames_of_a_video_are_read_by_index(video, order):
-    for index in order:
-        assert grey_at(video, index) == pytest.approx(GREYS[index], abs=2)
 
 
 def test_a_video_is_thread_safe_and_survives_reading_past_its_end(video):

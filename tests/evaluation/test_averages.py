@@ -1,13 +1,11 @@
 """Averages over frames, scenes and sets, against plain loops."""
 
 import statistics
-from dataclasses import fields
 
 import pytest
 import torch
 
 from viewmend.evaluation.averages import gains, records, speed, tables
-from viewmend.evaluation.scores import ViewScores
 
 METHODS = ("ours", "telea")
 
@@ -84,34 +82,11 @@ def test_omitted_frames_and_failures_are_counted(cells):
     assert (overall.rows[0].scenes, overall.rows[0].failed) == (5, 1)
 
 
-def test_one_set_has_no_overall_table(cells):
-    assert [table.title for table in tables(cells[:4], METHODS)] == ["A"]
-
-
 def test_nothing_to_average_is_none(make_cell, make_frame):
     scores = records([make_cell("s", "telea", "A", [make_frame(hole_px=0, hole_fg_px=0)])])
     assert scores.mean("psnr", "holes") is None and scores.mean("flicker", "holes") is None
     assert scores.mean("psnr", "whole") == 30
     assert scores.mean("hole_fraction", "hull") == scores.mean("hole_fraction", "image") == 0
-
-
-def test_each_score_of_a_frame_becomes_one_record(make_cell, make_frame):
-    names = [f.name for f in fields(ViewScores) if f.name != "time" and not f.name.endswith("_px")]
-    values = {name: float(n) for n, name in enumerate(names)}
-    found = records([make_cell("s", "telea", "A", [make_frame(**values, past_px=60)])])
-    by_metric = {(r.metric, r.region): r.value for r in found if r.metric != "hole_fraction"}
-    assert sorted(by_metric.values()) == sorted(values.values())
-    assert {metric for metric, _ in by_metric} == {
-        "psnr", "psnr_rendered", "ssim", "lpips_alex", "lpips_vgg", "alpha_iou", "hull_iou", "flicker", "change",
-    }  # fmt: skip
-    for metric_and_region, field in {
-        ("psnr", "holes_fg"): "psnr_holes_fg",
-        ("flicker", "holes"): "flicker",
-        ("change", "still"): "change_still",
-        ("psnr_rendered", "whole"): "psnr_whole_rendered",
-    }.items():
-        assert by_metric[metric_and_region] == values[field]
-    assert found.where(method="other").all == () and len(found.where(method="telea", region="masked").all) == 4
 
 
 def test_holes_visible_only_in_the_past_have_their_own_mean(make_cell, make_frame):

@@ -13,7 +13,7 @@ from viewmend.data.holdout.studio_scenes import lengthened, procedural_set, turn
 from viewmend.evaluation import scene_run
 from viewmend.evaluation.scene_run import RunSettings, evaluate_scene
 from viewmend.models.base import ContextProvider, State
-from viewmend.models.checkpoint import build, load_inpainter
+from viewmend.models.checkpoint import build
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import composite
 from viewmend.models.paper.config import paper_small
@@ -193,14 +193,3 @@ def test_classical_fills_get_white_views_and_keep_known_pixels(small_scenes):
     expected = Telea().step(white, nothing, State())[0].rgb
     torch.testing.assert_close(composite("white", done.rgb, done.opacity), expected)
     assert (expected[:, holes].mean() - Telea().step(view, nothing, State())[0].rgb[:, holes].mean()) > 0.02
-
-
-def test_scores_depend_on_the_background(small_scenes):
-    scene = replace(small_scenes[0], config=replace(small_scenes[0].config, frames=1))
-    black, white = (
-        evaluate_scene(scene, ("telea",), RunSettings(background=background)).runs[0].frames[0]
-        for background in ("black", "white")
-    )
-    assert black.hole_px == white.hole_px
-    assert black.psnr_whole != white.psnr_whole and black.psnr_subject != white.psnr_subject
-    assert Telea().background is None and load_inpainter("views").background == "black"

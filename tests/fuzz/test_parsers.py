@@ -5,6 +5,7 @@ This takes about a minute; VIEWMEND_FUZZ=100000 (inputs per parser) runs longer.
 
 import functools
 import json
+import math
 import struct
 
 import cv2
@@ -27,7 +28,7 @@ from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.synthetic.bvh import read_bvh
 from viewmend.data.synthetic.gltf import load_character
-from viewmend.live.protocol import Limits, parse, unpack
+from viewmend.live.protocol import Limits, Look, parse, unpack
 from viewmend.live.push import RigMessage, read_message
 from viewmend.models.checkpoint import load_network, save_inpainter
 from viewmend.utils.output_folder import OutputFolder
@@ -168,7 +169,14 @@ def test_live_messages():
     rig = {"type": "rig", "version": 1, "cameras": [camera], "up": [0, 1, 0]}
     header = to_json({"images": [{"camera": "a", "kind": "rgb", "bytes": 3}]})
     binary = b"VMF1" + struct.pack("<I", len(header)) + header + b"abc"
-    fuzz(mutated_json(look).map(to_json), lambda data: parse(data.decode(errors="replace"), Limits()))
+
+    def parse_look(data):
+        understood = parse(data.decode(errors="replace"), Limits())
+        if isinstance(understood, Look):
+            assert understood.width * understood.height <= Limits().max_pixels and len(understood.cameras) in (1, 2)
+            assert all(math.isfinite(v) for eye in understood.cameras for v in (eye.azimuth, *(eye.R or ())))
+
+    fuzz(mutated_json(look).map(to_json), parse_look)
     fuzz(mutated_json(rig).map(to_json), lambda data: read_message(data, RigMessage))
     fuzz(mutated_bytes(binary), lambda data: unpack(data, "images"))
 

@@ -3,6 +3,7 @@
 import math
 
 import torch
+import trimesh
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers, unproject
@@ -46,40 +47,24 @@ def around(half: float, center=(0.0, 0.0, 0.0)) -> Bounds:
     return Bounds(middle - half, middle + half)
 
 
-def ball_mesh(rings: int = 12, sectors: int = 18, radius: float = 0.5) -> Mesh:
-    """A closed, outward ball of 2 * sectors * (rings - 1) triangles."""
-    polar = torch.linspace(0, math.pi, rings + 1)[1:-1, None]
-    turn = torch.arange(sectors)[None] * (2 * math.pi / sectors)
-    side = [polar.sin() * turn.cos(), polar.cos().expand(-1, sectors), polar.sin() * turn.sin()]
-    poles = torch.tensor([[0.0, 1, 0], [0.0, -1, 0]])
-    vertices = torch.cat([torch.stack(side, -1).reshape(-1, 3), poles]) * radius
-    north, south = len(vertices) - 2, len(vertices) - 1
-    faces = []
-    for s in range(sectors):
-        t = (s + 1) % sectors
-        faces.append((north, t, s))
-        for r in range(rings - 2):
-            a, b, c, d = r * sectors + s, r * sectors + t, (r + 1) * sectors + s, (r + 1) * sectors + t
-            faces += [(a, b, c), (b, d, c)]
-        last = (rings - 2) * sectors
-        faces.append((south, last + s, last + t))
-    return Mesh(vertices, torch.tensor(faces, dtype=torch.int32))
+def ball_mesh(subdivisions: int = 2) -> Mesh:
+    """A closed, outward ball of radius 0.5 with 20 * 4**subdivisions triangles."""
+    ball = trimesh.creation.icosphere(subdivisions, radius=0.5)
+    return Mesh(torch.tensor(ball.vertices, dtype=torch.float32), torch.tensor(ball.faces, dtype=torch.int32))
+
+
+def _in_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
 
 
 def volume(mesh: Mesh) -> float:
     """Signed volume of a closed mesh: positive if its faces look outward."""
-    a, b, c = mesh.vertices.double()[mesh.faces.long()].unbind(1)
-    return float((torch.linalg.cross(a, b) * c).sum() / 6)
+    return float(_in_trimesh(mesh).volume)
 
 
-def sides(mesh: Mesh) -> tuple[torch.Tensor, torch.Tensor]:
-    """How often each undirected and each directed side of the triangles occurs."""
-    directed = mesh.faces.long()[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    undirected = directed.sort(1).values
-    return (
-        torch.unique(undirected, dim=0, return_counts=True)[1],
-        torch.unique(directed, dim=0, return_counts=True)[1],
-    )
+def is_closed(mesh: Mesh) -> bool:
+    """Whether each side belongs to two triangles, which pass it in opposite directions."""
+    return _in_trimesh(mesh).is_watertight and _in_trimesh(mesh).is_winding_consistent
 
 
 def silhouette_iou(depth: torch.Tensor, mask: torch.Tensor) -> float:

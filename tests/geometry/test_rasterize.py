@@ -32,7 +32,7 @@ def ball_scene() -> tuple[Mesh, Cameras]:
         camera_at((0.2, -0.3, -1.5), width=18, height=25),
         camera_at((0.0, 0.45, 0.3), target=(0.0, 0.1, 0.0), width=20, height=20, fov=1.5),
     ]
-    return ball_mesh(7, 10), skewed(concatenate_cameras(views))
+    return ball_mesh(1), skewed(concatenate_cameras(views))
 
 
 @pytest.mark.parametrize("cull", ["none", "back", "front"])
@@ -49,14 +49,6 @@ def test_equals_the_twin(ball_scene, draw, cull):
     assert (raster.triangle >= 0).any(-1).any(-1).all()
 
 
-@pytest.mark.parametrize("cull", ["none", "back", "front"])
-def test_numba_equals_torch(cull):
-    mesh, cameras = ball_mesh(40, 60), dome(5, width=120, height=90)
-    fast, slow = rasterize(mesh, cameras, cull), in_torch(mesh, cameras, cull)
-    assert (fast.triangle != slow.triangle).float().mean() < 1e-4
-    torch.testing.assert_close(fast.depth, slow.depth, rtol=2e-6, atol=0)
-
-
 def test_many_chunks_draw_what_one_does(ball_scene, monkeypatch):
     mesh, cameras = ball_scene
     whole = in_torch(mesh, cameras)
@@ -68,7 +60,7 @@ def test_many_chunks_draw_what_one_does(ball_scene, monkeypatch):
 def test_a_closed_surface_has_no_cracks(draw):
     """Seen from inside, a closed mesh covers every pixel, shared edges and corners included."""
     inside = camera_at((0.01, 0.02, 0.03), target=(1.0, 0.0, 0.0), width=64, height=64, fov=2.0)
-    assert (draw(ball_mesh(40, 60), inside).triangle >= 0).all()
+    assert (draw(ball_mesh(4), inside).triangle >= 0).all()
 
 
 @pytest.mark.parametrize("draw", [rasterize, in_torch])
@@ -124,7 +116,7 @@ def test_interpolation_is_perspective_correct(ball_scene):
 
 @pytest.mark.gpu
 def test_cuda_equals_cpu():
-    mesh, cameras = ball_mesh(40, 60), dome(5, width=120, height=90)
+    mesh, cameras = ball_mesh(4), dome(5, width=120, height=90)
     there = rasterize(mesh.to("cuda"), cameras.to("cuda"))
     here = rasterize(mesh, cameras)
     assert (there.triangle.cpu() != here.triangle).float().mean() < 1e-4

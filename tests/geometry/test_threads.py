@@ -10,25 +10,16 @@ import torch
 from viewmend.geometry.threads import heavy_operations, light_operations, parallel_for
 
 
-def threads(count: int) -> Iterator[None]:
+@pytest.fixture
+def three_threads() -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(3)
     yield
     torch.set_num_threads(before)
 
 
-@pytest.fixture
-def two_threads():
-    yield from threads(2)
-
-
-@pytest.fixture
-def three_threads():
-    yield from threads(3)
-
-
 @pytest.mark.parametrize("count", [0, 1, 2, 37])
-def test_every_item_is_worked_on_once(two_threads, count):
+def test_every_item_is_worked_on_once(three_threads, count):
     done = [0] * count
 
     def work(item: int) -> None:
@@ -38,7 +29,7 @@ def test_every_item_is_worked_on_once(two_threads, count):
     assert done == [1] * count
 
 
-def test_what_fails_is_raised_once_all_have_ended(two_threads):
+def test_what_fails_is_raised_once_all_have_ended(three_threads):
     def work(item: int) -> None:
         if item == 3:
             raise ValueError("three")
@@ -47,7 +38,7 @@ def test_what_fails_is_raised_once_all_have_ended(two_threads):
         parallel_for(work, 8)
 
 
-def test_callers_may_be_many_and_within_one_another(two_threads):
+def test_callers_may_be_many_and_within_one_another(three_threads):
     sums = []
 
     def outer(item: int) -> None:
@@ -63,7 +54,7 @@ def test_callers_may_be_many_and_within_one_another(two_threads):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_child_has_threads_of_its_own(two_threads):
+def test_a_forked_child_has_threads_of_its_own(three_threads):
     parallel_for(lambda n: None, 4)
     child = os.fork()
     if child == 0:

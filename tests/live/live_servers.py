@@ -1,6 +1,8 @@
 """Servers in this process, which show a small ball seen by six cameras, and helpers to talk to them."""
 
+import asyncio
 import contextlib
+import functools
 import json
 import socket
 import threading
@@ -8,6 +10,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -103,6 +106,17 @@ def running(source=None, inpainter=None, ready=True, now=time.monotonic, **confi
             server.stop()
             thread.join(WAIT_S)
             assert not thread.is_alive(), "the server does not stop"
+
+
+def in_own_loop(test):
+    """Runs an async test in a thread of its own: tests of the page leave an event loop running in this one."""
+
+    @functools.wraps(test)
+    def run(*arguments, **options):
+        with ThreadPoolExecutor(1) as own:
+            own.submit(asyncio.run, test(*arguments, **options)).result()
+
+    return run
 
 
 def get(url, headers=None, data=None):

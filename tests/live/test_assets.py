@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from live.live_servers import CAMERAS, WAIT_S, get, running
+from live.live_servers import CAMERAS, WAIT_S, get, in_own_loop, running
 from reference.ball import BallCapture
 
 from viewmend.geometry.cameras import project
@@ -150,69 +150,61 @@ def store_of(make=lambda frame, without: made_of()):
     return AssetStore(lambda index: None if index == 99 else FRAME, make, 1.0)
 
 
-def test_memory_is_bounded_and_the_last_used_is_kept():
-    async def use():
-        store = store_of()
-        first = await store.get(0, "a")
-        for index in range(1, 30):
-            await store.get(index, "a")
-            assert await store.get(0, "a") is first
-            assert await store.get(0, "a", (f"cam{index}",)) is not first, "without a camera"
-            assert await store.get(0, "a") is first
-            assert store.size_bytes == sum(made.size_bytes for made in store._kept.values()) <= 1_000_000
-        assert await store.get(0, "b") is not first, "another rig has other frames"
-        assert store.size_bytes == 400_000 and not store._making
-
-    asyncio.run(use())
+@in_own_loop
+async def test_memory_is_bounded_and_the_last_used_is_kept():
+    store = store_of()
+    first = await store.get(0, "a")
+    for index in range(1, 30):
+        await store.get(index, "a")
+        assert await store.get(0, "a") is first
+        assert await store.get(0, "a", (f"cam{index}",)) is not first, "without a camera"
+        assert await store.get(0, "a") is first
+        assert store.size_bytes == sum(made.size_bytes for made in store._kept.values()) <= 1_000_000
+    assert await store.get(0, "b") is not first, "another rig has other frames"
+    assert store.size_bytes == 400_000 and not store._making
 
 
-def test_a_frame_is_made_once_for_all_who_wait():
+@in_own_loop
+async def test_a_frame_is_made_once_for_all_who_wait():
     made = []
 
     def make(frame, without):
         made.append(made_of())
         return made[-1]
 
-    async def use():
-        store = store_of(make)
-        results = await asyncio.gather(*(store.get(3, "a") for _ in range(20)))
-        assert len({id(result) for result in results}) == len(made) == 1
-
-    asyncio.run(use())
+    store = store_of(make)
+    results = await asyncio.gather(*(store.get(3, "a") for _ in range(20)))
+    assert len({id(result) for result in results}) == len(made) == 1
 
 
-def test_frames_in_the_making_are_limited_and_a_late_one_ends(monkeypatch):
+@in_own_loop
+async def test_frames_in_the_making_are_limited_and_a_late_one_ends(monkeypatch):
     go = threading.Event()
 
     def make(frame, without):
         assert go.wait(WAIT_S)
         return made_of(1000)
 
-    async def use():
-        store = store_of(make)
-        waiting = [asyncio.create_task(store.get(index, "a")) for index in range(live_assets.MAX_MAKING)]
-        await asyncio.sleep(0)
-        with pytest.raises(BusyError):
-            await store.get(50, "a")
-        go.set()
-        await asyncio.gather(*waiting)
-        monkeypatch.setattr(live_assets, "READ_S", 0.0)
-        with pytest.raises(TimeoutError):
-            await store.get(99, "a")
-        assert not store._making
-
-    asyncio.run(use())
+    store = store_of(make)
+    waiting = [asyncio.create_task(store.get(index, "a")) for index in range(live_assets.MAX_MAKING)]
+    await asyncio.sleep(0)
+    with pytest.raises(BusyError):
+        await store.get(50, "a")
+    go.set()
+    await asyncio.gather(*waiting)
+    monkeypatch.setattr(live_assets, "READ_S", 0.0)
+    with pytest.raises(TimeoutError):
+        await store.get(99, "a")
+    assert not store._making
 
 
-def test_a_frame_without_a_subject_has_no_assets():
+@in_own_loop
+async def test_a_frame_without_a_subject_has_no_assets():
     def make(frame, without):
         raise ValueError("no foreground")
 
-    async def use():
-        store = store_of(make)
-        for _ in range(2):
-            with pytest.raises(ValueError, match="no foreground"):
-                await store.get(1, "a")
-        assert not store._making and not store._kept
-
-    asyncio.run(use())
+    store = store_of(make)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="no foreground"):
+            await store.get(1, "a")
+    assert not store._making and not store._kept

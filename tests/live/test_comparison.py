@@ -4,13 +4,13 @@ import json
 
 import pytest
 import torch
-from live.live_servers import CAMERAS, PIPELINE, Running, decode, get, open_websocket, running, say_hello
+from live.live_servers import CAMERAS, PIPELINE, Running, decode, get
 from reference.ball import BallCapture, camera_at
 
 from viewmend.evaluation.mending import Mender
+from viewmend.live.client import Client
 from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
-from viewmend.live.protocol import ProtocolError, unpack
-from viewmend.live.render_jobs import parse_query
+from viewmend.live.protocol import unpack
 from viewmend.live.renderer import Renderer, RenderRequest
 from viewmend.models.base import RenderQuality
 from viewmend.models.checkpoint import load_inpainter
@@ -89,12 +89,6 @@ def test_few_variants_are_kept(views):
     assert 0 < len(renderer._variants) <= 3
 
 
-@pytest.fixture(scope="module")
-def ball():
-    with running() as server:
-        yield server
-
-
 def test_errors_and_score_over_http(ball: Running):
     asked = f"{ball.url}/frame.jpg?time=0&mode=error&camera={LEFT_OUT}&without={LEFT_OUT}"
     status, headers, content = get(asked)
@@ -119,18 +113,10 @@ def test_assets_without_a_camera(ball: Running):
 
 
 def test_a_viewer_leaves_a_camera_out_and_compares(ball: Running):
-    with open_websocket(ball) as socket:
-        assert "paper-small" in say_hello(socket)["models"]
-        look = {"type": "look", "width": 48, "height": 48, "modes": ["mended", "compared"], "model": "paper-small"}
-        socket.send(json.dumps(look | {"without": [LEFT_OUT], "camera": {"azimuth": 75}}))
-        while isinstance(message := socket.recv(timeout=60), str):
-            assert json.loads(message)["type"] != "error", message
-        header, parts = unpack(message)
-        assert LEFT_OUT not in header["source_views"] and len(header["depth_m"]) == 2
-        mended, compared = (decode(part).astype(int) for part in parts)
+    with Client(ball.ws) as viewer:
+        assert "paper-small" in viewer.messages["welcome"]["models"]
+        look = {"width": 48, "height": 48, "modes": ["mended", "compared"], "model": "paper-small"}
+        shown = viewer.frame(viewer.look(**look, without=[LEFT_OUT], camera={"azimuth": 75}))
+        assert LEFT_OUT not in shown.header["source_views"] and len(shown.header["depth_m"]) == 2
+        mended, compared = (image.astype(int) for image in shown.images.values())
         assert abs(mended - compared).max() > 10
-
-
-def test_queries_without_what_they_need_are_refused(ball: Running):
-    with pytest.raises(ProtocolError, match="expected 'camera'"):
-        parse_query({"mode": "error"}, ball.live._config.limits)

@@ -5,12 +5,12 @@ import contextlib
 import gc
 import socket
 import struct
+import threading
 import weakref
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import uvicorn
-from live.live_servers import FakeClock, exchange, open_socket, running, wait_until
+from live.live_servers import FakeClock, close_code, exchange, in_own_loop, open_socket, running, wait_until
 from uvicorn.server import ServerState
 
 from viewmend.live import connection_limits as limits
@@ -104,12 +104,6 @@ async def answer(scope, receive, send):
     await send({"type": "http.response.body", "body": b"."})
 
 
-def run(coroutine):
-    """Run in a thread of its own: tests of the page leave an event loop running in this one."""
-    with ThreadPoolExecutor(1) as own:
-        return own.submit(asyncio.run, coroutine).result()
-
-
 async def settle():
     """Let all callbacks run that are due."""
     for _ in range(20):
@@ -174,104 +168,94 @@ def test_turns_are_taken_one_at_a_time_with_pauses_and_new_connections_first():
     assert taken[-1][0] == "alone", "an error stops no other turn"
 
 
-def test_unauthenticated_input_is_handed_on_in_pieces_and_bounded():
-    async def check():
-        all_limits = ConnectionLimits(clock := FakeClock())
-        timers = Timers(clock)
-        all_limits.scheduler = FairScheduler(clock, timers.call_later)
-        connection, transport = await connect(all_limits)
-        head = b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 10_000 + b"\r\n\r\n"
-        connection.data_received(head)
-        assert not transport.reading and not transport.written
-        while timers.planned:
-            timers.run_next()
-            await settle()
-        assert transport.written.startswith(b"HTTP/1.1 200") and transport.reading
-        connection.data_received(b"x" * limits.MAX_UNAUTHENTICATED_BYTES)
-        assert transport.closed
-
-    run(check())
-
-
-def test_a_turn_that_comes_after_the_client_was_authenticated_is_empty():
-    async def check():
-        all_limits = ConnectionLimits(FakeClock())
-        timers = Timers(all_limits.now)
-        all_limits.scheduler = FairScheduler(all_limits.now, timers.call_later)
-        all_limits.scheduler.submit(lambda: None, True)
-        connection, transport = await connect(all_limits)
-        connection.data_received(GET)
-        connection.authenticate(0)
+@in_own_loop
+async def test_unauthenticated_input_is_handed_on_in_pieces_and_bounded():
+    all_limits = ConnectionLimits(clock := FakeClock())
+    timers = Timers(clock)
+    all_limits.scheduler = FairScheduler(clock, timers.call_later)
+    connection, transport = await connect(all_limits)
+    head = b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 10_000 + b"\r\n\r\n"
+    connection.data_received(head)
+    assert not transport.reading and not transport.written
+    while timers.planned:
+        timers.run_next()
         await settle()
-        while timers.planned:
-            timers.run_next()
-            await settle()
-        assert transport.written.count(b"HTTP/1.1 200") == 1
-        connection.data_received(GET)
+    assert transport.written.startswith(b"HTTP/1.1 200") and transport.reading
+    connection.data_received(b"x" * limits.MAX_UNAUTHENTICATED_BYTES)
+    assert transport.closed
+
+
+@in_own_loop
+async def test_a_turn_that_comes_after_the_client_was_authenticated_is_empty():
+    all_limits = ConnectionLimits(FakeClock())
+    timers = Timers(all_limits.now)
+    all_limits.scheduler = FairScheduler(all_limits.now, timers.call_later)
+    all_limits.scheduler.submit(lambda: None, True)
+    connection, transport = await connect(all_limits)
+    connection.data_received(GET)
+    connection.authenticate(0)
+    await settle()
+    while timers.planned:
+        timers.run_next()
         await settle()
-        assert transport.written.count(b"HTTP/1.1 200") == 2
-
-    run(check())
-
-
-def test_a_request_is_answered_in_its_turn_and_dropped_if_its_client_has_gone():
-    async def check():
-        all_limits, answered = ConnectionLimits(FakeClock()), []
-        timers = Timers(all_limits.now)
-        all_limits.scheduler = FairScheduler(all_limits.now, timers.call_later)
-
-        async def app(scope, receive, send):
-            answered.append(scope["path"])
-            await answer(scope, receive, send)
-
-        connections = [await connect(all_limits, app) for _ in range(3)]
-        for (connection, _), path in zip(connections, (b"a", b"b", b"c"), strict=True):
-            connection.data_received(b"GET /" + path + b" HTTP/1.1\r\nHost: x\r\n\r\n")
-        gone, transport = connections[1]
-        transport.close()
-        gone.connection_lost(None)
-        while timers.planned:
-            timers.run_next()
-            await settle()
-        assert sorted(answered) == ["/a", "/c"] and gone not in all_limits.connections
-        assert [connection.requests for connection, _ in connections] == [0, 0, 0]
-
-    run(check())
+    assert transport.written.count(b"HTTP/1.1 200") == 1
+    connection.data_received(GET)
+    await settle()
+    assert transport.written.count(b"HTTP/1.1 200") == 2
 
 
-def test_the_oldest_unauthenticated_connections_are_closed_when_there_are_too_many():
-    async def check():
-        all_limits = ConnectionLimits(clock := FakeClock())
-        connections = []
-        for _ in range(limits.MAX_UNAUTHENTICATED + 3):
-            connections.append(await connect(all_limits))
-            clock.advance(0.1)
-            if len(connections) == 1:
-                connections[0][0].authenticate(0)
-        closed = [n for n, (_, transport) in enumerate(connections) if transport.closed]
-        assert closed == [1, 2], "the first one is authenticated"
+@in_own_loop
+async def test_a_request_is_answered_in_its_turn_and_dropped_if_its_client_has_gone():
+    all_limits, answered = ConnectionLimits(FakeClock()), []
+    timers = Timers(all_limits.now)
+    all_limits.scheduler = FairScheduler(all_limits.now, timers.call_later)
 
-    run(check())
+    async def app(scope, receive, send):
+        answered.append(scope["path"])
+        await answer(scope, receive, send)
+
+    connections = [await connect(all_limits, app) for _ in range(3)]
+    for (connection, _), path in zip(connections, (b"a", b"b", b"c"), strict=True):
+        connection.data_received(b"GET /" + path + b" HTTP/1.1\r\nHost: x\r\n\r\n")
+    gone, transport = connections[1]
+    transport.close()
+    gone.connection_lost(None)
+    while timers.planned:
+        timers.run_next()
+        await settle()
+    assert sorted(answered) == ["/a", "/c"] and gone not in all_limits.connections
+    assert [connection.requests for connection, _ in connections] == [0, 0, 0]
 
 
-def test_connections_without_a_request_are_closed():
-    async def check():
-        all_limits = ConnectionLimits(clock := FakeClock())
-        silent, half, busy = [await connect(all_limits) for _ in range(3)]
-        half[0].data_received(b"GET / HTTP/1.1\r\nHo")
-        busy[0].requests = 1
-        clock.advance(limits.IDLE_S - 1)
-        all_limits.close_stalled()
-        assert not any(transport.closed for _, transport in (silent, half, busy))
-        clock.advance(2)
-        all_limits.close_stalled()
-        assert [transport.closed for _, transport in (silent, half, busy)] == [True, True, False]
-        busy[0].requests, busy[0].idle_since_s = 0, clock()
-        clock.advance(limits.IDLE_S - 1)
-        all_limits.close_stalled()
-        assert not busy[1].closed, "it has been answered recently"
+@in_own_loop
+async def test_the_oldest_unauthenticated_connections_are_closed_when_there_are_too_many():
+    all_limits = ConnectionLimits(clock := FakeClock())
+    connections = []
+    for _ in range(limits.MAX_UNAUTHENTICATED + 3):
+        connections.append(await connect(all_limits))
+        clock.advance(0.1)
+        if len(connections) == 1:
+            connections[0][0].authenticate(0)
+    closed = [n for n, (_, transport) in enumerate(connections) if transport.closed]
+    assert closed == [1, 2], "the first one is authenticated"
 
-    run(check())
+
+@in_own_loop
+async def test_connections_without_a_request_are_closed():
+    all_limits = ConnectionLimits(clock := FakeClock())
+    silent, half, busy = [await connect(all_limits) for _ in range(3)]
+    half[0].data_received(b"GET / HTTP/1.1\r\nHo")
+    busy[0].requests = 1
+    clock.advance(limits.IDLE_S - 1)
+    all_limits.close_stalled()
+    assert not any(transport.closed for _, transport in (silent, half, busy))
+    clock.advance(2)
+    all_limits.close_stalled()
+    assert [transport.closed for _, transport in (silent, half, busy)] == [True, True, False]
+    busy[0].requests, busy[0].idle_since_s = 0, clock()
+    clock.advance(limits.IDLE_S - 1)
+    all_limits.close_stalled()
+    assert not busy[1].closed, "it has been answered recently"
 
 
 @pytest.mark.parametrize(
@@ -285,46 +269,40 @@ def test_connections_without_a_request_are_closed():
         ([500_000] * 15 + [0] + [500_000] * 15, False),
     ],
 )
-def test_clients_that_read_slowly_are_closed_only_if_they_read_too_little(unread, is_closed):
-    async def check():
-        all_limits = ConnectionLimits(clock := FakeClock())
-        connection, transport = await connect(all_limits)
-        connection.requests = 1
-        for transport.unread in unread:
-            clock.advance(1)
-            all_limits.close_stalled()
-        assert transport.closed == is_closed
-
-    run(check())
+@in_own_loop
+async def test_clients_that_read_slowly_are_closed_only_if_they_read_too_little(unread, is_closed):
+    all_limits = ConnectionLimits(clock := FakeClock())
+    connection, transport = await connect(all_limits)
+    connection.requests = 1
+    for transport.unread in unread:
+        clock.advance(1)
+        all_limits.close_stalled()
+    assert transport.closed == is_closed
 
 
-def test_data_that_is_nearly_read_counts_as_read():
-    async def check():
-        all_limits = ConnectionLimits(clock := FakeClock())
-        connection, transport = await connect(all_limits)
-        transport.unread = 50_000
-        assert not connection.is_stalled(clock() + limits.UNREAD_S - 1)
-        clock.advance(limits.UNREAD_S + 1)
-        assert connection.is_stalled(clock())
-        connection.resume_writing()
-        assert not connection.is_stalled(clock() + 1)
-
-    run(check())
+@in_own_loop
+async def test_data_that_is_nearly_read_counts_as_read():
+    all_limits = ConnectionLimits(clock := FakeClock())
+    connection, transport = await connect(all_limits)
+    transport.unread = 50_000
+    assert not connection.is_stalled(clock() + limits.UNREAD_S - 1)
+    clock.advance(limits.UNREAD_S + 1)
+    assert connection.is_stalled(clock())
+    connection.resume_writing()
+    assert not connection.is_stalled(clock() + 1)
 
 
-def test_input_waits_while_output_is_not_read():
-    async def check():
-        connection, transport = await connect(ConnectionLimits())
-        connection.authenticate(0)
-        connection.pause_writing()
-        connection.data_received(GET)
-        await settle()
-        assert not transport.reading and not transport.written
-        connection.resume_writing()
-        await settle()
-        assert transport.reading and transport.written.startswith(b"HTTP/1.1 200")
-
-    run(check())
+@in_own_loop
+async def test_input_waits_while_output_is_not_read():
+    connection, transport = await connect(ConnectionLimits())
+    connection.authenticate(0)
+    connection.pause_writing()
+    connection.data_received(GET)
+    await settle()
+    assert not transport.reading and not transport.written
+    connection.resume_writing()
+    await settle()
+    assert transport.reading and transport.written.startswith(b"HTTP/1.1 200")
 
 
 @pytest.mark.parametrize(
@@ -481,6 +459,8 @@ def test_small_answers_leave_at_once(ball):
 
 
 def test_the_server_stops_while_clients_are_connected(caplog):
+    """It frees the port, ends all threads, and closes viewers' connections with their code."""
+    before = set(threading.enumerate())
     with running(token=TOKEN) as server, contextlib.ExitStack() as stack:
         for sent in (b"", b"GET / HT", WRONG):
             stack.enter_context(open_socket(server)).sendall(sent)
@@ -488,4 +468,9 @@ def test_the_server_stops_while_clients_are_connected(caplog):
         viewer.frame(viewer.look(width=32, height=32, modes=["rendered"]))
         server.server.stop()
         wait_until(lambda: not server.connections)
+        assert close_code(viewer._socket._socket) in (1012, None)
+    with socket.socket() as again:
+        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        again.bind(("127.0.0.1", server.port))
+    wait_until(lambda: set(threading.enumerate()) <= before)
     assert "Traceback" not in caplog.text

@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -9,12 +8,10 @@ from live.live_servers import decode, get, running
 from viewmend.live.client import Client
 from viewmend.live.encoding import (
     COLOURS,
-    depth_stride,
     draw_mode,
     mean_confidence,
     pack_depth,
     surface_depth,
-    to_jpeg,
     unpack_depth,
 )
 from viewmend.models.smooth_fill import SmoothFill
@@ -61,17 +58,6 @@ def test_a_soft_outline_has_the_depth_of_the_neighbouring_surface(ball_view):
     assert (shown[20, 10:20] == 2).all() and shown[21].max() == 0 == shown[25, 25]
 
 
-@pytest.mark.parametrize("quality", [85, 95])
-def test_jpeg_comes_back(ball_view, quality):
-    image = draw_mode(ball_view, "mended")
-    back = cv2.imdecode(np.frombuffer(to_jpeg(image, quality), np.uint8), cv2.IMREAD_COLOR_RGB)
-    assert np.abs(back.astype(int) - image).mean() < 5
-
-
-def test_small_images_have_fine_depth():
-    assert [depth_stride(*size) for size in ((100, 160), (320, 200), (400, 401))] == [1, 2, 4]
-
-
 @pytest.mark.parametrize("stride", [1, 2, 4])
 @pytest.mark.parametrize("size", [(48, 48), (47, 50), (3, 2)])
 def test_depth_comes_back_where_it_was_taken(size, stride):
@@ -91,8 +77,7 @@ def test_depth_comes_back_where_it_was_taken(size, stride):
 
 def test_depth_without_a_surface():
     assert (unpack_depth(pack_depth(torch.zeros(20, 20), 4)) == 0).all()
-    flat = unpack_depth(pack_depth(torch.full((20, 20), 2.0), 4))
-    assert np.allclose(flat, 2.0, atol=1e-4)
+    assert np.allclose(unpack_depth(pack_depth(torch.full((20, 20), 2.0), 4)), 2.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("mode", ["mended", "rendered", "holes", "depth", "coverage", "confidence"])

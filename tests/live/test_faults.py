@@ -4,7 +4,6 @@ import contextlib
 import http.client
 import json
 import random
-import socket
 import threading
 
 import pytest
@@ -126,20 +125,6 @@ def test_viewers_that_disconnect_in_the_middle_of_a_frame_leave_nothing():
             viewer._socket._socket.socket.close()
         wait_until(lambda: not server.live.registry.sessions and not server.service._sessions)
         assert server.is_serving()
-
-
-def test_stopping_frees_the_port_and_ends_all_threads_while_viewers_watch():
-    before = set(threading.enumerate())
-    with running() as server:
-        port = server.port
-        viewer = Client(server.ws).__enter__()
-        viewer.frame(viewer.look(width=32, height=32))
-    with socket.socket() as again:
-        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        again.bind(("127.0.0.1", port))
-    assert close_code(viewer._socket._socket) in (1012, None)
-    viewer.close()
-    wait_until(lambda: set(threading.enumerate()) <= before)
 
 
 def test_a_port_in_use_is_an_error():

@@ -8,7 +8,7 @@ from reference.ball import camera_at, ring
 
 from viewmend.geometry.cameras import concatenate_cameras, project
 from viewmend.geometry.orbit import orbit
-from viewmend.live.poses import cameras_json, home_view, view_camera
+from viewmend.live.poses import cameras_json, home_view, stereo_pair, view_camera
 from viewmend.live.protocol import Camera
 
 CENTER = torch.tensor([0.1, 0.2, 0.3])
@@ -83,3 +83,20 @@ def test_cameras_as_json():
     (said,) = cameras_json(camera_at(0, "c"))
     assert said["width"] == 48 and len(said["K"]) == 9 and len(said["R"]) == 9
     assert said["center"] == pytest.approx([0, 0, 2], abs=1e-5) and said["T"] == pytest.approx([0, 0, 2], abs=1e-5)
+
+
+def test_two_eyes_have_no_disparity_at_the_subject_and_some_elsewhere():
+    camera = camera_at(40, "t", size=64, distance_m=2.0)
+    left, right = stereo_pair(camera, 0.1, torch.zeros(3))
+    across = right.centers[0] - left.centers[0]
+    assert float(across.norm()) == pytest.approx(0.1, abs=1e-5)
+    rightward = camera.world_from_camera[0, :3, 0]
+    assert float(across @ rightward) == pytest.approx(0.1, abs=1e-5), "the right eye is on the right"
+    ahead = camera.world_from_camera[0, :3, 2]
+    points = torch.stack([torch.zeros(3), 0.3 * rightward, -0.5 * ahead, 0.5 * ahead])
+    (l_uv, r_uv) = (project(points, eye)[0][0] for eye in (left, right))
+    apart = (l_uv - r_uv)[:, 0]
+    assert torch.allclose(apart[:2], torch.zeros(2), atol=1e-3) and torch.allclose(l_uv[:, 1], r_uv[:, 1], atol=1e-3)
+    assert apart[2] > 0.5 and apart[3] < -0.3, "nearer points have crossed disparity"
+    behind = stereo_pair(camera, 0.1, 5 * camera.centers[0])
+    assert all(torch.equal(eye.K, camera.K) for eye in behind)

@@ -1,11 +1,9 @@
 """Messages are parsed strictly, and packed and unpacked."""
 
 import json
-import math
+import struct
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from viewmend.live.protocol import (
     Ack,
@@ -60,6 +58,7 @@ def test_every_message_is_parsed():
         ),
         ({"type": "look", "error_rule": "some"}, 'error_rule: expected .*, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),
+        ({"type": "look", "modes": ["compared"]}, "expected 'model' for the mode 'compared'"),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, -1], "T": [0, 0, 0]}}, "expected 'R' as a rotation"),
         ({"type": "look", "camera": {"R": [1, 0, 0, 0, 1, 0, 0, 0, 1]}}, "'T'"),
         ({"type": "look", "camera": {"distance": -1}}, "camera: distance: expected a number >= 0.02, got -1"),
@@ -84,32 +83,11 @@ def test_invalid_json_is_refused(text):
         parse(text, LIMITS)
 
 
-def test_long_messages_are_refused():
+def test_long_messages_and_headers_are_refused():
     with pytest.raises(ProtocolError, match="at most 16384 bytes"):
         parse(" " * 20_000, LIMITS)
-
-
-NAMES = """type id sent_ms camera eyes width height modes top_k scale moving depth codec quality frame version codecs
-    seek playing speed live R T azimuth elevation distance target fov_y fx fy cx cy"""
-KEYS = st.sampled_from(NAMES.split())
-LEAVES = (
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.sampled_from(["look", "clock"])
-)
-VALUES = st.recursive(LEAVES, lambda v: st.lists(v, max_size=9) | st.dictionaries(KEYS, v, max_size=4), max_leaves=12)
-
-
-@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(st.dictionaries(KEYS, VALUES, max_size=8), st.sampled_from(["look", "clock", "ack", "hello", "ping", None]))
-def test_any_json_is_parsed_or_refused(message, kind):
-    message = message if kind is None else message | {"type": kind}
-    try:
-        understood = parse(json.dumps(message), LIMITS)
-    except ProtocolError as error:
-        assert len(str(error)) < 400
-    else:
-        if isinstance(understood, Look):
-            assert understood.width * understood.height <= LIMITS.max_pixels and len(understood.cameras) in (1, 2)
-            assert all(math.isfinite(v) for eye in understood.cameras for v in (eye.azimuth, *(eye.R or ())))
+    with pytest.raises(ProtocolError, match="at most 1000000 bytes, got one of 1000001"):
+        unpack(b"VMF1" + struct.pack("<I", 1_000_001) + b" " * 1_000_001, "images")
 
 
 def test_binary_messages_are_unpacked_as_packed():
@@ -121,14 +99,6 @@ def test_binary_messages_are_unpacked_as_packed():
             unpack(message[:cut])
     with pytest.raises(ProtocolError):
         unpack(message + b"x")
-
-
-@settings(max_examples=300, deadline=None)
-@given(st.binary(max_size=64), st.integers(0, 2**32 - 1))
-def test_binary_garbage_is_refused(garbage, length):
-    for message in (garbage, b"VMF1" + garbage, b"VMF1" + length.to_bytes(4, "little") + garbage):
-        with pytest.raises(ProtocolError):
-            unpack(message)
 
 
 def test_stage_times_are_added_and_averaged():

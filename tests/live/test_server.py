@@ -18,10 +18,12 @@ from viewmend.live import frame_source
 from viewmend.live import server as live_server
 from viewmend.live.client import Client
 from viewmend.live.frame_source import RecordedSource
-from viewmend.live.protocol import Limits, ProtocolError, read_message
+from viewmend.live.poses import stereo_pair, view_camera
+from viewmend.live.protocol import Camera, Limits, ProtocolError, read_message
 from viewmend.live.render_jobs import PathJob, parse_path
 from viewmend.models.smooth_fill import SmoothFill
 from viewmend.rendering.error_mask import ERROR_RULES
+from viewmend.rendering.proxy_views import CLAY
 
 ERROR_RULE = next(iter(ERROR_RULES))
 """The default: pixels that no camera colours."""
@@ -58,25 +60,30 @@ def test_an_image_from_a_requested_camera(ball):
         assert list(timing) == ["geometry", "context", "rendering", "inpainting"] and float(timing["rendering"]) > 0
         right = true_image(home, (64, 48), azimuth=float(azimuth), elevation=0.0)
         assert np.abs(image.astype(float) - right).mean() < 14
-    _, _, rendered = get(f"{ball.url}/frame.jpg?azimuth=200&time=0&width=64&height=48&mode=holes")
-    assert np.abs(decode(rendered).astype(float) - image).mean() > 1.5
+    query = f"{ball.url}/frame.jpg?azimuth=200&time=0&width=64&height=48&mode=holes"
+    assert np.abs(decode(get(query)[2]).astype(float) - image).mean() > 1.5
+    green = decode(get(f"{query}&background=00ff00")[2])
+    assert np.abs(green[:4, :4].astype(int) - (0, 255, 0)).max() < 12
 
 
 @pytest.mark.parametrize(
     ("query", "words"),
     [
-        ("azimuth=x", "azimuth: expected a number"),
-        ("width=99999", "from 16 to 2048"),
-        ("mode=naked", "mode: expected rendered or holes"),
-        ("error_rule=some", "error_rule: expected "),
-        ("time=soon", "time: expected"),
-        ("distanse=3", "expected keys among"),
-        ("elevation=90", "elevation: expected"),
-        ("azimuth=nan", "azimuth: expected"),
+        ("frame.jpg?azimuth=x", "azimuth: expected a number"),
+        ("frame.jpg?width=99999", "from 16 to 2048"),
+        ("frame.jpg?mode=naked", "mode: expected rendered or holes"),
+        ("frame.jpg?error_rule=some", "error_rule: expected "),
+        ("frame.jpg?time=soon", "time: expected"),
+        ("frame.jpg?distanse=3", "expected keys among"),
+        ("frame.jpg?elevation=90", "elevation: expected"),
+        ("frame.jpg?azimuth=nan", "azimuth: expected"),
+        *((f"frame.jpg?background={colour}", "expected") for colour in ("red", "00ff0", "00FF00", "00ff00%0A")),
+        *((f"camera.jpg?{query}", "expected") for query in ("", "name=none", "name=none&time=x", "name=none&size=3")),
+        ("camera.jpg?name=" + 99 * "a", "expected"),
     ],
 )
 def test_invalid_queries_are_refused(ball, query, words):
-    status, _, body = get(f"{ball.url}/frame.jpg?{query}")
+    status, _, body = get(f"{ball.url}/{query}")
     assert status == 400 and words in json.loads(body)["error"]
 
 
@@ -199,16 +206,23 @@ def test_the_number_of_viewers_is_limited():
         wait_until(lambda: not server.live.registry.sessions)
 
 
+def read_video(video: bytes):
+    """Frames, and how many a second."""
+    import av
+
+    with av.open(io.BytesIO(video)) as container:
+        fps = container.streams.video[0].average_rate
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], fps
+
+
 def test_a_path_becomes_a_video(ball):
-    av = pytest.importorskip("av")
+    pytest.importorskip("av")
     poses = [{"azimuth": 20.0 * n} for n in range(5)]
     body = {"poses": poses, "times": [0, 0, 1, 1, 2], "fps": 10, "width": 64, "height": 48, "mode": "mended"}
     status, headers, video = get(f"{ball.url}/path.mp4", data=json.dumps(body).encode())
     assert status == 200 and headers["content-type"] == "video/mp4", video
-    with av.open(io.BytesIO(video)) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-        assert container.streams.video[0].average_rate == 10
-    assert len(frames) == 5 and frames[0].shape == (48, 64, 3)
+    frames, fps = read_video(video)
+    assert len(frames) == 5 and fps == 10 and frames[0].shape == (48, 64, 3)
     assert np.abs(frames[0].astype(int) - frames[4]).mean() > 3
     right = true_image(ball.service.renderer.home, (64, 48), azimuth=0.0)
     assert np.abs(frames[0] - right.astype(float)).mean() < 14
@@ -318,19 +332,6 @@ def test_a_cameras_own_image(ball):
     assert get(f"{ball.url}/camera.jpg?name={name}&time=99999")[0] == 200, "the nearest frame"
 
 
-@pytest.mark.parametrize("query", ["", "name=none", "name=none&time=x", "name=none&size=3", "name=" + 99 * "a"])
-def test_invalid_queries_for_cameras_images_are_refused(ball, query):
-    status, _, body = get(f"{ball.url}/camera.jpg?{query}")
-    assert status == 400 and "expected" in json.loads(body)["error"]
-
-
-def test_invalid_backgrounds_are_refused(ball):
-    for colour in ("red", "00ff0", "00FF00", "00ff00%0A"):
-        assert get(f"{ball.url}/frame.jpg?width=32&height=32&background={colour}")[0] == 400
-    image = decode(get(f"{ball.url}/frame.jpg?width=64&height=64&background=00ff00")[2])
-    assert np.abs(image[:4, :4].astype(int) - (0, 255, 0)).max() < 12
-
-
 def test_the_progress_of_a_path(ball):
     pytest.importorskip("av")
     assert json.loads(get(f"{ball.url}/path")[2]) == {"done": None, "of": None}
@@ -383,3 +384,54 @@ def test_a_body_is_parsed_off_the_event_loop(ball, monkeypatch):
     chunked = b"POST /path.mp4 HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
     assert exchange(ball, chunked + b"1\r\nx\r\n0\r\n\r\n").startswith(b"HTTP/1.1 400")
     assert threads[0].startswith("asyncio_")
+
+
+def test_the_hull_and_its_points_are_modes(ball):
+    with Client(ball.ws) as viewer:
+        assert {*viewer.messages["welcome"]["modes"]} >= frozenset({"hull", "points"})
+        viewer.send("clock", seek=0, playing=False)
+        options = {"width": 64, "height": 64, "modes": ["hull", "points"], "quality": 95}
+        look = viewer.look(**options, background="ff0000", depth=True)
+        shown = viewer.frame(look, full=True)
+        black = viewer.frame(viewer.look(**options), full=True).images[0, "points"].astype(int)
+        rendered = viewer.frame(viewer.look(width=64, height=64, modes=["rendered"], quality=95), full=True)
+    hull, points = (shown.images[0, mode].astype(int) for mode in ("hull", "points"))
+    assert np.abs(hull[32, 32] - 255 * np.array(CLAY)).max() < 20, "lit from the viewer"
+    for corner in (hull[2, 2], points[2, 2]):
+        assert corner[0] > 230 and corner[1:].max() < 25, "on the background"
+    inside = shown.depth[0] > 0
+    assert inside.sum() > 100
+    body = np.zeros((64, 64), bool)
+    body[24:40, 24:40] = True
+    own = black[body & (black.sum(-1) > 150)]
+    assert 20 < len(own) < 256, "dots of the ball's colours, and gaps"
+    assert np.abs(own.mean(0) - rendered.images[0, "rendered"][body].mean(0)).max() < 25
+    assert shown.header["stage_ms"]["inpainting"] == 0, "without the model"
+
+
+def test_a_stereo_video_has_two_eyes_side_by_side(ball):
+    pytest.importorskip("av")
+    pose, size = {"azimuth": 20.0}, {"width": 64, "height": 64}
+    status, video = post(f"{ball.url}/path.mp4", poses=[pose] * 2, times=[0, 0], stereo_m=0.2, **size)
+    assert status == 200, video
+    both = read_video(video)[0][0].astype(int)
+    assert both.shape == (64, 128, 3)
+    home = ball.service.renderer.home
+    eyes = stereo_pair(view_camera(Camera(**pose), home, (64, 64)), 0.2, home.center)
+    for half, eye in zip((both[:, :64], both[:, 64:]), eyes, strict=True):
+        asked = {
+            "R": eye.camera_from_world[0, :3, :3].flatten().tolist(),
+            "T": eye.camera_from_world[0, :3, 3].tolist(),
+        }
+        lens = {"fx": float(eye.K[0, 0, 0]), "cx": float(eye.K[0, 0, 2]), "cy": float(eye.K[0, 1, 2])}
+        alone = read_video(post(f"{ball.url}/path.mp4", poses=[asked | lens], times=[0], **size)[1])[0][0]
+        assert np.abs(half - alone).mean() < 2
+    assert np.abs(both[:, :64] - both[:, 64:]).mean() > 1
+
+
+@pytest.mark.parametrize(
+    ("more", "said"), [({"stereo_m": -1}, "stereo_m"), ({"width": 1600, "height": 1000, "stereo_m": 0.06}, "2100000")]
+)
+def test_invalid_stereo_videos_are_refused(ball, more, said):
+    status, answer = post(f"{ball.url}/path.mp4", **{"poses": [{}], "width": 64, "height": 64} | more)
+    assert status == 400 and said in json.loads(answer)["error"]

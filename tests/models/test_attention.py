@@ -14,7 +14,6 @@ from viewmend.models.paper.transformer import (
     attend,
     attend_and_sum,
     attend_weighted,
-    most_attended,
     rope_cos_sin,
     rope_frequencies,
     rotate,
@@ -68,13 +67,6 @@ def test_gradients_of_every_path_equal_the_reference(qkv):
         gradients.append(torch.autograd.grad((path(*leaves) ** 2).sum(), leaves))
     for other in gradients[1:]:
         assert all(torch.allclose(a, b, atol=1e-4) for a, b in zip(gradients[0], other, strict=True))
-
-
-def test_padded_queries_do_not_count(qkv):
-    Q, K, V, keep = qkv
-    counted = torch.tensor([[1, 1, 1, 0, 0], [1, 1, 1, 1, 1]], dtype=torch.bool)
-    _, received = attend_and_sum(Q, K, V, keep, counted, SCALE)
-    assert torch.allclose(received[0], reference(Q[:, :, :3], K, V, keep)[1][0], atol=1e-5)
 
 
 def test_attention_without_keys_is_zero(qkv):
@@ -133,12 +125,6 @@ def test_the_transformer_equals_the_reference(rope, top_k, grad, rng):
         with torch.no_grad():
             slow = transformer_reference(net, P[b, :n], uvs[0][b, :n], R[b, :m], uvs[1][b, :m], top_k)
         assert torch.allclose(fast[b, :n], slow, atol=2e-4), b
-
-
-def test_most_attended_returns_ascending_indices_and_at_most_all():
-    received = torch.tensor([[0.1, 0.9, 0.3, 0.8]])
-    assert most_attended(received, 2).tolist() == [[1, 3]]
-    assert most_attended(received, 9).tolist() == [[0, 1, 2, 3]]
 
 
 def test_straight_through_is_hard_and_its_gradient_is_soft():

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
-from models.plates import NAMES, Rig, tiny, view
+from models.plates import NAMES, Rig
 
-from viewmend.models.base import REMEMBERED_FRAMES, ContextProvider, RenderQuality
+from viewmend.models.base import REMEMBERED_FRAMES, ContextProvider
 from viewmend.models.paper.config import paper
 from viewmend.models.paper.context import window_times
 
@@ -23,18 +23,6 @@ def test_windows_are_causal_and_short(n_c, n_w, k_w, time):
     assert times[0] == time and min(times) >= 0
     assert list(times) == sorted(set(times), reverse=True)
     assert len(times) <= 1 + n_c + n_w
-
-
-def test_only_missing_frames_are_requested():
-    net, rig = tiny(), Rig()
-    net.step(view(8), rig, net.initial_state())
-    assert rig.asked == [(t, NAMES) for t in window_times(8, net.config)]
-    rig.asked.clear()
-    net.step(replace(view(8), source_views=("left", "third")), rig, net.initial_state())
-    assert rig.asked == [(t, ("third",)) for t in window_times(8, net.config)]
-    rig.asked.clear()
-    net.step(view(9), rig, net.initial_state())
-    assert rig.asked == [(9, NAMES), (5, NAMES), (1, NAMES)]
 
 
 def test_a_providers_own_memory_is_bounded():
@@ -60,11 +48,3 @@ def test_excluded_cameras_are_never_provided():
     shared = {"left": "encoded for another viewer"}
     context = ContextProvider(rig, exclude=("left",), memory=lambda time: shared)
     assert context.encoded((3,), ("left",), lambda many: []) == []
-
-
-def test_lower_quality_uses_less_of_the_window():
-    net = tiny()
-    for count, times in ((None, window_times(8, net.config)), (2, (8, 7)), (1, (8,)), (0, ())):
-        rig = Rig()
-        net.step(view(8), ContextProvider(rig, RenderQuality(context_times=count)), net.initial_state())
-        assert [time for time, _ in rig.asked] == list(times)

@@ -7,11 +7,9 @@ from reference.encoder_reference import encode_reference
 from viewmend.models.paper.config import paper
 from viewmend.models.paper.patches import PATCH_CELLS, STEP_CELLS, padded_size, split
 from viewmend.models.paper.tokenizer import (
-    RECEPTIVE_RADIUS_PX,
     Encoder,
     Tokeniser,
     build_context_input,
-    find_crop,
     relative_depth,
 )
 
@@ -34,14 +32,6 @@ def test_the_papers_encoder_has_fuseformers_sizes():
     assert sum(p.numel() for p in Encoder(paper()).parameters()) == 4_206_400 + extra_inputs
 
 
-def test_the_receptive_radius(rng):
-    image = torch.rand(1, 5, 140, 140, generator=rng, requires_grad=True)
-    Encoder(TINY)(image)[0, :, 17, 17].square().sum().backward()
-    influences = torch.nonzero(image.grad[0].abs().sum(0))
-    radius = max(17 * 4 - int(influences.min()), int(influences.max()) - (17 * 4 + 3))
-    assert RECEPTIVE_RADIUS_PX - 4 <= radius <= RECEPTIVE_RADIUS_PX
-
-
 def test_encoding_a_crop_equals_encoding_the_whole_image():
     tokeniser = Tokeniser(TINY)
     for layer in tokeniser.encoder.layers:
@@ -59,21 +49,6 @@ def test_encoding_a_crop_equals_encoding_the_whole_image():
             whole.append(tokeniser.linear(patches.flatten(1)))
     assert torch.allclose(tokens, torch.cat(whole), atol=1e-4)
     assert not bool(stacks[1].kept.all()), "the crop must be smaller than the image"
-
-
-def test_a_crop_contains_every_kept_patch_with_its_margin():
-    kept = torch.zeros(5, 6, dtype=torch.bool)
-    kept[1, 2] = kept[3, 4] = True
-    # 3 patches and a margin of 2 on both sides, rounded up to 8.
-    assert find_crop(kept) == ((-1, 0), (7 * 16 + 28, 7 * 16 + 28))
-    assert find_crop(torch.zeros_like(kept)) == ((-2, -2), (7 * 16 + 28, 7 * 16 + 28))
-
-
-def test_background_patches_are_discarded_and_no_others():
-    images = build_context_input(context(0, width=200, height=170), TINY)
-    for view, row, col in torch.cartesian_prod(*map(torch.arange, images.kept.shape)).tolist():
-        patch = images.foreground[view, row * 16 : row * 16 + 28, col * 16 : col * 16 + 28]
-        assert bool(images.kept[view, row, col]) == bool(patch.any())
 
 
 def test_relative_depth_is_independent_of_scale(rng):

@@ -7,7 +7,7 @@ import torch
 
 from viewmend.models.base import ContextProvider, ErrorMap, RenderQuality, State
 from viewmend.models.checkpoint import load_network
-from viewmend.models.smooth_fill import SmoothFill, fill
+from viewmend.models.smooth_fill import fill
 from viewmend.models.views import error_predictor
 from viewmend.models.views.grid import rim_depth
 from viewmend.models.views.model import ViewSynthNet
@@ -15,7 +15,6 @@ from viewmend.rendering.crop import Crop
 from viewmend.rendering.error_mask import attenuate_background, select_by_gain
 from viewmend.rendering.view import RenderConfig
 from viewmend.stream import Stream, StreamConfig
-from viewmend.utils import timing
 
 
 @pytest.fixture(scope="module")
@@ -113,30 +112,6 @@ def test_the_rule_predicted_uses_the_inpainters_own_prediction(scene, net, small
         stream_of(ViewSynthNet(small_views), scene, error_rule="predicted").render(view.camera)
 
 
-def test_a_stream_uses_the_error_rule_of_its_inpainter(scene):
-    stream, view, _ = scene
-    cases = [(stream.inpainter, None), (SmoothFill(), "all"), (SmoothFill(), None), (stream.inpainter, "holes")]
-    masks = []
-    for inpainter, rule in cases:
-        own = stream_of(inpainter, scene, error_rule=rule)
-        masks.append(own.render(view.camera).error)
-        assert torch.equal(own.view(view.camera).completed.view.error, masks[-1])
-    assert torch.equal(masks[0], view.error) and torch.equal(masks[1], view.error)
-    assert torch.equal(masks[2] > 0, view.holes) and torch.equal(masks[3] > 0, view.holes)
-    assert int(view.holes.sum()) > 0
-
-
-def test_a_part_is_predicted_with_a_quick_guess(scene, small_views, monkeypatch):
-    _, view, _ = scene
-    net = ViewSynthNet(replace(small_views, coarse_fill="rays", error_features=8)).eval()
-    own, calls = stream_of(net, scene), []
-    monkeypatch.setattr(net.coarse, "forward", lambda *given: calls.append(given) or view.rgb)
-    own.view(view.camera, quality=RenderQuality(refine_fraction=0.3))
-    assert calls == []
-    own.view(view.camera)
-    assert len(calls) == 1
-
-
 def test_a_quality_limits_the_predicted_part(scene, net):
     _, view, _ = scene
     hull, holes = int((view.mask > 0).sum()), int(view.holes.sum())
@@ -169,16 +144,3 @@ def test_if_nothing_is_predicted_holes_are_filled_from_their_surroundings(scene,
     torch.testing.assert_close(completed.opacity[rest], ((1 - part.error) * view.mask)[rest])
     assert not bool(completed.confidence[view.holes].any())
     assert bool((completed.confidence[rest] == view.mask[rest]).all())
-
-
-def test_predicting_errors_counts_as_inpainting_time(scene, net, monkeypatch):
-    own, whole, clock = stream_of(net, scene), net.predict_errors, [0.0]
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
-
-    def slow(*given):
-        clock[0] += 1.0
-        return whole(*given)
-
-    monkeypatch.setattr(net, "predict_errors", slow)
-    times = own.view(scene[1].camera, quality=RenderQuality(refine_fraction=0.3)).times
-    assert times.inpainting == pytest.approx(1000) and times.rendering == 0

@@ -14,11 +14,9 @@ from viewmend.models.views.grid import (
     CELL_PX,
     TILE_PX,
     UNet,
-    concatenate_channels,
     detail_bands,
     downsample2x,
     index_image,
-    nearest_depth,
     rim_depth,
     run_tiled,
     scatter_to_image,
@@ -40,11 +38,6 @@ def test_the_rim_has_the_smallest_depth_within_two_pixels(shape, dtype):
             near = depth[max(0, row - 2) : row + 3, max(0, column - 2) : column + 3]
             least = min((z for z in near.flatten().tolist() if z > 0), default=0.0)
             assert found[row, column] == (depth[row, column] if depth[row, column] > 0 else least)
-
-
-def test_cells_have_the_nearest_depth():
-    depth = torch.tensor([[0.0, 3.0, 0.0], [2.0, 5.0, 0.0], [0.0, 0.0, 4.0]])
-    assert nearest_depth(depth).tolist() == [[2.0, 0.0], [0.0, 4.0]]
 
 
 @pytest.mark.parametrize("grad", [False, True])
@@ -90,14 +83,6 @@ def test_upsampling_interpolates_between_values_inside():
     image, inside = torch.tensor([[[1.0, 3.0, 100.0]]]), torch.tensor([[True, True, False]])
     large = upsample2x(image, inside, (2, 5))
     assert large.shape == (1, 2, 5) and large[0, 0].tolist() == pytest.approx([1.0, 1.5, 2.5, 3.0, 3.0])
-
-
-def test_channels_are_concatenated_as_convolutions_want_them():
-    points = torch.tensor([[0, 1], [2, 3]])
-    one, two = scatter_to_image(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), points, torch.Size((3, 4))), torch.rand(3, 3, 4)
-    whole = concatenate_channels(one, two)
-    assert torch.equal(whole, torch.cat([one, two])[None])
-    assert whole.is_contiguous(memory_format=torch.channels_last) and whole.stride(0) == whole[0].numel()
 
 
 def some_pixels(shape, share, rng):

@@ -16,7 +16,6 @@ from viewmend.models.paper.patches import (
     merge,
     padded_size,
     split,
-    tent,
 )
 
 
@@ -63,42 +62,6 @@ def test_split_merge_and_kept_patches_equal_the_references(rng):
         assert torch.allclose(fast[0], slow[0], atol=1e-5) and torch.equal(fast[1], slow[1])
     pixels = torch.rand(2, 70, 90, generator=rng) > 0.999
     assert torch.equal(any_in_patch(pixels), any_in_patch_reference(pixels, *grid_shape(70, 90)))
-
-
-def test_gradients_of_split_and_merge_equal_the_references(rng):
-    places = torch.tensor([[0, 0, 0], [0, 1, 0], [0, 0, 1]])
-    for fast, slow in (
-        (split, split_reference),
-        (
-            lambda x, *_: merge(split(x, places, 7, 4), places, (1, 11, 11), 4)[0],
-            lambda x, *_: merge_reference(split_reference(x, places, 7, 4), places, (1, 11, 11), 4)[0],
-        ),
-    ):
-        gradients = []
-        for function in (fast, slow):
-            x = torch.rand(1, 2, 11, 11, generator=torch.Generator().manual_seed(3), requires_grad=True)
-            (function(x, places, 7, 4) ** 2).sum().backward()
-            gradients.append(x.grad)
-        assert torch.allclose(*gradients, atol=1e-5)
-
-
-def test_blending_weights_are_positive_and_sum_to_one():
-    places = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 1, 1], [0, 2, 0]])
-    merged, coverage = merge(torch.ones(4, 1, 28, 28), places, (1, 70, 50), 16)
-    assert torch.allclose(merged[0, 0][coverage[0] > 0], torch.tensor(1.0))
-    assert bool((merged[0, 0][coverage[0] == 0] == 0).all())
-    assert 0 < float(coverage.mean()) < 1
-    weights = tent(28)
-    assert float(weights.min()) > 0 and torch.equal(weights, weights.T) and torch.equal(weights, weights.flip(0))
-
-
-def test_blending_is_linear_between_two_patches():
-    patches = torch.stack([torch.zeros(1, 28, 28), torch.ones(1, 28, 28)])
-    merged, _ = merge(patches, torch.tensor([[0, 0, 0], [0, 0, 1]]), (1, 28, 44), 16)
-    row = merged[0, 0, 14]
-    assert bool((row[:16] == 0).all()) and bool((row[28:] == 1).all())
-    slope = row[17:27].diff()
-    assert torch.allclose(slope, torch.full_like(slope, 1 / 12), atol=1e-6)
 
 
 @pytest.mark.parametrize(("top", "left"), [(-5, -3), (4, 6), (50, 2), (-40, 0), (3, 17)])

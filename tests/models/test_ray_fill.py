@@ -19,7 +19,6 @@ from viewmend.models.views.ray_fill import (
     RADIUS_PX,
     gather_ray_inputs,
     multi_scale_context,
-    windows,
 )
 
 SOURCES = SourceCameras.of(context(5), None)
@@ -41,13 +40,6 @@ def test_neighbourhoods_equal_the_reference(rng):
     assert torch.allclose(found[index].double(), torch.from_numpy(expected), atol=1e-4)
     again, where = multi_scale_context(incomplete, guess, pixels.repeat(2, 1))
     assert torch.equal(again, found) and torch.equal(where, index.repeat(2)), "pixels of one cell share it"
-
-
-def test_windows_are_zero_outside_the_image():
-    image = torch.arange(2 * 5 * 6.0).reshape(2, 5, 6)
-    corner, middle = windows(image, torch.tensor([[0, 0], [2, 3]]), 1)
-    assert torch.equal(middle, image[:, 1:4, 2:5])
-    assert torch.equal(corner[:, 1:, 1:], image[:, :2, :2]) and not corner[:, 0].any() and not corner[:, :, 0].any()
 
 
 @torch.no_grad()

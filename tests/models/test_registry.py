@@ -1,10 +1,7 @@
 """Methods by name: groups, baselines without weights, classes in files."""
 
-import json
-
 import pytest
 
-from viewmend import cli
 from viewmend.metrics.weights import FOLDERS_VARIABLE
 from viewmend.models import registry as methods
 from viewmend.models.checkpoint import shipped_models
@@ -28,11 +25,7 @@ number = 3
 """
 
 
-@pytest.fixture(autouse=True)
-def nowhere(tmp_path, monkeypatch):
-    """No published weights, whatever this machine has."""
-    for name in (FOLDERS_VARIABLE, "XDG_CACHE_HOME", "TORCH_HOME"):
-        monkeypatch.setenv(name, str(tmp_path / "nowhere"))
+pytestmark = pytest.mark.usefixtures("no_weights")
 
 
 def test_groups_stand_for_their_methods_each_once():
@@ -59,19 +52,6 @@ def test_a_damaged_checkpoint_is_an_error_not_a_gap(tmp_path, monkeypatch):
     monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
     with pytest.raises(ValueError, match="got 2 bytes that do not read"):
         split_missing(("dstt-o-def",))
-
-
-def test_reports_have_the_row_and_say_why_it_is_empty(tmp_path, capsys):
-    arguments = ["evaluate", "P", "--scenes", "1", "--frames", "1", "--size", "96", "--out", str(tmp_path / "out")]
-    assert cli.main([*arguments, "--methods", "unfilled,dstt-o-mul"]) == 0
-    assert "| dstt-o-mul | n/a | n/a |" in capsys.readouterr().out
-    text = (tmp_path / "out" / "report.md").read_text()
-    assert "* dstt-o-mul: expected the generator of DSTT as dstt.pth" in text
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert list(report["missing"]) == ["dstt-o-mul"] and report["methods"] == ["unfilled", "dstt-o-mul"]
-    assert {cell["method"] for cell in report["cells"]} == {"unfilled"}
-    assert cli.main([*arguments, "--weights", str(tmp_path / "absent")]) == 2
-    assert "expected a folder of weights, found none" in capsys.readouterr().err
 
 
 def test_a_class_in_a_file_is_a_method_and_a_changed_file_another(tmp_path):

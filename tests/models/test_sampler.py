@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from models.plates import camera, context, look, view
+from models.plates import context, view
 from reference.rays_reference import sample_fill_reference
 
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras
-from viewmend.models.views import pyramids
-from viewmend.models.views.config import AROUND, FAR, NEAR, OFFSETS
+from viewmend.models.views.aggregation import SampleAggregator
+from viewmend.models.views.config import AROUND, FAR, FEATURES, IN_VIEW, NEAR, OFFSETS, STATISTICS
 from viewmend.models.views.pyramids import (
     MipLevels,
     SceneScale,
@@ -26,6 +26,7 @@ from viewmend.models.views.sampler import (
     CameraFeatures,
     Projections,
     Rays,
+    RaySamples,
     sample_level,
     sample_level_cubic,
     sample_rays,
@@ -99,18 +100,6 @@ def test_cubic_samples_keep_straight_lines_and_overshoot_none(rng):
     assert float((narrow - 0.5).abs().mean()) > float((wide - 0.5).abs().mean()), "edges are sharper"
 
 
-def test_at_the_finest_level_both_networks_see_the_same(scene, monkeypatch):
-    _, view, sources = scene
-    monkeypatch.setattr(pyramids, "choose_levels", lambda cameras, last, *_: (0 * last, last))
-    pixels, rays = rays_of(view)
-    found = sample_rays(rays, sources, view.source_views, 1.0, SceneScale.of(view))
-    wanted = sample_behind_proxy(view, pixels, sources, OFFSETS)
-    assert len(pixels) > 500
-    for channels in (slice(4), slice(6, 9)):
-        torch.testing.assert_close(found.features[..., channels], wanted.features[..., channels], atol=1e-4, rtol=0)
-    torch.testing.assert_close(found.statistics[..., 6:8], wanted.statistics[..., 6:8], atol=1e-4, rtol=0)
-
-
 def test_positions_stay_exact_under_autocast(scene):
     _, view, sources = scene
     given = rays_of(view)[1], sources, view.source_views, 2.0, SceneScale.of(view)
@@ -149,15 +138,6 @@ def test_without_silhouettes_the_source_masks_count():
     assert torch.equal(without, given)
 
 
-def test_cameras_agree_on_the_colour_of_a_surface_point():
-    pixels, sources = torch.tensor([[30, 40], [25, 33]]), SourceCameras.of(context(5), None)
-    found = CameraFeatures.unstack(sample_behind_proxy(view(5), pixels, sources, offsets=(0.0,)).features)
-    truth = look(camera("novel"), 5)[0][:, pixels[:, 0], pixels[:, 1]].T[:, None, None]
-    assert torch.allclose(found.colour, truth.expand_as(found.colour), atol=0.05)
-    for behind in (found.depth_difference, found.coarse_depth_difference):
-        assert torch.allclose(behind, torch.zeros_like(behind), atol=1e-4), "at the proxy, not behind it"
-
-
 @pytest.mark.parametrize("unit", [0.001, 10.0])
 def test_the_unit_of_length_does_not_matter(unit):
     def scaled(cameras):
@@ -174,3 +154,36 @@ def test_the_unit_of_length_does_not_matter(unit):
     )
     before = sample_behind_proxy(incomplete, pixels, SourceCameras.of(seen, None))
     assert torch.allclose(after.features, before.features, atol=1e-3)
+
+
+# Samples are aggregated alike by the compiled loop and by PyTorch.
+
+
+@pytest.fixture
+def samples():
+    """150 rays with 3 samples and 5 cameras, each of which sees two thirds of them; one sample is in no view."""
+    torch.manual_seed(3)
+    seen = (torch.rand(150, 3, 5) > 1 / 3).float()
+    seen[7, 1] = 0
+    features = torch.rand(150, 3, 5, FEATURES) * seen[..., None]
+    features[..., IN_VIEW] = seen
+    prior = torch.rand(150, 3, 5) * seen
+    return RaySamples(features, prior / prior.sum(2, keepdim=True).clamp_min(1e-6), torch.rand(150, 3, STATISTICS))
+
+
+@pytest.mark.parametrize("own_prior", [True, False])
+def test_the_compiled_loop_equals_pytorch(samples, own_prior):
+    torch.manual_seed(0)
+    net, prior = SampleAggregator(24, 12), None if own_prior else torch.rand(150, 3, 5)
+    before = [part.clone() for part in samples]
+    with torch.no_grad():
+        fast = net(samples, prior)
+    assert all(torch.equal(part, old) for part, old in zip(samples, before, strict=True)), "inputs are not changed"
+    slow = net(samples, prior)
+    for name, own, wanted in zip(fast._fields, fast, slow, strict=True):
+        torch.testing.assert_close(own, wanted.detach(), atol=1e-5, rtol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+    seen = samples.features[..., IN_VIEW]
+    assert not bool(fast.trust[seen == 0].any())
+    torch.testing.assert_close(fast.trust.sum(2), seen.amax(2), atol=1e-5, rtol=0)
+    mean = (fast.trust[..., None] * samples.features).sum(2)
+    torch.testing.assert_close(torch.cat([fast.colour, fast.mask], -1), mean[..., :4])

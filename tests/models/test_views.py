@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from viewmend.models.base import ContextProvider, RenderQuality, State
-from viewmend.models.checkpoint import MismatchedWeightsError, load_inpainter, save_inpainter
 from viewmend.models.views import prediction, pyramids
 from viewmend.models.views.config import OFFSETS, ViewsConfig
 from viewmend.models.views.grid import rim_depth, scatter_to_image
@@ -87,18 +86,6 @@ def test_chunks_of_rays_give_the_same(scene, monkeypatch):
     whole = stream.inpainter(view, sources)
     monkeypatch.setattr(pyramids, "CPU_RAYS", 29)
     torch.testing.assert_close(stream.inpainter(view, sources).rgb, whole.rgb, atol=1e-5, rtol=0)
-
-
-def test_a_saved_model_loads(scene, small_views, tmp_path):
-    stream, view, sources = scene
-    save_inpainter(stream.inpainter, tmp_path / "model", "# card")
-    again = load_inpainter(tmp_path / "model", precision="float32")
-    assert isinstance(again, ViewSynthNet) and again.config == small_views
-    assert torch.equal(again(view, sources).rgb, stream.inpainter(view, sources).rgb)
-    config = tmp_path / "model" / "config.json"
-    config.write_text(config.read_text().replace('"views"', '"sweeping"'))
-    with pytest.raises(MismatchedWeightsError, match="got 'sweeping'"):
-        load_inpainter(tmp_path / "model")
 
 
 @pytest.mark.parametrize("values", [{"width": 0}, {"width": 2.5}, {"depth": 3}, {"features": True}, {"width": 10**9}])

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from reference.capture_folder import edit_description
 from reference.filmed_board import photograph, waved
 
 from viewmend.cli import main
@@ -21,7 +22,7 @@ from viewmend.geometry.cameras import project
 from viewmend.preprocess.calibration import silhouettes as held_out
 from viewmend.preprocess.calibration.board import Corners, parse_board
 from viewmend.preprocess.calibration.bundle import calibrate
-from viewmend.preprocess.calibration.silhouettes import HOLDS, Refinement, brought_to
+from viewmend.preprocess.calibration.silhouettes import HOLDS, HeldOutIou, Refinement, best_hold, brought_to, missed_px
 
 BOARD, SMALL_BOARD, DICTIONARY = "8x6:0.12:0.09", "6x5:0.16:0.12", "DICT_5X5_1000"
 TIMES = 14
@@ -122,14 +123,16 @@ def test_cameras_that_never_share_a_time_are_named():
 
 def disturbed(folder, px=1.5):
     """Turn each camera by about so many pixels, and move it as far."""
-    file = folder / "cameras.json"
-    description, rng = json.loads(file.read_text()), np.random.default_rng(0)
-    for camera in description["cameras"]:
-        focal = camera["K"][0][0]
-        turn = cv2.Rodrigues(rng.normal(0, px / focal, 3))[0]
-        camera["R"] = (turn @ np.array(camera["R"])).tolist()
-        camera["t"] = (turn @ np.array(camera["t"]) + rng.normal(0, px / focal, 3)).tolist()
-    file.write_text(json.dumps(description))
+    rng = np.random.default_rng(0)
+
+    def change(content):
+        for camera in content["cameras"]:
+            focal = camera["K"][0][0]
+            turn = cv2.Rodrigues(rng.normal(0, px / focal, 3))[0]
+            camera["R"] = (turn @ np.array(camera["R"])).tolist()
+            camera["t"] = (turn @ np.array(camera["t"]) + rng.normal(0, px / focal, 3)).tolist()
+
+    edit_description(folder, change)
 
 
 @pytest.fixture(scope="module")
@@ -189,8 +192,56 @@ def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, caps
 
 def test_three_cameras_are_too_few_for_silhouettes(studio, tmp_path, capsys):
     folder = shutil.copytree(studio[0], tmp_path / "take")
-    description = json.loads((folder / "cameras.json").read_text())
-    description["cameras"] = description["cameras"][:3]
-    (folder / "cameras.json").write_text(json.dumps(description))
+    edit_description(folder, lambda content: content.update(cameras=content["cameras"][:3]))
     assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes"]) == 2
     assert "expected 4 cameras or more" in capsys.readouterr().err
+
+
+# How strongly cameras are held is chosen by what the refinement has not seen.
+
+
+@pytest.fixture(scope="module")
+def frames():
+    capture = Studio(StudioConfig(seed=10002, cameras=6, frames=3, size_px=128))
+    return [capture.read(time) for time in range(3)]
+
+
+@pytest.mark.parametrize("best", HOLDS)
+def test_of_several_times_those_left_out_choose(frames, best, monkeypatch):
+    asked = []
+
+    def missed(frames, left, bounds, hold):
+        asked.append((left, hold))
+        return 0.1 if hold == best else 0.2
+
+    monkeypatch.setattr(held_out, "missed_px", missed)
+    assert best_hold(frames, None) == best
+    assert sorted(asked) == sorted((time, hold) for time in (0, 1) for hold in HOLDS)
+
+
+@pytest.mark.parametrize("best", HOLDS)
+def test_of_a_single_time_cameras_choose(frames, best, monkeypatch):
+    judged = lambda frames, name, bounds, hold: HeldOutIou(name, 0.9, 0.95 if hold == best else 0.94)  # noqa: E731
+    monkeypatch.setattr(held_out, "refined_without", judged)
+    assert best_hold(frames[:1], None) == best
+
+
+def test_the_time_that_is_left_out_is_not_refined_by(frames, monkeypatch):
+    seen = []
+
+    def refined(frames, bounds, hold):
+        seen.extend(frame.time for frame in frames)
+        return Refinement(frames[0].cameras, 0.0, 0.0)
+
+    monkeypatch.setattr(held_out, "refined_all", refined)
+    exact = missed_px(frames[:2], 1, None, HOLDS[0])
+    assert seen == [0] and exact < 0.3
+
+    def disturbed(frames, bounds, hold):
+        pose = frames[0].cameras.camera_from_world.clone()
+        pose[1, 1, 3] += 0.1
+        cameras = frames[0].cameras
+        return Refinement(type(cameras)(cameras.names, cameras.K, pose, cameras.size_px), 0.0, 0.0)
+
+    monkeypatch.setattr(held_out, "refined_all", disturbed)
+    assert missed_px(frames[:2], 1, None, HOLDS[0]) > exact + 0.3 and np.isfinite(exact)

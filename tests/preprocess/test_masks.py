@@ -1,13 +1,11 @@
 """Masks of images that have none: each method, and what cleans them."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
+from reference.ball import photograph, ring
 
-from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole, pixel_centers
-from viewmend.geometry.rigid import look_at
+from viewmend.geometry.cameras import Cameras
 from viewmend.preprocess.masks.maker import ChromaMasks, MaskMaker, lasting, without_spill
 from viewmend.preprocess.masks.masked import agreed
 from viewmend.preprocess.masks.plate import PlateMasks, median_plate
@@ -120,17 +118,9 @@ def test_what_is_there_at_one_time_only_goes():
 
 
 def rig_masks() -> tuple[torch.Tensor, Cameras]:
-    """Eight cameras round a ball, a metre wide."""
-    poses = []
-    for view in range(8):
-        angle = torch.tensor(view * math.pi / 4)
-        eye = torch.stack([3 * angle.cos(), torch.tensor(0.4), 3 * angle.sin()])
-        pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
-        poses.append(pinhole(0.7, 120, 120, pose, f"cam{view}"))
-    cameras = concatenate_cameras(poses)
-    uv = pixel_centers(120, 120)
-    ball = ((uv - 60).norm(dim=-1) < 27).to(torch.uint8) * 255
-    return ball.repeat(8, 1, 1), cameras
+    """Eight cameras round a ball."""
+    frame = photograph(ring(8, 120))
+    return frame.mask, frame.cameras
 
 
 def test_cameras_drop_what_no_other_supports_and_fill_what_all_do():

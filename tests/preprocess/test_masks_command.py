@@ -127,12 +127,3 @@ def test_whoever_needs_masks_hears_of_the_command(unmasked, tmp_path, capsys):
     assert f"viewmend masks {unmasked.path} OUT" in capsys.readouterr().err
     assert main(["info", str(unmasked.path)]) == 0
     assert "none (viewmend masks makes them)" in capsys.readouterr().out
-
-
-def test_nobodys_folder_is_written_over(unmasked, tmp_path, capsys):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine.txt").write_text("mine")
-    plates = str(unmasked.path / "plates")
-    assert main(["masks", str(unmasked.path), str(tmp_path / "out"), "--method", "plate", "--plate", plates]) == 2
-    assert "got one with files" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine.txt"]

@@ -1,6 +1,5 @@
 """Small films for tests, written by PyAV."""
 
-import json
 import shutil
 from collections.abc import Sequence
 from fractions import Fraction
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+from reference.capture_folder import edit_description
 
 from viewmend.data.images import read_rgb
 from viewmend.data.native_writer import write_capture
@@ -78,14 +78,16 @@ def _mux(film, packets, earlier_s: float) -> None:
 def write_film_capture(source: CaptureSource, folder: Path) -> None:
     """Write a capture with a nearly lossless film of each camera, and numbered masks."""
     write_capture(source, folder, images="png")
-    content = json.loads((folder / "cameras.json").read_text())
-    for camera in content["cameras"]:
-        images = sorted((folder / camera.pop("image")).parent.glob("*.png"))
-        camera["video"] = f"video/{camera['name']}.mp4"
-        frames = [read_rgb(path, "") for path in images]
-        write_film(folder / camera["video"], frames, fps=10, pix_fmt="yuv444p", options={"crf": "8"})
+
+    def replace_images(content):
+        for camera in content["cameras"]:
+            images = sorted((folder / camera.pop("image")).parent.glob("*.png"))
+            camera["video"] = f"video/{camera['name']}.mp4"
+            frames = [read_rgb(path, "") for path in images]
+            write_film(folder / camera["video"], frames, fps=10, pix_fmt="yuv444p", options={"crf": "8"})
+
+    edit_description(folder, replace_images)
     shutil.rmtree(folder / "image")
-    (folder / "cameras.json").write_text(json.dumps(content))
 
 
 def set_matrix(path: Path, name: str) -> Path:

@@ -1,6 +1,7 @@
 """Slow, obvious twin of viewmend.geometry.hull.visual_hull: one voxel, one camera at a time."""
 
 import numpy as np
+from scipy import ndimage
 
 
 def hull_twin(mask, cameras, low, voxel_m, shape, pool, needed):
@@ -21,12 +22,7 @@ def soften(image, size, pool):
     for y, x in np.ndindex(*pooled.shape):
         for j, i in np.ndindex(pool, pool):
             pooled[y, x] += image[min(y * pool + j, rows - 1), min(x * pool + i, columns - 1)] / pool**2
-    smooth = np.zeros_like(pooled)
-    for y, x in np.ndindex(*pooled.shape):
-        for j, i in np.ndindex(3, 3):
-            weight = (1, 2, 1)[j] * (1, 2, 1)[i] / 16
-            row, column = np.clip(y + j - 1, 0, pooled.shape[0] - 1), np.clip(x + i - 1, 0, pooled.shape[1] - 1)
-            smooth[y, x] += weight * pooled[row, column]
+    smooth = ndimage.correlate(pooled, np.outer([1, 2, 1], [1, 2, 1]) / 16, mode="nearest")
     return np.round(smooth) / 255
 
 
@@ -37,10 +33,5 @@ def look_up(image, cameras, view, point, pool):
     columns, rows = cameras.size_px[view].tolist()
     if z <= 0 or not (0 <= x / z < columns and 0 <= y / z < rows):
         return None
-    u = np.clip(x / z / pool - 0.5, 0, image.shape[1] - 1)
-    v = np.clip(y / z / pool - 0.5, 0, image.shape[0] - 1)
-    left, top = int(u), int(v)
-    right, bottom = min(left + 1, image.shape[1] - 1), min(top + 1, image.shape[0] - 1)
-    over = image[top, left] * (1 - u + left) + image[top, right] * (u - left)
-    under = image[bottom, left] * (1 - u + left) + image[bottom, right] * (u - left)
-    return over * (1 - v + top) + under * (v - top)
+    at = [[y / z / pool - 0.5], [x / z / pool - 0.5]]
+    return ndimage.map_coordinates(image, at, order=1, mode="nearest")[0]

@@ -2,6 +2,8 @@
 
 import numpy as np
 from reference.blend_twin import unit
+from scipy.ndimage import map_coordinates
+from skimage.measure import block_reduce
 
 
 def sample_fill_reference(view, pixels, ray_views, offsets, near, far, outline, patch):
@@ -37,26 +39,19 @@ def look(point, viewer, view, ray_views, index, size_m, near, far, outline, patc
     u, v, _ = camera.K[0].double().numpy() @ [x / z, y / z, 1]
     if not (0 <= u < width and 0 <= v < height):
         return np.zeros(14)
-    rgb, mask, coverage, surface = np.zeros(3), 0.0, 0.0, 0.0
-    for row, column, share in four_beyond(u, v):
-        if 0 <= row < frame.rgb.shape[2] and 0 <= column < frame.rgb.shape[3]:
-            there = float(ray_views.depth[index, row, column])
-            fore = float(frame.mask[index, row, column]) / 255
-            rgb += share * fore * frame.rgb[index, :, row, column].double().numpy() / 255
-            mask += share * fore
-            coverage += share * (there > 0)
-            surface += share * there
+    masks, depth = frame.mask.double().numpy() / 255, ray_views.depth.double().numpy()
+    proxy, black = (depth > 0).astype(float), frame.rgb[index].double().numpy() / 255 * masks[index]
+    coverage, surface = look_up(proxy[index], u, v), look_up(depth[index], u, v)
     behind = (z - surface / coverage) / size_m if coverage > 0.3 else 0.0
     centre = -pose[:3, :3].T @ pose[:3, 3]
     cosine = unit(centre - point) @ unit(viewer - point)
     chosen = camera.names[0] in view.source_views
-    masks, proxy = frame.mask.double().numpy() / 255, (ray_views.depth.numpy() > 0).astype(float)
     size_px = float(np.sqrt(masks.sum((1, 2)).mean()))
     side, half = max(1, round(outline * size_px)), max(1, round(patch / 2 * size_px))
-    black = frame.rgb[index].double().numpy() / 255 * masks[index]
     colours = [mean_around(channel[::2, ::2], half, u / 2, v / 2) for channel in black]
     around = [*colours, mean_around(masks[index], side, u, v), mean_around(proxy[index], side, u, v)]
-    return np.array([*rgb, mask, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, *around])
+    seen = [look_up(image, u, v) for image in (*black, masks[index])]
+    return np.array([*seen, np.tanh(behind / near), np.tanh(behind / far), cosine, chosen, 1, *around])
 
 
 def neighbourhoods_reference(view, guess, pixels, sizes, reach):
@@ -93,27 +88,16 @@ def see_mask(point, silhouettes, index, outline):
     width, height = camera.size_px[0].tolist()
     if not (0 <= u < width and 0 <= v < height):
         return 1.0, 1.0
-    rows, columns = silhouettes.mask.shape[1:]
-    around = [(r, c, share) for r, c, share in four_beyond(u, v) if 0 <= r < rows and 0 <= c < columns]
     masks = silhouettes.mask.double().numpy() / 255
     side = max(1, round(outline * np.sqrt(masks.sum((1, 2)).mean())))
-    return sum(share * masks[index, r, c] for r, c, share in around), mean_around(masks[index], side, u, v)
+    return look_up(masks[index], u, v), mean_around(masks[index], side, u, v)
 
 
 def mean_around(image, side, u, v):
     """The image's mean over squares, between the four squares around (u, v)."""
-    total = 0.0
-    for row, column, share in four_beyond(u / side, v / side):
-        if row >= 0 and column >= 0:
-            square = image[row * side : (row + 1) * side, column * side : (column + 1) * side]
-            total += share * square.sum() / side**2
-    return total
+    return look_up(block_reduce(image, side, np.mean), u / side, v / side)
 
 
-def four_beyond(u, v):
-    """The four pixels around (u, v), with bilinear shares; also those beyond the border."""
-    left, top = int(np.floor(u - 0.5)), int(np.floor(v - 0.5))
-    right_share, lower_share = u - 0.5 - left, v - 0.5 - top
-    for row, vertical in ((top, 1 - lower_share), (top + 1, lower_share)):
-        for column, horizontal in ((left, 1 - right_share), (left + 1, right_share)):
-            yield row, column, vertical * horizontal
+def look_up(image, u, v):
+    """The image between its pixels, whose centres are at halves; beyond the border it is black."""
+    return map_coordinates(image, [[v - 0.5], [u - 0.5]], order=1, mode="grid-constant")[0]

@@ -49,13 +49,6 @@ def test_a_crop_gives_the_same_image_as_the_whole_view(scene, azimuth, distance,
     assert whole.view.weights.shape == part.view.weights.shape
 
 
-def test_an_unchanged_image_is_not_copied(scene):
-    stream, frame, _ = scene
-    camera = view_camera(Camera(azimuth=frame.azimuth), frame, (200, 160))
-    part = stream.view(camera, quality=RenderQuality(mend=False)).completed
-    assert part.rgb is part.view.rgb
-
-
 def test_crops_lie_within_the_view(scene):
     _, frame, proxy = scene
     away = view_camera(Camera(azimuth=0.0, target=(5.0, 0.0, 0.0)), frame, (64, 48))
@@ -82,21 +75,6 @@ def test_crops_are_on_the_grid_and_have_their_margin(scene):
     again = found.uncropped(part, view.camera)
     for name in ("rgb", "mask", "error", "depth", "weights"):
         assert torch.equal(getattr(again, name), getattr(view, name))
-
-
-@pytest.mark.parametrize(
-    ("margin_px", "expected"), [(1, 16), (8, 16), (16, 16), (17, 32), (57, 64), (64, 64), (65, 128)]
-)
-def test_the_grid_is_the_first_power_of_two_that_holds_the_margin(margin_px, expected):
-    assert crop.grid_px(margin_px) == expected
-
-
-def test_the_camera_of_a_crop_has_the_same_rays(scene):
-    _, frame, _ = scene
-    camera = view_camera(Camera(), frame, (64, 48))
-    seen = Crop(16, 0, 40, 30).of_camera(camera)
-    assert seen.max_size_px == (24, 30)
-    assert float(seen.K[0, 0, 2]) == pytest.approx(float(camera.K[0, 0, 2]) - 16)
 
 
 def test_alpha_confidence_and_depth_are_pasted_into_the_whole_view(scene):

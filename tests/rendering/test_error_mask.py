@@ -47,11 +47,6 @@ def test_rule_all_marks_the_subject_and_its_rim_and_keeps_colours():
     assert torch.equal(whole.rgb, holes.rgb) and torch.equal(whole.weights, holes.weights)
 
 
-def test_an_unknown_rule_is_refused():
-    with pytest.raises(ValueError, match="expected an error rule among"):
-        RenderConfig(error_rule="hols")
-
-
 @pytest.mark.parametrize("fraction", [0.0, -1.0, 1.5, float("nan")])
 def test_an_impossible_fraction_is_refused(fraction):
     with pytest.raises(ValueError, match="expected a refine_fraction above 0"):

@@ -58,12 +58,6 @@ def test_points_equal_the_reference(distance_m):
     assert (np.abs(shown - wanted).max(0) > 1e-6).mean() < 0.003  # of two that are as near either may win
 
 
-def test_the_far_side_is_hidden():
-    red = torch.where(BALL.mesh.vertices[:, 2:] < -0.1, torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1]))
-    shown = hull_points(BALL, red, camera_at(0, "t", size=96))
-    assert float(shown[2].sum()) > 200 and float(shown[0].sum()) == 0
-
-
 def test_the_size_of_near_dots_is_bounded():
     vertices = torch.tensor([[0.0, 0, 1.99], [3, 0, -1], [0, 3, -1]])  # a centimetre before it, and two out of view
     near = replace(BALL, mesh=Mesh(vertices, torch.tensor([[0, 1, 2]]).int()), normals=torch.eye(3))

@@ -155,17 +155,6 @@ def test_training_refuses_test_data(tmp_path):
     assert isinstance(rig_source(replace(SCENES, performers=other, motions=other), (0,), "0"), StudioRigs)
 
 
-def test_hard_scenes_have_larger_errors_than_imperfect_ones():
-    def errors(**changes):
-        random = Random(3)
-        return [random_studio(replace(SCENES, **changes), 1, random).imperfections for _ in range(100)]
-
-    assert {it.calibration_px for it in errors(imperfect_fraction=0.0, hard_fraction=1.0)} == {0.0}
-    usual, hard = errors(imperfect_fraction=1.0), errors(imperfect_fraction=1.0, hard_fraction=1.0)
-    assert max(it.calibration_px for it in usual) <= 1 < max(it.calibration_px for it in hard) <= 4
-    assert max(it.mask_edge_px for it in usual) <= 1 < max(it.mask_edge_px for it in hard) <= 2
-
-
 def test_samples_depend_neither_on_workers_nor_on_where_a_stream_resumes():
     source = studio_samples("7")
     alone, helped = (samples_in_order(source, 0, workers) for workers in (0, 2))

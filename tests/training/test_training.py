@@ -150,12 +150,8 @@ def test_averages_forget_the_beginning_and_then_follow_slowly(tiny, tmp_path):
         seen = [[weight.detach().clone() for weight in run.model.parameters()] for _ in islice(run.steps(), 2)]
         for average, first, second in zip(run.averaged.parameters(), *seen, strict=True):
             assert torch.allclose(average, 2 / 11 * first + 9 / 11 * second, atol=1e-6), "faster at first"
-    average, update = torch.tensor([100.0]), averaging(0.998)
-    for count in range(1, 400):
-        update([average], [torch.tensor([float(count % 2)])], count)
-    assert 0.4 < float(average) < 0.6, "a hundred is forgotten"
     late = torch.tensor([0.0])
-    update([late], [torch.tensor([1.0])], 10**6)
+    averaging(0.998)([late], [torch.tensor([1.0])], 10**6)
     assert float(late) == pytest.approx(0.002, rel=1e-3)
 
 
@@ -171,14 +167,6 @@ def test_gradients_are_clipped(tiny, tmp_path, monkeypatch):
             list(islice(run.steps(), 1))
             moved[norm] = max(float((a.detach() - b).abs().max()) for a, b in zip(run.trained, before, strict=True))
     assert moved[1e-12] < 0.01 * moved[1.0]
-
-
-def test_files_of_others_are_not_touched(tiny, tmp_path):
-    (tmp_path / "log.jsonl").write_text('{"mine": 1}\n{"step": 7}\n')
-    with pytest.raises(ValueError, match=r"log\.jsonl: expected"):
-        train(tiny, tmp_path)
-    assert [f.name for f in tmp_path.iterdir()] == ["log.jsonl"]
-    assert (tmp_path / "log.jsonl").read_text() == '{"mine": 1}\n{"step": 7}\n'
 
 
 def test_a_run_interrupted_before_its_first_checkpoint_starts_again(tiny, tmp_path):

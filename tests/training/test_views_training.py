@@ -144,21 +144,6 @@ def test_drawn_errors_are_of_all_kinds_and_some_have_none():
         assert float((found[found > 0] - 2).abs().median()) < 0.1
 
 
-def test_splatted_points_keep_some_depths_and_show_gaps_or_what_is_behind():
-    torch.manual_seed(0)
-    depth = torch.zeros(40, 40)
-    depth[5:35, 5:35] = 2.0
-    gaps, behind = (DepthErrors(points=0.1, behind=on).apply(depth) for on in (False, True))
-    assert set(gaps.unique().tolist()) == {0.0, 2.0} and set(behind.unique().tolist()) == {0.0, 2.0, 2.25}
-    assert 0.4 < float((gaps[5:35, 5:35] > 0).float().mean()) < 0.8
-
-
-def test_stored_hulls_have_the_configured_resolution(studio):
-    scenes = [replace(VIEWS_SCENES, hull_resolution=n) for n in (16, 48)]
-    sizes = [sum(len(view.faces) for view in store_scene(scene_of(studio), s).held) for s in scenes]
-    assert 4 * sizes[0] < sizes[1]
-
-
 def test_a_crop_is_a_part_of_the_view_and_of_its_truth(view):
     torch.manual_seed(1)
     num_cameras = set()
@@ -291,11 +276,6 @@ def test_the_error_predictor_can_be_trained_alone(tiny_views, tmp_path):
         for a, b in zip(again.errors.state_dict().values(), trained.errors.state_dict().values(), strict=True)
     ]
     assert 0 < max(moved) < 0.1, "it starts from the trained predictor"
-
-
-def test_a_model_of_other_sizes_cannot_be_started_from(tiny_views, tmp_path):
-    with pytest.raises(ValueError, match="expected a ViewSynthNet of the recipe's sizes"):
-        train(tiny_views, tmp_path, start=ViewSynthNet(replace(VIEWS_MODEL, width=12)))
 
 
 def test_a_run_resumes_and_is_validated(tiny_views, tmp_path):

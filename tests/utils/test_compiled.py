@@ -19,7 +19,3 @@ def test_read_only_installation_caches_in_a_private_folder_or_not_at_all(monkeyp
     folder.chmod(0o777)  # someone else could place code there
     assert compiled._private_folder() is None
     assert compiled.kernel(double)(4) == 8
-
-
-def test_kernels_take_options():
-    assert compiled.kernel(cache=False, fastmath=True)(double)(1.5) == 3

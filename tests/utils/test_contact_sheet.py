@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from viewmend.utils.contact_sheet import BACKGROUND, GAP_PX, LABEL_PX, Tile, contact_sheet, in_rows, picture
+from viewmend.utils.contact_sheet import BACKGROUND, GAP_PX, LABEL_PX, Tile, contact_sheet, picture
 
 
 def test_tiles_land_in_their_boxes_with_their_aspect_kept():
@@ -22,8 +22,3 @@ def test_pictures_from_floats_bytes_and_masks():
     assert picture(rgb)[1, 3].tolist() == [0, 128, 255]
     assert picture((rgb.clamp(0, 1) * 255).round().byte())[1, 3].tolist() == [0, 128, 255]
     assert picture(torch.ones(1, 2, 4)).shape == (2, 4, 3)
-
-
-def test_rows_keep_the_order():
-    tiles = [Tile(str(i), None) for i in range(5)]
-    assert [[t.label for t in row] for row in in_rows(tiles, 2)] == [["0", "1"], ["2", "3"], ["4"]]

@@ -9,7 +9,6 @@ from models.plates import view as plate
 
 from viewmend.contrib.baselines.framing import Window, aim, camera_windows, foreground
 from viewmend.contrib.baselines.online import OnlineConfig, OnlineInpainter, Sampling
-from viewmend.contrib.baselines.token_transformers import DSTT
 from viewmend.models.base import Inpainter
 from viewmend.types import ContextViews, MultiViewFrame
 
@@ -109,15 +108,6 @@ def test_the_kept_past_is_bounded(grid):
     assert most <= {"absolute": 7, "relative": 30}[grid]
 
 
-@pytest.mark.parametrize("grid", ["absolute", "relative"])
-def test_what_is_dropped_is_never_looked_at_again(grid):
-    sampling = Sampling(grid=grid)
-    for past in range(40):
-        for now in range(past, 90):
-            if not sampling.is_wanted_after(past, now):
-                assert all(past not in sampling.times(later) for later in range(now + 1, 130))
-
-
 @pytest.mark.parametrize("framing", FRAMINGS)
 def test_a_view_that_nobody_wants_filled_leaves_the_state_that_filling_leaves(framing):
     network = Recorder()
@@ -208,9 +198,3 @@ def test_a_window_without_depth_looks_where_the_view_does_and_a_blind_view_shows
     at = aim(corner, Window(0, 0), SIZE)
     assert at is not None and float(at.point[0, 2]) == pytest.approx(2.0)
     assert look(camera("novel"), 0)[0].shape == (3, HEIGHT, WIDTH)
-
-
-def test_windows_that_cannot_be_are_refused():
-    assert OnlineConfig().overlap_px == 48, "as the figures of Table 1 were made"
-    with pytest.raises(ValueError, match="multiples of 24, got 430x240"):
-        OnlineInpainter(DSTT(), OnlineConfig(size_px=(240, 430)))

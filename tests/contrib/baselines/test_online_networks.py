@@ -36,14 +36,6 @@ ALL = [DSTT, pytest.param(FuseFormer, marks=pytest.mark.slow), pytest.param(E2FG
 
 @torch.no_grad()
 @pytest.mark.parametrize("kind", ALL)
-def test_without_a_past_the_view_is_completed_alone(kind, networks, rng):
-    network, now = networks(kind), frames(kind, 1, rng)
-    alone = network(now[None], 1) if isinstance(network, E2FGVI) else network(now[None])
-    assert torch.equal(network.complete_clip(Clip(now)), alone[0, 0])
-
-
-@torch.no_grad()
-@pytest.mark.parametrize("kind", ALL)
 def test_the_past_is_seen_and_the_first_frame_of_now_comes_out(kind, networks, rng):
     network, clip = networks(kind), frames(kind, 4, rng)
     alone = network.complete_clip(Clip(clip[:1]))
@@ -91,9 +83,3 @@ def test_sizes_that_a_network_cannot_take_are_refused(kind, size, message, netwo
     if all(size):
         with pytest.raises(ValueError, match=message):
             network.complete_clip(Clip(torch.zeros(1, 3, *size)))
-
-
-@pytest.mark.parametrize("local", [0, 3])
-def test_e2fgvi_refuses_more_local_frames_than_there_are(local, networks, rng):
-    with pytest.raises(ValueError, match=f"expected 1 to 2 local frames of 2, got {local}"):
-        networks(E2FGVIHQ)(frames(E2FGVIHQ, 2, rng)[None], local)

@@ -22,7 +22,7 @@ from viewmend.contrib.baselines.rgvi import (
 from viewmend.geometry.cameras import Cameras
 from viewmend.metrics import weights
 from viewmend.metrics.weights import KnownWeights
-from viewmend.models.base import ContextProvider, Inpainter
+from viewmend.models.base import ContextProvider
 from viewmend.types import IncompleteView
 from viewmend.utils.weight_files import MissingWeightsError, WeightsError
 
@@ -77,22 +77,6 @@ def stream(inpainter, texture, times, hole=(slice(30, 50), slice(40, 60)), shown
 
 def in_hole(completed, truth):
     return float((completed.rgb - truth)[:, completed.view.error > 0].abs().mean())
-
-
-def test_it_is_an_inpainter_that_sees_the_truth():
-    assert isinstance(Rgvi(), Inpainter)
-
-
-def test_dis_flow_points_to_where_the_pixel_was(texture):
-    flow = dis_flow(at(texture, 1), at(texture, 0))[:, 20:-20, 20:-20]
-    assert (flow.flatten(1).median(1).values + torch.tensor(MOTION).float()).abs().max() < 0.5
-
-
-def test_pulling_moves_and_knows_its_borders(texture):
-    pulled, inside = pull(at(texture, 0), constant(-MOTION[0], -MOTION[1]))
-    torch.testing.assert_close(pulled[:, inside], at(texture, 1)[:, inside], rtol=0, atol=1e-5)
-    assert not inside[: MOTION[1]].any() and not inside[:, : MOTION[0]].any()
-    assert inside[MOTION[1] :, MOTION[0] :].all()
 
 
 def test_flow_that_does_not_lead_home_disagrees():
@@ -150,11 +134,6 @@ def test_a_view_of_another_size_starts_a_new_past(texture):
     part = IncompleteView(small.camera, rgb, small.mask[:64], small.error[:64], small.depth[:64], (), weights, 2)
     completed, state = Rgvi().step(part, no_context, state)
     assert isinstance(state, RgviState) and len(state.past) == 1 and completed.rgb.shape == (3, 64, SIZE)
-
-
-def test_without_holes_it_leaves_the_view_alone(texture):
-    completed, _ = stream(Rgvi(), texture, 2, (slice(0, 0), slice(0, 0)))
-    assert torch.equal(completed.rgb, at(texture, 1))
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from viewmend.contrib.baselines.token_transformers import DSTT, FuseFormer
 from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, load_weights
 
 NETWORKS = {"DSTT": DSTT, "FuseFormer": FuseFormer, "E2FGVI": E2FGVI, "E2FGVI_HQ": E2FGVIHQ}
-PARAMETERS = {"DSTT": 34_529_155, "FuseFormer": 36_591_299, "E2FGVI": 41_799_743, "E2FGVI_HQ": 41_117_887}
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -21,9 +20,7 @@ def test_keys_and_shapes_are_the_published_ones(name, shared):
     for line in (shared / "parity" / f"keys_{name}.txt").read_text().splitlines():
         key, shape = line.split(" ", 1)
         listed[key] = tuple(int(side) for side in shape.strip("()").split(",") if side.strip())
-    network = NETWORKS[name]()
-    assert {key: tuple(value.shape) for key, value in network.state_dict().items()} == listed
-    assert sum(p.numel() for p in network.parameters()) == PARAMETERS[name]
+    assert {key: tuple(value.shape) for key, value in NETWORKS[name]().state_dict().items()} == listed
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +60,6 @@ def test_another_networks_weights_are_refused(weights, tmp_path):
     path = saved(tmp_path / "E2FGVI.pth", E2FGVI().state_dict())
     with pytest.raises(MismatchedWeightsError, match=r"2 missing \(sc.bias_conv.bias.*1 unknown \(sc.bias ...\)"):
         load_weights(E2FGVIHQ(), path)
-
-
-def test_weights_of_another_size_are_refused(weights, tmp_path):
     wrong = weights | {"patch2vec.bias": torch.zeros(7)}
     with pytest.raises(MismatchedWeightsError, match=r"1 of another shape \(patch2vec.bias \(7,\) for \(512,\) "):
         load_weights(fresh(), saved(tmp_path / "x.pth", wrong))

@@ -1,8 +1,6 @@
 """One viewer controls the broadcast view, all watchers get the same video, and it is made only while it is watched."""
 
 import threading
-import urllib.error
-import urllib.request
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from io import BytesIO
@@ -10,12 +8,11 @@ from io import BytesIO
 import numpy as np
 import pytest
 import torch
-from live.live_servers import PIPELINE, WAIT_S, FakeClock, running, wait_until
+from live.live_servers import PIPELINE, WAIT_S, FakeClock, get, running, wait_until
 from reference.ball import ring
 
 from viewmend.contrib import broadcast as broadcast_module
 from viewmend.contrib.broadcast import (
-    PLAYLIST,
     Broadcast,
     BroadcastSession,
     FilmSegments,
@@ -27,12 +24,12 @@ from viewmend.contrib.broadcast import (
 from viewmend.live.client import Client
 from viewmend.live.frame_source import Span
 from viewmend.live.poses import home_view, view_camera
-from viewmend.live.protocol import Camera, Look, OnAir
+from viewmend.live.protocol import Camera, Look
 from viewmend.live.push import LiveSource
 from viewmend.live.renderer import Renderer, RenderResult
 from viewmend.live.server import ServerConfig
 from viewmend.live.service import RenderService
-from viewmend.live.sessions import PlaybackState, ViewerSession
+from viewmend.live.sessions import PlaybackState
 from viewmend.live.video import video_codecs
 from viewmend.models.base import State
 from viewmend.models.smooth_fill import SmoothFill
@@ -56,26 +53,19 @@ def on_air():
         yield server
 
 
-def get(url, path, token=None):
-    asked = urllib.request.Request(f"{url}{path}", headers={"Authorization": f"Bearer {token}"} if token else {})
-    with urllib.request.urlopen(asked, timeout=WAIT_S) as answer:
-        return answer.headers, answer.read()
-
-
-def refused(url, path, token=None):
-    with pytest.raises(urllib.error.HTTPError) as error:
-        get(url, path, token)
-    return error.value.code, error.value.read().decode()
+def fetch(server, path, token=None):
+    """Status, headers and body."""
+    return get(server.url + path, {"Authorization": f"Bearer {token}"} if token else {})
 
 
 def playlist(server):
-    return get(server.url, "/broadcast/live.m3u8")[1].decode()
+    return fetch(server, "/broadcast/live.m3u8")[2].decode()
 
 
 def last_image(server):
     """The last image of the last segment."""
     last = playlist(server).split()[-1]
-    data = b"".join(get(server.url, f"/broadcast/{name}")[1] for name in ("init.mp4", last))
+    data = b"".join(fetch(server, f"/broadcast/{name}")[2] for name in ("init.mp4", last))
     with av.open(BytesIO(data)) as container:
         return list(container.decode(video=0))[-1].to_ndarray(format="rgb24")
 
@@ -136,7 +126,7 @@ def test_all_watchers_get_the_same_bytes(on_air):
         files = {}
         while len(files) < 4:
             names = [line for line in playlist(on_air).split() if line[0] != "#"]
-            files |= {name: get(on_air.url, f"/broadcast/{name}")[1] for name in names if name not in files}
+            files |= {name: fetch(on_air, f"/broadcast/{name}")[2] for name in names if name not in files}
         return files
 
     with ThreadPoolExecutor(6) as watchers:
@@ -148,18 +138,18 @@ def test_all_watchers_get_the_same_bytes(on_air):
 
 
 def test_http_headers_metrics_and_missing_files(on_air):
-    headers, content = get(on_air.url, "/broadcast/live.m3u8")
+    _, headers, content = fetch(on_air, "/broadcast/live.m3u8")
     assert headers["content-type"] == "application/vnd.apple.mpegurl" and headers["cache-control"] == "max-age=1"
-    headers, segment = get(on_air.url, f"/broadcast/{content.decode().split()[-1]}")
+    _, headers, segment = fetch(on_air, f"/broadcast/{content.decode().split()[-1]}")
     assert headers["content-type"] == "video/mp4" and headers["cache-control"] == "max-age=60" and segment
-    assert refused(on_air.url, "/broadcast/1.m4s")[0] == 404
-    assert refused(on_air.url, "/broadcast/..%2Fserver.py")[0] == 404
-    _, metrics = get(on_air.url, "/metrics")
+    assert fetch(on_air, "/broadcast/1.m4s")[0] == 404
+    assert fetch(on_air, "/broadcast/..%2Fserver.py")[0] == 404
+    metrics = fetch(on_air, "/metrics")[2]
     lines = dict(line.rsplit(" ", 1) for line in metrics.decode().splitlines() if not line.startswith("#"))
     assert lines["viewmend_broadcast_watched"] == "1"
     assert float(lines['viewmend_broadcast_files_total{kind="segments"}']) >= 1
     assert float(lines["viewmend_broadcast_bytes_total"]) > len(segment)
-    assert b"watch.js" in get(on_air.url, "/watch")[1]
+    assert b"watch.js" in fetch(on_air, "/watch")[2]
 
 
 def encoders():
@@ -176,7 +166,7 @@ def test_nothing_is_rendered_or_encoded_while_nothing_is_watched():
         extension._requested_at -= broadcast_module.UNWATCHED_S
         wait_until(lambda: not extension._thread.is_alive())
         assert not server.service._sessions and extension.session.image is None
-        assert refused(server.url, f"/broadcast/{first}")[0] == 404
+        assert fetch(server, f"/broadcast/{first}")[0] == 404
         again = playlist(server)  # a new video, whose segments are numbered on
         assert "#EXT-X-DISCONTINUITY" in again and int(again.split()[-1].removesuffix(".m4s")) > int(first[:-4])
     wait_until(lambda: set(encoders()) <= set(others))
@@ -208,38 +198,6 @@ def test_an_image_that_is_rendered_while_the_video_ends_is_dropped(ball_view):
     assert session.image is None
     session.deliver(request, result)
     assert session.image is not None
-
-
-def test_the_playlist_is_watched_for_some_seconds():
-    clock = FakeClock()
-    made = Broadcast(idle_service(clock), ServerConfig(budget_ms=None), SIZE)
-    assert not made.is_watched
-    made._requested_at = clock()
-    assert made.is_watched
-    clock.advance(broadcast_module.UNWATCHED_S)
-    assert not made.is_watched
-
-
-def test_only_the_looks_of_the_viewer_on_air_are_shown():
-    service = idle_service()
-    made = Broadcast(service, ServerConfig(budget_ms=None), SIZE)
-    viewers = [ViewerSession(lambda _: None, lambda _: None, None, now=service.now) for _ in range(2)]
-
-    def look(viewer, colour):
-        viewer.look(Look(background=colour))
-        made.handle(viewer, viewer.newest_look)
-
-    look(viewers[0], RED)
-    assert made.session.newest_look is None
-    assert made.handle(viewers[0], OnAir(True)) and made.session.newest_look.background == RED
-    look(viewers[1], GREEN)
-    assert made.session.newest_look.background == RED
-    assert made.handle(viewers[1], OnAir(True)) and made.session.newest_look.background == GREEN
-    assert [made.state_json(viewer)["on_air"] for viewer in viewers] == [False, True]
-    made.leave(viewers[0])
-    made.handle(viewers[1], OnAir(False))
-    look(viewers[1], BLUE)
-    assert made.session.newest_look.background == GREEN, "the last view stays"
 
 
 def test_a_failing_encoder_is_started_again(monkeypatch, caplog):
@@ -292,12 +250,12 @@ def test_a_video_that_does_not_begin_is_an_error(monkeypatch):
     monkeypatch.setattr(broadcast_module, "FIRST_S", 0.5)
     monkeypatch.setattr(FilmSegments, "add", lambda self, image, index: None)
     with broadcasting(size=(64, 48)) as server:
-        code, text = refused(server.url, "/broadcast/live.m3u8")
-        assert code == 503 and "did not begin in time" in text
+        status, _, text = fetch(server, "/broadcast/live.m3u8")
+        assert status == 503 and b"did not begin in time" in text
 
 
 def test_a_server_without_a_broadcast(ball):
-    assert refused(ball.url, "/broadcast/live.m3u8")[0] == 404
+    assert fetch(ball, "/broadcast/live.m3u8")[0] == 404
     with Client(ball.ws) as viewer:
         assert viewer.messages["welcome"]["broadcast"] is False
         viewer.on_air()
@@ -318,8 +276,8 @@ def test_of_two_compared_modes_the_first_is_on_air():
 def test_the_token_is_added_to_all_names_in_the_playlist():
     token = "0123456789abcdef&="
     with broadcasting(token=token) as server:
-        assert refused(server.url, "/broadcast/live.m3u8")[0] == 401
-        plain = get(server.url, "/broadcast/live.m3u8", token)[1].decode()
+        assert fetch(server, "/broadcast/live.m3u8")[0] == 401
+        plain = fetch(server, "/broadcast/live.m3u8", token)[2].decode()
         assert token not in plain and "?" not in plain
         with av.open(f"{server.url}/broadcast/live.m3u8?token=0123456789abcdef%26%3D", timeout=WAIT_S) as container:
             assert next(container.decode(video=0)).width == SIZE[0]
@@ -349,16 +307,3 @@ def test_invalid_sizes_are_refused(text, words):
     with pytest.raises(ValueError, match=words):
         broadcast_extension(text)
     assert broadcast_extension("96x64").keywords == {"size_px": (96, 64)}
-
-
-def test_a_request_for_the_playlist_starts_one_encoder(monkeypatch):
-    started = []
-    monkeypatch.setattr(Broadcast, "_run", lambda self: started.append(self._stopped.wait(WAIT_S)))
-    made = Broadcast(idle_service(), ServerConfig(budget_ms=None), SIZE)
-    assert made.file("init.mp4") is None and made._thread is None
-    for _ in range(3):
-        assert made.file(PLAYLIST) is None
-    thread = made._thread
-    made._stopped.set()
-    thread.join()
-    assert started == [True] and made.file(PLAYLIST) is None and made._thread is thread, "stopped for good"

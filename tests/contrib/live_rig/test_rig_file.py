@@ -101,11 +101,6 @@ def test_each_mistake_is_one_line(folder, text, said):
     assert said in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_missing_rig_is_said(tmp_path):
-    with pytest.raises(CaptureError, match="expected a rig's TOML file, got: No such file"):
-        read_rig(tmp_path / "rig.toml")
-
-
 def test_a_clean_plate_must_be_the_cameras(folder, ball_rig):
     camera = read(folder, rig_text(NAMES)).cameras[0]
     with pytest.raises(CaptureError, match=r"left\.png: the clean plate of camera 'left': expected a readable file"):

@@ -13,10 +13,8 @@ from reference.ball import photograph
 from reference.ball_rig import CAMERAS, make_rig, rig_text
 
 from viewmend.cli import main
-from viewmend.contrib.live_rig import frames as rig_frames
 from viewmend.contrib.live_rig.frames import RigSource
 from viewmend.data.errors import CaptureError
-from viewmend.data.video_clock import Track
 from viewmend.live.client import Publisher
 
 
@@ -108,16 +106,6 @@ def test_what_is_wrong_is_said_once_until_something_else_is(rig, caplog):
         supply._is_wrong(error)
     assert caplog.messages == ["no light", "no power"], "on the terminal"
     assert told == ["no light", "no light", "no power"] and supply.status.state == "failing"
-
-
-def test_recordings_are_played_as_long_as_the_shortest_is(rig, monkeypatch):
-    frames = dict(zip(CAMERAS.names, (90, 75, 80, 90, 70, 72), strict=True))
-
-    def track(name, kind, path):
-        return Track(name, kind, np.arange(frames[name]) / 10, 10.0)
-
-    monkeypatch.setattr(rig_frames, "video_track", track)
-    assert RigSource(rig, align=False)._playback.length_s == pytest.approx(7.0)
 
 
 def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):

@@ -31,13 +31,6 @@ def test_pauses_grow_and_stay_short():
     assert list(itertools.islice(pauses(), 6)) == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
 
 
-def test_the_newest_wins(camera):
-    worker = CameraWorker(camera, lambda _: None, lambda *_: None, lambda *_: True)
-    for n in range(3):
-        worker._offer(Picture(frame(), 10.0 + n))
-    assert worker.counts["replaced"] == 2 and worker._newest.get_nowait().taken_s == 12.0
-
-
 def test_a_camera_that_fails_is_reached_again(camera, monkeypatch):
     """Twice it is not there, once it ends, once its connection breaks with whatever it likes."""
     attempts, waits = itertools.count(), []

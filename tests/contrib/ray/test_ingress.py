@@ -1,9 +1,6 @@
 """The live server's application behind a proxy, which has connection limits of its own."""
 
-import asyncio
-from concurrent.futures import ThreadPoolExecutor
-
-from live.live_servers import PIPELINE
+from live.live_servers import PIPELINE, in_own_loop
 
 from viewmend.contrib.ray.replicas import StartWhenReady
 from viewmend.live.push import PushSource
@@ -13,12 +10,6 @@ from viewmend.live.service import RenderService
 from viewmend.models.smooth_fill import SmoothFill
 
 TOKEN = "a token, long enough"
-
-
-def run(coroutine):
-    """Run in a thread of its own: tests of the page leave an event loop running in this one."""
-    with ThreadPoolExecutor(1) as own:
-        return own.submit(asyncio.run, coroutine).result()
 
 
 async def ready_at_once():
@@ -31,7 +22,7 @@ def live_app(token=None):
     return LiveServer(service, ServerConfig(token=token)).app()
 
 
-def get(app, path, query=b"", headers=()):
+async def get(app, path, query=b"", headers=()):
     """Status and body."""
     sent = []
     scope = {"type": "http", "method": "GET", "path": path, "query_string": query, "http_version": "1.1"}
@@ -43,20 +34,22 @@ def get(app, path, query=b"", headers=()):
     async def receive():
         return {"type": "http.request", "body": b"", "more_body": False}
 
-    run(app(scope, receive, send))
+    await app(scope, receive, send)
     return sent[0]["status"], b"".join(message.get("body", b"") for message in sent)
 
 
-def test_token_and_origin_are_checked_behind_a_proxy():
-    status, body = get(StartWhenReady(live_app(), ready_at_once), "/")
+@in_own_loop
+async def test_token_and_origin_are_checked_behind_a_proxy():
+    status, body = await get(StartWhenReady(live_app(), ready_at_once), "/")
     assert status == 200 and b"viewmend" in body
     app = StartWhenReady(live_app(TOKEN), ready_at_once)
-    assert get(app, "/health")[0] == 401
-    assert get(app, "/health", b"token=a+token%2C+long+enough")[0] == 200
-    assert get(app, "/", headers=[(b"origin", b"http://elsewhere.example")])[0] == 403
+    assert (await get(app, "/health"))[0] == 401
+    assert (await get(app, "/health", b"token=a+token%2C+long+enough"))[0] == 200
+    assert (await get(app, "/", headers=[(b"origin", b"http://elsewhere.example")]))[0] == 403
 
 
-def test_the_start_is_reported_when_the_first_view_is_rendered():
+@in_own_loop
+async def test_the_start_is_reported_when_the_first_view_is_rendered():
     order = []
 
     async def app(scope, receive, send):
@@ -68,5 +61,5 @@ def test_the_start_is_reported_when_the_first_view_is_rendered():
     async def send(message):
         order.append(message["type"])
 
-    run(StartWhenReady(app, ready)({"type": "lifespan"}, None, send))
+    await StartWhenReady(app, ready)({"type": "lifespan"}, None, send)
     assert order == ["ready", "lifespan.startup.complete"]

@@ -8,15 +8,14 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.error
-import urllib.request
 from types import SimpleNamespace
 
 import pytest
+from live.live_servers import get
 
 from viewmend.cli import main
 from viewmend.contrib.ray import cluster
-from viewmend.contrib.ray.replicas import ManyViewers, _demand_no_serve, _free_port, serving
+from viewmend.contrib.ray.replicas import ManyViewers, _demand_no_serve, serving
 from viewmend.live.client import Client
 from viewmend.live.server import ServerConfig
 from viewmend.stream import StreamConfig
@@ -58,14 +57,6 @@ def test_a_local_cluster_has_a_token_and_sends_no_reports(monkeypatch):
     assert os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] == "0" and cluster.AS_URGENT.items() <= os.environ.items()
 
 
-def test_a_port_in_use_is_an_error_before_a_cluster_is_started():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(OSError, match=f"port {port} of 127.0.0.1: .* choose another --port"):
-            _free_port("127.0.0.1", port)
-    assert _free_port("127.0.0.1", port) == port and _free_port("127.0.0.1", 0) > 0
-
-
 def test_a_cluster_on_which_serve_runs_is_refused():
     def absent(name, namespace):
         raise ValueError
@@ -85,16 +76,6 @@ def test_replicas_of_one_machine_share_its_memory():
         config = ServerConfig(port=taken.getsockname()[1])
         with serving(ManyViewers(**vars(served(2)) | {"server": config}), "local"):
             pass
-
-
-def asked(address, path, headers):
-    """Status and body."""
-    try:
-        with urllib.request.urlopen(urllib.request.Request(address + path, headers=headers), timeout=60) as answer:
-            return answer.status, answer.read()
-    except urllib.error.HTTPError as refused:
-        refused.close()
-        return refused.code, b""
 
 
 @contextlib.contextmanager
@@ -117,10 +98,10 @@ def started(*options):
 @pytest.mark.slow
 def test_a_viewer_reconnects_when_its_replica_is_killed():
     with started(*SMALL) as (_, address):
-        assert asked(address, "/frame.jpg", {})[0] == 401
-        status, picture = asked(address, "/frame.jpg?width=64&height=64", HAS_IT)
+        assert get(f"{address}/frame.jpg")[0] == 401
+        status, _, picture = get(f"{address}/frame.jpg?width=64&height=64", HAS_IT)
         assert status == 200 and picture.startswith(b"\xff\xd8")
-        replicas = {json.loads(asked(address, "/health", HAS_IT)[1])["process"] for _ in range(40)}
+        replicas = {json.loads(get(f"{address}/health", HAS_IT)[2])["process"] for _ in range(40)}
         assert len(replicas) == 2, "requests go to both"
         with Client(address.replace("http", "ws"), TOKEN, again_s=60.0) as viewer:
             look = viewer.look(camera={"azimuth": 77.0}, width=48, height=48)

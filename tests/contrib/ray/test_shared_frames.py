@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import torch
 from live.live_servers import CAMERAS, PIPELINE, WAIT_S, FakeClock, wait_until
-from reference.ball import BallCapture, camera_at, photograph
+from reference.ball import BallCapture, photograph
 
 from viewmend.contrib.ray import shared_frames
 from viewmend.contrib.ray.shared_frames import Ingest, SharedFrame, SharedSource
 from viewmend.frame_cache import cache_frame
-from viewmend.geometry.proxy import GeometryProxy
-from viewmend.live.frame_source import FrameSource, RecordedSource, RigInfo, Span
+from viewmend.live.frame_source import RecordedSource
 from viewmend.live.poses import view_camera
 from viewmend.live.protocol import Camera
 from viewmend.live.push import PushSource
@@ -55,16 +54,6 @@ def test_arrays_are_not_copied():
     assert got.frame.time == 3 and got.frame.cameras.names == CAMERAS.names and got.size_bytes == shared.size_bytes
 
 
-def test_a_repeated_tensor_is_sent_once():
-    shared = ball_frame()
-    mask = shared.frame.mask
-    shared.cached.encoded.update(one=(mask,), two=(mask,))
-    got, buffers, _ = send(shared)
-    assert got.cached.encoded["one"][0] is got.cached.encoded["two"][0] is got.frame.mask
-    assert got.cached.frame is got.frame
-    assert sum(len(buffer) == mask.numel() for buffer in buffers) == 1
-
-
 def test_a_stream_has_nothing_left_to_compute():
     model = make_method("views")
     own = cache_frame(photograph(CAMERAS, 3), None, PIPELINE.hull)
@@ -73,39 +62,6 @@ def test_a_stream_has_nothing_left_to_compute():
     assert torch.equal(own.depth(CAMERAS.names), torch.stack([got.depths[name] for name in CAMERAS.names]))
     model.encode_cameras(own.context(CAMERAS.names), ContextProvider(lambda *_: None, memory=lambda _: own.encoded))
     assert own.encoded.keys() == got.encoded.keys() and len(got.encoded) == 2 * len(CAMERAS)
-
-
-def test_a_renderer_uses_the_depth_of_another_process(monkeypatch):
-    cached = {3: ball_frame().cached}
-
-    class Source(FrameSource):
-        def read(self, index):
-            return photograph(CAMERAS, index)
-
-        def read_cached(self, index):
-            return cached.get(index)
-
-    source = Source(Span(0, 4, 4, 15.0))
-    source.rig = RigInfo("ball", None, None)
-    rendered, depth = [], GeometryProxy.depth
-    monkeypatch.setattr(
-        GeometryProxy, "depth", lambda own, cameras: rendered.extend(cameras.names) or depth(own, cameras)
-    )
-    renderer = Renderer(source, SmoothFill(), PIPELINE)
-    assert renderer.prepare(3)
-    renderer.render(RenderRequest(3, (camera_at(20, "view"),), RenderQuality()), None)
-    assert set(rendered) <= {"view"}
-    del cached[3]
-    assert Renderer(source, SmoothFill(), PIPELINE).prepare(3)
-    assert set(rendered) & set(CAMERAS.names)
-
-
-def test_tokens_of_the_transformer_are_shared():
-    model = make_method("paper-small")
-    got, *_ = send(ball_frame(model))
-    assert set(got.cached.encoded) == set(CAMERAS.names)
-    frame = got.cached.encoded["c1"]
-    assert frame.name == "c1" and frame.keys_values.isfinite().all() and len(frame.tokens) == len(frame.places)
 
 
 def test_a_frame_without_a_hull():
@@ -195,16 +151,6 @@ def test_all_followers_get_what_was_carved_once(link, follow, carved):
     assert cached.depths.keys() == set(CAMERAS.names) and len(cached.proxy.mesh.vertices) > 100
 
 
-def test_only_the_following_frame_is_fetched_ahead(link, follow):
-    clock = FakeClock()
-    source = follow(link, now=clock)
-    fetch(source, FRAMES - 1)
-    wait_until(lambda: 0 in source._kept)  # the recording is played in a loop
-    with source._lock:
-        assert source._next_index() is None
-    assert link.requests == [FRAMES - 1, 0]
-
-
 def test_a_rendering_process_renders_the_same_pixels(link, follow):
     alone = recording()
     alone.start()
@@ -240,14 +186,6 @@ def test_an_ingest_that_ends_is_reported_and_its_successor_followed(link, follow
     fetch(source, 2)
     wait_until(lambda: source.status.state == "ready")
     restarted.stop()
-
-
-def test_a_frame_of_an_earlier_rig_is_dropped(link, follow):
-    source = follow(link)
-    frame = link.ingest.frame(2, 60.0)[1]
-    with source._lock:
-        source._keep(2, ("another", frame))
-    assert 2 not in source._kept
 
 
 def pushing(follow, **options):

@@ -33,10 +33,8 @@ def served():
         yield listener.getsockname()[1], server.service
 
 
-@contextlib.contextmanager
 def client(port):
-    with socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) as own:
-        yield own
+    return socket.create_connection(("127.0.0.1", port), timeout=WAIT_S)
 
 
 def exactly(own, count):
@@ -49,9 +47,13 @@ def exactly(own, count):
     return got
 
 
+def framed(message):
+    return struct.pack(">I", len(message)) + message
+
+
 def ask(own, payload):
     """The answer's task and body."""
-    own.sendall(struct.pack(">I", len(payload)) + payload)
+    own.sendall(framed(payload))
     answer = exactly(own, struct.unpack(">I", exactly(own, 4))[0])
     major, minor, task = struct.unpack("<HHi", answer[:8])
     assert (major, minor) == (1, 3)
@@ -162,6 +164,13 @@ GOOD = request(*gl(camera_at(0, "t")), 48, 48)
 BENT = np.diag([1.0, 2, 1, 1])
 
 
+def is_disconnected(own, sent=b""):
+    own.sendall(sent)
+    with pytest.raises(OSError):
+        exactly(own, 4)
+    return True
+
+
 @pytest.mark.parametrize(
     ("message", "said"),
     [
@@ -177,41 +186,35 @@ def test_a_malformed_request_ends_the_connection(served, message, said):
     with pytest.raises(ProtocolError, match=said):
         parse(message)
     with client(served[0]) as own:
-        own.sendall(struct.pack(">I", len(message)) + message)
-        with pytest.raises(OSError):
-            exactly(own, 4)
+        assert is_disconnected(own, framed(message))
     with client(served[0]) as own:
         assert image_of(own, GOOD)
 
 
 @pytest.mark.parametrize(
-    "bytes_sent",
+    "sent",
     [
         struct.pack(">I", 1 << 30),
-        struct.pack(">I", 8) + struct.pack("<HHi", 1, 3, 6),
-        struct.pack(">I", len(GOOD)) + request(*gl(camera_at(0, "t")), 4000, 4000),
-        struct.pack(">I", len(GOOD)) + request(*gl(camera_at(0, "t")), 0, 48),
+        framed(struct.pack("<HHi", 1, 3, 6)),
+        framed(request(*gl(camera_at(0, "t")), 4000, 4000)),
+        framed(request(*gl(camera_at(0, "t")), 0, 48)),
     ],
 )
-def test_a_request_that_is_not_supported_ends_the_connection(served, bytes_sent):
+def test_a_request_that_is_not_supported_ends_the_connection(served, sent):
     with client(served[0]) as own:
-        own.sendall(bytes_sent)
-        with pytest.raises(OSError):
-            exactly(own, 4)
+        assert is_disconnected(own, sent)
 
 
 def test_silent_and_surplus_clients_are_disconnected(served, monkeypatch):
     with contextlib.ExitStack() as all_of_them:
         clients = [all_of_them.enter_context(client(served[0])) for _ in range(3)]
         assert all(ask(own, GOOD)[0] in (NO_UPDATE, UPDATE) for own in clients)
-        with client(served[0]) as fourth, pytest.raises(OSError):
-            exactly(fourth, 4)
+        with client(served[0]) as fourth:
+            assert is_disconnected(fourth)
     wait_until(lambda: not served[1]._sessions)
     monkeypatch.setattr(riftcast_service, "SILENT_S", 0.3)
     with client(served[0]) as own:
-        own.sendall(struct.pack(">I", len(GOOD)) + GOOD[:20])
-        with pytest.raises(OSError):
-            exactly(own, 4)
+        assert is_disconnected(own, framed(GOOD)[:24])
 
 
 def test_a_port_in_use_is_an_error():

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.ball import BallCapture, ring
+from reference.capture_folder import edit_description
 
 from viewmend.cli import main
 from viewmend.cli.evaluate import RunOptions, scenes_of
@@ -155,9 +156,7 @@ def test_data_that_changed_are_refused(captures, tmp_path):
     out = tmp_path / "splits.json"
     assert main(["splits", *map(str, paths), "--out", str(out)]) == 0
     for path in paths:
-        told = json.loads((path / "cameras.json").read_text())
-        told["cameras"][0]["t"][0] += 0.01
-        (path / "cameras.json").write_text(json.dumps(told))
+        edit_description(path, lambda d: d["cameras"][0].update(t=[x + 0.01 for x in d["cameras"][0]["t"]]))
     with pytest.raises(ValueError, match=r"expected the calibration that splits\.json was made with"):
         split_scenes(out)
     for path in paths:

@@ -4,12 +4,12 @@ import hashlib
 
 import pytest
 import torch
+from reference.ball import ring
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.holdout.capture_scenes import capture_set, evenly_around
-from viewmend.data.holdout.studio_scenes import StudioScene, held_camera, performer_set, procedural_set
+from viewmend.data.holdout.studio_scenes import StudioScene, performer_set, procedural_set
 from viewmend.data.synthetic.stage import StudioConfig
-from viewmend.geometry.cameras import Cameras
 from viewmend.metrics.image_quality import warp_error
 
 P_SHA256 = "98fb42fd06fe55d11f1155fecbfd5175f729136f2808b09f00f36f65849f625e"
@@ -31,11 +31,6 @@ def test_set_p_is_what_it_always_was():
 
 def test_set_q_is_what_it_always_was(shared):
     assert sha256(performer_set(shared / "performers")) == Q_SHA256
-
-
-def test_every_rig_meets_every_tempo_equally_often():
-    pairs = [(s.rig, s.style) for s in procedural_set()]
-    assert len(pairs) == 30 and {pairs.count(pair) for pair in pairs} == {5} and len(set(pairs)) == 6
 
 
 def test_a_stage_behind_p_changes_the_images_and_neither_people_nor_rig():
@@ -81,22 +76,10 @@ def test_the_left_out_camera_is_none_of_the_inputs_and_true_motion_explains_the_
     assert warp_error(now, before, second.backward_flow_px, mask) < 0.03
 
 
-def test_held_camera_is_spread_over_the_rig():
-    assert len({held_camera(seed, 8) for seed in range(100)}) == 8
-
-
-def ring(turns: list[float]) -> Cameras:
-    world_from_camera = torch.eye(4).repeat(len(turns), 1, 1)
-    angle = torch.tensor(turns) * 2 * torch.pi
-    world_from_camera[:, 0, 3], world_from_camera[:, 2, 3] = 3 * angle.cos(), 3 * angle.sin()
-    names = tuple(f"c{n}" for n in range(len(turns)))
-    size = torch.tensor([[8, 8]] * len(turns))
-    return Cameras(names, torch.eye(3).repeat(len(turns), 1, 1), world_from_camera.inverse(), size)
-
-
 def test_cameras_are_taken_evenly_around():
-    assert evenly_around(ring([n / 8 for n in range(8)]), 4) == ("c0", "c2", "c4", "c6")
-    assert evenly_around(ring([0, 0.5, 0.25, 0.75]), 2) == ("c0", "c1")
+    cameras = ring(8)
+    assert evenly_around(cameras, 4) == ("c0", "c2", "c4", "c6")
+    assert evenly_around(cameras.select(["c0", "c4", "c2", "c6"]), 2) == ("c0", "c4")
 
 
 def test_a_real_capture_leaves_each_camera_out(shared):
@@ -110,8 +93,3 @@ def test_a_real_capture_leaves_each_camera_out(shared):
 def test_numbers_that_are_none_are_refused(shared, inputs, frames):
     with pytest.raises(ValueError, match="expected --"):
         capture_set(shared / "captures/wd2", inputs, frames)
-
-
-def test_a_capture_without_masks_is_refused(shared):
-    with pytest.raises(CaptureError, match="'mask'"):
-        capture_set(shared / "captures/pose2sim")

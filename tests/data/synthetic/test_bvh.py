@@ -2,7 +2,6 @@ import math
 
 import pytest
 import torch
-from data.synthetic.tiny_performer import write_motion
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.bvh import read_bvh
@@ -78,13 +77,5 @@ def test_bad_files_say_what_is_wrong(tmp_path, change, message):
     with pytest.raises(CaptureError, match=message) as caught:
         read_bvh(path)
     assert "bad.bvh" in str(caught.value)
-
-
-def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(CaptureError, match=r"none\.bvh"):
         read_bvh(tmp_path / "none.bvh")
-
-
-def test_the_tiny_motion_is_read(tmp_path):
-    motion = read_bvh(write_motion(tmp_path / "m.bvh", frames=5))
-    assert len(motion.root) == 5 and motion.duration_s == pytest.approx(4 / 30, rel=1e-4)

@@ -49,15 +49,6 @@ def test_random_views_are_mended_as_the_model_does(net, seed):
         assert float(off.median()) < 1e-6, name
 
 
-def test_the_smooth_fill_alone_will_do(net):
-    torch.manual_seed(0)
-    plain = ViewSynthNet(replace(CONFIG, coarse_fill="smooth")).eval()
-    view, context = random_view(0, plain, longest=100)
-    given, wanted = given_and_wanted(plain, holed(view), context)
-    for name, off in apart(ExportedModel(plain)(*given), wanted).items():
-        assert float((off > 1e-3).float().mean()) <= 1e-4, name
-
-
 def test_without_a_subject_the_view_stays(net):
     view, context = random_view(0, net, longest=100)
     nothing = torch.zeros_like(view.mask)
