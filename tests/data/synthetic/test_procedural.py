@@ -52,7 +52,7 @@ def test_a_scene_is_a_whole_and_valid_mesh(seed):
 
 def test_the_size_is_human(walker):
     person = walker.people[0]
-    bind = person.bound.mesh.vertices
+    bind = person.bound.rest.mesh.vertices
     tall = float(bind[:, 1].max() - bind[:, 1].min())
     assert tall == pytest.approx(person.physique.height_m, rel=0.05)
     # An A-pose: the finger tips are less far out than in a T-pose (half the height).

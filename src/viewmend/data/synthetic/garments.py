@@ -102,7 +102,7 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
     limb = torch.tensor(limb_of_node)[character.node_of_joint][character.joints]
     share = torch.zeros(len(limb), len(NAMES)).scatter_add_(1, limb, character.weights)
     matrices = world[character.node_of_joint] @ character.joint_from_bind
-    vertices = skin(character.vertices, character.joints, character.weights, matrices)
+    vertices, _ = skin(character.vertices, character.normals, character.joints, character.weights, matrices)
     joints = {part_of[name]: world[n, :3, 3].numpy() for n, name in enumerate(names) if name in part_of}
     return RestBody(vertices, joints, share[character.faces].sum(1).argmax(1))
 

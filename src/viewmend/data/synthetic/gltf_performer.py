@@ -10,7 +10,7 @@ from torch import Tensor
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.bvh import Motion, read_bvh
 from viewmend.data.synthetic.gltf import load_character
-from viewmend.data.synthetic.performer import TexturedMesh, skin, skin_with_normals
+from viewmend.data.synthetic.performer import TexturedMesh, skin
 from viewmend.data.synthetic.retarget import Retarget, retarget
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rigid import rotation_from_axis_angle
@@ -65,7 +65,7 @@ class GltfPerformer:
     def pose(self, time_s: float) -> TexturedMesh:
         """The performer `time_s` after the start of its window."""
         c = self.character
-        vertices, normals = skin_with_normals(c.vertices, c.normals, c.joints, c.weights, self._matrices(time_s))
+        vertices, normals = skin(c.vertices, c.normals, c.joints, c.weights, self._matrices(time_s))
         return TexturedMesh(Mesh(vertices, c.faces), normals, c.uv, c.texture_of_face, c.textures)
 
     def _matrices(self, time_s: float) -> Float[Tensor, "joint 4 4"]:
@@ -95,7 +95,7 @@ class GltfPerformer:
         lows = []
         for n in range(min(FLOOR_SAMPLES, count)):
             matrices = self._body.joint_matrices(float(n * count // min(FLOOR_SAMPLES, count)))
-            lows.append(skin(c.vertices, c.joints, c.weights, matrices)[:, 1].min())
+            lows.append(skin(c.vertices, c.normals, c.joints, c.weights, matrices)[0][:, 1].min())
         heights = torch.stack(lows)
         return float(torch.minimum(heights.quantile(0.5), heights.quantile(0.05) + FLIGHT_M))
 

@@ -1,5 +1,6 @@
 """Who stands on the studio's stage: a textured mesh at each moment; and its textures, ready for drawing."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -39,53 +40,29 @@ class Performer(Protocol):
         ...
 
 
-def blend_transforms(
-    joints: Int[Tensor, "vertex 4"], weights: Float[Tensor, "vertex 4"], world_from_bind: Float[Tensor, "joint 4 4"]
-) -> Float[Tensor, "vertex 3 4"]:
-    """Average each vertex' four joint transforms by weight: affine maps, given as their top three rows.
-
-    Weights are expected to sum to one per vertex; an unused slot has weight zero and any valid joint index.
-    """
-    rows = world_from_bind[:, :3].reshape(-1, 12)
-    # A bag of four rows per vertex: ten times as fast on a CPU as gathers and a weighted sum.
-    bags = torch.nn.functional.embedding_bag(joints.long(), rows, per_sample_weights=weights, mode="sum")
-    return bags.unflatten(1, (3, 4))
-
-
-def _turned(transforms: Float[Tensor, "vertex 3 4"], vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
-    a, b, c, _ = transforms.unbind(-1)
-    x, y, z = vectors[:, :, None].unbind(1)
-    return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
-
-
 def skin(
-    vertices: Float[Tensor, "vertex 3"],
-    joints: Int[Tensor, "vertex 4"],
-    weights: Float[Tensor, "vertex 4"],
-    world_from_bind: Float[Tensor, "joint 4 4"],
-) -> Float[Tensor, "vertex 3"]:
-    """Bind-pose vertices in the world: sum over slots of weight * (world_from_bind[joint] vertex), metres.
-
-    `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind matrix.
-    """
-    transforms = blend_transforms(joints, weights, world_from_bind)
-    return _turned(transforms, vertices) + transforms[:, :, 3]
-
-
-def skin_with_normals(
     vertices: Float[Tensor, "vertex 3"],
     normals: Float[Tensor, "vertex 3"],
     joints: Int[Tensor, "vertex 4"],
     weights: Float[Tensor, "vertex 4"],
     world_from_bind: Float[Tensor, "joint 4 4"],
 ) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "vertex 3"]]:
-    """`skin`, and the bind-pose normals turned by the same blend, of unit length again.
+    """Bind-pose vertices and normals in the world: sum over slots of weight * (world_from_bind[joint] vertex), metres.
 
-    Seams of the texture stay invisible: vertices that coincide and share a normal keep sharing it.
+    `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind matrix. Weights are
+    expected to sum to one per vertex; an unused slot has weight zero and any valid joint index. The normals are turned
+    by the same blend and of unit length; vertices that coincide and share a normal keep sharing it.
     """
-    transforms = blend_transforms(joints, weights, world_from_bind)
-    skinned = _turned(transforms, vertices) + transforms[:, :, 3]
-    return skinned, torch.nn.functional.normalize(_turned(transforms, normals), dim=-1)
+    rows = world_from_bind[:, :3].reshape(-1, 12)
+    # A bag of four rows per vertex: ten times as fast on a CPU as gathers and a weighted sum.
+    bags = torch.nn.functional.embedding_bag(joints.long(), rows, per_sample_weights=weights, mode="sum")
+    a, b, c, moved = bags.unflatten(1, (3, 4)).unbind(-1)
+
+    def turned(vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
+        x, y, z = vectors[:, :, None].unbind(1)
+        return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
+
+    return turned(vertices) + moved, torch.nn.functional.normalize(turned(normals), dim=-1)
 
 
 @dataclass(frozen=True)
@@ -112,27 +89,19 @@ def srgb_from_linear(linear: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
 
 def texture_pyramid(textures: Sequence[Float[Tensor, "3 _ _"]]) -> TexturePyramid:
     """Prepare sRGB textures of any sizes; costs about 50 ms for 1024 x 1024, so keep the result."""
-    texels: list[Tensor] = []
-    first: list[list[int]] = []
-    size: list[list[tuple[int, int]]] = []
-    total = 0
+    pyramids: list[list[Tensor]] = []
     for texture in textures:
-        level = linear_from_srgb(texture)
-        first.append([])
-        size.append([])
-        while True:
-            first[-1].append(total)
-            size[-1].append((level.shape[2], level.shape[1]))
-            texels.append(level.flatten(1).T)
-            total += level.shape[1] * level.shape[2]
-            if max(level.shape[1:]) == 1:
-                break
-            level = torch.nn.functional.adaptive_avg_pool2d(
-                level, (max(1, level.shape[1] // 2), max(1, level.shape[2] // 2))
-            )
-    depth = max(len(f) for f in first)
+        levels = [linear_from_srgb(texture)]
+        while max(levels[-1].shape[1:]) > 1:
+            half_height, half_width = (max(1, side // 2) for side in levels[-1].shape[1:])
+            levels.append(torch.nn.functional.adaptive_avg_pool2d(levels[-1], (half_height, half_width)))
+        pyramids.append(levels)
+    texels = [level.flatten(1).T for levels in pyramids for level in levels]
+    starts = itertools.accumulate(map(len, texels), initial=0)
+    first = [[next(starts) for _ in levels] for levels in pyramids]
+    size = [[level.shape[:0:-1] for level in levels] for levels in pyramids]
+    depth = max(map(len, pyramids))
     return TexturePyramid(
         torch.cat(texels).contiguous(),
-        torch.tensor([f + f[-1:] * (depth - len(f)) for f in first]),
-        torch.tensor([s + s[-1:] * (depth - len(s)) for s in size]),
+        *(torch.tensor([row + row[-1:] * (depth - len(row)) for row in table]) for table in (first, size)),
     )

@@ -11,8 +11,10 @@ from jaxtyping import Float
 
 from viewmend.data.synthetic.procedural.fabric import Image, Patch
 from viewmend.data.synthetic.procedural.skeleton import (
+    ARM,
     INDEX,
     JOINTS,
+    LEG,
     SIDES,
     SIGN,
     SPINE,
@@ -29,6 +31,10 @@ from viewmend.data.synthetic.procedural.skeleton import (
 )
 
 TORSO, ARM_PROFILE, LEG_PROFILE = (np.array(TABLES[name]) for name in ("torso", "arm", "leg"))
+
+
+RADII = ("width", "front", "back")
+"""The fields of `Torso` that are distances from its axis."""
 
 
 def smooth_table(xs: Float[np.ndarray, "knot"], table: Float[np.ndarray, "knot column"], samples: int = 256):
@@ -87,21 +93,19 @@ class Torso:
 
     def outside(self, other: "Torso", gap_m: float) -> "Torso":
         """This torso, widened where it would come nearer than `gap_m` to `other` (on the same samples)."""
-        names = ("width", "front", "back")
-        return replace(self, **{n: np.maximum(getattr(self, n), getattr(other, n) + gap_m) for n in names})
+        return replace(self, **{n: np.maximum(getattr(self, n), getattr(other, n) + gap_m) for n in RADII})
 
     def eased(self, ease_m: float, hang: float = 0.0, flare: float = 0.0) -> "Torso":
         """The torso of a garment: `ease_m` wider; with `hang` 1 the cloth below the chest never comes back in."""
-        tables = []
+        wider = {"bumps": self.bumps * np.array([1, 1, 1, 1 + 0.6 * hang, 1])}
         below = np.interp(self.y, [self.y[0], self.y[-1] * 0.8], [1.0, 0.0])
-        for table in (self.width, self.front, self.back):
+        chest = self.y < 0.84 * self.y[-1]
+        for name in RADII:
             # Cloth falls straight down from where the body below the arms is widest so far.
-            chest = self.y < 0.84 * self.y[-1]
+            table = getattr(self, name)
             fallen = np.maximum.accumulate(np.where(chest, table, 0)[::-1])[::-1]
-            tables.append(np.where(chest, table + hang * (fallen - table), table) + ease_m + flare * below)
-        bumps = self.bumps.copy()
-        bumps[:, 3] *= 1 + 0.6 * hang
-        return replace(self, width=tables[0], front=tables[1], back=tables[2], bumps=bumps)
+            wider[name] = np.where(chest, table + hang * (fallen - table), table) + ease_m + flare * below
+        return replace(self, **wider)
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,6 @@ class Limb:
 
     start: Vector
     end: Vector
-    forward: Vector
     t: Float[np.ndarray, "sample"]
     r: Float[np.ndarray, "sample"]
     shift: Float[np.ndarray, "sample"]
@@ -125,7 +128,7 @@ class Limb:
     def frame(self) -> Rotation:
         """Rows: sideways, up the limb, and forward."""
         up = unit(self.start - self.end)
-        side = unit(np.cross(up, self.forward))
+        side = unit(np.cross(up, np.array([0.0, 0.0, 1.0])))
         return np.stack([side, up, np.cross(side, up)])
 
     def center(self, t: Values) -> Points:
@@ -154,9 +157,8 @@ class Limb:
         hanging = self.t > hang_from
         held = float(np.interp(hang_from, self.t, r))
         far = np.clip((self.t - hang_from) / max(1 - hang_from, 1e-3), 0, 1)
-        r = np.where(hanging, np.maximum(r, held) + flare * far, r)
         shift = np.where(hanging, np.interp(hang_from, self.t, self.shift), self.shift)
-        return replace(self, r=r, shift=shift)
+        return replace(self, r=np.where(hanging, np.maximum(r, held) + flare * far, r), shift=shift)
 
 
 @dataclass(frozen=True)
@@ -164,32 +166,27 @@ class Body:
     """Torso and limbs; limbs are left arm, right arm, left leg, right leg."""
 
     torso: Torso
-    arms: tuple[Limb, Limb]
-    legs: tuple[Limb, Limb]
+    arms: tuple[Limb, ...]
+    legs: tuple[Limb, ...]
     blend_m: float
     """Softness of the union."""
 
     @property
-    def limbs(self) -> tuple[Limb, Limb, Limb, Limb]:
+    def limbs(self) -> tuple[Limb, ...]:
         """Arms and legs, left first."""
         return (*self.arms, *self.legs)
 
-    @property
-    def parts(self) -> tuple[Torso | Limb, ...]:
-        """Torso, arms, legs."""
-        return (self.torso, *self.limbs)
-
     def fields(self, points: Points) -> Float[np.ndarray, "part *n"]:
-        """The field of each part."""
-        return np.stack([part.field(points) for part in self.parts])
+        """The field of each part: torso, arms, legs."""
+        return np.stack([part.field(points) for part in (self.torso, *self.limbs)])
 
-    def settle(self, points: Points, outward: Points, part: int, seam_m: float = 0.002) -> Points:
+    def settle(self, points: Points, outward: Points, part: int) -> Points:
         """Move a part's surface outward onto the smooth union of all parts.
 
-        The other parts count as `seam_m` thinner: this part's sheet dives under theirs exactly where their fields
-        cross, so that overlapping sheets meet in a clean seam.
+        The other parts count as 2 mm thinner: this part's sheet dives under theirs exactly where their fields cross,
+        so that overlapping sheets meet in a clean seam.
         """
-        bias = np.full(len(self.parts), seam_m)
+        bias = np.full(5, 0.002)
         bias[part] = 0.0
         bias[opposite(part)] = np.inf
         moved = np.zeros(points.shape[:-1])
@@ -220,27 +217,16 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
     bust = (0.010 + 0.010 * f * (1 + 0.3 * w)) * f + 0.003 * (1 - f)
     bumps = [(s * 0.62, 0.722, 0.42, 0.026, bust) for s in (1, -1)]
     bumps += [(np.pi + s * 0.5, 0.51 * person.leg_share, 0.42, 0.030, 0.010 + 0.004 * f) for s in (1, -1)]
-    bump_table = np.array(bumps) * np.array([1, H, 1, H, H])
-    torso = Torso(heights, table[:, 0], table[:, 1], table[:, 2], table[:, 3], bump_table)
+    torso = Torso(heights, *table.T, bumps=np.array(bumps) * np.array([1, H, 1, H, H]))
     girth = 1 + 0.10 * w + 0.10 * (person.muscle - 0.5) - 0.06 * f
     leg_girth = 1 + 0.10 * w + 0.05 * (person.muscle - 0.5) + 0.03 * f
-    forward = np.array([0.0, 0.0, 1.0])
-    arms = [_limb(skeleton, f"{s}_upperarm", f"{s}_hand", ARM_PROFILE, girth * H, H, forward) for s in SIDES]
-    legs = [_limb(skeleton, f"{s}_thigh", f"{s}_foot", LEG_PROFILE, leg_girth * H, H, forward) for s in SIDES]
-    return Body(torso, (arms[0], arms[1]), (legs[0], legs[1]), 0.010 * H)
 
+    def pair(first: str, last: str, profile: Float[np.ndarray, "knot 3"], girth: float) -> tuple[Limb, ...]:
+        t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth * H, H]))
+        return tuple(Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES)
 
-def _limb(
-    skeleton: Skeleton,
-    first: str,
-    last: str,
-    profile: Float[np.ndarray, "knot 3"],
-    girth_m: float,
-    height_m: float,
-    forward: Vector,
-) -> Limb:
-    t, table = smooth_table(profile[:, 0], profile[:, 1:] * np.array([girth_m, height_m]))
-    return Limb(skeleton.at(first), skeleton.at(last), forward, t, table[:, 0], table[:, 1])
+    arms, legs = pair("upperarm", "hand", ARM_PROFILE, girth), pair("thigh", "foot", LEG_PROFILE, leg_girth)
+    return Body(torso, arms, legs, 0.010 * H)
 
 
 def smoothstep(x: Values, low: float, high: float) -> Values:
@@ -264,7 +250,7 @@ def mix(first: Weights, second: Weights, share: Values) -> Weights:
 def body_weights(body: Body, skeleton: Skeleton, height_m: float, points: Points, part: int = 0) -> Weights:
     """Weights of points on or near the body: soft membership in a part, then soft steps along the part's chain.
 
-    Points of a limb's sheet (`part`, as in `Body.parts`) never follow the limb of the other side.
+    Points of a limb's sheet (`part`, as in `Body.fields`) never follow the limb of the other side.
     """
     fields = body.fields(points)
     fields[opposite(part)] = 1.0
@@ -273,22 +259,14 @@ def body_weights(body: Body, skeleton: Skeleton, height_m: float, points: Points
     member /= member.sum(0)
     weights = member[0][..., None] * _trunk(skeleton, height_m, points)
     for i, side in enumerate(SIDES):
-        weights = weights + member[1 + i][..., None] * limb_weights(
-            body.arms[i], points, [f"{side}_{j}" for j in ("upperarm", "forearm", "hand")], skeleton, 0.10
-        )
-        weights = weights + member[3 + i][..., None] * limb_weights(
-            body.legs[i], points, [f"{side}_{j}" for j in ("thigh", "shin", "foot")], skeleton, 0.085
-        )
+        # The width is half the bend's extent as a share of the limb.
+        for n, names, width in ((i, ARM[1:4], 0.10), (2 + i, LEG[:3], 0.085)):
+            t = body.limbs[n].along(points)
+            middle = float(body.limbs[n].along(skeleton.at(f"{side}_{names[1]}")[None])[0])
+            first, second, third = (one_joint(points.shape[:-1], f"{side}_{name}") for name in names)
+            bent = mix(first, second, smoothstep(t, middle - width, middle + width))
+            weights = weights + member[1 + n][..., None] * mix(bent, third, smoothstep(t, 0.94, 1.05))
     return weights
-
-
-def limb_weights(limb: Limb, points: Points, names: list[str], skeleton: Skeleton, width: float) -> Weights:
-    """Weights along a limb's three joints; `width` is half the bend's extent as a share of the limb."""
-    t = limb.along(points)
-    middle = float(limb.along(skeleton.at(names[1])[None])[0])
-    weights = one_joint(points.shape[:-1], names[0])
-    weights = mix(weights, one_joint(points.shape[:-1], names[1]), smoothstep(t, middle - width, middle + width))
-    return mix(weights, one_joint(points.shape[:-1], names[2]), smoothstep(t, 0.94, 1.05))
 
 
 def _trunk(skeleton: Skeleton, height_m: float, points: Points) -> Weights:
@@ -306,18 +284,19 @@ def _trunk(skeleton: Skeleton, height_m: float, points: Points) -> Weights:
 
 
 def _tube(
-    centers: Float[np.ndarray, "row 3"],
-    across: Float[np.ndarray, "row 3"],
-    radii: Float[np.ndarray, "row 2"],
-    columns: int,
-) -> Float[np.ndarray, "row column 3"]:
-    """Ellipses around a line that runs from its far end to its near end (up); `across` is the first radius' axis."""
+    tip: Vector, centers: Float[np.ndarray, "row 3"], across: Vector, radii: Float[np.ndarray, "2 row"], columns: int
+) -> Float[np.ndarray, "row+1 column 3"]:
+    """Ellipses around a line that runs from its far end to its near end (up), after their tip.
+
+    `across` is the axis of the first radius.
+    """
     up = unit(np.gradient(centers, axis=0))
     side = unit(across - up * (across * up).sum(-1, keepdims=True))
     front = np.cross(side, up)
     phi = np.linspace(-np.pi, np.pi, columns)[None, :, None]
-    ring = radii[:, None, :1] * np.sin(phi) * side[:, None] + radii[:, None, 1:] * np.cos(phi) * front[:, None]
-    return centers[:, None] + ring
+    first, second = radii[..., None, None]
+    ring = first * np.sin(phi) * side[:, None] + second * np.cos(phi) * front[:, None]
+    return np.concatenate([np.broadcast_to(tip, (1, columns, 3)), centers[:, None] + ring])
 
 
 def unit_grid(shape: tuple[int, ...]) -> Float[np.ndarray, "row column 2"]:
@@ -338,18 +317,14 @@ def hand_patches(body: Body, skeleton: Skeleton, height_m: float, side: str, ski
     breadth = np.interp(s, [-0.12, 0.1, 0.45, 0.8, 1.0], [0.0140, 0.0160, 0.0220, 0.0235, 0.0215]) * H * girth
     thick = np.interp(s, [-0.12, 0.1, 0.5, 1.0], [0.0115, 0.0110, 0.0105, 0.0070]) * H * girth
     centers = wrist + reach[:, None] * along
-    grid = _tube(centers, np.broadcast_to(forward, centers.shape), np.stack([breadth, thick], 1), 17)
-    grid = np.concatenate([np.broadcast_to(centers[0] + 0.006 * along, (1, 17, 3)), grid])
-    weights = one_joint(grid.shape[:2], f"{side}_hand")
-    wrist_turn = smoothstep(arm.along(grid), 0.96, 1.03)
-    weights = mix(one_joint(grid.shape[:2], f"{side}_forearm"), weights, wrist_turn)
+    grid = _tube(centers[0] + 0.006 * along, centers, forward, np.stack([breadth, thick]), 17)
+    before, behind = (one_joint(grid.shape[:2], f"{side}_{name}") for name in ("forearm", "hand"))
+    weights = mix(before, behind, smoothstep(arm.along(grid), 0.96, 1.03))
     patches = [Patch(grid, unit_grid(grid.shape), weights, skin)]
-    for k in range(4):
-        spread = (1.5 - k) * 0.0108 * H * girth
-        length = (0.043, 0.048, 0.045, 0.036)[k] * H
-        root = wrist + (0.050 * along) * H + spread * forward
-        lean = along + 0.10 * (1.5 - k) * 0.5 * forward
-        patches.append(_finger(root, unit(lean), palm, length, 0.0050 * H * girth, f"{side}_fingers", skin))
+    for k, length in enumerate((0.043, 0.048, 0.045, 0.036)):
+        root = wrist + (0.050 * along) * H + (1.5 - k) * 0.0108 * H * girth * forward
+        lean = unit(along + 0.10 * (1.5 - k) * 0.5 * forward)
+        patches.append(_finger(root, lean, palm, length * H, 0.0050 * H * girth, f"{side}_fingers", skin))
     root = wrist + (0.012 * along + 0.014 * forward) * H
     thumb = unit(0.78 * along + 0.62 * forward + 0.15 * palm)
     return [*patches, _finger(root, thumb, palm, 0.045 * H, 0.0062 * H * girth, f"{side}_hand", skin)]
@@ -358,15 +333,11 @@ def hand_patches(body: Body, skeleton: Skeleton, height_m: float, side: str, ski
 def _finger(
     root: Vector, along: Vector, palm: Vector, length_m: float, radius_m: float, joint: str, skin: Image
 ) -> Patch:
-    s = np.linspace(1, 0, 9)
-    curl = 0.28 * s**2
-    centers = root + length_m * (s[:, None] * along * (1 - 0.25 * s[:, None] * 0.3) + curl[:, None] * palm)
-    radius = radius_m * np.interp(s, [0, 0.5, 0.9, 1.0], [1.05, 1.0, 0.8, 0.45])
-    radii = np.stack([radius, radius], 1)
-    side = np.broadcast_to(np.cross(palm, along), centers.shape)
-    grid = _tube(centers, side, radii, 9)
+    s = np.linspace(1, 0, 9)[:, None]
+    centers = root + length_m * (s * along * (1 - 0.25 * s * 0.3) + 0.28 * s**2 * palm)
+    radius = radius_m * np.interp(s[:, 0], [0, 0.5, 0.9, 1.0], [1.05, 1.0, 0.8, 0.45])
     tip = centers[0] + 0.35 * radius_m * unit(centers[0] - centers[1])
-    grid = np.concatenate([np.broadcast_to(tip, (1, 9, 3)), grid])
+    grid = _tube(tip, centers, np.cross(palm, along), np.stack([radius, radius]), 9)
     return Patch(grid, unit_grid(grid.shape), one_joint(grid.shape[:2], joint), skin)
 
 
@@ -391,13 +362,11 @@ def shoe_patch(skeleton: Skeleton, height_m: float, side: str, upper_rgb: Vector
     z = np.broadcast_to(((s - 0.25) * 0.152 * H)[:, None], x.shape)
     splay = SIGN[side] * 0.04 * H * np.maximum(s - 0.25, 0)[:, None] * 0.7
     points = np.stack([ankle[0] + x + splay, y, ankle[2] + z], -1)
-    chart = np.empty((96, 128, 3))
     u = np.linspace(0, 1, 128)[None, :, None] * 2 * np.pi
     v = np.linspace(1, 0, 96)[:, None, None]
-    chart[:] = np.where((np.sin(u) < 0.16), sole_rgb, upper_rgb)
     laces = (np.abs(np.sin(u) - 1) < 0.14) & (v > 0.42) & (v < 0.66) & ((v * 24) % 1 < 0.4)
-    chart = np.where(laces, 0.5 * np.asarray(sole_rgb) + 0.45, chart)
-    weights = one_joint(points.shape[:2], f"{side}_foot")
+    chart = np.where(laces, 0.5 * sole_rgb + 0.45, np.where(np.sin(u) < 0.16, sole_rgb, upper_rgb))
     toe = float(skeleton.at(f"{side}_toe")[2])
-    bend = smoothstep(points[..., 2], toe - 0.02 * H, toe + 0.02 * H)
-    return Patch(points, unit_grid(points.shape), mix(weights, one_joint(points.shape[:2], f"{side}_toe"), bend), chart)
+    foot, tip = (one_joint(points.shape[:2], f"{side}_{name}") for name in ("foot", "toe"))
+    weights = mix(foot, tip, smoothstep(points[..., 2], toe - 0.02 * H, toe + 0.02 * H))
+    return Patch(points, unit_grid(points.shape), weights, chart)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from viewmend.data.synthetic.procedural.body import Body, Limb, Torso, body_weights, mix, one_joint, smoothstep
+from viewmend.data.synthetic.procedural.body import Body, Torso, body_weights, mix, one_joint, smoothstep
 from viewmend.data.synthetic.procedural.fabric import (
     PX_PER_M,
     QUIET,
@@ -148,7 +148,7 @@ def limb_sheet(
     folds: Folds = BARE,
     grid: tuple[int, int] = (36, 29),
 ) -> Patch:
-    """A limb of `shape` (part 1..4 of `Body.parts`) from t = `low` (towards the body) to `high`, with a lip there.
+    """A limb of `shape` (part 1..4 of `Body.fields`) from t = `low` (towards the body) to `high`, with a lip there.
 
     `grid` counts its rows and columns.
     """
@@ -341,25 +341,21 @@ class Tailor:
     def lower_shape(self) -> Body:
         """The body in what covers the legs."""
         body, cut = self.wearer.body, self.cut
-        legs = [leg.eased(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs]
-        return Body(body.torso.eased(min(cut.ease_m, 0.006) - 0.001), body.arms, (legs[0], legs[1]), body.blend_m)
+        legs = tuple(leg.eased(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs)
+        return replace(body, torso=body.torso.eased(min(cut.ease_m, 0.006) - 0.001), legs=legs)
 
     def _trunk(self, under: Torso) -> Torso:
         """The trunk in the top, over what is tucked into it."""
         return self.wearer.body.torso.eased(self.cut.loose_m, self.cut.hang, 0.004).outside(under, 0.005)
 
-    def _sleeves(self) -> tuple[Limb, Limb]:
-        short, ease = self.cut.sleeve < 0.7, self.cut.loose_m + 0.003
-        hang, flare = (0.10, 0.012) if short else (0.62, -0.006)
-        left, right = (arm.eased(ease, hang, flare) for arm in self.wearer.body.arms)
-        return left, right
-
     def top(self) -> list[Patch]:
         """Shirt, sweater or the like: trunk and sleeves."""
         H, outfit, body, cut = self.wearer.height_m, self.outfit, self.wearer.body, self.cut
         lower = self.lower_shape()
-        legs = [leg.eased(0.004) for leg in lower.legs]
-        shape = Body(self._trunk(lower.torso), self._sleeves(), (legs[0], legs[1]), body.blend_m)
+        hang, flare = (0.10, 0.012) if cut.sleeve < 0.7 else (0.62, -0.006)
+        arms = tuple(arm.eased(cut.loose_m + 0.003, hang, flare) for arm in body.arms)
+        legs = tuple(leg.eased(0.004) for leg in lower.legs)
+        shape = replace(body, torso=self._trunk(lower.torso), arms=arms, legs=legs)
         around = azimuths(65)
         wide = 0.008 if outfit.top == "tank top" else 0.0
         high = neckline(around, H, cut.neck, cut.vee, wide)
@@ -447,7 +443,7 @@ class Tailor:
         hem = float(rng.uniform(0.17, 0.36))
         flare = float(rng.uniform(0.14, 0.42))
         pleats = (int(rng.integers(7, 15)), float(rng.uniform(0.002, 0.014)))
-        shape = Body(body.torso.eased(0.014, 0.0), body.arms, body.legs, body.blend_m)
+        shape = replace(body, torso=body.torso.eased(0.014))
         waist = 0.606 if self.cut.top_hem > 0.58 else self.cut.top_hem + 0.02
         return skirt_sheets(self.wearer, shape, waist * H, hem * H, azimuths(97), fabric.paint, flare, pleats)
 
@@ -460,8 +456,7 @@ class Tailor:
         ease = float(rng.uniform(0.026, 0.034))
         torso = body.torso.eased(ease, float(rng.uniform(0.5, 0.9)))
         torso = torso.outside(self._trunk(self.lower_shape().torso), 0.012)
-        arms = [arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms]
-        shape = Body(torso, (arms[0], arms[1]), body.legs, body.blend_m)
+        shape = replace(body, torso=torso, arms=tuple(arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms))
         gap = float(rng.uniform(0.12, 0.4))
         around = azimuths(65, gap)
         coat = outfit.outer == "coat"

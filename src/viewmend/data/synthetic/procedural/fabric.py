@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from viewmend.data.synthetic.performer import TexturedMesh
 from viewmend.data.synthetic.procedural.skeleton import Vector
 from viewmend.geometry.mesh import Mesh, vertex_normals
 
@@ -20,6 +21,7 @@ KINDS = (
 )
 QUIET = ("plain", "heather", "denim", "knit", "stripes", "gradient", "bands")
 """Kinds that leave room for a word across the chest."""
+PRINTED = ("bands", "dots", "flowers", "blobs", "gradient", "zigzag", "letters")
 Image = Float[np.ndarray, "height width 3"]
 Plane = Float[np.ndarray, "height width"]
 
@@ -76,7 +78,8 @@ class Fabric:
     def paint(self, canvas: Canvas) -> Image:
         """The cloth laid flat on this canvas."""
         rng = np.random.default_rng(self.seed)
-        image = _PAINTERS[KINDS.index(self.kind)](self, canvas, rng)
+        flat = np.broadcast_to(self.colors[0], (*canvas.shape, 3)).astype(np.float64)
+        image = (_printed if self.kind in PRINTED else _woven)(flat, self, canvas, rng)
         weave = 1 + 0.025 * rng.standard_normal(canvas.shape)
         return np.clip(image * weave[..., None], 0, 1)
 
@@ -116,62 +119,77 @@ def wave(position_m: Plane, period_m: float, share: float, canvas: Canvas) -> Pl
     return edge((phase - 0.5 + share / 2) * period_m, canvas)
 
 
-def _flat(fabric: Fabric, canvas: Canvas, color: int = 0) -> Image:
-    return np.broadcast_to(fabric.colors[color], (*canvas.shape, 3)).astype(np.float64)
-
-
-def _heather(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    grain = 0.10 * canvas.noise(rng, 0.006, 0.002) + 0.05 * canvas.noise(rng, 0.02, 0.004)
-    return _flat(fabric, canvas) * (1 + grain[..., None])
-
-
-def _stripes(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    share = rng.uniform(0.25, 0.6)
-    return blend(_flat(fabric, canvas), fabric.colors[1], wave(canvas.y, fabric.period_m, share, canvas))
-
-
-def _pinstripes(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    period = fabric.period_m * rng.uniform(0.5, 1.2)
-    return blend(_flat(fabric, canvas), fabric.colors[1], wave(canvas.x, period, 0.25, canvas))
-
-
-def _bands(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    low, high = sorted(rng.uniform(0.25, 0.85, 2) * canvas.height_m)
-    inside = edge(canvas.y - low, canvas) * edge(high + 0.03 - canvas.y, canvas)
-    image = blend(_flat(fabric, canvas), fabric.colors[1], inside)
-    rim = edge(0.012 - np.abs(canvas.y - low), canvas) + edge(0.012 - np.abs(canvas.y - high - 0.03), canvas)
-    return blend(image, fabric.colors[2], rim)
-
-
-def _gingham(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    image = blend(_flat(fabric, canvas), fabric.colors[1], 0.5 * wave(canvas.y, fabric.period_m, 0.5, canvas))
-    return blend(image, fabric.colors[1], 0.5 * wave(canvas.x, fabric.period_m, 0.5, canvas))
-
-
-def _tartan(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    image, period = _flat(fabric, canvas), fabric.period_m * 1.8
-    for color, share, shift, alpha in ((1, 0.35, 0.0, 0.5), (2, 0.10, 0.31, 0.75), (1, 0.05, 0.62, 0.8)):
-        for axis in (canvas.x, canvas.y):
-            stripe = wave(axis + shift * period, period, share, canvas)
-            image = blend(image, fabric.colors[color], alpha * stripe)
+def _woven(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    """Cloth whose pattern is that of its threads, painted on an image of its first colour."""
+    x, y, period, (_, second, third) = canvas.x, canvas.y, fabric.period_m, fabric.colors
+    match fabric.kind:
+        case "heather":
+            grain = 0.10 * canvas.noise(rng, 0.006, 0.002) + 0.05 * canvas.noise(rng, 0.02, 0.004)
+            image = image * (1 + grain[..., None])
+        case "stripes":
+            image = blend(image, second, wave(y, period, rng.uniform(0.25, 0.6), canvas))
+        case "pinstripes":
+            image = blend(image, second, wave(x, period * rng.uniform(0.5, 1.2), 0.25, canvas))
+        case "gingham":
+            for axis in (y, x):
+                image = blend(image, second, 0.5 * wave(axis, period, 0.5, canvas))
+        case "tartan":
+            period = period * 1.8
+            stripes = ((second, 0.35, 0.0, 0.5), (third, 0.10, 0.31, 0.75), (second, 0.05, 0.62, 0.8))
+            for color, share, shift, alpha in stripes:
+                for axis in (x, y):
+                    image = blend(image, color, alpha * wave(axis + shift * period, period, share, canvas))
+        case "denim":
+            twill = 0.08 * rng.standard_normal(canvas.shape) + 0.06 * canvas.noise(rng, 0.003, 0.03)
+            image = image * (1 + (twill + 0.16 * canvas.noise(rng, 0.12, 0.25))[..., None])
+        case "knit":
+            rib = 0.13 * np.cos(2 * np.pi * x / 0.018) + 0.05 * np.cos(2 * np.pi * y / 0.011)
+            image = image * (0.9 + rib[..., None])
     return image
 
 
-def _dots(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    period, radius = fabric.period_m, fabric.period_m * rng.uniform(0.18, 0.32)
-    row = np.floor(canvas.y / period)
-    x = (canvas.x / period + 0.5 * (row % 2)) % 1.0 - 0.5
-    y = (canvas.y / period) % 1.0 - 0.5
-    return blend(_flat(fabric, canvas), fabric.colors[1], edge(radius - period * np.hypot(x, y), canvas))
+def _printed(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    """Cloth with a print on an image of its first colour."""
+    x, y, period, (_, second, third) = canvas.x, canvas.y, fabric.period_m, fabric.colors
+    match fabric.kind:
+        case "bands":
+            low, high = sorted(rng.uniform(0.25, 0.85, 2) * canvas.height_m)
+            image = blend(image, second, edge(y - low, canvas) * edge(high + 0.03 - y, canvas))
+            rim = edge(0.012 - np.abs(y - low), canvas) + edge(0.012 - np.abs(y - high - 0.03), canvas)
+            image = blend(image, third, rim)
+        case "dots":
+            radius = period * rng.uniform(0.18, 0.32)
+            across = (x / period + 0.5 * (np.floor(y / period) % 2)) % 1.0 - 0.5
+            distance = period * np.hypot(across, (y / period) % 1.0 - 0.5)
+            image = blend(image, second, edge(radius - distance, canvas))
+        case "flowers":
+            image = _flowers(image, fabric, canvas, rng)
+        case "blobs":
+            cell = period * 0.9
+            for color, level in ((second, 0.2), (third, 0.6)):
+                spots = canvas.noise(rng, cell, cell) + 0.4 * canvas.noise(rng, cell / 2.5, cell / 2.5)
+                image = blend(image, color, edge((spots - level) * cell * 0.3, canvas))
+        case "gradient":
+            image = blend(image, second, y / canvas.height_m)
+        case "zigzag":
+            fold = period * 0.6 * np.abs((x / period) % 1.0 - 0.5)
+            image = blend(image, second, wave(y + fold, period, 0.4, canvas))
+            image = blend(image, third, wave(y + fold + 0.4 * period, period, 0.12, canvas))
+        case "letters":
+            step, word = 0.13, WORDS[int(rng.integers(len(WORDS)))]
+            for row, top in enumerate(np.arange(step / 2, canvas.height_m, step)):
+                for left in np.arange(-(row % 2) * step - canvas.width_m / 2, canvas.width_m / 2, 1.9 * step):
+                    image = write(image, canvas, word, second, (left + step, top), 0.8 * step)
+    return image
 
 
-def _flowers(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    image = _bytes(_flat(fabric, canvas))
+def _flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
+    # Bytes are the only depth that OpenCV draws smooth edges in.
+    flat = np.ascontiguousarray((255 * image).astype(np.uint8))
     rows, columns = canvas.shape
     size = fabric.period_m * 0.42 * canvas.px_per_m
-    count = int(rows * columns / (2.6 * size) ** 2 * 1.6)
     palette = [fabric.colors[1], fabric.colors[2], hsv(0.32, 0.5, 0.4)]
-    for _ in range(max(count, 3)):
+    for _ in range(max(int(rows * columns / (2.6 * size) ** 2 * 1.6), 3)):
         center = rng.uniform(0, 1, 2) * (columns, rows)
         turn, scale = rng.uniform(0, 6.3), size * rng.uniform(0.5, 1.1)
         color, petals = (255 * palette[int(rng.integers(3))]).tolist(), int(rng.integers(4, 7))
@@ -179,49 +197,10 @@ def _flowers(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
             angle = turn + 2 * np.pi * k / petals
             x, y = center + 0.55 * scale * np.array([np.cos(angle), np.sin(angle)])
             axes = (max(1, int(0.45 * scale)), max(1, int(0.25 * scale)))
-            cv2.ellipse(image, (int(x), int(y)), axes, np.degrees(angle), 0, 360, color, -1, cv2.LINE_AA)
+            cv2.ellipse(flat, (int(x), int(y)), axes, np.degrees(angle), 0, 360, color, -1, cv2.LINE_AA)
         middle, radius = (int(center[0]), int(center[1])), max(1, int(0.22 * scale))
-        cv2.circle(image, middle, radius, (240, 200, 50), -1, cv2.LINE_AA)
-    return image / 255.0
-
-
-def _blobs(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    cell = fabric.period_m * 0.9
-    first = canvas.noise(rng, cell, cell) + 0.4 * canvas.noise(rng, cell / 2.5, cell / 2.5)
-    second = canvas.noise(rng, cell, cell) + 0.4 * canvas.noise(rng, cell / 2.5, cell / 2.5)
-    image = blend(_flat(fabric, canvas), fabric.colors[1], edge((first - 0.2) * cell * 0.3, canvas))
-    return blend(image, fabric.colors[2], edge((second - 0.6) * cell * 0.3, canvas))
-
-
-def _gradient(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    return blend(_flat(fabric, canvas), fabric.colors[1], canvas.y / canvas.height_m)
-
-
-def _zigzag(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    period = fabric.period_m
-    fold = period * 0.6 * np.abs((canvas.x / period) % 1.0 - 0.5)
-    image = blend(_flat(fabric, canvas), fabric.colors[1], wave(canvas.y + fold, period, 0.4, canvas))
-    return blend(image, fabric.colors[2], wave(canvas.y + fold + 0.4 * period, period, 0.12, canvas))
-
-
-def _denim(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    twill = 0.08 * rng.standard_normal(canvas.shape) + 0.06 * canvas.noise(rng, 0.003, 0.03)
-    worn = 0.16 * canvas.noise(rng, 0.12, 0.25)
-    return _flat(fabric, canvas) * (1 + (twill + worn)[..., None])
-
-
-def _knit(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    rib = 0.13 * np.cos(2 * np.pi * canvas.x / 0.018) + 0.05 * np.cos(2 * np.pi * canvas.y / 0.011)
-    return _flat(fabric, canvas) * (0.9 + rib[..., None])
-
-
-def _letters(fabric: Fabric, canvas: Canvas, rng: np.random.Generator) -> Image:
-    image, step = _flat(fabric, canvas), 0.13
-    word = WORDS[int(rng.integers(len(WORDS)))]
-    for row, top in enumerate(np.arange(step / 2, canvas.height_m, step)):
-        for left in np.arange(-(row % 2) * step - canvas.width_m / 2, canvas.width_m / 2, 1.9 * step):
-            image = write(image, canvas, word, fabric.colors[1], (left + step, top), 0.8 * step)
-    return image
+        cv2.circle(flat, middle, radius, (240, 200, 50), -1, cv2.LINE_AA)
+    return flat / 255.0
 
 
 def write(
@@ -236,18 +215,6 @@ def write(
     ink = np.zeros(canvas.shape, dtype=np.uint8)
     cv2.putText(ink, word, (left, base), font, scale, 255, thick, cv2.LINE_AA)
     return blend(image, color, ink / 255.0)
-
-
-def _bytes(image: Image) -> UInt8[np.ndarray, "height width 3"]:
-    """The only depth OpenCV draws smooth edges in."""
-    return np.ascontiguousarray((255 * image).astype(np.uint8))
-
-
-_PAINTERS = (
-    *(lambda fabric, canvas, rng: _flat(fabric, canvas), _heather, _stripes, _pinstripes, _bands, _gingham, _tartan),
-    *(_dots, _flowers, _blobs, _gradient, _zigzag, _denim, _knit, _letters),
-)
-"""In the order of `KINDS`."""
 
 
 ATLAS_GUTTER_PX = 3
@@ -271,14 +238,11 @@ class Patch:
 
 @dataclass(frozen=True)
 class BoundMesh:
-    """A skinned mesh in its bind pose, ready for `skinning.skin_with_normals`."""
+    """A mesh in its bind pose, ready for `performer.skin`."""
 
-    mesh: Mesh
-    normals: Float[Tensor, "vertex 3"]
-    uv: Float[Tensor, "vertex 2"]
+    rest: TexturedMesh
     joints: Int[Tensor, "vertex 4"]
     weights: Float[Tensor, "vertex 4"]
-    atlas: Float[Tensor, "3 texture_height texture_width"]
 
 
 def outward_of(azimuth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
@@ -293,20 +257,12 @@ def two_sided(outside: Patch, inside: Float[np.ndarray, "row column 3"], shade: 
     return [outside, back]
 
 
-def grid_faces(rows: int, columns: int) -> Int[np.ndarray, "face 3"]:
-    """Two triangles for each cell of a grid, counter-clockwise from outside."""
-    index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-
-
 def assemble(patches: list[Patch]) -> BoundMesh:
     """One mesh and one atlas out of all patches."""
     offsets, atlas = pack_charts([patch.chart for patch in patches])
     height, width = atlas.shape[:2]
     faces, normals, uvs, first = [], [], [], 0
     for patch, (left, top) in zip(patches, offsets, strict=True):
-        rows, columns = patch.points.shape[:2]
         triangles = _shown_faces(patch)
         normals.append(_grid_normals(patch, triangles).reshape(-1, 3))
         chart_height, chart_width = patch.chart.shape[:2]
@@ -314,7 +270,7 @@ def assemble(patches: list[Patch]) -> BoundMesh:
         v = (top + 0.5 + (1 - patch.uv[..., 1]) * (chart_height - 1)) / height
         uvs.append(np.stack([u, v], -1).reshape(-1, 2))
         faces.append(triangles + first)
-        first += rows * columns
+        first += len(normals[-1])
     vertices = np.concatenate([patch.points.reshape(-1, 3) for patch in patches])
     dense = np.concatenate([patch.weights.reshape(-1, patch.weights.shape[-1]) for patch in patches])
     joints = np.argsort(-dense, axis=1, kind="stable")[:, :4]
@@ -322,14 +278,15 @@ def assemble(patches: list[Patch]) -> BoundMesh:
     weights /= weights.sum(1, keepdims=True)
     # Vertices that no face uses would stretch bounding boxes and move the lowest point: drop them.
     face_table, inverse = np.unique(np.concatenate(faces), return_inverse=True)
-    return BoundMesh(
-        mesh=Mesh(_float(vertices[face_table]), torch.from_numpy(inverse.reshape(-1, 3).astype(np.int64))),
-        normals=_float(np.concatenate(normals)[face_table]),
-        uv=_float(np.clip(np.concatenate(uvs)[face_table], 0, 1)),
-        joints=torch.from_numpy(joints[face_table].astype(np.int64)),
-        weights=_float(weights[face_table]),
-        atlas=_float(atlas).permute(2, 0, 1).contiguous(),
+    mesh = Mesh(_float(vertices[face_table]), torch.from_numpy(inverse.reshape(-1, 3).astype(np.int64)))
+    rest = TexturedMesh(
+        mesh,
+        _float(np.concatenate(normals)[face_table]),
+        _float(np.clip(np.concatenate(uvs)[face_table], 0, 1)),
+        torch.zeros(len(mesh.faces), dtype=torch.int64),
+        (_float(atlas).permute(2, 0, 1).contiguous(),),
     )
+    return BoundMesh(rest, torch.from_numpy(joints[face_table].astype(np.int64)), _float(weights[face_table]))
 
 
 def _float(array: np.ndarray) -> Tensor:
@@ -337,7 +294,11 @@ def _float(array: np.ndarray) -> Tensor:
 
 
 def _shown_faces(patch: Patch) -> Int[np.ndarray, "face 3"]:
-    triangles = grid_faces(*patch.points.shape[:2])
+    """Two triangles for each kept cell of a grid, counter-clockwise from outside; none that are a line or a point."""
+    rows, columns = patch.points.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (part.reshape(-1) for part in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    triangles = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
     if patch.keep is not None:
         triangles = triangles[patch.keep.reshape(-1)[triangles].any(1)]
     a, b, c = patch.points.reshape(-1, 3)[triangles].transpose(1, 0, 2)

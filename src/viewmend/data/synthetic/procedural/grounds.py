@@ -1,5 +1,6 @@
 """What carries the body: where feet and pelvis are by time, for each kind of motion."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,7 +19,6 @@ from viewmend.data.synthetic.procedural.skeleton import (
     Transforms,
     Vector,
     hinge_frame,
-    joint_origin,
     rotation,
     two_bone,
     unit,
@@ -58,8 +58,8 @@ class Stance:
 
     pelvis: Vector
     yaw: float
-    feet: tuple[FootPose, FootPose]
-    arms: tuple[ArmPose, ArmPose]
+    feet: Sequence[FootPose]
+    arms: Sequence[ArmPose]
     lean: float = 0.0
     roll: float = 0.0
     sway: float = 0.0
@@ -83,11 +83,11 @@ def solve(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float) 
     third = rotation(1, stance.twist / 3) @ rotation(0, stance.bend / 3) @ rotation(2, -stance.side / 3)
     for name in ("spine", "chest", "upper"):
         R = R @ third
-        skeleton.place(INDEX[name], R, world)
+        skeleton.place(name, R, world)
     half = rotation(1, stance.look / 2) @ rotation(0, stance.nod / 2) @ rotation(2, -stance.tilt / 2)
     for name in ("neck", "head"):
         R = R @ half
-        skeleton.place(INDEX[name], R, world)
+        skeleton.place(name, R, world)
     for i, side in enumerate(SIDES):
         _place_arm(skeleton, side, stance.arms[i], world)
         _place_leg(skeleton, side, stance.feet[i], stance, world)
@@ -121,8 +121,7 @@ def _reachable(skeleton: Skeleton, stance: Stance, R: Rotation) -> Vector:
 
 
 def _place_leg(skeleton: Skeleton, side: str, foot: FootPose, stance: Stance, world: Transforms) -> None:
-    hip_parent = world[INDEX["pelvis"]]
-    hip = hip_parent[:3, :3] @ skeleton.at(f"{side}_thigh") + hip_parent[:3, 3]
+    hip = skeleton.moved(f"{side}_thigh", world[0])
     ankle, foot_R = _ankle(skeleton, side, foot)
     names = [f"{side}_{part}" for part in ("thigh", "shin", "foot", "toe")]
     lengths = (skeleton.length(names[0], names[1]), skeleton.length(names[1], names[2]))
@@ -132,10 +131,10 @@ def _place_leg(skeleton: Skeleton, side: str, foot: FootPose, stance: Stance, wo
     thigh, shin, hinge = two_bone(hip, ankle, lengths, pole)
     for i, along in ((0, thigh), (1, shin)):
         bind = hinge_frame(skeleton.at(names[i + 1]) - skeleton.at(names[i]), np.array([1.0, 0, 0]))
-        skeleton.place(INDEX[names[i]], hinge_frame(along, hinge) @ bind.T, world)
-    skeleton.place(INDEX[names[2]], foot_R, world)
+        skeleton.place(names[i], hinge_frame(along, hinge) @ bind.T, world)
+    skeleton.place(names[2], foot_R, world)
     flat = rotation(1, foot.yaw) @ rotation(0, -max(foot.pitch, 0.0))
-    skeleton.place(INDEX[names[3]], flat, world)
+    skeleton.place(names[3], flat, world)
 
 
 def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -> None:
@@ -145,22 +144,21 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -
     hanging = rotation(2, -s * ARM_ANGLE_RAD)
     raised = max(0.0, arm.abduction - 0.6) + 0.5 * max(0.0, arm.flexion - 0.9)
     lift = 0.0 if arm.target is not None else 0.28 * float(np.tanh(raised))
-    skeleton.place(INDEX[names[0]], chest @ rotation(2, s * lift), world)
+    skeleton.place(names[0], chest @ rotation(2, s * lift), world)
     if arm.target is None:
         R = chest @ rotation(0, -arm.flexion) @ rotation(2, s * arm.abduction) @ rotation(1, -s * arm.twist)
         upper, fore = R @ hanging, R @ rotation(0, -arm.elbow) @ hanging
     else:
-        clavicle = world[INDEX[names[0]]]
-        shoulder = clavicle[:3, :3] @ skeleton.at(names[1]) + clavicle[:3, 3]
+        shoulder = skeleton.moved(names[1], world[INDEX[names[0]]])
         lengths = (skeleton.length(names[1], names[2]), skeleton.length(names[2], names[3]))
         pole = chest @ np.array([0.6 * s, -1.0, -0.7])
         along, second, hinge = two_bone(shoulder, arm.target, lengths, pole)
         upper, fore = (hinge_frame(bone, -hinge) @ hanging for bone in (along, second))
-    skeleton.place(INDEX[names[1]], upper, world)
-    skeleton.place(INDEX[names[2]], fore, world)
-    skeleton.place(INDEX[names[3]], fore, world)
+    skeleton.place(names[1], upper, world)
+    skeleton.place(names[2], fore, world)
+    skeleton.place(names[3], fore, world)
     curl = hanging.T @ rotation(2, -s * arm.curl) @ hanging
-    skeleton.place(INDEX[names[4]], fore @ curl, world)
+    skeleton.place(names[4], fore @ curl, world)
 
 
 def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, world: Transforms) -> None:
@@ -171,10 +169,8 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
     weight = pelvis.T @ np.array([0.0, -1.0, 0.0])
     bones = {}
     for segment, first, last in (("high", "thigh", "shin"), ("low", "shin", "foot")):
-        ends = [
-            joint_origin(skeleton, f"{s}_{last}", world) - joint_origin(skeleton, f"{s}_{first}", world) for s in SIDES
-        ]
-        bones[segment] = np.array([pelvis.T @ unit(end) for end in ends] + [weight])
+        ends = [[skeleton.moved(f"{s}_{part}", world[INDEX[f"{s}_{part}"]]) for part in (first, last)] for s in SIDES]
+        bones[segment] = np.array([pelvis.T @ unit(end - start) for start, end in ends] + [weight])
     azimuth = 2 * np.pi * np.arange(SKIRT_COLUMNS) / SKIRT_COLUMNS
     outward = np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], 1)
     for segment, give in (("high", 0.6), ("low", 1.0)):
@@ -193,7 +189,7 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
     head = world[INDEX["head"], :3, :3]
     drop = unit(0.6 * np.array([0, -1.0, 0]) + 0.4 * head @ np.array([0, -1.0, 0]) - 0.15 * pelvis @ speed)
     lag = rotation(1, -0.5 * float(np.tanh(turning / 4)))
-    skeleton.place(INDEX["tail"], lag @ hinge_frame(drop, head @ np.array([1.0, 0, 0])), world)
+    skeleton.place("tail", lag @ hinge_frame(drop, head @ np.array([1.0, 0, 0])), world)
 
 
 def _tilted(
@@ -235,16 +231,21 @@ class Score:
     amounts: Float[np.ndarray, "8"]
     """Personal amounts in [0, 1] and phases."""
 
-    def rest(self, at: Float[np.ndarray, "2"], yaw: float, width: float, drop: float = 0.012) -> Stance:
-        """Standing at a place with the feet `width` apart (shares of the height for lengths)."""
+    @property
+    def turn(self) -> Rotation:
+        """To the heading."""
+        return rotation(1, self.heading)
+
+    def rest(self, width: float, drop: float, ahead_m: float = 0.0) -> Stance:
+        """Standing with the feet `width` apart and the pelvis `drop` lower than at rest (shares of the height)."""
         H = self.height_m
-        place = np.array([at[0], 0.0, at[1]])
+        place = ahead_m * (self.turn @ np.array([0, 0, 1.0]))
         feet = [
-            FootPose(place + rotation(1, yaw) @ np.array([SIGN[s] * width * H / 2, 0, 0]), yaw + SIGN[s] * 0.16)
-            for s in SIDES
+            FootPose(place + self.turn @ np.array([s * width * H / 2, 0, 0]), self.heading + s * 0.16)
+            for s in SIGN.values()
         ]
         pelvis = place + np.array([0, float(self.legs.at("pelvis")[1]) - drop * H, 0])
-        return Stance(pelvis, yaw, (feet[0], feet[1]), (ArmPose(), ArmPose()))
+        return Stance(pelvis, self.heading, feet, (ArmPose(), ArmPose()))
 
 
 def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
@@ -300,7 +301,7 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
     return Stance(
         pelvis,
         yaw,
-        (feet[0], feet[1]),
+        feet,
         (ArmPose(), ArmPose()),
         lean=0.14 if run else 0.03,
         roll=0.05 * float(np.sin(turn)),
@@ -315,20 +316,20 @@ def _standing(score: Score, time_s: float, beats: float) -> Stance:
     a, H = score.amounts, score.height_m
     calm = score.tempo == "calm"
     strong = {"talk": 0.5, "sway": 1.0, "groove": 1.3, "box": 0.8, "lunge": 1.0}[score.kind]
-    base = score.rest(np.zeros(2), score.heading, 0.14 + 0.10 * a[0] * strong, 0.015 + 0.02 * strong)
+    base = score.rest(0.14 + 0.10 * a[0] * strong, 0.015 + 0.02 * strong)
     beat = 2 * np.pi * beats
     shift = (0.020 + 0.022 * a[1]) * strong * np.sin(beat / 2 if not calm else beat)
     dip = 0.0 if calm else (0.018 + 0.02 * a[2]) * (1 - np.cos(beat * 1.0)) * strong
     if score.kind == "lunge":
         shift, dip = 2.6 * shift, 1.2 * dip + 0.05
-    move = rotation(1, score.heading) @ np.array([shift, 0, 0.3 * shift * np.cos(beat / 2)])
+    move = score.turn @ np.array([shift, 0, 0.3 * shift * np.cos(beat / 2)])
     s, c = float(np.sin(beat / 2 if not calm else beat)), float(np.cos(beat / 2))
     heel = -0.35 * strong * (not calm) * np.clip(np.array([-s, s]), 0, 1) ** 2
-    feet = tuple(replace(foot, pitch=float(h)) for foot, h in zip(base.feet, heel, strict=True))
+    feet = [replace(foot, pitch=float(h)) for foot, h in zip(base.feet, heel, strict=True)]
     return replace(
         base,
         pelvis=base.pelvis + H * (move + np.array([0, -dip, 0])),
-        feet=(feet[0], feet[1]),
+        feet=feet,
         roll=0.10 * strong * s,
         side=-0.16 * strong * s,
         sway=0.18 * strong * c * (not calm),
@@ -341,34 +342,27 @@ def _standing(score: Score, time_s: float, beats: float) -> Stance:
 def _jumping(score: Score, time_s: float, beats: float) -> Stance:
     """Jumping jacks: feet and arms open and close, with a hop between."""
     H = score.height_m
-    base = score.rest(np.zeros(2), score.heading, 0.0, 0.02)
+    base = score.rest(0.0, 0.02)
     open_ = 0.5 + 0.5 * np.sin(2 * np.pi * beats)
     hop = 0.06 * H * np.cos(2 * np.pi * beats) ** 2
-    turn = rotation(1, score.heading)
-    feet = [
-        FootPose(
-            turn @ np.array([SIGN[s] * (0.05 + 0.13 * open_) * H, 0, 0]) + np.array([0, hop, 0]),
-            score.heading + SIGN[s] * 0.2,
-            -8.0 * hop / H * 0.6,
-        )
-        for s in SIDES
-    ]
-    pelvis = base.pelvis + np.array([0, 0.9 * hop - 0.04 * H * open_, 0])
-    return replace(base, pelvis=pelvis, feet=(feet[0], feet[1]))
+    feet = []
+    for s in SIGN.values():
+        place = score.turn @ np.array([s * (0.05 + 0.13 * open_) * H, 0, 0]) + np.array([0, hop, 0])
+        feet.append(FootPose(place, score.heading + s * 0.2, -8.0 * hop / H * 0.6))
+    return replace(base, pelvis=base.pelvis + np.array([0, 0.9 * hop - 0.04 * H * open_, 0]), feet=feet)
 
 
 def _crouching(score: Score, time_s: float, beats: float) -> Stance:
     """Down on bent knees and up again."""
     H, a = score.height_m, score.amounts
-    base = score.rest(np.zeros(2), score.heading, 0.16 + 0.06 * a[0], 0.015)
-    low = 0.5 - 0.5 * np.cos(2 * np.pi * 0.5 * beats)
-    low = ease(low) * (0.75 + 0.25 * a[1])
-    back = rotation(1, score.heading) @ np.array([0, 0, -0.07 * low * H])
-    feet = tuple(replace(foot, pitch=-0.35 * ease((low - 0.35) / 0.6)) for foot in base.feet)
+    base = score.rest(0.16 + 0.06 * a[0], 0.015)
+    low = ease(0.5 - 0.5 * np.cos(2 * np.pi * 0.5 * beats)) * (0.75 + 0.25 * a[1])
+    back = score.turn @ np.array([0, 0, -0.07 * low * H])
+    feet = [replace(foot, pitch=-0.35 * ease((low - 0.35) / 0.6)) for foot in base.feet]
     return replace(
         base,
         pelvis=base.pelvis + back + np.array([0, -0.27 * H * low, 0]),
-        feet=(feet[0], feet[1]),
+        feet=feet,
         lean=0.45 * float(low),
         bend=0.45 * float(low),
         knees_out=0.25 + 0.2 * float(a[2]),
@@ -383,14 +377,12 @@ def seat_height(height_m: float) -> float:
 def _sitting(score: Score, time_s: float, beats: float) -> Stance:
     """Sitting on a stool at the centre; some get up and sit down again."""
     H, a = score.height_m, score.amounts
-    forward = rotation(1, score.heading) @ np.array([0, 0, 1.0])
-    feet_at = 0.21 * H * forward
-    base = score.rest(feet_at[[0, 2]], score.heading, 0.13 + 0.06 * a[0], 0.01)
+    forward = score.turn @ np.array([0, 0, 1.0])
+    base = score.rest(0.13 + 0.06 * a[0], 0.01, 0.21 * H)
     seated = np.array([0, seat_height(H) + 0.062 * H, 0]) - 0.02 * H * forward
     cycle = (time_s / 7.0 + a[1]) % 1.0
     down = 1.0 if a[2] < 0.5 else 1 - ease((cycle - 0.55) / 0.18) + ease((cycle - 0.82) / 0.18)
-    upright = base.pelvis - 0.0 * forward
-    pelvis = upright + down * (seated - upright) - 0.03 * H * np.sin(np.pi * down) * forward
+    pelvis = base.pelvis + down * (seated - base.pelvis) - 0.03 * H * np.sin(np.pi * down) * forward
     leaning = float(0.75 * np.sin(np.pi * down))
     rock = float(np.sin(2 * np.pi * 0.5 * beats))
     return replace(
@@ -407,25 +399,24 @@ def _sitting(score: Score, time_s: float, beats: float) -> Stance:
 def _reaching(score: Score, time_s: float, beats: float) -> Stance:
     """Hands that go from one place to the next: up, aside, forward, to the floor."""
     H, a = score.height_m, score.amounts
-    base = score.rest(np.zeros(2), score.heading, 0.18, 0.03)
+    base = score.rest(0.18, 0.03)
     step, tau = int(np.floor(beats)), float(beats - np.floor(beats))
     share = ease(tau / 0.7)
     goals = [_goal(score, step + k) for k in (0, 1)]
     goal = goals[0] + share * (goals[1] - goals[0])
-    turn = rotation(1, score.heading)
     middle = goal.mean(0)
     low = float(np.clip(0.62 - middle[1], 0, 0.5))
     lean = (0.10 * (middle - np.array([0, 0.7, 0.15]))) * np.array([1, 0, 0.5])
-    arms = [ArmPose(curl=0.25, target=turn @ (goal[i] * H)) for i in range(2)]
+    arms = [ArmPose(curl=0.25, target=score.turn @ (goal[i] * H)) for i in range(2)]
     return replace(
         base,
-        pelvis=base.pelvis + turn @ (lean * H) + np.array([0, -0.35 * low * H, 0]),
+        pelvis=base.pelvis + score.turn @ (lean * H) + np.array([0, -0.35 * low * H, 0]),
         bend=0.15 + 1.6 * low,
         lean=0.9 * low,
         side=float(0.6 * middle[0]),
         twist=float(0.9 * middle[0]),
         knees_out=0.15 + 0.1 * float(a[0]),
-        arms=(arms[0], arms[1]),
+        arms=arms,
     )
 
 

@@ -1,12 +1,12 @@
 """Performers and scenes drawn from a seed."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from viewmend.data.synthetic.performer import TexturedMesh, skin_with_normals
+from viewmend.data.synthetic.performer import TexturedMesh, skin
 from viewmend.data.synthetic.procedural.body import build_body, hand_patches, shoe_patch
 from viewmend.data.synthetic.procedural.clothing import (
     Cut,
@@ -45,12 +45,9 @@ class ProceduralPerson:
         """The person at this time, in seconds."""
         now, before = self.motion.stance(time_s), self.motion.stance(time_s - LAG_S)
         transforms = torch.from_numpy(solve(self.skeleton, now, before, LAG_S)).float()
-        bound = self.bound
-        vertices, normals = skin_with_normals(
-            bound.mesh.vertices, bound.normals, bound.joints, bound.weights, transforms
-        )
-        texture = torch.zeros(len(bound.mesh.faces), dtype=torch.int64)
-        return TexturedMesh(Mesh(vertices, bound.mesh.faces), normals, bound.uv, texture, (bound.atlas,))
+        rest, joints, weights = self.bound.rest, self.bound.joints, self.bound.weights
+        vertices, normals = skin(rest.mesh.vertices, rest.normals, joints, weights, transforms)
+        return replace(rest, mesh=Mesh(vertices, rest.mesh.faces), normals=normals)
 
 
 def draw_person(
@@ -173,7 +170,7 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
     words = " and ".join(person.description for person in people)
     if names:
         words += ", next to " + " and ".join(names)
-    return ProceduralPerformer(tuple(people), still(assemble(patches)) if patches else None, words)
+    return ProceduralPerformer(tuple(people), assemble(patches).rest if patches else None, words)
 
 
 def _check(style: PerformerStyle) -> None:
@@ -229,9 +226,3 @@ def merge(parts: Sequence[TexturedMesh]) -> TexturedMesh:
         torch.cat(textures),
         tuple(texture for part in parts for texture in part.textures),
     )
-
-
-def still(bound: BoundMesh) -> TexturedMesh:
-    """A mesh that stays in its bind pose: what stands on the floor."""
-    texture = torch.zeros(len(bound.mesh.faces), dtype=torch.int64)
-    return TexturedMesh(bound.mesh, bound.normals, bound.uv, texture, (bound.atlas,))

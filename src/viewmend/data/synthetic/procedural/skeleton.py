@@ -3,6 +3,7 @@
 The bind pose is an A-pose that faces +z, left side at +x, arms `ARM_ANGLE_RAD` away from hanging straight down.
 """
 
+import itertools
 import tomllib
 from dataclasses import dataclass
 from importlib.resources import files
@@ -27,32 +28,20 @@ SPINE = ("pelvis", "spine", "chest", "upper", "neck", "head")
 ARM = ("clavicle", "upperarm", "forearm", "hand", "fingers")
 LEG = ("thigh", "shin", "foot", "toe")
 SIDES = ("left", "right")
-JOINTS: tuple[str, ...] = (
-    *SPINE,
-    *(f"{side}_{name}" for side in SIDES for name in (*ARM, *LEG)),
-    *(f"skirt{column}_{segment}" for column in range(SKIRT_COLUMNS) for segment in ("high", "low")),
-    "tail",
+_CHAINS = (
+    SPINE,
+    *(
+        (root, *(f"{side}_{name}" for name in limb))
+        for side in SIDES
+        for root, limb in (("upper", ARM), ("pelvis", LEG))
+    ),
+    *(("pelvis", f"skirt{column}_high", f"skirt{column}_low") for column in range(SKIRT_COLUMNS)),
+    ("head", "tail"),
 )
+_PARENT = {child: parent for chain in _CHAINS for parent, child in itertools.pairwise(chain)}
+JOINTS: tuple[str, ...] = ("pelvis", *_PARENT)
 INDEX: dict[str, int] = {name: i for i, name in enumerate(JOINTS)}
-
-
-def _parent(name: str) -> int:
-    if name == "pelvis":
-        return -1
-    if name in SPINE:
-        return INDEX[SPINE[SPINE.index(name) - 1]]
-    if name == "tail":
-        return INDEX["head"]
-    if name.startswith("skirt"):
-        return INDEX["pelvis"] if name.endswith("high") else INDEX[name.replace("low", "high")]
-    side, part = name.split("_")
-    chain = ARM if part in ARM else LEG
-    if part == chain[0]:
-        return INDEX["upper"] if chain is ARM else INDEX["pelvis"]
-    return INDEX[f"{side}_{chain[chain.index(part) - 1]}"]
-
-
-PARENTS: tuple[int, ...] = tuple(_parent(name) for name in JOINTS)
+PARENTS: tuple[int, ...] = (-1, *(INDEX[name] for name in _PARENT.values()))
 SIGN = {"left": 1.0, "right": -1.0}
 """Sign of x on each side of the body."""
 
@@ -109,18 +98,16 @@ class Skeleton:
         """Distance between two joints in the bind pose, metres."""
         return float(np.linalg.norm(self.at(second) - self.at(first)))
 
-    def place(self, joint: int, R: Rotation, world_from_bind: Transforms) -> None:
-        """Set `joint` to the world rotation R at the place its parent carries it to."""
-        parent = world_from_bind[PARENTS[joint]]
-        origin = parent[:3, :3] @ self.positions[joint] + parent[:3, 3]
+    def moved(self, name: str, motion: Float[np.ndarray, "4 4"]) -> Vector:
+        """Where a motion from the bind pose takes this joint, world metres."""
+        return motion[:3, :3] @ self.at(name) + motion[:3, 3]
+
+    def place(self, name: str, R: Rotation, world_from_bind: Transforms) -> None:
+        """Set a joint to the world rotation R at the place its parent carries it to."""
+        joint = INDEX[name]
+        origin = self.moved(name, world_from_bind[PARENTS[joint]])
         world_from_bind[joint, :3, :3] = R
-        world_from_bind[joint, :3, 3] = origin - R @ self.positions[joint]
-
-
-def joint_origin(skeleton: Skeleton, name: str, world_from_bind: Transforms) -> Vector:
-    """World position of a joint that is already placed."""
-    motion = world_from_bind[INDEX[name]]
-    return motion[:3, :3] @ skeleton.at(name) + motion[:3, 3]
+        world_from_bind[joint, :3, 3] = origin - R @ self.at(name)
 
 
 TABLES: dict[str, Any] = tomllib.loads((files("viewmend.data.synthetic.procedural") / "tables.toml").read_text())
@@ -154,47 +141,33 @@ def sample_physique(rng: np.random.Generator) -> Physique:
     feminine = bool(rng.random() < 0.5)
     height = rng.normal(1.66, 0.07) if feminine else rng.normal(1.78, 0.08)
     tone = rng.uniform(0, len(SKIN_RGB) - 1)
-    skin = [float(np.interp(tone, np.arange(len(SKIN_RGB)), SKIN_RGB[:, c])) for c in range(3)]
+    red, green, blue = (float(np.interp(tone, np.arange(len(SKIN_RGB)), column)) for column in SKIN_RGB.T)
     return Physique(
         height_m=float(np.clip(height, 1.5, 1.95)),
         femininity=float(np.clip(rng.normal(0.92 if feminine else 0.08, 0.08), 0, 1)),
         weight=float(np.clip(rng.normal(0.1, 0.5), -0.8, 1.6)),
         muscle=float(rng.uniform(0.1, 0.9)),
         leg_share=float(np.clip(rng.normal(1.0, 0.025), 0.95, 1.05)),
-        skin_rgb=(skin[0], skin[1], skin[2]),
+        skin_rgb=(red, green, blue),
         face=tuple(float(v) for v in rng.uniform(-1, 1, 8)),
     )
 
 
 def build_skeleton(person: Physique) -> Skeleton:
     """Bind positions of the joints of this person."""
-    places: dict[str, tuple[float, float, float]] = {
-        "pelvis": (0, 0.535, 0),
-        "spine": (0, 0.585, 0.002),
-        "chest": (0, 0.66, -0.004),
-        "upper": (0, 0.74, -0.012),
-        "neck": (0, 0.835, -0.014),
-        "head": (0, 0.878, -0.002),
-        "tail": (0, 0.96, -0.052),
-    }
+    places: dict[str, Any] = dict(TABLES["trunk"])
     shoulder = 0.106 - 0.011 * person.femininity + 0.003 * person.muscle
     hip = 0.049 + 0.004 * person.femininity
     arm = np.array([np.sin(ARM_ANGLE_RAD), -np.cos(ARM_ANGLE_RAD), 0.0])
     for side in SIDES:
-        s = SIGN[side]
-        mirror = np.array([s, 1, 1])
-        start = np.array([shoulder, 0.795, -0.013])
-        places[f"{side}_clavicle"] = (s * 0.018, 0.80, -0.004)
-        for part, reach in (("upperarm", 0.0), ("forearm", 0.168), ("hand", 0.312), ("fingers", 0.366)):
-            x, y, z = (start + reach * arm) * mirror
-            places[f"{side}_{part}"] = (x, y, z)
-        places[f"{side}_thigh"] = (s * hip, 0.522, 0.0)
-        places[f"{side}_shin"] = (s * (hip + 0.006), 0.281, 0.004)
-        places[f"{side}_foot"] = (s * (hip + 0.010), 0.043, -0.010)
-        places[f"{side}_toe"] = (s * (hip + 0.014), 0.010, 0.068)
+        mirror = np.array([SIGN[side], 1, 1])
+        places[f"{side}_clavicle"] = mirror * (0.018, 0.80, -0.004)
+        for part, reach in zip(ARM[1:], (0.0, 0.168, 0.312, 0.366), strict=True):
+            places[f"{side}_{part}"] = mirror * (np.array([shoulder, 0.795, -0.013]) + reach * arm)
+        for part, (x, y, z) in zip(LEG, TABLES["leg_joints"], strict=True):
+            places[f"{side}_{part}"] = mirror * (hip + x, y, z)
     for column in range(SKIRT_COLUMNS):
-        azimuth = 2 * np.pi * column / SKIRT_COLUMNS
-        x, z = np.sin(azimuth), np.cos(azimuth)
+        x, z = np.sin(2 * np.pi * column / SKIRT_COLUMNS), np.cos(2 * np.pi * column / SKIRT_COLUMNS)
         places[f"skirt{column}_high"] = (0.07 * x, 0.57, 0.045 * z)
         places[f"skirt{column}_low"] = (0.09 * x, 0.40, 0.07 * z)
     positions = np.array([places[name] for name in JOINTS], dtype=np.float64)
