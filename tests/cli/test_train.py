@@ -1,6 +1,7 @@
 """`viewmend train` from the command line."""
 
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -94,6 +95,7 @@ def test_a_damaged_capture_is_one_line_also_from_a_worker(capture, tmp_path, cap
     assert main([*command, "--count", "40", "--workers", "1"]) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and "expected an image" in lines[0] and "Traceback" not in lines[0]
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow

@@ -115,15 +115,19 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
             gc.unfreeze()
     else:
         loaded = (numbered[number] for number in count(first))
-    empty = 0
-    for number, samples in loaded:
-        if isinstance(samples, Exception):
-            raise samples
-        empty = 0 if samples else empty + 1
-        if empty == MAX_EMPTY_SCENES:
-            raise ValueError(
-                f"expected views with holes to train on, got none in {empty} scenes; use rigs of fewer cameras, or "
-                "larger images"
-            )
-        for index, sample in enumerate(samples):
-            yield number, index, sample
+    empty, samples = 0, None
+    try:
+        for number, samples in loaded:
+            if isinstance(samples, Exception):
+                raise samples
+            empty = 0 if samples else empty + 1
+            if empty == MAX_EMPTY_SCENES:
+                raise ValueError(
+                    f"expected views with holes to train on, got none in {empty} scenes; use rigs of fewer cameras, or "
+                    "larger images"
+                )
+            for index, sample in enumerate(samples):
+                yield number, index, sample
+    finally:
+        # An error that is raised refers to this frame, which must not keep the workers alive.
+        del loaded, samples
