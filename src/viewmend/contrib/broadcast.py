@@ -220,7 +220,7 @@ class BroadcastSession(ViewerSession):
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the edge."""
-        if self._look is None:
+        if self.newest_look is None:
             home = playback.home
             self.look(Look(camera=Camera(azimuth=home.azimuth, elevation=home.elevation)))
         return super().next_request(now, playback)

@@ -21,6 +21,7 @@ from functools import cached_property
 from hashlib import blake2b
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from msgspec import Meta, Struct
@@ -47,6 +48,7 @@ COLOUR_STRIDE = 4
 """Vertices are coloured from images reduced by this factor: neighbouring vertices are several pixels apart."""
 READ_S, POLL_S = 10.0, 0.02
 """Time limit for reading a frame, and time between attempts."""
+NOT_IN_TIME = "the frame was not available in time; see /health"
 MAX_MAKING = 16
 """Frames whose assets are being made at a time."""
 MEMORY_MB = 64.0
@@ -109,7 +111,7 @@ class AssetStore:
         make: Callable[[MultiViewFrame, Names], FrameAssets],
         memory_mb: float = MEMORY_MB,
     ) -> None:
-        """Begin empty; `read` returns None while a frame is not in memory, and `make` is called on a thread."""
+        """Set up; `read` returns None while a frame is not in memory, and `make` is called on a thread."""
         self._read, self._make, self._max_bytes = read, make, 1e6 * memory_mb
         self._kept: OrderedDict[Key, FrameAssets] = OrderedDict()
         self._making: dict[Key, asyncio.Task[FrameAssets]] = {}
@@ -144,26 +146,29 @@ class AssetStore:
         return await asyncio.shield(task)
 
     async def _prepare(self, key: Key, version: str) -> FrameAssets:
-        end = time.monotonic() + READ_S
         try:
-            while (frame := self._read(key[0])) is None:
-                if time.monotonic() > end:
-                    raise TimeoutError("the frame was not available in time; see /health")
-                await asyncio.sleep(POLL_S)
+            frame = await wait_for_frame(self._read, key[0], READ_S)
             async with self._turn:
                 made = await asyncio.to_thread(self._make, frame, key[1])
             if version == self._version:
-                self._keep(key, made)
+                self._kept[key] = made
+                self.size_bytes += made.size_bytes
+                while self.size_bytes > self._max_bytes and len(self._kept) > 1:
+                    self.size_bytes -= self._kept.popitem(last=False)[1].size_bytes
             return made
         finally:
             if version == self._version:
                 self._making.pop(key, None)
 
-    def _keep(self, key: Key, made: FrameAssets) -> None:
-        self._kept[key] = made
-        self.size_bytes += made.size_bytes
-        while self.size_bytes > self._max_bytes and len(self._kept) > 1:
-            self.size_bytes -= self._kept.popitem(last=False)[1].size_bytes
+
+async def wait_for_frame(read: Callable[[int], MultiViewFrame | None], index: int, limit_s: float) -> MultiViewFrame:
+    """A frame once it is in memory; TimeoutError if it is not read in time."""
+    end = time.monotonic() + limit_s
+    while (frame := read(index)) is None:
+        if time.monotonic() > end:
+            raise TimeoutError(NOT_IN_TIME)
+        await asyncio.sleep(POLL_S)
+    return frame
 
 
 def make_assets(frame: MultiViewFrame, proxy: GeometryProxy, config: RenderConfig) -> FrameAssets:
@@ -231,10 +236,9 @@ def _colours(frame: MultiViewFrame, proxy: GeometryProxy) -> Float[np.ndarray, "
 
 
 def pack_differences(values: Int[np.ndarray, "row column"]) -> bytes:
-    """Integers of 31 bits as deflated differences to the row before.
+    """Integers of 31 bits as deflated differences to the row before, folded to unsigned (0, -1, 1, -2 to 0, 1, 2, 3).
 
-    They are folded to unsigned (0, -1, 1, -2, ... become 0, 1, 2, 3, ...) and stored column by column: first the
-    lowest byte of all, then the second, the third and the highest.
+    They are stored column by column: first the lowest byte of all, then the second, the third and the highest.
     """
     differences = np.diff(values, axis=0, prepend=np.zeros((1, values.shape[1]), values.dtype)).T
     folded = ((differences << 1) ^ (differences >> 63)).astype("<u4")
@@ -260,8 +264,6 @@ def _encode_image(
     rgb: UInt8[np.ndarray, "height width 3"], mask: UInt8[np.ndarray, "height width"]
 ) -> tuple[bytes, bytes]:
     """JPEG and deflated mask."""
-    import cv2
-
     near = cv2.dilate(mask, np.ones((2 * KEPT_PX + 1, 2 * KEPT_PX + 1), np.uint8))
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]

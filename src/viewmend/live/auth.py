@@ -29,9 +29,7 @@ class AccessControl:
     def __init__(self, host: str, token: str | None, public_url: str | None = None) -> None:
         """Set up the checks of one server, which a proxy may serve at a public address.
 
-        Raises:
-            ValueError: other machines can reach the server and there is no token, the token is too short, or the public
-                address is not one.
+        ValueError if other machines can reach the server and there is no token, or if token or address are none.
         """
         if token is not None and len(token) < MIN_TOKEN_LENGTH:
             raise ValueError(
@@ -48,7 +46,13 @@ class AccessControl:
                 f"expected --token with --public-url {public_url}, which other machines can reach; create a "
                 "long random one"
             )
-        self._public = None if public_url is None else public_origin(public_url)
+        self._public: str | None = None
+        if public_url is not None:
+            url = urlsplit(public_url)
+            if url.scheme not in ("http", "https") or not _parse_host(url.netloc, 80) or url.query or url.fragment:
+                next_step = "write the proxy's address"
+                raise ValueError(f"expected --public-url https://NAME/PATH, got '{public_url[:80]}'; {next_step}")
+            self._public = f"{url.scheme}://{url.netloc}".lower()
         # Without a token, a page whose name resolves to this machine could read what it shows.
         self._any_host = bool(token) or not is_loopback(host)
         self._token = token
@@ -96,18 +100,6 @@ def _is_same_origin(origin: str, host: str) -> bool:
     scheme, _, address = origin.partition("://")
     port = {"http": 80, "https": 443}.get(scheme.lower())
     return port is not None and None is not _parse_host(host, port) == _parse_host(address, port)
-
-
-def public_origin(url: str) -> str:
-    """Scheme, name and port of the address that a proxy serves.
-
-    Raises:
-        ValueError: it is not the address of a page.
-    """
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not _parse_host(parts.netloc, 80) or parts.query or parts.fragment:
-        raise ValueError(f"expected --public-url https://NAME/PATH, got '{url[:80]}'; write the proxy's address")
-    return f"{parts.scheme}://{parts.netloc}".lower()
 
 
 class RateLimit:

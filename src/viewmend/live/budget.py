@@ -114,14 +114,11 @@ class Budget:
     """Chooses the quality level of one viewer, frame by frame."""
 
     def __init__(self, target_ms: float, levels: Sequence[QualityLevel] = CONTEXT_LADDER.levels) -> None:
-        """Start in the middle of the ladder.
-
-        Raises:
-            ValueError: the target is not positive, or there are no levels.
-        """
+        """Start in the middle of the ladder; ValueError if the target is not positive, or there are no levels."""
         if not target_ms > 0 or not levels:
             raise ValueError(f"expected a positive budget and levels, got {target_ms} ms and {len(levels)} levels")
-        self.target_ms = target_ms
+        self.budget_ms = self.target_ms = target_ms
+        """The time of a view if there are no other viewers; the target is lower if there are."""
         self.levels = tuple(levels)
         self.index = len(levels) // 2
         self.measured_ms = 0.0
@@ -138,8 +135,10 @@ class Budget:
 
     def predict_ms(self, level: QualityLevel) -> float:
         """The predicted time of a view at this level; 0 before the first frame."""
-        inpainting = level.relative_cost + (_median(self._context) if level.context_times else 0.0)
-        return _median(self._geometry) + _median(self._pixels) * level.scale**2 + _median(self._inpainting) * inpainting
+        stages = (self._geometry, self._pixels, self._inpainting, self._context)
+        geometry, pixels, inpainting, context = (median(times or (0.0,)) for times in stages)
+        cost = level.relative_cost + (context if level.context_times else 0.0)
+        return geometry + pixels * level.scale**2 + inpainting * cost
 
     def record(self, level: QualityLevel, times: FrameTimes) -> None:
         """Add the measured times of a frame, and choose the level of the next one."""
@@ -157,7 +156,10 @@ class Budget:
         if self._frames_since_up == PROBATION_FRAMES:
             self._up_after = UP_AFTER_FRAMES
         if self.predict_ms(self.level) > self.target_ms and self.index > 0:
-            self._go_down()
+            if self._frames_since_up < PROBATION_FRAMES:
+                self._up_after = min(MAX_UP_AFTER_FRAMES, 2 * self._up_after)
+            good = [n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms]
+            self.index, self._frames_with_room, self._frames_since_up = max(good, default=0), 0, PROBATION_FRAMES
         elif self.index + 1 < len(self.levels):
             fits = self.predict_ms(self.levels[self.index + 1]) <= HEADROOM * self.target_ms
             self._frames_with_room = self._frames_with_room + 1 if fits else 0
@@ -178,25 +180,13 @@ class Budget:
             "levels": len(self.levels),
         }
 
-    def _go_down(self) -> None:
-        if self._frames_since_up < PROBATION_FRAMES:
-            self._up_after = min(MAX_UP_AFTER_FRAMES, 2 * self._up_after)
-        good = [n for n in range(self.index) if self.predict_ms(self.levels[n]) <= HEADROOM * self.target_ms]
-        self.index, self._frames_with_room, self._frames_since_up = max(good, default=0), 0, PROBATION_FRAMES
-
-
-def _median(values: Sequence[float]) -> float:
-    return median(values) if values else 0.0
-
 
 class ResolutionLimit:
-    """Lowers the resolution of views so that no viewer of a server waits too long for another one's image.
-
-    It uses the slowest of the last large images, in seconds per pixel.
-    """
+    """Lowers the resolution of views so that no viewer of a server waits too long for another one's image."""
 
     def __init__(self) -> None:
         self._seconds_per_px: deque[float] = deque(maxlen=16)
+        """Of the last large images; the slowest counts."""
 
     def record(self, pixels: float | int, level: QualityLevel, seconds: float) -> None:
         """Add the time of an image of this many pixels at this level."""

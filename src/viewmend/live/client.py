@@ -41,8 +41,7 @@ class ServerSocket:
             from websockets.sync.client import connect
         except ImportError:
             raise ImportError("a connection needs websockets: pip install 'viewmend'") from None
-        self._closed = ConnectionClosed
-        self._context = contextlib.ExitStack()
+        self._closed, self._context = ConnectionClosed, contextlib.ExitStack()
         address = f"{url}{token_query(token)}"
         try:
             self._socket = self._context.enter_context(connect(address, max_size=None, compression=None))
@@ -315,6 +314,6 @@ class Publisher(Connection):
 
     def _request(self, message: str | bytes) -> dict[str, Any]:
         self._socket.send(message)
-        answer = self._socket.receive(timeout_s=ANSWER_S)
+        answer = self._socket.receive(ANSWER_S)
         assert isinstance(answer, dict), "the server answers rigs in JSON"
         return answer

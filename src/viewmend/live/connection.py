@@ -97,7 +97,7 @@ class SessionRegistry:
     """Those that have said hello, each with the time before which nothing is due on it unless something changes."""
     numbers: "itertools.count[int]" = field(default_factory=itertools.count)
     shown: dict[str, Any] | None = None
-    """The message `show` that moved all pages last."""
+    """The message `show` that moves all pages, also those that will be opened; set on any thread."""
 
     _informer: "asyncio.Task[None] | None" = None
 
@@ -134,10 +134,6 @@ class SessionRegistry:
     def common(self) -> Common:
         """What is the same for all viewers: their part of `state`, the messages `show` and `rig`, and their number."""
         return self.source_json(), self.shown, self.service.renderer.rig_json, len(self.sessions)
-
-    def show(self, message: dict[str, Any]) -> None:
-        """Move all pages, and those that will be opened; from any thread."""
-        self.shown = message
 
     def source_json(self) -> dict[str, Any]:
         """The part of the message `state` that is the same for all viewers."""

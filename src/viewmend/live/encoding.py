@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8, UInt16
@@ -25,7 +26,7 @@ HOLE = (1.0, 0.15, 0.55)
 COLOURS = ((230, 120, 60), (70, 150, 230), (120, 200, 90), (200, 110, 210), (235, 200, 70), (90, 205, 200))
 """Colours of the source views in the mode `coverage`."""
 DEPTH_STRIDES = ((160, 1), (400, 2))
-"""Pairs (longest side, stride): image pixels per depth pixel for images of at most this size."""
+"""Pairs (longest side, stride): image pixels per depth pixel, so that outlines of small images are not ragged."""
 COARSEST_STRIDE = 4
 """Image pixels per depth pixel in larger images."""
 LARGE_ERROR = 0.25
@@ -48,8 +49,6 @@ def draw_mode(
     image = _draw_on_black(completed, mode) if own is None else _to_8bit(own[:3])
     if background == BLACK:
         return image
-    import cv2
-
     opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if own is None else own[3]
     transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
     channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
@@ -61,7 +60,10 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
     if mode == "mended":
         return _to_8bit(completed.rgb)
     if mode == "confidence":
-        return _draw_confidence(completed)
+        if completed.confidence is None:
+            return _to_8bit(completed.rgb.mean(0).expand(3, -1, -1))
+        heat = torch.from_numpy(heat_map(completed.confidence, "viridis"))
+        return _to_8bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
     if mode == "depth":
         near, far = depth_range(view.depth)
         colours = heat_map((far - view.depth) / max(far - near, 1e-6), "turbo")
@@ -74,10 +76,7 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
 
 
 def surface_depth(completed: CompletedView) -> Float[Tensor, "height width"]:
-    """Depth in metres, 0 for background; the proxy's if the inpainter predicts none.
-
-    Pixels of soft outlines get the depth of the neighbouring surface.
-    """
+    """Depth in metres, 0 for background, on soft outlines that of the surface; the proxy's if no depth is predicted."""
     if completed.depth is None:
         return completed.view.depth
     return torch.where(completed.opacity > FAINT, rim_depth(completed.depth), 0.0)
@@ -99,17 +98,8 @@ def depth_range(depth: Float[Tensor, "height width"]) -> tuple[float, float]:
 
 def heat_map(values: Float[Tensor, "height width"], colours: str) -> Image:
     """Values in [0, 1] in one of OpenCV's colour maps."""
-    import cv2
-
     levels = (values.clamp(0, 1) * 255).round().byte().cpu().numpy()
     return cv2.applyColorMap(levels, getattr(cv2, f"COLORMAP_{colours.upper()}"))[..., ::-1].copy()
-
-
-def _draw_confidence(completed: CompletedView) -> Image:
-    if completed.confidence is None:
-        return _to_8bit(completed.rgb.mean(0).expand(3, -1, -1))
-    heat = torch.from_numpy(heat_map(completed.confidence, "viridis"))
-    return _to_8bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
 
 
 def _draw_coverage(view: IncompleteView) -> Float[Tensor, "3 height width"]:
@@ -125,8 +115,6 @@ def _to_8bit(rgb: Float[Tensor, "3 height width"]) -> Image:
 
 def to_jpeg(image: Image, quality: int) -> bytes:
     """Encode as JPEG; without chroma subsampling from quality 90, to keep coloured edges."""
-    import cv2
-
     options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if quality >= 90:
         options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -137,8 +125,6 @@ def to_jpeg(image: Image, quality: int) -> bytes:
 
 def from_jpeg(data: bytes) -> Image:
     """Decode a JPEG as RGB."""
-    import cv2
-
     return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
 
 
@@ -153,11 +139,6 @@ class PackedDepth:
     """Image pixels per depth pixel, horizontally and vertically."""
     near_m: float
     far_m: float
-
-
-def depth_stride(height: int, width: int) -> int:
-    """Image pixels per depth pixel; small images need fine depth, or their outlines become ragged."""
-    return next((stride for longest, stride in DEPTH_STRIDES if max(height, width) <= longest), COARSEST_STRIDE)
 
 
 def pack_depth(depth: Float[Tensor, "height width"], stride: int) -> PackedDepth:
@@ -218,7 +199,8 @@ def encode_frame(
             data.append(encoded)
         if look.depth:
             depth = surface_depth(completed) if MENDED_MODES.issuperset(look.modes) else completed.view.depth
-            packed = asdict(pack_depth(depth, depth_stride(*depth.shape)))
+            stride = next((stride for longest, stride in DEPTH_STRIDES if max(depth.shape) <= longest), COARSEST_STRIDE)
+            packed = asdict(pack_depth(depth, stride))
             data.append(packed.pop("data"))
             parts.append({"kind": "depth", "eye": eye, "bytes": len(data[-1]), "encoding": "u16-delta-zlib", **packed})
     encode_ms = 1000 * (time.perf_counter() - start)

@@ -17,7 +17,7 @@ from viewmend.frame_cache import CachedFrame
 from viewmend.geometry.bounds import Bounds
 from viewmend.live.protocol import ClockChange
 from viewmend.types import MultiViewFrame
-from viewmend.utils.tensors import to_mmap
+from viewmend.utils.tensors import size_bytes, to_mmap
 
 RETRY_S = 1.0
 """A source that failed is tried again after this long."""
@@ -84,7 +84,7 @@ class Clock:
     def change(self, change: ClockChange, span: Span) -> None:
         """Apply a viewer's message `clock`."""
         if change.seek is not None:
-            self.position, self.live = span.clamp(float(change.seek)), False
+            self.position, self.live = span.clamp(change.seek), False
         if change.speed is not None and not span.live:
             self.speed = change.speed
             self.live = self.live and change.speed == 1
@@ -161,10 +161,7 @@ class FrameSource(ABC):
 
 
 class FrameCache:
-    """Frames by index, bounded by bytes.
-
-    The oldest are dropped first, or with `by_last_use` the least recently used.
-    """
+    """Frames by index, bounded by bytes: the oldest are dropped, or with `by_last_use` the least recently used."""
 
     def __init__(self, memory_mb: float, by_last_use: bool) -> None:
         self._by_last_use = by_last_use
@@ -179,9 +176,10 @@ class FrameCache:
         """Store a frame under this index."""
         frame = to_mmap(replace(frame, depth=None, time=index))
         self._frames[index] = frame
-        self._bytes += _size_bytes(frame)
+        self._bytes += size_bytes((frame.rgb, frame.mask))
         while self._bytes > self._max_bytes and len(self._frames) > 1:
-            self._bytes -= _size_bytes(self._frames.popitem(last=False)[1])
+            _, oldest = self._frames.popitem(last=False)
+            self._bytes -= size_bytes((oldest.rgb, oldest.mask))
 
     def get(self, index: int) -> MultiViewFrame | None:
         """The frame, or None."""
@@ -193,7 +191,7 @@ class FrameCache:
     def capacity(self) -> int:
         """The number of frames of the newest one's size that fit."""
         newest = next(reversed(self._frames.values()), None)
-        return 1 if newest is None else max(1, int(self._max_bytes // _size_bytes(newest)))
+        return 1 if newest is None else max(1, int(self._max_bytes // size_bytes((newest.rgb, newest.mask))))
 
     @property
     def oldest(self) -> int:
@@ -201,15 +199,10 @@ class FrameCache:
         return min(self._frames, default=0)
 
 
-def _size_bytes(frame: MultiViewFrame) -> int:
-    return frame.rgb.numel() + (0 if frame.mask is None else frame.mask.numel())
-
-
 class RecordedSource(FrameSource):
     """A recording, read on a thread of low priority: the requested frame and the following ones.
 
-    The frames of a `generated` recording (the studio) are made one after the other; only those that exist can be
-    requested.
+    Frames of a `generated` one (the studio) are made one after the other, and can be requested once they exist.
     """
 
     def __init__(
@@ -255,17 +248,14 @@ class RecordedSource(FrameSource):
                 if capture is None:
                     capture = self._open()
                 self._step(capture)
-            except Exception as error:  # reported, and tried again
-                self._fail(f"{type(error).__name__}: {error}"[:400])
+            except Exception as error:  # reported, in the log unless it is the same as before, and tried again
+                reason = f"{type(error).__name__}: {error}"[:400]
+                if self.status.error != reason:
+                    log.warning("while reading: %s", reason)
+                self.status = replace(self.status, state="failing", error=reason)
+                self.changed()
                 with self._lock:
                     self._lock.wait_for(lambda: self._stopped, RETRY_S)
-
-    def _fail(self, reason: str) -> None:
-        """Report an error by the status, and in the log unless it is the same as before."""
-        if self.status.error != reason:
-            log.warning("while reading: %s", reason)
-        self.status = replace(self.status, state="failing", error=reason)
-        self.changed()
 
     def _open(self) -> CaptureSource:
         capture = self._open_capture()

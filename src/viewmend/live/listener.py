@@ -49,11 +49,7 @@ class Server:
 
     @contextlib.contextmanager
     def bind(self) -> Iterator[str]:
-        """Take the port; gives the server's address.
-
-        Raises:
-            OSError: the port is in use.
-        """
+        """Take the port; gives the server's address. OSError if the port is in use."""
         family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
         # With the protocol given, asyncio sets TCP_NODELAY on accepted connections: small answers leave at once.
         with socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:

@@ -103,10 +103,8 @@ def view_camera(asked: Camera, home: HomeView, size_px: tuple[int, int], scale: 
 def stereo_pair(camera: Cameras, apart_m: float, center: Float[Tensor, "3"]) -> tuple[Cameras, Cameras]:
     """The parallel left and right eye of a stereo camera.
 
-    Their principal points are shifted so that both show the depth of `center` at the same pixel, which is the distance
-    at which a screen appears.
-
-    If `center`, in metres, is behind the camera, the eyes converge at infinity.
+    Their principal points are shifted so that both show the depth of `center` (metres) at the same pixel, which is
+    where a screen appears; if it is behind the camera, the eyes converge at infinity.
     """
     z = float(camera.camera_from_world[0, 2, :3] @ center.to(camera.K) + camera.camera_from_world[0, 2, 3])
     eyes = []

@@ -200,13 +200,6 @@ class ShowView(Struct, frozen=True):
     mode: Mode | None = None
 
 
-def show_json(**given: Any) -> dict[str, Any]:
-    """The message `show` with those values that are not None; ProtocolError if one is out of range."""
-    given = {key: value for key, value in given.items() if value is not None}
-    read_message(given, ShowView)
-    return {"type": "show"} | given
-
-
 def parse(text: str, limits: Limits) -> Message:
     """Parse a client's message; ProtocolError if it is malformed or exceeds the limits."""
     if len(text) > limits.max_message_bytes:

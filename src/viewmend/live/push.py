@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -40,7 +41,7 @@ MAX_PIXELS = 64_000_000
 IMAGE_BYTES = 65_536
 """Bytes of an encoded image in addition to four per pixel."""
 MAX_FRAME_BYTES = 8 + HEADER_BYTES + 4 * MAX_PIXELS + MAX_CAMERAS * IMAGE_BYTES
-"""Of any rig; `_max_frame_bytes` is a rig's own limit."""
+"""Of any rig; a rig's own limit is that of its images."""
 SILENT_S = 30.0
 """A rig that sends nothing for this long is disconnected."""
 ImageSide = Annotated[int, Meta(ge=8, le=16384)]
@@ -108,7 +109,8 @@ async def receive_rig(socket: WebSocket, source: PushSource) -> None:
             index = None
             if cameras is None or message.get("text"):  # a rig may change while it pushes
                 cameras = await asyncio.to_thread(_begin_rig, message.get("text") or "", source)
-                authenticate(socket, _max_frame_bytes(cameras))
+                image_bytes = 4 * int(cameras.size_px.prod(1).sum()) + IMAGE_BYTES * len(cameras)
+                authenticate(socket, 8 + HEADER_BYTES + image_bytes)
             else:  # decoded on a thread, so that other messages need not wait
                 data = message.get("bytes") or b""
                 frame = await asyncio.to_thread(_decode_frame, data, cameras, lambda: is_gone(socket))
@@ -191,11 +193,6 @@ def _begin_rig(text: str, source: PushSource) -> Cameras:
     return Cameras(tuple(c.name for c in rig.cameras), K.view(-1, 3, 3), rigid(R.view(-1, 3, 3), T), size_px)
 
 
-def _max_frame_bytes(cameras: Cameras) -> int:
-    """The largest message that a frame of this rig may be."""
-    return 8 + HEADER_BYTES + 4 * int(cameras.size_px.prod(1).sum()) + IMAGE_BYTES * len(cameras)
-
-
 def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], bool]) -> MultiViewFrame | None:
     """One frame from its JPEGs and PNGs; cameras that lack the image or the mask are left out. None if cancelled.
 
@@ -227,8 +224,6 @@ def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], b
 
 
 def _decode_image(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[np.ndarray, "height width *channel"]:
-    import cv2
-
     width, height = cameras.size_px[cameras.names.index(name)].tolist()
     expected = f"camera '{name}': expected {kind} of {width} x {height} pixels"
     if not data.startswith((b"\x89PNG", b"\xff\xd8")):
@@ -237,8 +232,8 @@ def _decode_image(data: bytes, name: str, kind: str, cameras: Cameras) -> UInt8[
         raise ProtocolError(f"{expected}, got {size_px[0]} x {size_px[1]}")
     flags = cv2.IMREAD_COLOR_RGB if kind == "rgb" else cv2.IMREAD_GRAYSCALE
     image = decode_image(data, flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.shape[:2] != (height, width):
-        raise ProtocolError(
-            f"{expected}, got {'no image' if image is None else f'{image.shape[1]} x {image.shape[0]}'}"
-        )
+    if image is None:
+        raise ProtocolError(f"{expected}, got no image")
+    if image.shape[:2] != (height, width):
+        raise ProtocolError(f"{expected}, got {image.shape[1]} x {image.shape[0]}")
     return image

@@ -88,11 +88,6 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
         """The names in `without`."""
         return tuple(name.strip() for name in self.without.split(",") if name.strip())
 
-    @property
-    def pose(self) -> Camera:
-        """The view's camera."""
-        return Camera(azimuth=self.azimuth, elevation=self.elevation, distance=self.distance, fov_y=self.fov_y)
-
 
 class SourceImageQuery(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The query of `GET /camera.jpg`."""
@@ -149,18 +144,15 @@ class PathBody(ViewOptions, frozen=True, kw_only=True):
             raise ProtocolError(f"expected a time for each of {len(self.poses)} poses, got {len(self.times)}")
 
 
-def parse_query(query: dict[str, str], limits: Limits) -> ImageQuery:
-    """Parse the query of an image; ProtocolError if it is malformed or the image is too large."""
-    asked: ImageQuery = read_message(query, ImageQuery, strict=False)
-    limits.check_size(asked.width, asked.height)
-    return asked
-
-
 def parse_path(body: bytes | bytearray, limits: Limits) -> PathBody:
     """Parse the body of a request for a video; ProtocolError if it is malformed or the images are too large."""
     asked: PathBody = read_message(bytes(body), PathBody)
     limits.check_size(asked.width, asked.height, 1 if asked.stereo_m is None else 2)
     return asked
+
+
+class RenderError(RuntimeError):
+    """A view of a job could not be rendered."""
 
 
 class RenderJob(ABC, Generic[Result]):
@@ -170,10 +162,7 @@ class RenderJob(ABC, Generic[Result]):
         self.viewer: State | None = None
         self.done: Future[Result] = Future()
 
-    @property
-    def wants_views(self) -> bool:
-        """Always."""
-        return True
+    wants_views = True
 
     @abstractmethod
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
@@ -203,9 +192,9 @@ class RenderJob(ABC, Generic[Result]):
             self.done.set_result(result)
 
     def fail(self, message: str) -> None:
-        """Set a RuntimeError, unless the job was cancelled."""
+        """Set a RenderError, unless the job was cancelled."""
         with suppress(InvalidStateError):
-            self.done.set_exception(RuntimeError(message))
+            self.done.set_exception(RenderError(message))
 
 
 class ImageJob(RenderJob[tuple[bytes, RenderResult]]):
@@ -217,12 +206,11 @@ class ImageJob(RenderJob[tuple[bytes, RenderResult]]):
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The view; None while its frame is being read."""
-        index = playback.edge if self._asked.time == "live" else self._asked.time
-        return None if self.done.done() else self._request(index, playback)
-
-    def _request(self, index: float | int, playback: PlaybackState) -> RenderRequest | None:
-        request = request_view(self._asked, self._asked.pose, index, playback)
+        if self.done.done():
+            return None
         asked = self._asked
+        pose = Camera(azimuth=asked.azimuth, elevation=asked.elevation, distance=asked.distance, fov_y=asked.fov_y)
+        request = request_view(asked, pose, playback.edge if asked.time == "live" else asked.time, playback)
         return None if request is None else replace(request, without=asked.left_out, truth=asked.camera)
 
     def encode(self, result: RenderResult) -> None:
@@ -285,11 +273,7 @@ def draw_eyes(asked: ViewOptions, result: RenderResult) -> Image:
 
 
 def source_jpeg(frame: MultiViewFrame, name: str) -> bytes:
-    """A camera's undistorted image as JPEG.
-
-    Raises:
-        ProtocolError: the frame has no such camera.
-    """
+    """A camera's undistorted image as JPEG; ProtocolError if the frame has no such camera."""
     if name not in frame.cameras.names:
         raise ProtocolError(
             f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got another"

@@ -199,11 +199,7 @@ class Renderer:
         return RenderResult(request.time, tuple(completed), views[0].viewer, times, self.background, extra, psnr_db)
 
     def left_out(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Those of these names that are cameras of the rig, in its order.
-
-        Raises:
-            ValueError: fewer than two cameras are left.
-        """
+        """Those of these names that are cameras of the rig, in its order; ValueError if fewer than two are left."""
         own = [camera["name"] for camera in (self.rig_json or {"cameras": []})["cameras"]]
         if names and len(set(own) - set(names)) < 2:
             raise ValueError(f"expected two input cameras or more, got {len(set(own) - set(names))}; leave out fewer")
@@ -212,16 +208,14 @@ class Renderer:
     def make_assets(self, frame: MultiViewFrame, without: tuple[str, ...] = ()) -> FrameAssets:
         """What a page needs to draw views of a frame without some of its cameras; callable from any thread.
 
-        Raises:
-            ValueError: the frame has no geometry.
+        ValueError if the frame has no geometry.
         """
         return make_assets(frame.without(without), self.geometry(frame, without), self._config.render)
 
     def geometry(self, frame: MultiViewFrame, without: tuple[str, ...] = ()) -> GeometryProxy:
         """The proxy of a frame without some of its cameras, on the CPU; callable from any thread.
 
-        Raises:
-            ValueError: the frame has no geometry, or no rig has been prepared yet.
+        ValueError if the frame has no geometry, or no rig has been prepared yet.
         """
         shared = None if without else self._source.read_cached(frame.time)
         if shared is not None and isinstance(shared.proxy, GeometryProxy):
@@ -249,18 +243,15 @@ class Renderer:
         if key not in self._variants:
             inpainter, errors = self._inpainter, self._error_model
             if model is not None:  # by the error rule that it is made for
-                inpainter, errors = self._load(model), errors if errors is not None else self._inpainter
+                if model not in self._models:
+                    self._models[model] = load_inpainter(model, self._device)
+                inpainter, errors = self._models[model], errors if errors is not None else self._inpainter
                 config = replace(config, render=replace(config.render, error_rule=None))
             self._variants[key] = Stream(inpainter, config, self._stream.bounds, errors)
         self._variants.move_to_end(key)
         while len(self._variants) > MAX_VARIANTS:
             self._variants.popitem(last=False)
         return self._variants[key]
-
-    def _load(self, model: str) -> Inpainter:
-        if model not in self._models:
-            self._models[model] = load_inpainter(model, self._device)
-        return self._models[model]
 
     def _complete_by(
         self, model: str, cached: CachedFrame, camera: Cameras, without: tuple[str, ...], quality: RenderQuality
@@ -325,16 +316,13 @@ class Renderer:
 
     def _view(self, stream: Stream, camera: Cameras, viewer: State, index: int, quality: RenderQuality) -> StreamView:
         """One view; with its holes if the model fails."""
+        if not quality.mend:
+            return stream.view(camera, viewer, index, quality)
         try:
-            view = stream.view(camera, viewer, index, quality)
+            view, self.model_error = stream.view(camera, viewer, index, quality), None
         except CancelledError:
             raise
         except Exception as error:
-            if not quality.mend:
-                raise
             view = stream.view(camera, viewer, index, replace(quality, mend=False))
             self.model_error = f"{type(error).__name__}: {error}"[:400]
-        else:
-            if quality.mend:
-                self.model_error = None
         return view

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from starlette.requests import ClientDisconnect, Request
@@ -37,26 +36,18 @@ MEDIA_TYPES = {
 }
 
 
-@dataclass(frozen=True)
-class PageFile:
-    """A file of the page."""
-
-    content: bytes
-    media_type: str
-
-
-def page_files() -> dict[str, PageFile]:
+def page_files() -> dict[str, Asset]:
     """All files of `viewmend/live/page` by their relative path, read once: requests can name no other file."""
     root = Path(__file__).parent / "page"
     paths = [path.relative_to(root) for path in root.rglob("*") if path.is_file()]
     return {
-        path.as_posix(): PageFile((root / path).read_bytes(), MEDIA_TYPES.get(path.suffix, "application/octet-stream"))
+        path.as_posix(): Asset((root / path).read_bytes(), MEDIA_TYPES.get(path.suffix, "application/octet-stream"))
         for path in paths
         if not any(part.startswith((".", "_")) for part in path.parts)
     }
 
 
-def error_response(status: int, message: str | None) -> Response:
+def error_response(status: int, message: str) -> Response:
     """An error message as JSON."""
     return JSONResponse({"error": message}, status, headers={"Cache-Control": "no-store"})
 
@@ -73,11 +64,7 @@ def asset_response(request: Request, asset: Asset, is_final: bool) -> Response:
 
 
 async def read_body(request: Request) -> bytearray | None:
-    """Read the body of a request; None if it is too large.
-
-    Raises:
-        ProtocolError: the body is incomplete, or does not arrive in time.
-    """
+    """The body of a request; None if it is too large, ProtocolError if it is incomplete or does not arrive in time."""
     body = bytearray()
     try:
         async with asyncio.timeout(BODY_S):

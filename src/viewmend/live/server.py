@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import functools
 import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -18,7 +19,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
 from viewmend.geometry.orbit import coarse_surface
-from viewmend.live.assets import AssetQuery, AssetStore, BusyError
+from viewmend.live.assets import NOT_IN_TIME, AssetQuery, AssetStore, BusyError, wait_for_frame
 from viewmend.live.auth import AccessControl
 from viewmend.live.connection import Extension, SessionRegistry, ViewerConnection
 from viewmend.live.connection_limits import authenticate
@@ -26,14 +27,15 @@ from viewmend.live.protocol import HEADER_BYTES, Limits, ProtocolError, read_mes
 from viewmend.live.push import PushSource, receive_rig
 from viewmend.live.render_jobs import (
     ImageJob,
+    ImageQuery,
     PathJob,
+    RenderError,
     RenderJob,
     Result,
     SourceImageQuery,
     TurntableQuery,
     frame_motion,
     parse_path,
-    parse_query,
     source_jpeg,
 )
 from viewmend.live.responses import (
@@ -48,7 +50,6 @@ from viewmend.live.responses import (
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 from viewmend.models.checkpoint import shipped_models
-from viewmend.types import MultiViewFrame
 from viewmend.utils.plugins import import_object
 
 IMAGE_S, SOURCE_IMAGE_S, EXPORT_S = 60.0, 5.0, 3600.0
@@ -87,12 +88,7 @@ ExtensionFactory = Callable[[RenderService, ServerConfig], Extension]
 
 
 def load_extension(name: str, value: Any) -> ExtensionFactory:
-    """Prepare an optional part of the server with the value of its option.
-
-    Raises:
-        ValueError: the value is malformed, or a package is missing.
-        OSError: a port is in use.
-    """
+    """Prepare an optional part of the server with the value of its option; ValueError or OSError if that cannot be."""
     return import_object(EXTENSIONS[name])(value)
 
 
@@ -104,7 +100,7 @@ class LiveServer:
         self._access = AccessControl(config.host, config.token, config.public_url)
         self._files = page_files()
         self.assets = AssetStore(service.source.read, service.renderer.make_assets)
-        self._num_images = 0
+        self._images = asyncio.Semaphore(MAX_IMAGES)
         self._is_exporting = False
         self._path_job: PathJob | None = None
         self._is_pushing = False
@@ -129,7 +125,7 @@ class LiveServer:
         routes: list[BaseRoute] = [
             Route("/", page),
             Route("/page/{name:path}", page),
-            Route("/watch", self._guard(self._watch, needs_token=False)),
+            Route("/watch", self._guard(functools.partial(self._page, name="watch.html"), needs_token=False)),
             Route("/health", self._guard(self._health)),
             Route("/metrics", self._guard(self._metrics)),
             Route("/frame.jpg", self._guard(self._image)),
@@ -176,17 +172,15 @@ class LiveServer:
                 return await handler(request)
             except ProtocolError as error:
                 return error_response(400, str(error))
+            except BusyError as error:
+                return error_response(429, str(error))
+            except (TimeoutError, RenderError) as error:
+                return error_response(503, str(error))
 
         return guarded
 
-    async def _page(self, request: Request) -> Response:
-        return self._page_file(request.path_params.get("name", "index.html"))
-
-    async def _watch(self, request: Request) -> Response:
-        return self._page_file("watch.html")
-
-    def _page_file(self, name: str) -> Response:
-        file = self._files.get(name)
+    async def _page(self, request: Request, name: str = "index.html") -> Response:
+        file = self._files.get(request.path_params.get("name", name))
         if file is None:
             return error_response(404, "the page has no such file")
         return Response(file.content, media_type=file.media_type, headers=HEADERS)
@@ -213,61 +207,40 @@ class LiveServer:
         return PlainTextResponse(metrics_text(self.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _image(self, request: Request) -> Response:
-        asked = parse_query(dict(request.query_params), self._config.limits)
-        self._check_cameras(asked.camera, asked.left_out)
-        if self._num_images >= MAX_IMAGES:
-            return error_response(429, TOO_MANY_IMAGES)
-        job = ImageJob(asked)
-        self._num_images += 1
-        try:
-            image, result = await self._wait(request, job, IMAGE_S)
-        except (TimeoutError, RuntimeError) as error:
-            return error_response(503, str(error) or "the frame was not available in time; see /health")
-        finally:
-            self._num_images -= 1
+        asked: ImageQuery = read_message(dict(request.query_params), ImageQuery, strict=False)
+        self._config.limits.check_size(asked.width, asked.height)
+        renderer = self._service.renderer
+        if renderer.rig_json is not None:
+            names = [camera["name"] for camera in renderer.rig_json["cameras"]]
+            if asked.camera is not None and asked.camera not in names:
+                raise ProtocolError(f"expected a camera among {', '.join(names)[:200]}, got another")
+            try:
+                renderer.left_out(asked.left_out)
+            except ValueError as error:
+                raise ProtocolError(str(error)) from None
+        async with self._image_slot():
+            image, result = await self._wait(request, ImageJob(asked), IMAGE_S, NOT_IN_TIME)
         timing = ", ".join(f"{stage};dur={ms:.1f}" for stage, ms in vars(result.times).items())
         headers = {"Server-Timing": timing, "X-Viewmend-Time": str(result.time), "Cache-Control": "no-store"}
         if result.psnr_db is not None:
             headers["X-Viewmend-PSNR"] = f"{result.psnr_db:.3f}"
         return Response(image, media_type="image/jpeg", headers=headers)
 
-    def _check_cameras(self, camera: str | None, without: tuple[str, ...]) -> None:
-        """Raise a ProtocolError if a camera is not the rig's, or too few are left."""
-        renderer = self._service.renderer
-        if renderer.rig_json is None:
-            return
-        names = [known["name"] for known in renderer.rig_json["cameras"]]
-        if camera is not None and camera not in names:
-            raise ProtocolError(f"expected a camera among {', '.join(names)[:200]}, got another")
-        try:
-            renderer.left_out(without)
-        except ValueError as error:
-            raise ProtocolError(str(error)) from None
+    def _image_slot(self) -> asyncio.Semaphore:
+        """A context for one of the images that are rendered at a time; BusyError if there is none left."""
+        if self._images.locked():
+            raise BusyError(TOO_MANY_IMAGES)
+        return self._images
 
     async def _source_image(self, request: Request) -> Response:
         asked: SourceImageQuery = read_message(dict(request.query_params), SourceImageQuery, strict=False)
-        if self._num_images >= MAX_IMAGES:
-            return error_response(429, TOO_MANY_IMAGES)
-        source = self._service.source
-        index = int(source.span.clamp(source.edge if asked.time == "live" else asked.time))
-        self._num_images += 1
-        try:
-            image = await asyncio.to_thread(source_jpeg, await self._frame(index), asked.name)
-        except TimeoutError as error:
-            return error_response(503, str(error))
-        finally:
-            self._num_images -= 1
+        async with self._image_slot():
+            source = self._service.source
+            index = int(source.span.clamp(source.edge if asked.time == "live" else asked.time))
+            frame = await wait_for_frame(source.read, index, SOURCE_IMAGE_S)
+            image = await asyncio.to_thread(source_jpeg, frame, asked.name)
         headers = {"X-Viewmend-Time": str(index), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
-
-    async def _frame(self, index: int) -> MultiViewFrame:
-        """A frame of the source; TimeoutError if it is not read in time."""
-        end = time.monotonic() + SOURCE_IMAGE_S
-        while (frame := self._service.source.read(index)) is None:
-            if time.monotonic() > end:
-                raise TimeoutError("the frame was not available in time; see /health")
-            await asyncio.sleep(0.05)
-        return frame
 
     async def _turntable(self, request: Request) -> Response:
         asked: TurntableQuery = read_message(dict(request.query_params), TurntableQuery, strict=False)
@@ -275,21 +248,17 @@ class LiveServer:
         source, home = self._service.source, self._service.renderer.home
         if home is None or source.rig is None:
             return error_response(503, "there is no frame yet; see /health")
-        if self._num_images >= MAX_IMAGES:
-            return error_response(429, TOO_MANY_IMAGES)
-        self._num_images += 1
         points = []
-        try:
+        async with self._image_slot():
             for index in asked.moments(source.span):
-                frame = await self._frame(index)
+                frame = await wait_for_frame(source.read, index, SOURCE_IMAGE_S)
                 assert frame.mask is not None, "frames with geometry have masks"
-                points.append(await asyncio.to_thread(coarse_surface, frame.mask, frame.cameras, source.rig.bounds))
+                try:
+                    points.append(await asyncio.to_thread(coarse_surface, frame.mask, frame.cameras, source.rig.bounds))
+                except ValueError as error:
+                    return error_response(503, str(error))
                 if await request.is_disconnected():
                     break
-        except (TimeoutError, ValueError) as error:
-            return error_response(503, str(error))
-        finally:
-            self._num_images -= 1
         fitted = frame_motion(asked, torch.cat(points), home)
         return JSONResponse(fitted, headers={"Cache-Control": "no-store"})
 
@@ -302,10 +271,6 @@ class LiveServer:
         try:
             without = self._service.renderer.left_out(asked.without.split(","))
             made = await self.assets.get(asked.time, version, without)
-        except BusyError as error:
-            return error_response(429, str(error))
-        except TimeoutError as error:
-            return error_response(503, str(error))
         except ValueError as error:
             return error_response(404, f"this frame has no geometry: {error}"[:400])
         if asked.camera is not None and asked.camera >= len(made.images):
@@ -328,22 +293,20 @@ class LiveServer:
             # Parsed on a thread, as a megabyte of JSON would block the event loop.
             job = PathJob(await asyncio.to_thread(parse_path, body, self._config.limits))
             self._path_job = job
-            video = await self._wait(request, job, EXPORT_S)
-        except (TimeoutError, RuntimeError) as error:
-            return error_response(503, str(error) or "the path took too long; request fewer poses")
+            video = await self._wait(request, job, EXPORT_S, "the path took too long; request fewer poses")
         finally:
             self._is_exporting, self._path_job = False, None
         return Response(video, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
-    async def _wait(self, request: Request, job: RenderJob[Result], limit_s: float) -> Result:
-        """The result of a job, which is cancelled if its client disconnects."""
+    async def _wait(self, request: Request, job: RenderJob[Result], limit_s: float, late: str) -> Result:
+        """The result of a job; TimeoutError with the message `late` after the limit, or if the client disconnects."""
         self._service.join(job)
         end, result = time.monotonic() + limit_s, asyncio.wrap_future(job.done)
         try:
             while not result.done():
                 await asyncio.wait([result], timeout=0.5)
                 if not result.done() and (time.monotonic() > end or await request.is_disconnected()):
-                    raise TimeoutError
+                    raise TimeoutError(late)
             return result.result()
         finally:
             self._service.leave(job)

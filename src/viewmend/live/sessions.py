@@ -53,7 +53,6 @@ class Session(Protocol):
 
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The view to render now; None for none."""
-        ...
 
     def deliver(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Encode and pass on a view; returns the times of all stages."""
@@ -61,7 +60,6 @@ class Session(Protocol):
 
     def fail(self, message: str) -> None:
         """Report that the view could not be rendered."""
-        ...
 
     @property
     def is_cancelled(self) -> bool:
@@ -70,7 +68,6 @@ class Session(Protocol):
 
     def give_up(self) -> None:
         """Note that the view was not rendered, because it was cancelled."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -111,10 +108,10 @@ class ViewerSession:
         self.rendered_level = FULL
         """The level of the last view, after the limit on its resolution."""
         self._ladder = ladder
-        self._budget_ms = budget_ms
         self._send, self._report_error, self._now = send, report_error, now
         self._frame_numbers = count()
-        self._look: Look | None = None
+        self.newest_look: Look | None = None
+        """The view to show; None before the first look, and after it was cancelled."""
         self._look_at = 0.0
         self._advanced_at = now()
         self._requested: tuple[Look | None, int] = (None, -1)
@@ -131,21 +128,18 @@ class ViewerSession:
 
     def look(self, look: Look) -> None:
         """Set the view to show; a look that was not rendered yet is dropped."""
-        if self._look is not self._requested[0]:
+        if self.newest_look is not self._requested[0]:
             self.dropped += 1
-        self._look, self._look_at = look, self._now()
+        self.newest_look, self._look_at = look, self._now()
         self._cancel_final_view()
         self._encoders.key_frame |= look.key  # kept until a frame is encoded, even if this look is dropped
 
     def cancel(self) -> None:
         """Drop the look, and the view that is being rendered for it."""
-        self._look, self.is_cancelled = None, True
+        self.newest_look, self.is_cancelled = None, True
 
     def _cancel_final_view(self) -> None:
-        """Give up the view that is being rendered if only a resting viewer has use for it.
-
-        Views of a movement are finished, as they show it best: each would be replaced before it is done.
-        """
+        """Give up the view that is being rendered if only a resting viewer has use for it; others show a movement."""
         look = self._requested[0]
         self.is_cancelled |= look is not None and (look.full or self._is_refined)
 
@@ -156,12 +150,7 @@ class ViewerSession:
     @property
     def wants_views(self) -> bool:
         """Whether there is a look; pages that draw by themselves have none while they move."""
-        return self._look is not None
-
-    @property
-    def newest_look(self) -> Look | None:
-        """The view to show; None before the first look."""
-        return self._look
+        return self.newest_look is not None
 
     def frame(self, span: Span, edge: float) -> int:
         """The index of the frame to show now; -1 while there is none."""
@@ -178,7 +167,7 @@ class ViewerSession:
 
     def is_active(self, now: float) -> bool:
         """Whether a frame was sent within the last second, or the newest look waits for its first one."""
-        waits = self.in_flight is None and self._look is not None and self._look is not self._requested[0]
+        waits = self.in_flight is None and self.newest_look is not None and self.newest_look is not self._requested[0]
         return waits or self.sent_since(now - 1)
 
     def sent_since(self, since_s: float) -> bool:
@@ -193,7 +182,7 @@ class ViewerSession:
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the clock's frame, or the same view again at a better level."""
         self.buffering = False
-        if (look := self._look) is None or self.in_flight is not None:
+        if (look := self.newest_look) is None or self.in_flight is not None:
             return None
         if (index := self.frame(playback.span, playback.edge)) < 0:
             return None
@@ -244,14 +233,12 @@ class ViewerSession:
     def _choose_level(self, look: Look, active_viewers: int) -> QualityLevel:
         if look.full:
             return FULL
-        if self.budget is not None and self._budget_ms is not None:
-            self.budget.target_ms = self._budget_ms / max(1, active_viewers)
-            level = self.budget.level
-        else:
+        if self.budget is None:
             level = self._ladder.moving if look.moving else FULL
-        if not look.adaptive:
-            return replace(level, scale=1.0)
-        return level if self.budget is None else replace(level, scale=level.scale * min(1.0, 1 / self._enlarged(look)))
+            return level if look.adaptive else replace(level, scale=1.0)
+        self.budget.target_ms = self.budget.budget_ms / active_viewers
+        level = self.budget.level
+        return replace(level, scale=level.scale * min(1.0, 1 / self._enlarged(look)) if look.adaptive else 1.0)
 
     def _enlarged(self, look: Look) -> float:
         """Ratio of the side lengths of this look's image to those of a moving one."""

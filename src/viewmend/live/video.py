@@ -41,12 +41,9 @@ class VideoStream:
         self._count = 0
 
     def encode(self, image: UInt8[np.ndarray, "height width 3"], codec: str, key: bool) -> tuple[bytes, bool]:
-        """Encode an RGB image, as a key frame if `key`.
+        """Encode an RGB image, as a key frame if `key`; returns one chunk, and whether it is a key frame.
 
         Images with odd sides are padded to the right and below by their last column and row.
-
-        Returns:
-            The frame as one chunk, and whether it is a key frame.
         """
         from av import VideoFrame
         from av.video.frame import PictureType

@@ -1,7 +1,6 @@
 """The live server from Python: a script or a notebook starts it, and says what its pages show."""
 
 import threading
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from viewmend.data.source import CaptureSource
 from viewmend.geometry.cameras import Cameras
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.poses import cameras_json
-from viewmend.live.protocol import show_json, token_query
+from viewmend.live.protocol import ShowView, read_message, token_query
 from viewmend.live.renderer import Renderer
 from viewmend.models.base import Inpainter
 from viewmend.models.registry import default_method, error_model_for, make_method
@@ -31,20 +30,26 @@ class Viewer:
         'Viewer'
     """
 
-    def __init__(
-        self, address: str, show: Callable[[dict[str, Any]], None], run: Callable[[], None], stop: Callable[[], None]
-    ) -> None:
-        """Start a bound server on a thread; `serve` does it.
+    def __init__(self, renderer: Renderer, source: RecordedSource, **address: Any) -> None:
+        """Start a server on a thread, which `serve` does; the other arguments are those of `ServerConfig`.
 
-        Args:
-            address: what a browser opens.
-            show: sends a message to all pages.
-            run: serves until `stop` is called.
-            stop: ends `run`, from any thread.
+        Raises:
+            OSError: the port is in use.
         """
-        self.address = address
+        from viewmend.live.listener import Server
+        from viewmend.live.server import LiveServer, ServerConfig
+        from viewmend.live.service import RenderService
+
+        config, port = ServerConfig(**address), ExitStack()
+        self._live = LiveServer(RenderService(renderer, source), config)
+        self._server = Server(self._live, config)
+        self.address = f"{port.enter_context(self._server.bind())}/{token_query(config.token)}"
         """What a browser opens, with the token if there is one."""
-        self._show, self._stop = show, stop
+
+        def run() -> None:
+            with port:
+                self._server.run()
+
         self._thread = threading.Thread(target=run, name="server", daemon=True)
         self._thread.start()
 
@@ -79,7 +84,10 @@ class Viewer:
             raise ValueError(f"expected a camera or {', '.join(given)}, got both; give one of them")
         if camera is not None:
             given = {name: cameras_json(camera)[0][name] for name in ("R", "T")}
-        self._show(show_json(pose=given or None, time=time, mode=mode))
+        values = {"pose": given or None, "time": time, "mode": mode}
+        shown = {key: value for key, value in values.items() if value is not None}
+        read_message(shown, ShowView)
+        self._live.registry.shown = {"type": "show"} | shown
 
     def wait(self) -> None:
         """Return once the server has stopped: by `close`, on another thread."""
@@ -88,7 +96,7 @@ class Viewer:
 
     def close(self) -> None:
         """Stop the server."""
-        self._stop()
+        self._server.stop()
         self._thread.join(STOP_S)
 
     def __enter__(self) -> "Viewer":
@@ -142,22 +150,4 @@ def serve(
     inpainter = model if isinstance(model, Inpainter) else make_method(name, device)
     source = RecordedSource(lambda: opened)
     renderer = Renderer(source, inpainter, config, device, error_model_for(inpainter, device))
-    return _start(renderer, source, host=host, port=port, token=token, budget_ms=budget_ms, model=name)
-
-
-def _start(renderer: Renderer, source: RecordedSource, **address: Any) -> Viewer:
-    """Serve on a thread; the other arguments are those of `ServerConfig`."""
-    from viewmend.live.listener import Server
-    from viewmend.live.server import LiveServer, ServerConfig
-    from viewmend.live.service import RenderService
-
-    settings = ServerConfig(**address)
-    live, stack = LiveServer(RenderService(renderer, source), settings), ExitStack()
-    server = Server(live, settings)
-    bound = stack.enter_context(server.bind())
-
-    def run() -> None:
-        with stack:
-            server.run()
-
-    return Viewer(f"{bound}/{token_query(settings.token)}", live.registry.show, run, server.stop)
+    return Viewer(renderer, source, host=host, port=port, token=token, budget_ms=budget_ms, model=name)
