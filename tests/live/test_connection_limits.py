@@ -115,6 +115,14 @@ class Timers:
 
     def __init__(self, clock):
         self.clock, self.planned = clock, []
+        self.limits = ConnectionLimits(clock)
+        self.limits.scheduler = FairScheduler(clock, self.call_later)
+
+    async def run(self):
+        """Run all timers, and the callbacks that they cause."""
+        while self.planned:
+            self.run_next()
+            await settle()
 
     def call_later(self, delay_s, callback):
         self.planned.append((self.clock() + delay_s, callback))
@@ -170,16 +178,12 @@ def test_turns_are_taken_one_at_a_time_with_pauses_and_new_connections_first():
 
 @in_own_loop
 async def test_unauthenticated_input_is_handed_on_in_pieces_and_bounded():
-    all_limits = ConnectionLimits(clock := FakeClock())
-    timers = Timers(clock)
-    all_limits.scheduler = FairScheduler(clock, timers.call_later)
-    connection, transport = await connect(all_limits)
+    timers = Timers(FakeClock())
+    connection, transport = await connect(timers.limits)
     head = b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 10_000 + b"\r\n\r\n"
     connection.data_received(head)
     assert not transport.reading and not transport.written
-    while timers.planned:
-        timers.run_next()
-        await settle()
+    await timers.run()
     assert transport.written.startswith(b"HTTP/1.1 200") and transport.reading
     connection.data_received(b"x" * limits.MAX_UNAUTHENTICATED_BYTES)
     assert transport.closed
@@ -187,17 +191,13 @@ async def test_unauthenticated_input_is_handed_on_in_pieces_and_bounded():
 
 @in_own_loop
 async def test_a_turn_that_comes_after_the_client_was_authenticated_is_empty():
-    all_limits = ConnectionLimits(FakeClock())
-    timers = Timers(all_limits.now)
-    all_limits.scheduler = FairScheduler(all_limits.now, timers.call_later)
-    all_limits.scheduler.submit(lambda: None, True)
-    connection, transport = await connect(all_limits)
+    timers = Timers(FakeClock())
+    timers.limits.scheduler.submit(lambda: None, True)
+    connection, transport = await connect(timers.limits)
     connection.data_received(GET)
     connection.authenticate(0)
     await settle()
-    while timers.planned:
-        timers.run_next()
-        await settle()
+    await timers.run()
     assert transport.written.count(b"HTTP/1.1 200") == 1
     connection.data_received(GET)
     await settle()
@@ -206,24 +206,20 @@ async def test_a_turn_that_comes_after_the_client_was_authenticated_is_empty():
 
 @in_own_loop
 async def test_a_request_is_answered_in_its_turn_and_dropped_if_its_client_has_gone():
-    all_limits, answered = ConnectionLimits(FakeClock()), []
-    timers = Timers(all_limits.now)
-    all_limits.scheduler = FairScheduler(all_limits.now, timers.call_later)
+    timers, answered = Timers(FakeClock()), []
 
     async def app(scope, receive, send):
         answered.append(scope["path"])
         await answer(scope, receive, send)
 
-    connections = [await connect(all_limits, app) for _ in range(3)]
+    connections = [await connect(timers.limits, app) for _ in range(3)]
     for (connection, _), path in zip(connections, (b"a", b"b", b"c"), strict=True):
         connection.data_received(b"GET /" + path + b" HTTP/1.1\r\nHost: x\r\n\r\n")
     gone, transport = connections[1]
     transport.close()
     gone.connection_lost(None)
-    while timers.planned:
-        timers.run_next()
-        await settle()
-    assert sorted(answered) == ["/a", "/c"] and gone not in all_limits.connections
+    await timers.run()
+    assert sorted(answered) == ["/a", "/c"] and gone not in timers.limits.connections
     assert [connection.requests for connection, _ in connections] == [0, 0, 0]
 
 

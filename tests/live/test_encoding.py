@@ -6,14 +6,7 @@ import torch
 from live.live_servers import decode, get, running
 
 from viewmend.live.client import Client
-from viewmend.live.encoding import (
-    COLOURS,
-    draw_mode,
-    mean_confidence,
-    pack_depth,
-    surface_depth,
-    unpack_depth,
-)
+from viewmend.live.encoding import COLOURS, draw_mode, mean_confidence, pack_depth, surface_depth, unpack_depth
 from viewmend.models.smooth_fill import SmoothFill
 
 
@@ -66,12 +59,8 @@ def test_depth_comes_back_where_it_was_taken(size, stride):
     depth[rows < columns / 2] = 0
     packed = pack_depth(depth, stride)
     back = unpack_depth(packed)
-    expected = np.zeros((packed.height, packed.width))
-    for i in range(packed.height):
-        for j in range(packed.width):
-            expected[i, j] = depth[
-                min(stride * i + stride // 2, size[0] - 1), min(stride * j + stride // 2, size[1] - 1)
-            ]
+    taken = ([min(stride * n + stride // 2, side - 1) for n in range(-(-side // stride))] for side in size)
+    expected = depth.numpy()[np.ix_(*taken)]
     assert back.shape == expected.shape and np.abs(back - expected).max() < 1e-4
 
 

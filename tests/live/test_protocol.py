@@ -52,10 +52,7 @@ def test_every_message_is_parsed():
         ({"type": "look", "width": 2048, "height": 2048}, "at most 2100000 pixels, got 2048 x 2048"),
         ({"type": "look", "width": 1024, "height": 1100, "eyes": [{}, {}]}, "at most 2100000 pixels"),
         ({"type": "look", "width": 99.5}, "a whole number"),
-        (
-            {"type": "look", "modes": ["mended", "mendet"]},
-            'expected rendered or holes or .* or points, got "mendet"',
-        ),
+        ({"type": "look", "modes": ["mended", "mendet"]}, 'expected rendered or holes or .* or points, got "mendet"'),
         ({"type": "look", "error_rule": "some"}, 'error_rule: expected .*, got "some"'),
         ({"type": "look", "modes": []}, "modes: expected a list that is not empty"),
         ({"type": "look", "modes": ["compared"]}, "expected 'model' for the mode 'compared'"),

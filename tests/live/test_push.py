@@ -86,31 +86,42 @@ def rig_message(**changes):
     return json.dumps(rig | changes)
 
 
+CAMERA = cameras_json(CAMERAS)[0]
+# Four cameras have a million pixels, but need a tensor of a billion.
+ODD = [CAMERA | {"name": str(n), "width": (16, 16_000)[n % 2], "height": (16_000, 16)[n % 2]} for n in range(4)]
+
+
 @pytest.mark.parametrize(
-    "message",
+    ("message", "words"),
     [
-        "nonsense",
-        rig_message(version=2),
-        rig_message(cameras=[]),
-        rig_message(cameras=cameras_json(CAMERAS[[0, 0]])),
-        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"width": 16000, "height": 16000}]),
-        rig_message(up=[0, 0, 0]),
-        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"R": [-1, 0, 0, 0, 1, 0, 0, 0, 1]}]),
-        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"K": [-50, 0, 24, 0, 50, 24, 0, 0, 1]}]),
-        rig_message(cameras=[cameras_json(CAMERAS)[0] | {"K": [0] * 9}]),
-        rig_message(bounds={"low": [0, 0, 0], "high": [0, 1, 1]}),
+        ("nonsense", "expected"),
+        (rig_message(version=2), "expected version 1, got 2"),
+        (rig_message(cameras=[]), "expected a list that is not empty"),
+        (rig_message(cameras=[CAMERA] * 2), "expected unique camera names"),
+        (rig_message(cameras=[CAMERA | {"width": 16000, "height": 16000}]), "cameras x widest x highest"),
+        (rig_message(cameras=ODD), "cameras x widest x highest"),
+        (rig_message(up=[0, 0, 0]), "expected 'up' as a direction"),
+        (rig_message(cameras=[CAMERA | {"R": [-1, 0, 0, 0, 1, 0, 0, 0, 1]}]), "expected 'R' as a rotation"),
+        (rig_message(cameras=[CAMERA | {"K": [-50, 0, 24, 0, 50, 24, 0, 0, 1]}]), "expected 'K' as"),
+        (rig_message(cameras=[CAMERA | {"K": [0] * 9}]), "expected 'K' as"),
+        (rig_message(bounds={"low": [0, 0, 0], "high": [0, 1, 1]}), "expected low < high"),
     ],
 )
-def test_invalid_rigs_are_refused(message):
+def test_invalid_rigs_are_refused(message, words):
     with running(PushSource(), ready=False) as server, open_websocket(server, "/push") as bad:
         bad.send(message)
         answer = json.loads(bad.recv(timeout=WAIT_S))
-        assert answer["type"] == "error" and "expected" in answer["message"] and close_code(bad) == 4400
+        assert answer["type"] == "error" and words in answer["message"] and close_code(bad) == 4400
 
 
-def frame_message(name="c0", kind="rgb", data=None, size=48):
-    image = cv2.imencode(".png", np.zeros((size, size), np.uint8))[1].tobytes() if data is None else data
-    return pack({"images": [{"camera": name, "kind": kind, "bytes": len(image)}]}, [image])
+def png(*shape, value=0):
+    return cv2.imencode(".png", np.full(shape or (48, 48), value, np.uint8))[1].tobytes()
+
+
+def frame_message(*images):
+    """The message of a frame with these images: camera, kind and content of each."""
+    listed = [{"camera": name, "kind": kind, "bytes": len(data)} for name, kind, data in images]
+    return pack({"images": listed}, [data for *_, data in images])
 
 
 CHUNK = b"IHDR" + struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
@@ -122,13 +133,11 @@ HUGE_PNG = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + CHUNK + struct.pack(">
     [
         b"garbage",
         "text",
-        frame_message(),
-        frame_message(name="c99"),
-        frame_message(kind="depth"),
-        frame_message(size=47),
-        frame_message(data=b"GIF89a"),
-        frame_message(data=b"\x89PNG and nothing more"),
-        frame_message(data=HUGE_PNG),
+        frame_message(("c0", "rgb", png())),
+        frame_message(("c99", "rgb", png())),
+        frame_message(("c0", "depth", png())),
+        frame_message(("c0", "rgb", png(47, 47))),
+        *(frame_message(("c0", "rgb", data)) for data in (b"GIF89a", b"\x89PNG and nothing more", HUGE_PNG)),
         pack({"images": [3]}, [b""]),
     ],
 )
@@ -176,17 +185,6 @@ def test_memory_of_a_live_rig_is_bounded():
     assert source.read(source.span.first) is not None and source.read(source.span.first - 1) is None
 
 
-def test_cameras_of_different_shapes_count_with_the_largest_sides():
-    """Four cameras of 16 x 16,000 and of 16,000 x 16 pixels have a million pixels, but need a tensor of a billion."""
-    shapes = [(16, 16_000), (16_000, 16)] * 2
-    odd = [c | {"width": w, "height": h} for c, (w, h) in zip(cameras_json(CAMERAS), shapes, strict=False)]
-    with running(PushSource(), ready=False) as server, open_websocket(server, "/push") as bad:
-        bad.send(rig_message(cameras=odd))
-        assert (
-            "cameras x widest x highest" in json.loads(bad.recv(timeout=WAIT_S))["message"] and close_code(bad) == 4400
-        )
-
-
 def test_the_size_of_an_image_is_checked_before_decoding(monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
     with pytest.raises(ProtocolError, match="expected rgb of 48 x 48 pixels, got 100000 x 100000"):
@@ -198,28 +196,24 @@ def test_the_size_of_an_image_is_checked_before_decoding(monkeypatch):
 
 def test_a_frame_of_a_rig_that_has_disconnected_is_not_decoded(monkeypatch):
     monkeypatch.setattr(push, "_decode_image", lambda *_: pytest.fail("decoded"))
-    assert push._decode_frame(frame_message(), CAMERAS, lambda: True) is None
+    assert push._decode_frame(frame_message(("c0", "rgb", png())), CAMERAS, lambda: True) is None
 
 
 def test_a_repeated_image_is_refused():
-    image = cv2.imencode(".png", np.zeros((48, 48), np.uint8))[1].tobytes()
-    entry = {"camera": "c0", "kind": "mask", "bytes": len(image)}
     with pytest.raises(ProtocolError, match="one image of each camera and kind"):
-        push._decode_frame(pack({"images": [entry] * 100}, [image] * 100), CAMERAS, lambda: False)
-
-
-def whole_frame(names, size=48):
-    """Image and mask of these cameras."""
-    rgb, mask = (cv2.imencode(".png", np.full((size, size, *k), 9, np.uint8))[1].tobytes() for k in ((3,), ()))
-    images = [(name, kind, data) for name in names for kind, data in (("rgb", rgb), ("mask", mask))]
-    listed = [{"camera": name, "kind": kind, "bytes": len(data)} for name, kind, data in images]
-    return pack({"images": listed}, [data for *_, data in images])
+        push._decode_frame(frame_message(*[("c0", "mask", png())] * 100), CAMERAS, lambda: False)
 
 
 def test_a_frame_needs_two_complete_cameras():
+    images = {"rgb": png(48, 48, 3, value=9), "mask": png(value=9)}
+
+    def decode(*names):
+        message = frame_message(*((name, kind, data) for name in names for kind, data in images.items()))
+        return push._decode_frame(message, CAMERAS, lambda: False)
+
     with pytest.raises(ProtocolError, match="image and mask of two cameras or more, got 1"):
-        push._decode_frame(whole_frame(["c0"]), CAMERAS, lambda: False)
-    frame = push._decode_frame(whole_frame(["c4", "c1"]), CAMERAS, lambda: False)
+        decode("c0")
+    frame = decode("c4", "c1")
     assert frame.cameras.names == ("c1", "c4") and bool((frame.rgb == 9).all()) and bool((frame.mask == 9).all())
 
 

@@ -2,6 +2,7 @@
 
 import json
 
+import av
 import numpy as np
 import pytest
 from live.live_servers import WAIT_S, open_websocket, running, say_hello
@@ -9,7 +10,6 @@ from live.live_servers import WAIT_S, open_websocket, running, say_hello
 from viewmend.live.protocol import unpack
 from viewmend.live.video import ENCODERS, STRINGS, VideoStream, video_codecs
 
-av = pytest.importorskip("av")
 CODECS = [pytest.param(c, marks=pytest.mark.skipif(c not in video_codecs(), reason=f"no {c} here")) for c in ENCODERS]
 
 
