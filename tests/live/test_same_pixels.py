@@ -55,5 +55,6 @@ def test_serve_and_mend_show_the_same_pixels_of_wd2(shared, tmp_path, model):
     assert command.shape == (360, 480, 3) and command.any(2).mean() > 0.05
     off = np.abs(command.astype(int) - page.astype(int)).max(2)
     assert (off > 1).mean() < 2e-4, "a pose in JSON is rounded, and an edge may fall to the other side of a pixel"
-    unaligned, _ = served(capture, model, align=False)
-    assert (np.abs(unaligned.astype(int) - page.astype(int)).max(2) > 1).mean() > 0.01, "the alignment shows"
+    if model == "telea":  # the quicker one
+        unaligned, _ = served(capture, model, align=False)
+        assert (np.abs(unaligned.astype(int) - page.astype(int)).max(2) > 1).mean() > 0.01, "the alignment shows"
