@@ -34,8 +34,6 @@ from viewmend.models.base import State
 
 if TYPE_CHECKING:
     from av import Packet
-    from av.container import OutputContainer
-    from av.video.stream import VideoStream
 
 PLAYLIST, INIT = "live.m3u8", "init.mp4"
 FIRST, LISTED = 3, 6
@@ -70,28 +68,26 @@ class FilmSegments:
     """
 
     def __init__(self, size_px: tuple[int, int], fps: int) -> None:
+        import av
+        from av.video.stream import VideoStream
+
         self._size_px, self._fps = size_px, fps
         self._files: dict[str, bytes] = {}
         self._segments: deque[str] = deque()
         self._second = -1
         self._held: list[Packet] = []
-        self._container, self._stream = self._open()
-
-    def _open(self) -> "tuple[OutputContainer, VideoStream]":
-        import av
-        from av.video.stream import VideoStream
-
-        container = av.open(f"memory://{PLAYLIST}", "w", format="hls", io_open=self._file, options=MUXER)
-        stream = container.add_stream("libx264", rate=self._fps)
+        opened = partial(_File, self)
+        self._container = av.open(f"memory://{PLAYLIST}", "w", format="hls", io_open=opened, options=MUXER)
+        stream = self._container.add_stream("libx264", rate=fps)
         assert isinstance(stream, VideoStream), "that encoder is a video's"
-        stream.width, stream.height = self._size_px
+        stream.width, stream.height = size_px
         stream.pix_fmt = "yuv420p"
         tag_colours(stream.codec_context)
-        stream.time_base = stream.codec_context.time_base = Fraction(1, self._fps)
-        stream.codec_context.gop_size = 10 * self._fps  # `add` says where key frames are
+        stream.time_base = stream.codec_context.time_base = Fraction(1, fps)
+        stream.codec_context.gop_size = 10 * fps  # `add` says where key frames are
         stream.codec_context.thread_count = 1
         stream.options = {**ENCODER}
-        return container, stream
+        self._stream = stream
 
     def __enter__(self) -> "FilmSegments":
         return self
@@ -137,9 +133,6 @@ class FilmSegments:
         """The playlist, the header of all segments, or a segment; None if there is none of that name."""
         return None if name == PLAYLIST and len(self._segments) < FIRST else self._files.get(name)
 
-    def _file(self, url: str, flags: int, options: dict[str, str]) -> "_File":
-        return _File(url.removeprefix("memory://"), self)
-
     def keep(self, name: str, content: bytes) -> None:
         """Store a finished file; the oldest segments are dropped."""
         if name.endswith(".m4s"):
@@ -152,9 +145,9 @@ class FilmSegments:
 class _File(BytesIO):
     """A file that the muxer writes; stored when it is closed."""
 
-    def __init__(self, name: str, film: FilmSegments) -> None:
+    def __init__(self, film: FilmSegments, url: str, flags: int, options: dict[str, str]) -> None:
         super().__init__()
-        self._name, self._film = name, film
+        self._name, self._film = url.removeprefix("memory://"), film
 
     def close(self) -> None:
         if not self.closed:
@@ -186,32 +179,25 @@ class BroadcastSession(ViewerSession):
         self._size_px = size_px
         self._lock = threading.Lock()
         self._is_open = False
-        self._image: Image | None = None
+        self.image: Image | None = None
+        """The newest image; None before the first."""
 
     def open(self) -> None:
         """Accept images from now on."""
-        with self._lock:
-            self._is_open = True
+        self._is_open = True
 
     def close(self) -> None:
         """Drop the image, and any that is still being rendered: the next video must not begin with it."""
         with self._lock:
-            self._is_open, self._image = False, None
-
-    @property
-    def image(self) -> Image | None:
-        """The newest image; None before the first."""
-        with self._lock:
-            return self._image
+            self._is_open, self.image = False, None
 
     def look(self, look: Look) -> None:
         """Show a viewer's look, in the video's size."""
         width, height = self._size_px
-        resized = replace(
-            look, camera=centred_camera(look), eyes=None, modes=look.modes[:1], width=width, height=height
-        )
+        centred = replace(look, camera=centred_camera(look), eyes=None, modes=look.modes[:1])
         # Not as moving: the viewer may leave with this look, which is then shown at rest.
-        super().look(replace(resized, scale=1.0, depth=False, moving=False, full=False))
+        still = {"scale": 1.0, "depth": False, "moving": False, "full": False}
+        super().look(replace(centred, width=width, height=height, **still))
 
     @property
     def wants_views(self) -> bool:
@@ -235,7 +221,7 @@ class BroadcastSession(ViewerSession):
             image = draw_mode(completed, look.modes[0], look.background or result.background, extra)
         with self._lock:
             if self._is_open:
-                self._image = image
+                self.image = image
         times = FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
         self._record(look, times, size_bytes=0)
         return times

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import socket
 import struct
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -32,6 +32,8 @@ from viewmend.models.base import State
 MAJOR, MINOR = 1, 3
 REQUEST_IMAGE, NO_UPDATE, UPDATE, CAMERA_DATA = 3, 4, 5, 10
 HEAD = struct.Struct("<HHi")
+NOTHING_NEW = HEAD.pack(MAJOR, MINOR, NO_UPDATE)
+"""The answer if there is no new image yet."""
 LARGEST = 4096
 """Bytes of a message that a client may send; a request has 152."""
 STEPS_PER_M = 5000
@@ -76,7 +78,13 @@ def parse(message: bytes) -> ImageRequest | int:
     with np.errstate(all="ignore"):  # results are checked
         view, projection = (np.frombuffer(body, "<f4", 16, at).reshape(4, 4).T.astype(float) for at in (12, 80))
         camera = camera_of(view, projection, width, height)
-        return ImageRequest(width, height, camera, _inverse(projection @ view))
+        try:
+            inverse = np.linalg.inv(projection @ view).astype("<f4")
+        except np.linalg.LinAlgError:
+            inverse = np.full((4, 4), np.nan)
+    if not np.isfinite(inverse).all():
+        raise ProtocolError("expected a projection that can be undone, got another")
+    return ImageRequest(width, height, camera, _columns(inverse))
 
 
 def camera_of(view: Float[np.ndarray, "4 4"], projection: Float[np.ndarray, "4 4"], width: int, height: int) -> Camera:
@@ -98,22 +106,12 @@ def camera_of(view: Float[np.ndarray, "4 4"], projection: Float[np.ndarray, "4 4
     return Camera(R=R, T=T, fx=fx, fy=fy, cx=cx, cy=cy)
 
 
-def _inverse(matrix: Float[np.ndarray, "4 4"]) -> bytes:
-    try:
-        inverse = np.linalg.inv(matrix).astype("<f4")
-    except np.linalg.LinAlgError:
-        inverse = np.full((4, 4), np.nan)
-    if not np.isfinite(inverse).all():
-        raise ProtocolError("expected a projection that can be undone, got another")
-    return inverse.T.tobytes()
-
-
 def update(request: ImageRequest, jpeg: bytes, depth: Float[Tensor, "height width"]) -> bytes:
     """A requested image, top row first, and its depth (metres, 0 without subject), bottom row first, as Zstandard."""
     import zstandard
 
     packed = zstandard.ZstdCompressor(level=1).compress(depth_steps(depth).tobytes())
-    return _head(UPDATE) + b"".join(struct.pack(">I", len(p)) + p for p in (request.world_from_clip, jpeg, packed))
+    return HEAD.pack(MAJOR, MINOR, UPDATE) + b"".join(map(_sized, (request.world_from_clip, jpeg, packed)))
 
 
 def depth_steps(depth: Float[Tensor, "height width"]) -> UInt16[np.ndarray, "height width"]:
@@ -123,11 +121,6 @@ def depth_steps(depth: Float[Tensor, "height width"]) -> UInt16[np.ndarray, "hei
     return np.ascontiguousarray(steps, dtype="<u2")
 
 
-def no_update() -> bytes:
-    """The answer if there is no new image yet."""
-    return _head(NO_UPDATE)
-
-
 def camera_data(cameras: Cameras) -> bytes:
     """The rig: all views' matrices, then all projections'."""
     views = [_columns(FLIP @ pose.double().cpu().numpy()) for pose in cameras.camera_from_world]
@@ -135,7 +128,7 @@ def camera_data(cameras: Cameras) -> bytes:
         _columns(_projection(K.double().cpu().numpy(), *size))
         for K, size in zip(cameras.K, cameras.size_px.tolist(), strict=True)
     ]
-    return _head(CAMERA_DATA) + _blob(views) + _blob(projections)
+    return HEAD.pack(MAJOR, MINOR, CAMERA_DATA) + _sized(b"".join(views)) + _sized(b"".join(projections))
 
 
 def _projection(K: Float[np.ndarray, "3 3"], width: int, height: int) -> Float[np.ndarray, "4 4"]:
@@ -152,17 +145,9 @@ def _columns(matrix: Float[np.ndarray, "4 4"]) -> bytes:
     return matrix.T.astype("<f4").tobytes()
 
 
-def _blob(parts: Sequence[bytes]) -> bytes:
-    return struct.pack(">I", sum(map(len, parts))) + b"".join(parts)
-
-
-def _head(task: int) -> bytes:
-    return HEAD.pack(MAJOR, MINOR, task)
-
-
-def framed(message: bytes) -> bytes:
-    """The message after its length."""
-    return struct.pack(">I", len(message)) + message
+def _sized(data: bytes) -> bytes:
+    """The data after its length."""
+    return struct.pack(">I", len(data)) + data
 
 
 SILENT_S = 30.0
@@ -170,19 +155,6 @@ SILENT_S = 30.0
 JPEG_QUALITY = 90
 UNREAD_BYTES = 256_000
 """Unread answers above this size delay the next one."""
-
-
-def listen(port: int) -> socket.socket:
-    """A socket that only this machine can reach, as the protocol has no token.
-
-    Raises:
-        OSError: the port is in use.
-    """
-    try:
-        return socket.create_server(("127.0.0.1", port))
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise OSError(f"port {port} of 127.0.0.1: {reason}; choose another --riftcast-port") from None
 
 
 class RgbdJob(RenderJob[bytes]):
@@ -222,28 +194,21 @@ class RiftcastClient:
         if asked == CAMERA_DATA:
             source = self._service.source
             frame = None if source.rig is None else source.read(int(source.edge))
-            return no_update() if frame is None else camera_data(frame.cameras)
+            return NOTHING_NEW if frame is None else camera_data(frame.cameras)
         if not isinstance(asked, ImageRequest):
             raise ProtocolError(f"expected a request for an image or for the cameras, got task {asked}")
         if min(asked.width, asked.height) < 16:
             raise ProtocolError(f"expected sides of at least 16 pixels, got {asked.width} x {asked.height}")
         self._limits.check_size(asked.width, asked.height)
-        finished = self._finished()
+        job, answer = self._job, NOTHING_NEW
+        if job is not None and job.done.done():
+            self.leave()
+            if job.done.exception() is None:  # a failed image is dropped
+                self._viewer, answer = job.viewer, job.done.result()
         if self._job is None:
             self._job = RgbdJob(asked, self._viewer)
             self._service.join(self._job)
-        return finished or no_update()
-
-    def _finished(self) -> bytes | None:
-        """The image that was being rendered, if it is finished; a failed one is dropped."""
-        job = self._job
-        if job is None or not job.done.done():
-            return None
-        self.leave()
-        if job.done.exception() is not None:
-            return None
-        self._viewer = job.viewer
-        return job.done.result()
+        return answer
 
     def leave(self) -> None:
         """Cancel the image that is being rendered."""
@@ -289,7 +254,7 @@ class RiftcastService(Extension):
                     if size > LARGEST:
                         break
                     message = await reader.readexactly(size)
-                writer.write(framed(client.answer(message)))
+                writer.write(_sized(client.answer(message)))
                 async with asyncio.timeout(SILENT_S):
                     await writer.drain()
         except (asyncio.IncompleteReadError, TimeoutError, OSError, ProtocolError):
@@ -301,9 +266,14 @@ class RiftcastService(Extension):
 
 
 def riftcast_extension(port: int) -> ExtensionFactory:
-    """The extension for `--riftcast-port`; takes the port at once.
+    """The extension for `--riftcast-port`; takes the port at once, for this machine alone: the protocol has no token.
 
     Raises:
         OSError: the port is in use.
     """
-    return partial(RiftcastService, listener=listen(port))
+    try:
+        listener = socket.create_server(("127.0.0.1", port))
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OSError(f"port {port} of 127.0.0.1: {reason}; choose another --riftcast-port") from None
+    return partial(RiftcastService, listener=listener)

@@ -12,7 +12,7 @@ from reference.baselines_twin import (
 )
 from torch.nn import functional as F
 
-from viewmend.contrib.baselines.e2fgvi import FocalAttention, FocalTokens, pooled_places, window_places
+from viewmend.contrib.baselines.e2fgvi import FocalAttention, pooled_places, window_places
 from viewmend.contrib.baselines.e2fgvi_propagation import SPyNet, deform_conv2d, warp
 from viewmend.contrib.baselines.layers import FusionFeedForward, SoftComposition, SoftSplit
 
@@ -106,7 +106,7 @@ def test_focal_attention_is_attention_to_those_places(rng):
     fine = torch.randn(1, 3, 10, 18, 8, generator=rng)
     pooled = torch.randn(1, 3, 2, 2, 8, generator=rng)
     with torch.no_grad():
-        out = attention(FocalTokens(fine, pooled))
+        out = attention(fine, pooled)
         frames = [(fine[0, t], pooled[0, t]) for t in range(3)]
         assert torch.allclose(out[0, 0], focal_attention_twin(attention, frames), atol=1e-5)
         # Frames have no order: each sees the same three.

@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from io import BytesIO
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from reference.films import picture, set_matrix, write_film
@@ -60,9 +61,15 @@ def shade(frame):
     return int(frame.to_ndarray(format="rgb24").max())
 
 
-def test_a_recording_is_played_in_time_over_and_over(camera, clock):
-    playback = Playback()
-    playback.start_s, playback.length_s = clock.now, 8 / FPS
+@pytest.fixture
+def playback(clock):
+    """Of eight frames, from now on."""
+    playback = Playback(8 / FPS)
+    playback.start_s = clock.now
+    return playback
+
+
+def test_a_recording_is_played_in_time_over_and_over(camera, clock, playback):
     with closing(pictures_of(camera, Counter(), playback, clock.wait)) as played:
         taken = [next(played) for _ in range(20)]
     assert [round(FPS * (p.taken_s - 1000)) for p in taken] == list(range(20))
@@ -70,9 +77,7 @@ def test_a_recording_is_played_in_time_over_and_over(camera, clock):
     assert shades[8:16] == shades[:8] and shades[:8] == sorted(set(shades[:8]), reverse=True)
 
 
-def test_a_recording_is_joined_where_the_others_are_and_what_is_past_is_left_out(camera, clock):
-    playback = Playback()
-    playback.start_s, playback.length_s = clock.now, 8 / FPS
+def test_a_recording_is_joined_where_the_others_are_and_what_is_past_is_left_out(camera, clock, playback):
     clock.now += 8 / FPS + 0.31
     with closing(pictures_of(camera, Counter(), playback, clock.wait)) as played:
         assert next(played).taken_s == pytest.approx(1000 + 1.2)
@@ -103,11 +108,8 @@ def test_a_turned_recording_is_played_upright(tmp_path, camera, clock):
     assert (np.rot90(shown[0], -1) == shown[1]).all()
 
 
-def test_an_offset_is_taken_off(camera, clock):
-    playback = Playback()
-    playback.start_s = clock.now
-    late = replace(camera, offset_s=0.03)
-    with closing(pictures_of(late, Counter(), playback, clock.wait)) as played:
+def test_an_offset_is_taken_off(camera, clock, playback):
+    with closing(pictures_of(replace(camera, offset_s=0.03), Counter(), playback, clock.wait)) as played:
         assert next(played).taken_s == pytest.approx(1000 - 0.03)
 
 
@@ -115,11 +117,8 @@ def test_an_offset_is_taken_off(camera, clock):
     ("url", "said"), [("nowhere.mp4", "No such file"), ("http://127.0.0.1:9/x?token=s", "refused")]
 )
 def test_addresses_where_nothing_is_are_said_without_their_secrets(camera, url, said):
-    with (
-        pytest.raises(OSError) as error,
-        closing(pictures_of(replace(camera, url=url), Counter(), Playback(), bool)) as p,
-    ):
-        next(p)
+    with pytest.raises(OSError) as error:
+        next(pictures_of(replace(camera, url=url), Counter(), Playback(), bool))
     assert said in str(error.value) and "token" not in str(error.value)
 
 
@@ -189,7 +188,8 @@ def transport_stream(pictures_rgb):
 def test_a_damaged_stream_shows_no_damaged_picture(camera):
     """Noise over HTTP, of which some packets are lost and others are garbage."""
     noise = np.random.default_rng(0)
-    sent = [cv_noise(noise) for _ in range(30)]
+    small = [noise.integers(0, 255, (12, 12, 3), np.uint8) for _ in range(30)]
+    sent = [cv2.resize(image, (96, 96), interpolation=cv2.INTER_CUBIC) for image in small]
     stream = transport_stream(sent)
     for at in (9, 17):  # of the second and the fourth group
         start = len(stream) * at // 30 // 188 * 188
@@ -216,13 +216,6 @@ def test_a_damaged_stream_shows_no_damaged_picture(camera):
     assert counts["torn"] >= 2 and 10 <= len(shown) <= 26
     away = [min(np.abs(image - other).mean() for other in sent) for image in shown]
     assert max(away) < 12
-
-
-def cv_noise(chance, size=(96, 96)):
-    import cv2
-
-    small = chance.integers(0, 255, (12, 12, 3), np.uint8)
-    return cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
 
 
 # Where a sender's clock is.

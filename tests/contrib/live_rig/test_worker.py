@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+from contextlib import contextmanager
 
 import av
 import numpy as np
@@ -9,12 +10,21 @@ import pytest
 from live.live_servers import WAIT_S, wait_until
 from reference.ball_rig import CAMERAS
 
-from viewmend.contrib.live_rig import worker as workers
 from viewmend.contrib.live_rig.frame_readers import Picture
 from viewmend.contrib.live_rig.rig_file import read_rig
-from viewmend.contrib.live_rig.worker import CameraWorker, pauses
+from viewmend.contrib.live_rig.worker import CameraWorker
 
 SIZE = CAMERAS.max_size_px
+
+
+@contextmanager
+def working(camera, connect, deliver=lambda *_: None, wants=lambda *_: True, **replaced):
+    """A worker that is started and stopped; `replaced` are methods."""
+    worker = CameraWorker(camera, connect, deliver, wants)
+    vars(worker).update(replaced)
+    worker.start()
+    yield worker
+    worker.stop()
 
 
 def frame(size=SIZE):
@@ -27,36 +37,34 @@ def camera(ball_rig):
     return read_rig(ball_rig / "rig.toml").cameras[0]
 
 
-def test_pauses_grow_and_stay_short():
-    assert list(itertools.islice(pauses(), 6)) == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
-
-
-def test_a_camera_that_fails_is_reached_again(camera, monkeypatch):
-    """Twice it is not there, once it ends, once its connection breaks with whatever it likes."""
+def test_a_camera_that_fails_is_reached_again(camera):
+    """Six times it is not there, once it ends, once its connection breaks with whatever it likes."""
     attempts, waits = itertools.count(), []
     here, go_on = threading.Event(), threading.Event()
 
     def connect(worker):
         attempt = next(attempts)
-        if attempt < 2:
+        if attempt < 6:
             raise OSError("nobody there")
         yield Picture(frame(), 10.0 + attempt)
-        if attempt == 3:
+        if attempt == 7:
             raise ZeroDivisionError("what a decoder may raise")
-        if attempt == 4:
+        if attempt == 8:
             here.set()
             go_on.wait(WAIT_S)
             raise OSError("the stream has ended")
 
-    worker = CameraWorker(camera, connect, lambda *_: None, lambda *_: True)
-    monkeypatch.setattr(worker, "wait", lambda seconds: waits.append(round(seconds, 1)) or go_on.is_set())
-    worker.start()
-    assert here.wait(WAIT_S) and worker.up and worker.error is None
-    assert worker.counts["read"] == worker.counts["connects"] == 3
-    go_on.set()
-    worker.stop()
+    def wait(seconds):
+        waits.append(round(seconds, 1))
+        return go_on.is_set()
+
+    with working(camera, connect, wait=wait) as worker:
+        assert here.wait(WAIT_S) and worker.up and worker.error is None
+        assert worker.counts["read"] == worker.counts["connects"] == 3
+        go_on.set()
     assert not worker.up and worker.error == "the stream has ended"
-    assert waits[:4] == [0.1, 0.2, 0.1, 0.1], "a camera that was there is tried at once"
+    expected = [0.1, 0.2, 0.4, 0.8, 1.0, 1.0, 0.1, 0.1]
+    assert waits[:8] == expected, "pauses grow and stay short; a camera that was there is tried at once"
 
 
 def test_pictures_of_another_size_are_refused_and_said(camera):
@@ -69,17 +77,13 @@ def test_pictures_of_another_size_are_refused_and_said(camera):
         yield Picture(frame(), 3.0)
         worker.wait(WAIT_S)
 
-    worker = CameraWorker(camera, connect, lambda *_: said.set(), lambda *_: True)
-    worker.start()
-    assert said.wait(WAIT_S)
-    worker.stop()
-    assert worker.counts["refused"] == 3
-    assert worker.error == "expected pictures of 48 x 48 as the calibration says, got 64 x 48; " + (
-        "set the camera's mode in 'options'"
-    )
+    with working(camera, connect, lambda *_: said.set()) as worker:
+        assert said.wait(WAIT_S)
+    expected = "expected pictures of 48 x 48 as the calibration says, got 64 x 48; set the camera's mode in 'options'"
+    assert worker.counts["refused"] == 3 and worker.error == expected
 
 
-def test_a_slow_mask_costs_pictures_and_never_delay(camera, monkeypatch):
+def test_a_slow_mask_costs_pictures_and_never_delay(camera):
     delivered, go_on = [], threading.Event()
 
     def connect(worker):
@@ -88,11 +92,11 @@ def test_a_slow_mask_costs_pictures_and_never_delay(camera, monkeypatch):
         go_on.set()
         worker.wait(WAIT_S)
 
-    worker = CameraWorker(camera, connect, lambda name, taken_s, _: delivered.append(taken_s), lambda *_: True)
-    monkeypatch.setattr(worker, "_images", lambda picture: go_on.wait(WAIT_S) and None)
-    worker.start()
-    wait_until(lambda: 49.0 in delivered)
-    worker.stop()
+    def images(picture):
+        go_on.wait(WAIT_S)
+
+    with working(camera, connect, lambda name, taken_s, _: delivered.append(taken_s), _images=images) as worker:
+        wait_until(lambda: 49.0 in delivered)
     assert len(delivered) <= 2 and worker.counts["replaced"] == 50 - len(delivered)
 
 
@@ -104,8 +108,6 @@ def test_pictures_that_nobody_wants_are_not_masked(camera):
             yield Picture(frame(), n / 10)
         worker.wait(WAIT_S)
 
-    worker = CameraWorker(camera, connect, lambda *_: None, lambda at_s, period_s: wanted.append(period_s) or False)
-    worker.start()
-    wait_until(lambda: len(wanted) == 20)
-    worker.stop()
-    assert worker.counts["thinned"] == 20 and wanted[-1] == pytest.approx(0.1) and workers.FIRST_PAUSE_S == 0.1
+    with working(camera, connect, wants=lambda at_s, period_s: wanted.append(period_s)) as worker:
+        wait_until(lambda: len(wanted) == 20)
+    assert worker.counts["thinned"] == 20 and wanted[-1] == pytest.approx(0.1)

@@ -1,4 +1,4 @@
-"""`viewmend serve --ray`: its options, and the command with a local cluster."""
+"""`viewmend serve --ray`: its options, its application behind a proxy, and the command with a local cluster."""
 
 import contextlib
 import json
@@ -11,13 +11,17 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from live.live_servers import get
+from live.live_servers import PIPELINE, get, in_own_loop
 
 from viewmend.cli import main
 from viewmend.contrib.ray import cluster
-from viewmend.contrib.ray.replicas import ManyViewers, _demand_no_serve, serving
+from viewmend.contrib.ray.replicas import ManyViewers, StartWhenReady, _demand_no_serve, serving
 from viewmend.live.client import Client
-from viewmend.live.server import ServerConfig
+from viewmend.live.push import PushSource
+from viewmend.live.renderer import Renderer
+from viewmend.live.server import LiveServer, ServerConfig
+from viewmend.live.service import RenderService
+from viewmend.models.smooth_fill import SmoothFill
 from viewmend.stream import StreamConfig
 
 TOKEN = "a token, long enough"
@@ -76,6 +80,54 @@ def test_replicas_of_one_machine_share_its_memory():
         config = ServerConfig(port=taken.getsockname()[1])
         with serving(ManyViewers(**vars(served(2)) | {"server": config}), "local"):
             pass
+
+
+async def ask(app, path, query=b"", headers=()):
+    """Status and body, without a socket."""
+    sent = []
+    scope = {"type": "http", "method": "GET", "path": path, "query_string": query, "http_version": "1.1"}
+    scope |= {"headers": [(b"host", b"127.0.0.1:8008"), *headers], "server": ("127.0.0.1", 8008), "root_path": ""}
+
+    async def send(message):
+        sent.append(message)
+
+    async def receive():
+        return {"type": "http.request", "body": b"", "more_body": False}
+
+    await app(scope, receive, send)
+    return sent[0]["status"], b"".join(message.get("body", b"") for message in sent)
+
+
+@in_own_loop
+async def test_token_and_origin_are_checked_behind_a_proxy_which_has_connection_limits_of_its_own():
+    async def ready():
+        pass
+
+    source = PushSource()
+    service = RenderService(Renderer(source, SmoothFill(), PIPELINE), source)
+    open_app, app = (StartWhenReady(LiveServer(service, ServerConfig(token=t)).app(), ready) for t in (None, TOKEN))
+    status, body = await ask(open_app, "/")
+    assert status == 200 and b"viewmend" in body
+    assert (await ask(app, "/health"))[0] == 401
+    assert (await ask(app, "/health", b"token=a+token%2C+long+enough"))[0] == 200
+    assert (await ask(app, "/", headers=[(b"origin", b"http://elsewhere.example")]))[0] == 403
+
+
+@in_own_loop
+async def test_the_start_is_reported_when_the_first_view_is_rendered():
+    order = []
+
+    async def app(scope, receive, send):
+        await send({"type": "lifespan.startup.complete"})
+
+    async def ready():
+        order.append("ready")
+
+    async def send(message):
+        order.append(message["type"])
+
+    await StartWhenReady(app, ready)({"type": "lifespan"}, None, send)
+    assert order == ["ready", "lifespan.startup.complete"]
 
 
 @contextlib.contextmanager

@@ -5,7 +5,6 @@ import socket
 import struct
 import subprocess
 import sys
-from functools import partial
 
 import cv2
 import numpy as np
@@ -16,7 +15,7 @@ from live.live_servers import CAMERAS, WAIT_S, running, wait_until
 from reference.ball import BallCapture, camera_at, photograph
 
 from viewmend.contrib import riftcast as riftcast_service
-from viewmend.contrib.riftcast import RiftcastClient, RiftcastService, camera_of, listen, parse
+from viewmend.contrib.riftcast import RiftcastClient, camera_of, parse, riftcast_extension
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.protocol import Limits, ProtocolError
 
@@ -26,11 +25,10 @@ NO_UPDATE, UPDATE, CAMERA_DATA = 4, 5, 10
 @pytest.fixture(scope="module")
 def served():
     """A port for RIFTCast's clients, and the render service of its server."""
-    listener = listen(0)
-    extension = partial(RiftcastService, listener=listener)
+    extension = riftcast_extension(0)
     source = RecordedSource(lambda: BallCapture(CAMERAS, 1))
     with running(source, limits=Limits(viewers=3), extensions=(extension,)) as server:
-        yield listener.getsockname()[1], server.service
+        yield extension.keywords["listener"].getsockname()[1], server.service
 
 
 def client(port):
@@ -218,10 +216,10 @@ def test_silent_and_surplus_clients_are_disconnected(served, monkeypatch):
 
 
 def test_a_port_in_use_is_an_error():
-    with listen(0) as taken:
+    with riftcast_extension(0).keywords["listener"] as taken:
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=f"port {port} of 127.0.0.1: .*choose another --riftcast-port"):
-            listen(port)
+            riftcast_extension(port)
 
 
 def test_the_command_serves_viewers_and_riftcast_clients():

@@ -1,6 +1,7 @@
 """E2FGVI and E2FGVI-HQ: flow completion, feature propagation and focal transformer (Li et al. 2022)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from einops import rearrange, repeat
@@ -20,22 +21,12 @@ from viewmend.contrib.baselines.layers import (
     SoftSplit,
 )
 from viewmend.contrib.baselines.online import Clip
-from viewmend.contrib.baselines.token_transformers import BLOCKS, CELLS, HEADS, NATIVE_PX, initialise
+from viewmend.contrib.baselines.token_transformers import BLOCKS, CELLS, HEADS, NATIVE_PX, Clips, initialise
 
 WINDOW = (5, 9)
 """Rows and columns of tokens in a window."""
 REACH = (WINDOW[0] // 2, WINDOW[1] // 2)
 """How far around a window its surroundings reach, in tokens; and around a pooled token, in windows."""
-
-
-@dataclass(frozen=True)
-class FocalTokens:
-    """Frames' tokens in one block."""
-
-    fine: Float[Tensor, "sample frame row column dim"]
-    """After the block's first norm."""
-    pooled: Float[Tensor, "sample frame window_row window_column dim"]
-    """One of each window."""
 
 
 class FocalAttention(nn.Module):
@@ -50,37 +41,30 @@ class FocalAttention(nn.Module):
         self.proj = nn.Linear(dim, dim)
         self.register_buffer("valid_ind_rolled", _outside_of_window())
 
-    def forward(self, own: FocalTokens) -> Float[Tensor, "sample frame row column dim"]:
-        """The frames' tokens after attention to those of all frames."""
-        batch, dim, grid = own.fine.shape[0], own.fine.shape[-1], (own.pooled.shape[2], own.pooled.shape[3])
+    def forward(
+        self,
+        tokens: Float[Tensor, "sample frame row column dim"],
+        pooled: Float[Tensor, "sample frame window_row window_column dim"],
+    ) -> Float[Tensor, "sample frame row column dim"]:
+        """The frames' tokens after attention to those of all frames; `pooled` has one token of each window."""
+        dim, grid, device = tokens.shape[-1], (pooled.shape[2], pooled.shape[3]), tokens.device
 
         # Keys and values of every window: the same places in all frames.
         weight, bias = self.qkv.weight.split([dim, 2 * dim]), self.qkv.bias.split([dim, 2 * dim])
-        fine = F.linear(own.fine, weight[1], bias[1]).flatten(2, 3)
-        pooled = F.linear(own.pooled, weight[1], bias[1]).flatten(2, 3)
-        places = self._places(grid).to(fine.device)
-        cells, near = (x.to(fine.device) for x in pooled_places(grid))
-        KV = torch.cat([fine[:, :, places], pooled[:, :, cells]], 3)
+        fine, coarse = (F.linear(x, weight[1], bias[1]).flatten(2, 3) for x in (tokens, pooled))
+        own, rolled = window_places(grid)
+        places = torch.cat([own, rolled[:, self.valid_ind_rolled.to(rolled.device)]], 1).to(device)
+        cells, near = (x.to(device) for x in pooled_places(grid))
+        KV = torch.cat([fine[:, :, places], coarse[:, :, cells]], 3)
         K, V = rearrange(KV, "b t n k (two heads c) -> two (b n) heads (t k) c", two=2, heads=self.heads)
         present = torch.cat([near.new_ones(places.shape), near], 1)
-        present = repeat(present, "n k -> (b n) 1 1 (t k)", b=batch, t=fine.shape[1])
+        present = repeat(present, "n k -> (b n) 1 1 (t k)", b=len(tokens), t=tokens.shape[1])
 
-        Q = F.linear(own.fine, weight[0], bias[0])
-        Q = rearrange(
-            Q, "b t (i y) (j x) (heads c) -> (b i j) heads (t y x) c", y=WINDOW[0], x=WINDOW[1], heads=self.heads
-        )
+        split = {"i": grid[0], "j": grid[1], "y": WINDOW[0], "x": WINDOW[1], "heads": self.heads}
+        Q = F.linear(tokens, weight[0], bias[0])
+        Q = rearrange(Q, "b t (i y) (j x) (heads c) -> (b i j) heads (t y x) c", **split)
         looked = F.scaled_dot_product_attention(Q, K, V, present)
-        looked = rearrange(
-            looked,
-            "(b i j) heads (t y x) c -> b t (i y) (j x) (heads c)",
-            i=grid[0], j=grid[1], y=WINDOW[0], x=WINDOW[1],
-        )  # fmt: skip
-        return self.proj(looked)
-
-    def _places(self, grid: tuple[int, int]) -> Int[Tensor, "window key"]:
-        """Where each window's own and surrounding tokens are, in a frame of `grid` windows read row by row."""
-        own, rolled = window_places(grid)
-        return torch.cat([own, rolled[:, self.valid_ind_rolled.to(rolled.device)]], 1)
+        return self.proj(rearrange(looked, "(b i j) heads (t y x) c -> b t (i y) (j x) (heads c)", **split))
 
 
 def window_places(grid: tuple[int, int]) -> tuple[Int[Tensor, "window own"], Int[Tensor, "window rolled"]]:
@@ -123,11 +107,6 @@ def _outside_of_window() -> Int[Tensor, "120"]:
 MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)
 """Height and width of one attention window: 60 x 108."""
 
-Clips = Float[Tensor, "sample frame 3 height width"]
-"""Frames in [-1, 1], 0 in the holes."""
-Features = Float[Tensor, "sample frame 128 rows cols"]
-"""Features of clips, at a quarter of the frames' size."""
-
 
 @dataclass(frozen=True)
 class LocalFlows:
@@ -154,7 +133,7 @@ class FocalBlock(nn.Module):
         """The tokens after the block; `size` is that of the feature map."""
         normed = self.norm1(tokens)
         windows = rearrange(normed, "b t (i y) (j x) c -> b t i j c (y x)", y=WINDOW[0], x=WINDOW[1])
-        tokens = tokens + self.attn(FocalTokens(normed, self.pool_layers[0](windows)[..., 0]))
+        tokens = tokens + self.attn(normed, self.pool_layers[0](windows)[..., 0])
         mixed = self.mlp(self.norm2(tokens).flatten(0, 1), size)
         return tokens + mixed.unflatten(0, tokens.shape[:2])
 
@@ -162,22 +141,21 @@ class FocalBlock(nn.Module):
 class E2FGVI(nn.Module):
     """41.8 M parameters; 243 tensors, named as in the official checkpoint. Takes 432x240; in training, also less."""
 
+    composition = partial(SoftComposition, bias_size=CELLS)
+
     def __init__(self) -> None:
         super().__init__()
         self.encoder = HierarchicalEncoder()
         self.decoder = FrameDecoder()
         self.feat_prop_module = Propagation()
         self.ss = SoftSplit()
-        self.sc = self._composition()
+        self.sc = self.composition()
         self.transformer = nn.ModuleList(FocalBlock() for _ in range(BLOCKS))
         self.update_spynet = SPyNet()
         initialise(self)
         for module in self.modules():
             if isinstance(module, AlignedConvolution):
                 module.initialise()
-
-    def _composition(self) -> SoftComposition:
-        return SoftComposition(bias_size=CELLS)
 
     def forward(self, frames: Clips, local: int) -> Clips:
         """All frames completed, in [-1, 1].
@@ -196,11 +174,15 @@ class E2FGVI(nn.Module):
         self.check_size(frames.shape[-2], frames.shape[-1])
         if not 1 <= local <= frames.shape[1]:
             raise ValueError(f"expected 1 to {frames.shape[1]} local frames of {frames.shape[1]}, got {local}")
-        flows = self.flows(frames[:, :local])
-        features = self.encode(frames)
+        clips, flows = frames.shape[:2], self.flows(frames[:, :local])
+        features = self.encoder(frames.flatten(0, 1)).unflatten(0, clips)
         consecutive = self.feat_prop_module(features[:, :local], flows.to_next, flows.to_previous)
-        features = torch.cat([consecutive, features[:, local:]], 1)
-        return self.decode(self.transform(features)), flows
+        features = torch.cat([consecutive, features[:, local:]], 1).flatten(0, 1)
+        size = (features.shape[-2], features.shape[-1])
+        tokens = self.ss(features).unflatten(0, clips)
+        for block in self.transformer:
+            tokens = block(tokens, size)
+        return self.decoder(features + self.sc(tokens.flatten(0, 1), size)).unflatten(0, clips), flows
 
     def check_size(self, height: int, width: int) -> None:
         """ValueError unless the frame is 432x240: the bias map is learned for this size.
@@ -216,7 +198,9 @@ class E2FGVI(nn.Module):
 
     def flows(self, frames: Clips) -> LocalFlows:
         """Flows between consecutive frames, holes and all: the network learned to complete them."""
-        small = self.shrink(frames)
+        size = [side // STRIDE_PX for side in frames.shape[-2:]]
+        small = F.interpolate((frames.flatten(0, 1) + 1) / 2, size=size, mode="bilinear", align_corners=True)
+        small = small.unflatten(0, frames.shape[:2])
         first, second = small[:, :-1].flatten(0, 1), small[:, 1:].flatten(0, 1)
         if not len(first):
             none = small.new_zeros(len(frames), 0, 2, *small.shape[-2:])
@@ -225,44 +209,20 @@ class E2FGVI(nn.Module):
         to_next, to_previous = rearrange(both, "(two b t) c h w -> two b t c h w", two=2, b=len(frames))
         return LocalFlows(to_next, to_previous)
 
-    def shrink(self, frames: Clips) -> Float[Tensor, "sample frame 3 rows cols"]:
-        """Frames as the flow network takes them: in [0, 1], a quarter of the size."""
-        size = [side // STRIDE_PX for side in frames.shape[-2:]]
-        small = F.interpolate((frames.flatten(0, 1) + 1) / 2, size=size, mode="bilinear", align_corners=True)
-        return small.unflatten(0, frames.shape[:2])
-
-    def encode(self, frames: Clips) -> Features:
-        """Features of each frame by itself, at a quarter of its size."""
-        return self.encoder(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-
-    def transform(self, features: Features) -> Features:
-        """Features after the transformer."""
-        size = (features.shape[-2], features.shape[-1])
-        tokens = self.ss(features.flatten(0, 1)).unflatten(0, features.shape[:2])
-        for block in self.transformer:
-            tokens = block(tokens, size)
-        return features + self.sc(tokens.flatten(0, 1), size).unflatten(0, features.shape[:2])
-
-    def decode(self, features: Features) -> Clips:
-        """Frames in [-1, 1]."""
-        return self.decoder(features.flatten(0, 1)).unflatten(0, features.shape[:2])
-
     def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
         """See `OnlineNetwork`. Local are the view's own frames in the order of time; all others are references.
 
         Other cameras' images are references too: flow is between times, not between cameras.
         """
         times = (*reversed(clip.neighbours), clip.now)
-        local = [frames[:1] for frames in times]
-        others = [frames[1:] for frames in times]
-        return self(torch.cat([*local, *others, *clip.references])[None], len(local))[0, len(local) - 1]
+        ordered = [*(frames[:1] for frames in times), *(frames[1:] for frames in times), *clip.references]
+        return self(torch.cat(ordered)[None], len(times))[0, len(times) - 1]
 
 
 class E2FGVIHQ(E2FGVI):
     """41.1 M parameters; 244 tensors. Takes any multiple of 60 x 108 pixels (height x width)."""
 
-    def _composition(self) -> SoftComposition:
-        return SoftComposition(bias_convolution=True)
+    composition = partial(SoftComposition, bias_convolution=True)
 
     def check_size(self, height: int, width: int) -> None:
         """ValueError unless attention windows of 60 x 108 pixels cover the frame."""

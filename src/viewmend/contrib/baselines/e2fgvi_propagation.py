@@ -1,7 +1,6 @@
 """E2FGVI's optical flow (SPyNet), and the propagation of features along it, backward in time and then forward."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -58,24 +57,16 @@ class SPyNet(nn.Module):
         """Flow in pixels, (right, down): `warp(others, flow)` looks like `images`. RGB in [0, 1], any size."""
         height, width = images.shape[-2:]
         size = tuple(-(-side // MULTIPLE) * MULTIPLE for side in (height, width))
-        flow = self._refine(_resize(images, size), _resize(others, size))
-        scale = flow.new_tensor([width / size[1], height / size[0]]).view(2, 1, 1)
-        return _resize(flow, (height, width)) * scale
-
-    def _refine(
-        self, images: Float[Tensor, "sample 3 height width"], others: Float[Tensor, "sample 3 height width"]
-    ) -> Float[Tensor, "sample 2 height width"]:
-        """The flow of images whose sides are multiples of 32."""
-        pairs = [((images - self.mean) / self.std, (others - self.mean) / self.std)]
+        pairs = [[(_resize(x, size) - self.mean) / self.std for x in (images, others)]]
         for _ in range(LEVELS - 1):
-            image, other = pairs[-1]
-            pairs.append((F.avg_pool2d(image, 2), F.avg_pool2d(other, 2)))
+            pairs.append([F.avg_pool2d(x, 2) for x in pairs[-1]])
         flow = images.new_zeros(len(images), 2, *pairs[-1][0].shape[-2:])
         for level, (image, other) in zip(self.basic_module, reversed(pairs), strict=True):
             if flow.shape[-1] != image.shape[-1]:
                 flow = 2 * F.interpolate(flow, scale_factor=2, mode="bilinear", align_corners=True)
             flow = flow + level(torch.cat([image, warp(other, flow, "border"), flow], 1))
-        return flow
+        scale = flow.new_tensor([width / size[1], height / size[0]]).view(2, 1, 1)
+        return _resize(flow, (height, width)) * scale
 
 
 class _Level(nn.Module):
@@ -146,16 +137,6 @@ Feature = Float[Tensor, "sample channel height width"]
 Flow = Float[Tensor, "sample 2 height width"]
 
 
-@dataclass(frozen=True)
-class Propagated:
-    """State of one direction: the last two results and the flow between them."""
-
-    features: tuple[Feature, ...] = ()
-    """At most two results, the latest last."""
-    flow: Flow | None = None
-    """The flow from the latest frame to the one before it, once there are two."""
-
-
 class AlignedConvolution(nn.Module):
     """Aligns two earlier results with the current frame: a deformable convolution along corrected flow."""
 
@@ -163,9 +144,8 @@ class AlignedConvolution(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(channels, 2 * channels, 3, 3))
         self.bias = nn.Parameter(torch.zeros(channels))
-        layers: list[nn.Module] = []
-        for inputs in (3 * channels + 4, channels, channels):
-            layers += [nn.Conv2d(inputs, channels, 3, padding=1), nn.LeakyReLU(0.1)]
+        shapes = pairwise((3 * channels + 4, channels, channels, channels))
+        layers = [layer for i, o in shapes for layer in (nn.Conv2d(i, o, 3, padding=1), nn.LeakyReLU(0.1))]
         self.conv_offset = nn.Sequential(*layers, nn.Conv2d(channels, 3 * GROUPS * POINTS, 3, padding=1))
 
     def initialise(self) -> None:
@@ -224,34 +204,22 @@ class Propagation(nn.Module):
         backward = self._sweep("backward_", [(x,) for x in reversed(frames)], to_next.unbind(1))
         known = list(zip(frames, reversed(backward), strict=True))
         forward = self._sweep("forward_", known, to_previous.unbind(1))
-        return torch.stack([self._fuse(x, back, ahead) for (x, back), ahead in zip(known, forward, strict=True)], 1)
-
-    def _fuse(self, current: Feature, backward: Feature, forward: Feature) -> Feature:
-        return current + self.fusion(torch.cat([backward, forward], 1))
+        fused = zip(known, forward, strict=True)
+        return torch.stack([x + self.fusion(torch.cat([back, ahead], 1)) for (x, back), ahead in fused], 1)
 
     def _sweep(self, way: str, known: Sequence[tuple[Feature, ...]], flows: Sequence[Flow]) -> list[Feature]:
-        state, results = Propagated(), []
+        """The results of the frames in this order, each from the last two and the flows to them."""
+        results: list[Feature] = []
         for number, seen in enumerate(known):
-            result, state = self._step(way, seen, flows[number - 1] if number else None, state)
-            results.append(result)
-        return results
-
-    def _step(
-        self, way: str, seen: tuple[Feature, ...], flow: Flow | None, state: Propagated
-    ) -> tuple[Feature, Propagated]:
-        """The result at one frame, and the state for the next."""
-        current = seen[0]
-        result = torch.zeros_like(current)
-        if flow is not None:
-            last = state.features[-1]
-            if state.flow is None:
+            result = torch.zeros_like(seen[0])
+            if number:
+                last, flow = results[-1], flows[number - 1]
                 earlier, flow2 = torch.zeros_like(last), torch.zeros_like(flow)
                 warped2 = earlier
-            else:
-                earlier = state.features[-2]
-                flow2 = flow + warp(state.flow, flow)
-                warped2 = warp(earlier, flow2)
-            around = torch.cat([warp(last, flow), current, warped2], 1)
-            result = self.deform_align[way](torch.cat([last, earlier], 1), around, flow, flow2)
-        result = result + self.backbone[way](torch.cat([*seen, result], 1))
-        return result, Propagated((*state.features[-1:], result), flow)
+                if number > 1:
+                    earlier, flow2 = results[-2], flow + warp(flows[number - 2], flow)
+                    warped2 = warp(earlier, flow2)
+                around = torch.cat([warp(last, flow), seen[0], warped2], 1)
+                result = self.deform_align[way](torch.cat([last, earlier], 1), around, flow, flow2)
+            results.append(result + self.backbone[way](torch.cat([*seen, result], 1)))
+        return results

@@ -59,12 +59,11 @@ def windows_over(holes: Bool[Tensor, "height width"], size: tuple[int, int], ove
     alone, so a stream has the same windows at each time. The middles of overlaps divide the canvas among the windows;
     a window is needed if its part has a hole.
     """
-    tops, lefts = (_starts(length, side, overlap_px) for length, side in zip(holes.shape, size, strict=True))
-    rows, cols = _middles(tops, size[0], holes.shape[0]), _middles(lefts, size[1], holes.shape[1])
+    rows, cols = (_grid(length, side, overlap_px) for length, side in zip(holes.shape, size, strict=True))
     return tuple(
         Window(top, left)
-        for top, (above, below) in zip(tops, pairwise(rows), strict=True)
-        for left, (before, behind) in zip(lefts, pairwise(cols), strict=True)
+        for top, above, below in rows
+        for left, before, behind in cols
         if bool(holes[above:below, before:behind].any())
     )
 
@@ -73,8 +72,7 @@ def stitch(
     pieces: Sequence[Image], windows: Sequence[Window], canvas: tuple[int, int], overlap_px: int
 ) -> Float[Tensor, "3 canvasheight canvaswidth"]:
     """The windows' images in one; in overlaps, weights fall towards each window's edge. Elsewhere 0."""
-    total = pieces[0].new_zeros(3, *canvas)
-    weights = pieces[0].new_zeros(canvas)
+    total, weights = pieces[0].new_zeros(3, *canvas), pieces[0].new_zeros(canvas)
     size = (pieces[0].shape[1], pieces[0].shape[2])
     rows, cols = (_ramp(side, overlap_px).to(total) for side in size)
     weight = rows[:, None] * cols
@@ -102,14 +100,12 @@ def _canvas(rgb: Image, missing: Bool[Tensor, "height width"], dilation_px: int)
     return Canvas((2 * rgb - 1) * ~dilated(missing, dilation_px), missing)
 
 
-def _starts(length: int, side: int, overlap_px: int) -> list[int]:
+def _grid(length: int, side: int, overlap_px: int) -> list[tuple[int, int, int]]:
+    """Along one axis of the canvas: where each window starts, and where its part of the canvas starts and ends."""
     count = 1 + math.ceil((length - side) / (side - overlap_px))
-    return [round(i * (length - side) / max(count - 1, 1)) for i in range(count)]
-
-
-def _middles(starts: list[int], side: int, length: int) -> list[int]:
-    """Where one window's part of the canvas ends and the next one's begins, with the canvas's own ends."""
-    return [0, *((first + second + side) // 2 for first, second in pairwise(starts)), length]
+    starts = [round(i * (length - side) / max(count - 1, 1)) for i in range(count)]
+    ends = [0, *((first + second + side) // 2 for first, second in pairwise(starts)), length]
+    return list(zip(starts, ends[:-1], ends[1:], strict=True))
 
 
 def _ramp(side: int, overlap_px: int) -> Float[Tensor, " side"]:

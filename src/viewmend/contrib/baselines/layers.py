@@ -19,17 +19,14 @@ SHALLOW, FEATURES = 256, 128
 class HierarchicalEncoder(nn.Module):
     """Nine convolutions in one list, as FuseFormer and E2FGVI name them: `layers.0, .2, ... .16`."""
 
-    def __init__(self, channels: int = 3) -> None:
+    def __init__(self) -> None:
         super().__init__()
         deep = ((256, 384, 1), (640, 512, 2), (768, 384, 4), (640, 256, 8), (512, FEATURES, 1))
-        self.layers = nn.Sequential(
-            *shallow_layers(channels), *_with_leaks(_convolution(i, o, 1, g) for i, o, g in deep)
-        )
+        self.layers = nn.Sequential(*shallow_layers(), *_deep_layers(deep))
 
-    def forward(self, frames: Float[Tensor, "frame channel height width"]) -> Float[Tensor, "frame 128 rows cols"]:
+    def forward(self, frames: Float[Tensor, "frame 3 height width"]) -> Float[Tensor, "frame 128 rows cols"]:
         """Features at a quarter of the size; height and width are multiples of 4."""
-        layers = list(self.layers)
-        return with_skips(layers[8:], nn.Sequential(*layers[:8])(frames))
+        return with_skips(list(self.layers)[8:], self.layers[:8](frames))
 
 
 class DeepLayers(nn.Module):
@@ -38,11 +35,11 @@ class DeepLayers(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         deep = ((256, 256, 1), (512, 256, 2), (512, 256, 4), (512, 256, 8), (512, FEATURES, 1))
-        self.layers = nn.Sequential(*_with_leaks(_convolution(i, o, 1, g) for i, o, g in deep))
+        self.layers = _deep_layers(deep)
 
     def forward(self, shallow: Float[Tensor, "frame 256 rows cols"]) -> Float[Tensor, "frame 128 rows cols"]:
         """Features of the same size as `shallow`, the first four convolutions' output."""
-        return with_skips(list(self.layers), shallow)
+        return with_skips(self.layers, shallow)
 
 
 class UpsampledConvolution(nn.Module):
@@ -77,39 +74,32 @@ class FrameDecoder(nn.Sequential):
         return super().forward(features).float().tanh()
 
 
-def shallow_layers(channels: int = 3) -> nn.Sequential:
+def shallow_layers() -> nn.Sequential:
     """The first four convolutions, `0, 2, 4, 6`: to 256 channels at a quarter of the size."""
-    shapes = ((channels, 64, 2), (64, 64, 1), (64, 128, 2), (128, SHALLOW, 1))
-    return nn.Sequential(*_with_leaks(_convolution(i, o, stride) for i, o, stride in shapes))
+    shapes = ((3, 64, 2), (64, 64, 1), (64, 128, 2), (128, SHALLOW, 1))
+    return _with_leaks([nn.Conv2d(i, o, 3, stride, 1) for i, o, stride in shapes])
+
+
+def _deep_layers(shapes: tuple[tuple[int, int, int], ...]) -> nn.Sequential:
+    """Convolutions of these inputs, outputs and groups."""
+    return _with_leaks([nn.Conv2d(i, o, 3, 1, 1, groups=groups) for i, o, groups in shapes])
+
+
+def _with_leaks(convolutions: list[nn.Conv2d]) -> nn.Sequential:
+    return nn.Sequential(*(layer for c in convolutions for layer in (c, nn.LeakyReLU(SLOPE, inplace=True))))
 
 
 def with_skips(
-    layers: list[nn.Module], shallow: Float[Tensor, "frame 256 rows cols"]
+    layers: Iterable[nn.Module], shallow: Float[Tensor, "frame 256 rows cols"]
 ) -> Float[Tensor, "frame channel rows cols"]:
     """Run the layers; every convolution but the first also takes `shallow`, a slice of it per group."""
     features = shallow
     for number, layer in enumerate(layers):
         if number > 0 and isinstance(layer, nn.Conv2d):
-            features = _interleave(shallow, features, layer.groups)
+            split = [rearrange(x, "f (g c) h w -> f g c h w", g=layer.groups) for x in (shallow, features)]
+            features = torch.cat(split, 2).flatten(1, 2)
         features = layer(features)
     return features
-
-
-def _interleave(
-    first: Float[Tensor, "frame a rows cols"], second: Float[Tensor, "frame b rows cols"], groups: int
-) -> Float[Tensor, "frame c rows cols"]:
-    split = [rearrange(x, "f (g c) h w -> f g c h w", g=groups) for x in (first, second)]
-    return rearrange(torch.cat(split, 2), "f g c h w -> f (g c) h w")
-
-
-def _convolution(inputs: int, outputs: int, stride: int = 1, groups: int = 1) -> nn.Conv2d:
-    return nn.Conv2d(inputs, outputs, 3, stride, 1, groups=groups)
-
-
-def _with_leaks(convolutions: Iterable[nn.Conv2d]) -> Iterable[nn.Module]:
-    for convolution in convolutions:
-        yield convolution
-        yield nn.LeakyReLU(SLOPE, inplace=True)
 
 
 PATCH_CELLS, STEP_CELLS, MARGIN_CELLS = 7, 3, 3
@@ -121,6 +111,8 @@ DIM = 512
 FUSION_CHANNELS = 40
 """Channels of the map in which the fusion feed-forward lets neighbouring patches mix."""
 
+FeatureMaps = Float[Tensor, "frame 128 height width"]
+"""Features of frames, at a quarter of their size."""
 Tokens = Float[Tensor, "frame rows cols 512"]
 """Tokens in the grid of their patches: ceil(height / 3) x ceil(width / 3) of a feature map."""
 
@@ -145,7 +137,7 @@ class SoftSplit(nn.Module):
         super().__init__()
         self.embedding = nn.Linear(FEATURES * PATCH_CELLS**2, DIM)
 
-    def forward(self, features: Float[Tensor, "frame 128 height width"]) -> Tokens:
+    def forward(self, features: FeatureMaps) -> Tokens:
         """Tokens of overlapping patches."""
         rows, cols = token_grid(*features.shape[-2:])
         return rearrange(self.embedding(_patches(features)), "f (r c) d -> f r c d", r=rows, c=cols)
@@ -164,7 +156,7 @@ class SoftComposition(nn.Module):
         self.bias = nn.Parameter(torch.zeros(FEATURES, *bias_size)) if bias_size else None
         self.bias_conv = nn.Conv2d(FEATURES, FEATURES, 3, 1, 1) if bias_convolution else None
 
-    def forward(self, tokens: Tokens, size: tuple[int, int]) -> Float[Tensor, "frame 128 height width"]:
+    def forward(self, tokens: Tokens, size: tuple[int, int]) -> FeatureMaps:
         """The feature map of this (height, width)."""
         features = _add_up(self.embedding(rearrange(tokens, "f r c d -> f (r c) d")), size)
         if self.bias is not None:

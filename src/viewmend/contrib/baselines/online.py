@@ -1,7 +1,8 @@
 """Published video inpainters as inpainters of live views: one frame at a time, only the past, any resolution."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
@@ -149,9 +150,13 @@ class OnlineInpainter(Inpainter):
         completed = view.rgb
         windows = self._windows_with_holes(view, canvas)
         if windows:
-            look = _WindowFrames(self.config, view, context, {view.time: canvas.image, **state.frames})
-            pieces = [self._piece(window, look, state) for window in windows]
-            filled = self._fitted(stitch(pieces, windows, state.canvas_px, self.config.overlap_px), view)
+            frames = {view.time: canvas.image, **state.frames}
+            cameras = cache(partial(self._cameras, view, context))  # fetched once for all windows
+            pieces = [self.network.complete_clip(self._clip(window, view, frames, cameras)) for window in windows]
+            filled = (stitch(pieces, windows, state.canvas_px, self.config.overlap_px).float() + 1) / 2
+            height, width = view.error.shape
+            is_whole = self.config.framing == "def"
+            filled = resized(filled.clamp(0, 1), (height, width)) if is_whole else filled[:, :height, :width]
             completed = blend(view.rgb, view.error, filled, torch.ones_like(view.error))
         return CompletedView(view, completed), self._kept(state, view.time, canvas)
 
@@ -181,42 +186,28 @@ class OnlineInpainter(Inpainter):
             return [Window(0, 0)] if bool((view.error > 0).any()) else []
         return list(windows_over(canvas.holes, self.config.size_px, self.config.overlap_px))
 
-    def _piece(self, window: Window, look: "_WindowFrames", state: OnlineState) -> Tensor:
-        """A window completed by a run on all of its frames."""
-        time, sampling = look.view.time, self.config.sampling
-        near, far = sampling.neighbour_times(time), sampling.reference_times(time)
-        past = (tuple(look(window, t) for t in times if t in state.frames) for times in (near, far))
-        return self.network.complete_clip(Clip(look(window, time), *past))
+    def _cameras(self, view: IncompleteView, context: ContextProvider, time: int) -> tuple[ContextViews, Tensor] | None:
+        """The view's source cameras at a time, and their images; None if there are none, and except in mul."""
+        is_mul = self.config.framing == "mul" and view.source_views
+        views = context(time, view.source_views) if is_mul else None
+        return None if views is None else (views, foreground(views))
 
-    def _fitted(
-        self, filled: Float[Tensor, "3 canvasheight canvaswidth"], view: IncompleteView
-    ) -> Float[Tensor, "3 height width"]:
-        height, width = view.error.shape
-        zero_to_one = (filled.float() + 1) / 2
-        if self.config.framing == "def":
-            return resized(zero_to_one.clamp(0, 1), (height, width))
-        return zero_to_one[:, :height, :width]
+    def _clip(
+        self,
+        window: Window,
+        view: IncompleteView,
+        frames: Mapping[int, Tensor],
+        cameras: Callable[[int], tuple[ContextViews, Tensor] | None],
+    ) -> Clip:
+        """A window at the view's time and at the past times that the sampling wants."""
+        size, sampling = self.config.size_px, self.config.sampling
 
+        def look(time: int) -> Frames:
+            own = window.of(frames[time], size)[None]
+            if (found := cameras(time)) is None:
+                return own
+            views, images = found
+            return torch.cat([own, camera_windows(images, views, aim(view, window, size), size).to(own)])
 
-class _WindowFrames:
-    """Frames of a window at a time, with the cameras' in mul; images of a time are fetched once for all windows."""
-
-    def __init__(
-        self, config: OnlineConfig, view: IncompleteView, context: ContextProvider, frames: Mapping[int, Tensor]
-    ) -> None:
-        self.config, self.view, self.context, self.frames = config, view, context, frames
-        self.seen: dict[int, tuple[ContextViews, Tensor] | None] = {}
-
-    def __call__(self, window: Window, time: int) -> Frames:
-        size = self.config.size_px
-        own = window.of(self.frames[time], size)[None]
-        if self.config.framing != "mul":
-            return own
-        if time not in self.seen:
-            views = self.context(time, self.view.source_views) if self.view.source_views else None
-            self.seen[time] = None if views is None else (views, foreground(views))
-        seen = self.seen[time]
-        if seen is None:
-            return own
-        views, images = seen
-        return torch.cat([own, camera_windows(images, views, aim(self.view, window, size), size).to(own)])
+        past = (sampling.neighbour_times(view.time), sampling.reference_times(view.time))
+        return Clip(look(view.time), *(tuple(look(t) for t in times if t in frames) for times in past))

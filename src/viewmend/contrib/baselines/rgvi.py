@@ -6,7 +6,7 @@ its weights are available, otherwise OpenCV's. The smooth fill completes the flo
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -26,8 +26,6 @@ from viewmend.utils.weight_files import load_weights
 Image = Float[Tensor, "3 height width"]
 FlowMap = Float[Tensor, "2 height width"]
 """Where each pixel's point is in another image, relative to the pixel: x right, y down, pixels."""
-
-
 DISAGREEMENT = (0.01, 0.5)
 """Forward and backward flow may differ, squared, by this fraction of their squares plus this many square pixels."""
 
@@ -108,11 +106,6 @@ FLOW_MARGIN_PX = 4
 
 Flow = Callable[[Image, Image], FlowMap]
 """flow(image, other), of images in [0, 1]."""
-Completion = Callable[
-    [Float[Tensor, "channel height width"], Bool[Tensor, "height width"], Bool[Tensor, "height width"]],
-    Float[Tensor, "channel height width"],
-]
-"""completion(image, missing, subject): the image with its missing pixels filled, the others as they are."""
 
 
 @dataclass(frozen=True)
@@ -126,16 +119,10 @@ class RgviState(State):
 
 
 class Rgvi(Inpainter):
-    """RGVI on a stream of views. Without `reveal_truth`, its own results are its past.
+    """RGVI on a stream of views. Without `reveal_truth`, its own results are its past."""
 
-    Args:
-        flow: optical flow between two frames.
-        complete_flow: completes flow in and near holes.
-        complete: fills pixels that cannot be pulled from the past.
-    """
-
-    def __init__(self, flow: Flow = dis_flow, complete_flow: Completion = fill, complete: Completion = fill) -> None:
-        self.flow, self.complete_flow, self.complete = flow, complete_flow, complete
+    def __init__(self, flow: Flow = dis_flow) -> None:
+        self.flow = flow
 
     def initial_state(self) -> State:
         """A stream without a past."""
@@ -145,12 +132,11 @@ class Rgvi(Inpainter):
         """Fills from the past along flow, the rest from the view alone; `context` is not used."""
         assert isinstance(state, RgviState), "the state of another inpainter"
         past = state.past if not state.past or state.past[0].shape == view.rgb.shape else ()
-        missing, subject = view.error > 0, view.mask > 0
-        image, left = view.rgb, missing
-        if bool(missing.any()) and past:
+        image, left, subject = view.rgb, view.error > 0, view.mask > 0
+        if bool(left.any()) and past:
             image, left = self._pull(view, past, state.flows)
         if bool(left.any()):
-            image = self.complete(image, left, subject)
+            image = fill(image, left, subject)
         mended = blend(view.rgb, view.error, image, torch.ones_like(view.error))
         return CompletedView(view, mended), self._remember(mended, past, state.flows if past else ())
 
@@ -167,10 +153,10 @@ class Rgvi(Inpainter):
         # Flow needs colours in the holes; flow estimated there, and close by, is replaced.
         guess = fill(view.rgb, missing, subject)
         size = 2 * FLOW_MARGIN_PX + 1
-        unknown = max_pool2d(missing[None, None].float(), size, 1, FLOW_MARGIN_PX)[0, 0] > 0
+        near = max_pool2d(missing[None, None].float(), size, 1, FLOW_MARGIN_PX)[0, 0] > 0
         flow = self.flow(guess, past[0])
-        unknown = unknown | disagreeing(flow, self.flow(past[0], guess))
-        flow = self.complete_flow(flow, unknown, subject)
+        unknown = near | disagreeing(flow, self.flow(past[0], guess))
+        flow = fill(flow, unknown, subject)
         image, left, seen = view.rgb, missing, torch.ones_like(missing)
         for age, frame in enumerate(past):
             if age:
@@ -184,7 +170,7 @@ class Rgvi(Inpainter):
     def _remember(self, image: Image, past: tuple[Image, ...], flows: tuple[FlowMap, ...]) -> RgviState:
         older = past[: PAST_FRAMES - 1]
         newest = (self.flow(image, older[0]),) if older else ()
-        return replace(RgviState(), past=(image, *older), flows=(*newest, *flows)[: len(older)])
+        return RgviState(past=(image, *older), flows=(*newest, *flows)[: len(older)])
 
 
 def make_rgvi(device: torch.device | str = "cpu") -> Rgvi:

@@ -5,6 +5,7 @@ DSTT: Liu et al. 2021, "Decoupled Spatial-Temporal Transformer for Video Inpaint
 """
 
 from abc import ABC, abstractmethod
+from collections import OrderedDict
 
 import torch
 from einops import rearrange
@@ -21,11 +22,13 @@ from viewmend.contrib.baselines.layers import (
     STEP_PX,
     STRIDE_PX,
     DeepLayers,
+    FeatureMaps,
     FrameDecoder,
     FusionFeedForward,
     HierarchicalEncoder,
     SoftComposition,
     SoftSplit,
+    Tokens,
     part_of,
     shallow_layers,
     token_grid,
@@ -39,6 +42,8 @@ NATIVE_PX = (240, 432)
 CELLS = (NATIVE_PX[0] // STRIDE_PX, NATIVE_PX[1] // STRIDE_PX)
 """Rows and columns of the feature map, fixed by the learned maps of FuseFormer and E2FGVI."""
 
+Clips = Float[Tensor, "sample frame 3 height width"]
+"""Frames in [-1, 1], 0 in the holes."""
 TokenClips = Float[Tensor, "sample frame rows cols 512"]
 """Tokens of clips in the grid of their patches."""
 
@@ -53,17 +58,15 @@ class MultiHeadAttention(nn.Module):
         self.key_embedding = nn.Linear(DIM, DIM)
         self.output_linear = nn.Linear(DIM, DIM)
 
-    def forward(
-        self, queries: Float[Tensor, "group query 512"], sources: Float[Tensor, "group key 512"]
-    ) -> Float[Tensor, "group query 512"]:
-        """Each query's mixture of the sources of its group."""
-        projected = self.query_embedding(queries), self.key_embedding(sources), self.value_embedding(sources)
+    def forward(self, tokens: Float[Tensor, "group token 512"]) -> Float[Tensor, "group token 512"]:
+        """Each token's mixture of those of its group."""
+        projected = self.query_embedding(tokens), self.key_embedding(tokens), self.value_embedding(tokens)
         Q, K, V = (rearrange(x, "g n (h c) -> g h n c", h=HEADS) for x in projected)
         return self.output_linear(rearrange(scaled_dot_product_attention(Q, K, V), "g h n c -> g n (h c)"))
 
 
-class TokenBlock(nn.Module, ABC):
-    """One block: attention, then a feed-forward. Keys `attention`, `ffn`, `norm1`, `norm2`."""
+class TokenBlock(nn.Module):
+    """The parts of one block: attention, then a feed-forward. Keys `attention`, `ffn`, `norm1`, `norm2`."""
 
     def __init__(self, ffn: nn.Module) -> None:
         super().__init__()
@@ -71,16 +74,13 @@ class TokenBlock(nn.Module, ABC):
         self.ffn = ffn
         self.norm1, self.norm2 = nn.LayerNorm(DIM), nn.LayerNorm(DIM)
 
-    @abstractmethod
-    def forward(self, tokens: TokenClips) -> TokenClips:
-        """The tokens after the block."""
-
 
 class TokenTransformer(nn.Module, ABC):
     """From frames with holes to whole frames; subclasses name the parts as the official checkpoints do."""
 
     encoder: nn.Module
     transformer: nn.ModuleList
+    decoder: FrameDecoder
 
     @abstractmethod
     def check_size(self, height: int, width: int) -> None:
@@ -91,18 +91,14 @@ class TokenTransformer(nn.Module, ABC):
         return self.encoder(frames)
 
     @abstractmethod
-    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+    def split(self, features: FeatureMaps) -> Tokens:
         """Tokens of overlapping patches."""
 
     @abstractmethod
-    def decode(
-        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
-    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
-        """Frames from the encoder's features and what the tokens add to them."""
+    def compose(self, tokens: Tokens, size: tuple[int, int]) -> FeatureMaps:
+        """What the tokens add to the encoder's features, which have this height and width."""
 
-    def forward(
-        self, clips: Float[Tensor, "sample frame 3 height width"]
-    ) -> Float[Tensor, "sample frame 3 height width"]:
+    def forward(self, clips: Clips) -> Clips:
         """All frames of each clip, filled, in [-1, 1].
 
         Args:
@@ -116,7 +112,8 @@ class TokenTransformer(nn.Module, ABC):
         tokens = self.split(features).unflatten(0, clips.shape[:2])
         for block in self.transformer:
             tokens = block(tokens)
-        return self.decode(features, tokens.flatten(0, 1)).unflatten(0, clips.shape[:2])
+        added = self.compose(tokens.flatten(0, 1), (features.shape[-2], features.shape[-1]))
+        return self.decoder(features + added).unflatten(0, clips.shape[:2])
 
     def complete_clip(self, clip: Clip) -> Float[Tensor, "3 height width"]:
         """See `OnlineNetwork`."""
@@ -139,18 +136,6 @@ SIZE_STEP_PX = STEP_PX * ZONES
 """Heights and widths are multiples of this, so that zones are equal."""
 
 
-class FeedForward(nn.Module):
-    """Linear, ReLU, linear; keys `conv.0` and `conv.3` (the official dropout between them is inactive)."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv = nn.Sequential(nn.Linear(DIM, HIDDEN), nn.ReLU(inplace=True), nn.Identity(), nn.Linear(HIDDEN, DIM))
-
-    def forward(self, tokens: TokenClips) -> TokenClips:
-        """The same grid of tokens."""
-        return self.conv(tokens)
-
-
 class DecoupledBlock(TokenBlock):
     """Attention over all frames within each zone (`temporal`), or over all tokens of each frame.
 
@@ -158,33 +143,22 @@ class DecoupledBlock(TokenBlock):
     """
 
     def __init__(self, temporal: bool) -> None:
-        super().__init__(FeedForward())
+        # The feed-forward's keys are `conv.0` and `conv.3`; the official dropout between them is inactive.
+        layers = nn.Linear(DIM, HIDDEN), nn.ReLU(inplace=True), nn.Identity(), nn.Linear(HIDDEN, DIM)
+        super().__init__(nn.Sequential(OrderedDict(conv=nn.Sequential(*layers))))
         self.temporal = temporal
 
     def forward(self, tokens: TokenClips) -> TokenClips:
-        """See `TokenBlock`."""
+        """The tokens after the block."""
         own = self.norm1(tokens)
-        x = own + (self._over_time(own) if self.temporal else self._over_frames(own))
+        if self.temporal:
+            split = {"i": ZONES, "j": ZONES, "f": own.shape[1], "r": own.shape[2] // ZONES}
+            zones = rearrange(own, "b f (i r) (j c) d -> (b i j) (f r c) d", **split)
+            looked = rearrange(self.attention(zones), "(b i j) (f r c) d -> b f (i r) (j c) d", **split)
+        else:
+            looked = self.attention(rearrange(own, "b f r c d -> (b f) (r c) d")).reshape(own.shape)
+        x = own + looked
         return x + self.ffn(self.norm2(x))
-
-    def _over_time(self, own: TokenClips) -> TokenClips:
-        samples, frames, rows, cols, _ = own.shape
-        zones = rearrange(own, "b f (i r) (j c) d -> (b i j) (f r c) d", i=ZONES, j=ZONES)
-        mixed = self.attention(zones, zones)
-        return rearrange(
-            mixed,
-            "(b i j) (f r c) d -> b f (i r) (j c) d",
-            b=samples,
-            f=frames,
-            i=ZONES,
-            j=ZONES,
-            r=rows // ZONES,
-            c=cols // ZONES,
-        )
-
-    def _over_frames(self, own: TokenClips) -> TokenClips:
-        flat = rearrange(own, "b f r c d -> (b f) (r c) d")
-        return self.attention(flat, flat).reshape(own.shape)
 
 
 class DSTT(TokenTransformer):
@@ -212,16 +186,13 @@ class DSTT(TokenTransformer):
         """Features at a quarter of the size."""
         return self.hier_enc(self.encoder(frames))
 
-    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+    def split(self, features: FeatureMaps) -> Tokens:
         """Tokens of overlapping patches; the convolution is soft split's linear layer."""
         return self.patch2vec(features).movedim(1, -1)
 
-    def decode(
-        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
-    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
-        """Frames in [-1, 1]."""
-        rows, cols = features.shape[-2:]
-        return self.decoder(features + self.vec2patch(tokens, (rows, cols)))
+    def compose(self, tokens: Tokens, size: tuple[int, int]) -> FeatureMaps:
+        """See `TokenTransformer.compose`."""
+        return self.vec2patch(tokens, size)
 
 
 TOKENS = token_grid(*CELLS)
@@ -234,9 +205,9 @@ class JointBlock(TokenBlock):
         super().__init__(FusionFeedForward(nn.ReLU(inplace=True), nn.Identity()))
 
     def forward(self, tokens: TokenClips) -> TokenClips:
-        """See `TokenBlock`."""
+        """The tokens after the block."""
         flat = rearrange(self.norm1(tokens), "b f r c d -> b (f r c) d")
-        x = tokens + self.attention(flat, flat).reshape(tokens.shape)
+        x = tokens + self.attention(flat).reshape(tokens.shape)
         size = (STEP_CELLS * x.shape[2], STEP_CELLS * x.shape[3])
         fused = self.ffn(self.norm2(x).flatten(0, 1), size)
         return x + fused.reshape(x.shape)
@@ -251,7 +222,7 @@ class PositionalEmbedding(nn.Module):
         self.pos_emb = nn.Parameter(torch.empty(1, 1, rows * cols, DIM))
         nn.init.normal_(self.pos_emb, 0, 0.02)
 
-    def forward(self, tokens: Float[Tensor, "frame rows cols 512"]) -> Float[Tensor, "frame rows cols 512"]:
+    def forward(self, tokens: Tokens) -> Tokens:
         """Tokens with their positional embedding."""
         everywhere = self.pos_emb.reshape(*TOKENS, DIM).movedim(-1, 0)
         return tokens + part_of(everywhere, (tokens.shape[1], tokens.shape[2])).movedim(0, -1)
@@ -282,12 +253,10 @@ class FuseFormer(TokenTransformer):
                 f"{width}x{height}; resize them or run windows of that size"
             )
 
-    def split(self, features: Float[Tensor, "frame 128 height width"]) -> Float[Tensor, "frame rows cols 512"]:
+    def split(self, features: FeatureMaps) -> Tokens:
         """Tokens of overlapping patches with their positional embedding."""
         return self.add_pos_emb(self.ss(features))
 
-    def decode(
-        self, features: Float[Tensor, "frame 128 height width"], tokens: Float[Tensor, "frame rows cols 512"]
-    ) -> Float[Tensor, "frame 3 fullheight fullwidth"]:
-        """Frames in [-1, 1]."""
-        return self.decoder(features + self.sc(tokens, (features.shape[-2], features.shape[-1])))
+    def compose(self, tokens: Tokens, size: tuple[int, int]) -> FeatureMaps:
+        """See `TokenTransformer.compose`."""
+        return self.sc(tokens, size)

@@ -158,11 +158,10 @@ class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
     def forward(self, batch: Sequence[Sample]) -> StepOutput:
         """The terms of a batch, each sample in a random framing."""
         options = self.options
-        framings = [int(torch.randint(len(FRAMINGS), ())) for _ in batch]
-        pairs = zip(batch, framings, strict=True)
+        framings: list[Framing] = [FRAMINGS[int(torch.randint(len(FRAMINGS), ()))] for _ in batch]
         clips = [
-            training_clip(sample, options.size_px, FRAMINGS[framing], options.background, options.clip_length)
-            for sample, framing in pairs
+            training_clip(sample, options.size_px, framing, options.background, options.clip_length)
+            for sample, framing in zip(batch, framings, strict=True)
         ]
         made, flow_terms = zip(*(self._complete(clip) for clip in clips), strict=True)
         terms = [clip_terms(frames, clip) for frames, clip in zip(made, clips, strict=True)]
@@ -173,8 +172,8 @@ class BaselineObjective(Objective[TokenTransformer | E2FGVI]):
             [(frames.transpose(0, 1) + 1) / 2 for frames in composed],
             [clip.holes.float() for clip in clips],
         )
-        total = inside + outside + torch.stack(flow_terms).mean()
-        return StepOutput(ImageLoss(inside, outside, torch.zeros_like(inside)), total, judged)
+        loss = ImageLoss(inside, outside, torch.zeros_like(inside))
+        return StepOutput(loss, inside + outside + torch.stack(flow_terms).mean(), judged)
 
     def _complete_view(self, model: nn.Module, sample: Sample) -> Float[Tensor, "3 height width"]:
         """A view as a stream of one frame."""

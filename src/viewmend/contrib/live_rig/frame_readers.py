@@ -131,7 +131,12 @@ def _received(camera: LiveCamera, counts: "Counter[str]") -> Iterator[Picture]:
         packets = container.demux(stream)
         while True:
             asked_s = time.monotonic()
-            packet = _next(packets)
+            try:
+                packet = next(packets, None)
+            except av.FFmpegError as error:
+                raise OSError(_said(error)) from None
+            if packet is None or packet.size == 0:
+                raise OSError("the stream has ended")
             arrived_s = time.monotonic()
             stamps.saw(packet, arrived_s, arrived_s - asked_s > WAITED_S)
             try:
@@ -180,31 +185,13 @@ def _opened(camera: LiveCamera) -> "InputContainer":
 
     options = FOR_ALL | BY_SCHEME.get(camera.url.partition("://")[0], {}) | dict(camera.options)
     try:
-        given = {} if camera.is_file else options
-        container = av.open(camera.url, format=camera.format, options=given, timeout=(OPEN_S, SILENT_S))
+        container = av.open(camera.url, format=camera.format, options=options, timeout=(OPEN_S, SILENT_S))
     except (av.FFmpegError, ValueError) as error:
         raise OSError(_said(error)) from None
     if not container.streams.video:
         container.close()
         raise OSError("expected a video, got none there")
     return container
-
-
-def _next(packets: "Iterator[Packet]") -> "Packet":
-    """The next packet.
-
-    Raises:
-        OSError: there is none.
-    """
-    import av
-
-    try:
-        packet = next(packets, None)
-    except av.FFmpegError as error:
-        raise OSError(_said(error)) from None
-    if packet is None or packet.size == 0:
-        raise OSError("the stream has ended")
-    return packet
 
 
 def _said(error: Exception) -> str:

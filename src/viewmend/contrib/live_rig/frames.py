@@ -48,7 +48,6 @@ class Taken:
 class Together:
     """The cameras' images of one tick."""
 
-    tick: int
     since_s: float
     """When the first of them arrived."""
     taken: dict[str, Taken] = field(default_factory=dict)
@@ -57,39 +56,20 @@ class Together:
     def spread_s(self) -> float:
         """Time between the first and the last exposure."""
         times = [taken.taken_s for taken in self.taken.values()]
-        return max(times) - min(times) if times else 0.0
-
-
-class TimeLine:
-    """Evenly spaced ticks that follow the cameras' own rate and phase."""
-
-    def __init__(self, interval_s: float) -> None:
-        self.interval_s = interval_s
-        self._origin_s: float | None = None
-
-    def nearest(self, taken_s: float) -> tuple[int, float]:
-        """The nearest tick, and the offset from it; the first call sets tick 0."""
-        if self._origin_s is None:
-            self._origin_s = taken_s
-        tick = math.floor((taken_s - self._origin_s) / self.interval_s + 0.5)
-        return tick, taken_s - self._origin_s - tick * self.interval_s
-
-    def follow(self, offsets_s: Sequence[float]) -> None:
-        """Correct the ticks by the cameras' offsets from one of them."""
-        if self._origin_s is not None and offsets_s:
-            self._origin_s += FOLLOWS * statistics.median(offsets_s)
+        return max(times) - min(times)
 
 
 class Aligner:
     """Groups images, which arrive in any order, by tick. One thread at a time.
 
-    A tick is complete when each camera has an image for it or a later one; cameras that are away do not count. An
-    incomplete tick waits for `wait_s`.
+    Ticks are evenly spaced and follow the cameras' own rate and phase. A tick is complete when each camera has an image
+    for it or a later one; cameras that are away do not count. An incomplete tick waits for `wait_s`.
     """
 
     def __init__(self, names: Sequence[str], interval_s: float, tolerance_s: float, wait_s: float) -> None:
-        self._line = TimeLine(interval_s)
-        self._tolerance_s, self._wait_s = tolerance_s, wait_s
+        self._interval_s, self._tolerance_s, self._wait_s = interval_s, tolerance_s, wait_s
+        self._origin_s: float | None = None
+        """Time of tick 0."""
         self._most = SPARE + math.ceil(wait_s / interval_s)
         self._waiting: dict[int, Together] = {}
         self._done = -math.inf
@@ -100,27 +80,34 @@ class Aligner:
 
     def wants(self, taken_s: float, period_s: float) -> bool:
         """Whether an image of a camera with this period is the nearest to a tick."""
-        return period_s > self._line.interval_s / 1.5 or abs(self._line.nearest(taken_s)[1]) <= period_s / 2
+        return period_s > self._interval_s / 1.5 or abs(self._nearest(taken_s)[1]) <= period_s / 2
+
+    def _nearest(self, taken_s: float) -> tuple[int, float]:
+        """The nearest tick, and the offset from it; the first call sets tick 0."""
+        if self._origin_s is None:
+            self._origin_s = taken_s
+        tick = math.floor((taken_s - self._origin_s) / self._interval_s + 0.5)
+        return tick, taken_s - self._origin_s - tick * self._interval_s
 
     def put(self, name: str, taken: Taken, now_s: float) -> None:
         """Add one camera's image. One that is late, in the future or far from its tick is counted and dropped."""
         counts = self.counts[name]
         self._heard_s[name] = now_s
-        if taken.taken_s > now_s + self._line.interval_s / 2:  # a clock that jumps must not affect the others
+        if taken.taken_s > now_s + self._interval_s / 2:  # a clock that jumps must not affect the others
             counts["misaligned"] += 1
             return
-        tick, offset_s = self._line.nearest(taken.taken_s)
+        tick, offset_s = self._nearest(taken.taken_s)
         self._newest[name] = max(self._newest[name], tick)
         if tick <= self._done:
             counts["late"] += 1
         elif abs(offset_s) > self._tolerance_s:
             counts["misaligned"] += 1
         else:
-            together = self._waiting.setdefault(tick, Together(tick, now_s))
+            together = self._waiting.setdefault(tick, Together(now_s))
             other = together.taken.get(name)
             if other is not None:
                 counts["surplus"] += 1
-            if other is None or abs(offset_s) < abs(self._line.nearest(other.taken_s)[1]):
+            if other is None or abs(offset_s) < abs(self._nearest(other.taken_s)[1]):
                 together.taken[name] = taken
             while len(self._waiting) > self._most:
                 self._done = min(self._waiting)
@@ -141,7 +128,9 @@ class Aligner:
                 self.counts[name]["used"] += 1
             for name in present - together.taken.keys():
                 self.counts[name]["missing"] += 1
-            self._line.follow([self._line.nearest(taken.taken_s)[1] for taken in together.taken.values()])
+            offsets_s = [self._nearest(taken.taken_s)[1] for taken in together.taken.values()]
+            assert self._origin_s is not None, "an image has set it"
+            self._origin_s += FOLLOWS * statistics.median(offsets_s)
             out.append(together)
         return out
 
@@ -221,10 +210,9 @@ class RigSource(LiveSource):
             self._lock_cameras.notify_all()
         if self._thread.is_alive():
             self._thread.join(timeout=10)
-        workers = list(self._workers.values())
-        for worker in workers:
+        for worker in self._workers.values():
             worker.ask_to_stop()
-        for worker in workers:
+        for worker in self._workers.values():
             worker.stop()
 
     def camera_counts(self) -> dict[str, dict[str, int]]:
@@ -239,8 +227,8 @@ class RigSource(LiveSource):
         Raises:
             CaptureError: a clean plate or a recording cannot be used; nothing has changed then.
         """
-        unchanged = {camera.key for camera in rig.cameras}
-        kept = {name: worker for name, worker in self._workers.items() if worker.camera.key in unchanged}
+        unchanged = {repr(camera) for camera in rig.cameras}
+        kept = {name: worker for name, worker in self._workers.items() if repr(worker.camera) in unchanged}
         new = {camera.name: self._worker_of(camera) for camera in rig.cameras if camera.name not in kept}
         tracks = [video_track(c.name, "images", Path(c.url)) for c in rig.cameras if c.is_file]
         if tracks:
@@ -296,8 +284,12 @@ class RigSource(LiveSource):
         """Add one frame, prepared as in `viewmend mend`."""
         taken = {name: images for name, images in together.taken.items() if name in self._cameras.names}
         names = [name for name in self._cameras.names if name in taken]
-        if len(names) < 2 or self._gathers(len(names)):
+        if len(names) < 2:
             return
+        now_s = time.monotonic()
+        self._gather_until = self._gather_until or now_s + GATHER_S
+        if self._prepared is None and len(names) < len(self._cameras) and now_s < self._gather_until:
+            return  # the first frame waits for more cameras
         frame = stack_images([taken[name].images for name in names], self._cameras.select(names), 0)
         assert frame.mask is not None, "live cameras are masked"
         if int((frame.mask.amax((1, 2)) > FOREGROUND).sum()) < 2:
@@ -312,13 +304,6 @@ class RigSource(LiveSource):
                 log.warning("%s", text)
         self.spread_ms = 1000 * together.spread_s
         self.add(replace(self._prepared, source=source).read(0))
-
-    def _gathers(self, there: int) -> bool:
-        """Whether to wait for more cameras before the first frame."""
-        now_s = time.monotonic()
-        if self._gather_until is None:
-            self._gather_until = now_s + GATHER_S
-        return self._prepared is None and there < len(self._cameras) and now_s < self._gather_until
 
     def _deliver(self, name: str, taken_s: float, images: CameraImages) -> None:
         """Called by the cameras' workers."""
@@ -346,10 +331,8 @@ class RigSource(LiveSource):
         gone = [worker for worker in self._workers.values() if not worker.up]
         there = len(self._workers) - len(gone)
         if there < 2:
-            error = (
-                f"two cameras or more are needed, {there} there; '{gone[0].camera.name}': {gone[0].error or 'silent'}"
-            )
-            self._is_wrong(error)
+            missed = f"'{gone[0].camera.name}': {gone[0].error or 'silent'}"
+            self._is_wrong(f"two cameras or more are needed, {there} there; {missed}")
 
     def _is_wrong(self, error: str) -> None:
         """Report an error in the status, and to the terminal once until it changes."""
@@ -365,8 +348,8 @@ class RigSource(LiveSource):
         for name, counts in counted.items():
             before = self._said.get(name, {})
             new = {event: counts.get(event, 0) - before.get(event, 0) for event in WORTH_SAYING}
-            lost = [f"{count} {event}" for event, count in new.items() if count > 0]
-            lines += [f"{name} {', '.join(lost)}"] if lost else []
+            if lost := [f"{count} {event}" for event, count in new.items() if count > 0]:
+                lines.append(f"{name} {', '.join(lost)}")
         self._said = counted
         if lines:
             log.warning("in the last %.0f s: %s", REPORT_S, "; ".join(lines))

@@ -103,11 +103,6 @@ class LiveCamera:
         """Whether it is a recording that is played as if it were live."""
         return "://" not in self.url and self.format is None
 
-    @property
-    def key(self) -> str:
-        """Changes whenever any of its settings does."""
-        return repr(self)
-
 
 @dataclass(frozen=True)
 class LiveRig:
@@ -143,10 +138,8 @@ def read_rig(path: Path, max_image_size: int | None = None) -> LiveRig:
     calibration = _calibration(folder / rig.calibration, rig.format)
     known = {camera.name: camera for camera in calibration.cameras}
     if unknown := [camera.name for camera in rig.cameras if camera.name not in known]:
-        names = ", ".join(known)
-        raise CaptureError(
-            f"{path}: expected cameras that {calibration.file} has ({names}), got {unknown}; rename them"
-        )
+        expected = f"expected cameras that {calibration.file} has ({', '.join(known)})"
+        raise CaptureError(f"{path}: {expected}, got {unknown}; rename them")
     return LiveRig(
         name=rig.name or folder.name,
         cameras=tuple(_camera(entry, known[entry.name], rig.mask, folder, max_image_size) for entry in rig.cameras),

@@ -5,7 +5,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from queue import Empty, Queue
 from typing import Any
 
@@ -59,14 +59,6 @@ PERIOD_FOLLOWS = 0.05
 """Weight of the newest interval in the estimate of the interval between images."""
 
 log = logging.getLogger("viewmend.live")
-
-
-def pauses() -> Iterator[float]:
-    """Pauses between attempts to connect, seconds."""
-    pause_s = FIRST_PAUSE_S
-    while True:
-        yield pause_s
-        pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
 
 class CameraWorker:
@@ -123,11 +115,11 @@ class CameraWorker:
 
     def wait(self, seconds: float) -> bool:
         """Wait; returns whether the worker must end."""
-        return self._stopped.wait(max(0.0, seconds)) if seconds > 0 else self._stopped.is_set()
+        return self._stopped.wait(max(0.0, seconds))
 
     def read(self) -> None:
         """Read images, reconnecting after failures, until stopped."""
-        pause = pauses()
+        pause_s = FIRST_PAUSE_S
         while not self._stopped.is_set():
             began_s = time.monotonic()
             try:
@@ -135,7 +127,7 @@ class CameraWorker:
                     for picture in pictures:
                         if not self.up:
                             self._is_up()
-                            pause = pauses()
+                            pause_s = FIRST_PAUSE_S
                         self._offer(picture)
                         if self._stopped.is_set():
                             return
@@ -143,8 +135,9 @@ class CameraWorker:
                     self._is_down("its pictures have ended")
             except Exception as error:  # any failure is reported, and the camera tried again
                 self._is_down(str(error) or type(error).__name__)
-            if self.wait(began_s + next(pause) - time.monotonic()):
+            if self.wait(began_s + pause_s - time.monotonic()):
                 return
+            pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
 
     def work(self) -> None:
         """Process the newest image, again and again, until stopped."""

@@ -17,7 +17,6 @@ QUIET = {"RAY_USAGE_STATS_ENABLED": "0"}
 """Disables usage reports."""
 ON_LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 """Binds a cluster's sockets to 127.0.0.1."""
-
 AS_URGENT = {"RAY_worker_niceness": "0"}
 """Gives work the priority of the command that started it; Ray's default is the lowest."""
 
@@ -50,7 +49,9 @@ def connect(ray: Any, address: str, **own: object) -> None:
     """
     local = address == LOCAL
     try:
-        _knock(address)
+        host, colon, port = address.removeprefix("ray://").rpartition(":")
+        if colon and port.isdecimal():  # Ray itself would wait for minutes
+            socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
         quiet = {"include_dashboard": False, "log_to_driver": False, "configure_logging": False}
         ray.init(None if local else address, **quiet, **(own if local else {}))
     except (OSError, RuntimeError, ValueError) as error:
@@ -58,13 +59,6 @@ def connect(ray: Any, address: str, **own: object) -> None:
             f"expected a Ray cluster at '{address}', got none ({' '.join(str(error).split())[:200]}); check --ray, or "
             f"use --ray {LOCAL}"
         ) from error
-
-
-def _knock(address: str) -> None:
-    """Raise OSError if HOST:PORT does not accept connections; Ray itself would wait for minutes."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if colon and port.isdecimal():
-        socket.create_connection((host, int(port)), timeout=ANSWER_S).close()
 
 
 def run_on_ray(tasks: Sequence[Task], settings: RunSettings, address: str) -> Runs:

@@ -124,12 +124,10 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
     host, port = served.server.host, _free_port(served.server.host, served.server.port)
     ray = find_ray(address)
     logging.getLogger("ray").setLevel(logging.ERROR)
-    cpus = served.replicas[1] + 1
-    connect(ray, address, num_cpus=cpus, object_store_memory=int(1e6 * served.store_mb))
+    connect(ray, address, num_cpus=served.replicas[1] + 1, object_store_memory=int(1e6 * served.store_mb))
     from ray import serve  # pyright: ignore
 
     logging.getLogger("ray.serve").setLevel(logging.ERROR)
-
     try:
         _demand_no_serve(ray)
         calls = 4 * served.replicas[1] + 8  # two calls per replica, and per replica that is being replaced
@@ -138,7 +136,12 @@ def serving(served: ManyViewers, address: str) -> Iterator[str]:
         opened = ingest.state.remote(-1, 0.0, False)
         quiet = {"enable_access_log": False, "log_level": "ERROR"}
         serve.start(http_options={"host": host, "port": port}, logging_config=quiet)
-        _demand(ray, opened)
+        try:
+            ray.get(opened)
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, ValueError | OSError):  # the source's own
+                raise error.cause from None
+            raise
         serve.run(_application(serve, served, ingest), name=NAME, route_prefix="/", logging_config=quiet)
         try:
             yield f"http://{f'[{host}]' if ':' in host else host}:{port}"
@@ -157,17 +160,13 @@ def _application(serve: Any, served: ManyViewers, ingest: Any) -> Any:
         return _replica(served, RayIngest(ingest))
 
     viewers, (fewest, most) = served.server.limits.viewers, served.replicas
-    scaling = {
-        "min_replicas": fewest,
-        "initial_replicas": fewest,
-        "max_replicas": most,
-        "target_ongoing_requests": max(1, math.floor(WELL_FILLED * viewers)),
-    }
+    target = max(1, math.floor(WELL_FILLED * viewers))
+    scaling = {"min_replicas": fewest, "initial_replicas": fewest, "max_replicas": most}
     deployment = serve.deployment(
         name="replica",
         ray_actor_options={"num_cpus": 1, "num_gpus": 1 if served.device.startswith("cuda") else 0},
         max_ongoing_requests=viewers + SPARE_REQUESTS,
-        autoscaling_config=scaling,
+        autoscaling_config={**scaling, "target_ongoing_requests": target},
         graceful_shutdown_timeout_s=STOPPING_S,
         health_check_period_s=1.0,
     )
@@ -201,9 +200,8 @@ def _replica(served: ManyViewers, ingest: RayIngest) -> StartWhenReady:
     configure_allocator()
     source = SharedSource(ingest, served.replica_mb / 2)
     stream = replace(served.stream, memory_mb=min(served.stream.memory_mb or math.inf, served.replica_mb / 2))
-    inpainter = served.load_inpainter()
+    inpainter, in_page = served.load_inpainter(), served.server.draws_in_page
     error_model = error_model_for(inpainter, served.device)
-    in_page = served.server.draws_in_page
     renderer = Renderer(source, inpainter, stream, served.device, error_model, draws_in_page=in_page)
     service = RenderService(renderer, source)
 
@@ -235,16 +233,6 @@ def _demand_no_serve(ray: Any) -> None:
     )
 
 
-def _demand(ray: Any, opened: Any) -> None:
-    """Wait until the source is open; its own errors are raised."""
-    try:
-        ray.get(opened)
-    except ray.exceptions.RayTaskError as error:
-        if isinstance(error.cause, ValueError | OSError):
-            raise error.cause from None
-        raise
-
-
 def _free_port(host: str, port: int) -> int:
     """The port, or a free one for 0; checked here because Ray reports a used port late and at length.
 
@@ -256,5 +244,4 @@ def _free_port(host: str, port: int) -> int:
         with socket.create_server((host, port), family=family) as listener:
             return int(listener.getsockname()[1])
     except OSError as error:
-        what = error.strerror or str(error)
-        raise OSError(f"port {port} of {host}: {what}; choose another --port or --host") from None
+        raise OSError(f"port {port} of {host}: {error.strerror or error}; choose another --port or --host") from None

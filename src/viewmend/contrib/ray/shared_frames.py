@@ -1,5 +1,6 @@
 """Frames that processes share: one reads the rig and computes the hull, the others render; arrays are not copied."""
 
+import copyreg
 import io
 import logging
 import math
@@ -10,11 +11,10 @@ import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -63,43 +63,22 @@ class SharedFrame:
         return size_bytes([self.frame.rgb, self.frame.mask]) if self.cached is None else self.cached.size
 
     def __reduce__(self) -> tuple[Any, ...]:
-        content = io.BytesIO()
-        pickler = _TensorPickler(content, protocol=5)
-        pickler.dump({part.name: getattr(self, part.name) for part in fields(self)})
-        return _unpickle, (content.getvalue(), pickler.arrays)
+        content, buffers = io.BytesIO(), []
+        pickler = pickle.Pickler(content, 5, buffer_callback=buffers.append)
+        pickler.dispatch_table = copyreg.dispatch_table | {Tensor: _as_array}
+        pickler.dump((self.frame, self.cached))
+        return _unpickle, (content.getvalue(), buffers)
 
 
-class _TensorPickler(pickle.Pickler):
-    """Pickles everything but tensors, which are collected as arrays, each of them once."""
-
-    def __init__(self, file: io.BytesIO, protocol: int) -> None:
-        super().__init__(file, protocol)
-        self.arrays: list[np.ndarray] = []
-        self._indices: dict[int, int] = {}
-
-    def persistent_id(self, obj: Any) -> int | None:
-        if not isinstance(obj, torch.Tensor):
-            return None
-        if id(obj) not in self._indices:
-            self._indices[id(obj)] = len(self.arrays)
-            self.arrays.append(obj.detach().contiguous().numpy())
-        return self._indices[id(obj)]
+def _as_array(tensor: Tensor) -> tuple[Any, ...]:
+    """A tensor for pickle: an array, whose buffer is out of band."""
+    return torch.from_numpy, (tensor.detach().contiguous().numpy(),)
 
 
-class _TensorUnpickler(pickle.Unpickler):
-    def __init__(self, file: io.BytesIO, tensors: Sequence[Tensor]) -> None:
-        super().__init__(file)
-        self._tensors = tensors
-
-    def persistent_load(self, pid: int) -> Tensor:
-        return self._tensors[pid]
-
-
-def _unpickle(content: bytes, arrays: Sequence[np.ndarray]) -> SharedFrame:
+def _unpickle(content: bytes, buffers: Sequence[Any]) -> SharedFrame:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="The given NumPy array is not writable")  # they are only read
-        tensors = [torch.from_numpy(array) for array in arrays]
-    return SharedFrame(**_TensorUnpickler(io.BytesIO(content), tensors).load())
+        return SharedFrame(*pickle.loads(content, buffers=buffers))
 
 
 LEAD_S = 2.0
