@@ -34,7 +34,7 @@ class Options(RunOptions):
     paper-small takes the row of the paper's model; all others have rows of their own."""
     models: Path | None = None
     """Table 3: a folder of models named full, no-rope, no-past, single-camera, single-camera-no-masks; with -s0, -s1
-    ... appended for several seeds, as research/ablation.py leaves them in OUT/models."""
+    ... appended for several seeds, as research/ablation.py leaves them."""
 
 
 def run(options: Options) -> int:
