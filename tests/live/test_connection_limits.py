@@ -320,7 +320,8 @@ def test_an_impossible_upgrade_is_refused_and_closed(ball, path, more):
         assert not received or received.startswith(b"HTTP/1.1 4")
 
 
-def test_no_websocket_is_accepted_without_the_token():
+def test_no_websocket_is_accepted_without_the_token(monkeypatch):
+    monkeypatch.setattr(limits, "IDLE_S", 1.0)
     with running(token=TOKEN) as server:
         for path in ("/ws", "/push", "/ws?token=wrong"):
             answer = exchange(server, UPGRADE.format(path=path, more=KEYS).encode())

@@ -5,34 +5,21 @@ import struct
 
 import pytest
 
-from viewmend.live.protocol import (
-    Ack,
-    Camera,
-    Cancel,
-    ClockChange,
-    FrameTimes,
-    Hello,
-    Limits,
-    Look,
-    Ping,
-    ProtocolError,
-    pack,
-    parse,
-    unpack,
-)
+from viewmend.live import protocol
+from viewmend.live.protocol import Ack, Camera, Cancel, ClockChange, FrameTimes, Hello, Limits, Look, ProtocolError
 
 LIMITS = Limits()
 
 
 def said(**message):
-    return parse(json.dumps(message), LIMITS)
+    return protocol.parse(json.dumps(message), LIMITS)
 
 
 def test_every_message_is_parsed():
     assert said(type="hello", version=1, codecs=["h264", "theora", "jpeg"]) == Hello(1, ("h264", "theora", "jpeg"))
     assert said(type="ack", frame=3) == Ack(3)
     assert said(type="cancel") == Cancel()
-    assert said(type="ping", sent_ms=1.5) == Ping(1.5)
+    assert said(type="ping", sent_ms=1.5) == protocol.Ping(1.5)
     assert said(type="clock", seek=4, speed=2) == ClockChange(None, 2.0, 4, False)
     assert said(type="clock", playing=False, live=True) == ClockChange(False, None, None, True)
     assert said(type="look") == Look()
@@ -69,7 +56,7 @@ def test_every_message_is_parsed():
 )
 def test_errors_name_the_invalid_value(message, words):
     with pytest.raises(ProtocolError, match=words):
-        parse(json.dumps(message), LIMITS)
+        protocol.parse(json.dumps(message), LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -77,25 +64,25 @@ def test_errors_name_the_invalid_value(message, words):
 )
 def test_invalid_json_is_refused(text):
     with pytest.raises(ProtocolError):
-        parse(text, LIMITS)
+        protocol.parse(text, LIMITS)
 
 
 def test_long_messages_and_headers_are_refused():
     with pytest.raises(ProtocolError, match="at most 16384 bytes"):
-        parse(" " * 20_000, LIMITS)
+        protocol.parse(" " * 20_000, LIMITS)
     with pytest.raises(ProtocolError, match="at most 1000000 bytes, got one of 1000001"):
-        unpack(b"VMF1" + struct.pack("<I", 1_000_001) + b" " * 1_000_001, "images")
+        protocol.unpack(b"VMF1" + struct.pack("<I", 1_000_001) + b" " * 1_000_001, "images")
 
 
 def test_binary_messages_are_unpacked_as_packed():
     header = {"frame": 3, "parts": [{"kind": "image", "bytes": 2}, {"kind": "depth", "bytes": 0}]}
-    message = pack(header, [b"ab", b""])
-    assert unpack(message) == (header, [b"ab", b""])
+    message = protocol.pack(header, [b"ab", b""])
+    assert protocol.unpack(message) == (header, [b"ab", b""])
     for cut in range(len(message)):
         with pytest.raises(ProtocolError):
-            unpack(message[:cut])
+            protocol.unpack(message[:cut])
     with pytest.raises(ProtocolError):
-        unpack(message + b"x")
+        protocol.unpack(message + b"x")
 
 
 def test_stage_times_are_added_and_averaged():

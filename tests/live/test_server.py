@@ -15,8 +15,7 @@ import pytest
 from live.live_servers import CAMERAS, decode, exchange, get, open_socket, post, running, true_image, wait_until
 from reference.ball import BallCapture
 
-from viewmend.live import frame_source
-from viewmend.live import server as live_server
+from viewmend.live import frame_source, render_jobs
 from viewmend.live.client import Client
 from viewmend.live.frame_source import RecordedSource
 from viewmend.live.poses import stereo_pair, view_camera
@@ -374,7 +373,7 @@ def test_a_body_is_parsed_off_the_event_loop(ball, monkeypatch):
         threads.append(threading.current_thread().name)
         raise ProtocolError("parsed")
 
-    monkeypatch.setattr(live_server, "parse_path", parse)
+    monkeypatch.setattr(render_jobs, "parse_path", parse)
     chunked = b"POST /path.mp4 HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
     assert exchange(ball, chunked + b"1\r\nx\r\n0\r\n\r\n").startswith(b"HTTP/1.1 400")
     assert threads[0].startswith("asyncio_")

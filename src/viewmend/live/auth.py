@@ -3,7 +3,6 @@
 import asyncio
 import hmac
 import re
-import time
 from collections.abc import Callable
 from ipaddress import ip_address
 from urllib.parse import urlsplit
@@ -105,7 +104,7 @@ def _is_same_origin(origin: str, host: str) -> bool:
 class RateLimit:
     """A token bucket: `per_s` events a second on average, `burst` at once."""
 
-    def __init__(self, per_s: float | int, burst: float | int, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, per_s: float | int, burst: float | int, now: Callable[[], float]) -> None:
         self._per_s, self._burst, self._now = per_s, burst, now
         self._left, self._updated_s = burst, now()
 

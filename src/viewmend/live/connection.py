@@ -12,22 +12,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from viewmend.live import protocol
 from viewmend.live.auth import RateLimit
-from viewmend.live.protocol import (
-    MODES,
-    VERSION,
-    Ack,
-    Cancel,
-    ClockChange,
-    Hello,
-    Limits,
-    Look,
-    Message,
-    Ping,
-    ProtocolError,
-    error_json,
-    parse,
-)
+from viewmend.live.protocol import Ack, Cancel, ClockChange, Hello, Limits, Look, Message, Ping, ProtocolError
 from viewmend.live.service import RenderService
 from viewmend.live.sessions import ViewerSession
 from viewmend.rendering.error_mask import ERROR_RULES
@@ -160,7 +147,7 @@ class ClosingError(Exception):
 
 async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
     """Send an error message and close a socket."""
-    await socket.send_text(json.dumps(error_json(code, message, fatal=True)))
+    await socket.send_text(json.dumps(protocol.error_json(code, message, fatal=True)))
     await socket.close(code)
 
 
@@ -214,21 +201,21 @@ class ViewerConnection:
     async def _shake_hands(self) -> None:
         try:
             async with asyncio.timeout(HELLO_S):
-                hello = parse(await self._receive(), self._registry.limits)
+                hello = protocol.parse(await self._receive(), self._registry.limits)
         except TimeoutError:
             raise ClosingError(4408, f"expected a hello within {HELLO_S:g} s; reconnect") from None
         except ProtocolError as error:
             raise ClosingError(4400, str(error)) from None
         if not isinstance(hello, Hello):
             raise ClosingError(4400, "expected 'hello' as the first message; see docs/live-protocol.md")
-        if hello.version != VERSION:
-            raise ClosingError(4426, f"expected version {VERSION}, got {hello.version}; reload the page")
+        if hello.version != protocol.VERSION:
+            raise ClosingError(4426, f"expected version {protocol.VERSION}, got {hello.version}; reload the page")
         about = self._registry.about
         welcome = about | {
             "type": "welcome",
-            "version": VERSION,
+            "version": protocol.VERSION,
             "viewer": next(self._registry.numbers),
-            "modes": MODES,
+            "modes": protocol.MODES,
             "error_rules": tuple(ERROR_RULES),
             "error_rule": self._service.renderer.error_rule,
             "background": self._service.renderer.background,
@@ -268,14 +255,14 @@ class ViewerConnection:
                         4429, f"expected at most {self._registry.limits.messages_per_s} messages a second"
                     )
                     continue
-                self._handle(parse(text, self._registry.limits))
+                self._handle(protocol.parse(text, self._registry.limits))
             except ProtocolError as error:
                 self._count_fault(4400, str(error))
 
     def _count_fault(self, code: int, message: str) -> None:
         if not self._faults.allow():
             raise ClosingError(code, message)
-        self._send_soon(error_json(code, message, fatal=False))
+        self._send_soon(protocol.error_json(code, message, fatal=False))
 
     def _handle(self, message: Message) -> None:
         if isinstance(message, Ping):
@@ -383,4 +370,4 @@ class ViewerConnection:
 
     def _report_error(self, message: str) -> None:
         with contextlib.suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(self._send_soon, error_json("render", message, fatal=False))
+            self._loop.call_soon_threadsafe(self._send_soon, protocol.error_json("render", message, fatal=False))

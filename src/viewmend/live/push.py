@@ -19,19 +19,11 @@ from viewmend.data.images import decode_image, size_from_header
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, is_intrinsics
 from viewmend.geometry.rigid import rigid
+from viewmend.live import protocol
 from viewmend.live.connection import close_with_error
 from viewmend.live.connection_limits import authenticate, is_gone
 from viewmend.live.frame_source import FrameCache, FrameSource, RigInfo, SourceStatus, Span
-from viewmend.live.protocol import (
-    HEADER_BYTES,
-    VERSION,
-    Point,
-    ProtocolError,
-    Rotation,
-    check_rotation,
-    read_message,
-    unpack,
-)
+from viewmend.live.protocol import HEADER_BYTES, Point, ProtocolError, Rotation, check_rotation, read_message
 from viewmend.types import MultiViewFrame
 from viewmend.utils.untrusted_input import one_of
 
@@ -163,8 +155,8 @@ class RigMessage(Struct, frozen=True, kw_only=True, tag="rig"):
     up: Point | None = None
 
     def __post_init__(self) -> None:
-        if self.version != VERSION:
-            raise ProtocolError(f"expected version {VERSION}, got {self.version}; update the client")
+        if self.version != protocol.VERSION:
+            raise ProtocolError(f"expected version {protocol.VERSION}, got {self.version}; update the client")
         if len({camera.name for camera in self.cameras}) < len(self.cameras):
             raise ProtocolError("expected unique camera names, got one twice; rename it")
         if self.up is not None and sum(x * x for x in self.up) < 1e-12:
@@ -198,7 +190,7 @@ def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], b
 
     ProtocolError if an image is malformed or unexpected, or if fewer than two cameras are complete.
     """
-    header, parts = unpack(message, "images")
+    header, parts = protocol.unpack(message, "images")
     images: dict[tuple[str, str], np.ndarray] = {}
     listed: list[ImagePart] = read_message(header["images"], list[ImagePart])
     if len({(entry.camera, entry.kind) for entry in listed}) < len(listed):

@@ -21,16 +21,7 @@ from viewmend.live import protocol
 from viewmend.live.encoding import Image, draw_mode, to_jpeg
 from viewmend.live.frame_source import Span
 from viewmend.live.poses import HomeView, stereo_pair, view_camera
-from viewmend.live.protocol import (
-    EXTRA_MODES,
-    MENDED_MODES,
-    MODES,
-    Camera,
-    FrameTimes,
-    Limits,
-    ProtocolError,
-    read_message,
-)
+from viewmend.live.protocol import Camera, FrameTimes, Limits, ProtocolError, read_message
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.sessions import PlaybackState
 from viewmend.models.base import RenderQuality, State
@@ -73,7 +64,7 @@ class ImageQuery(ViewOptions, frozen=True, kw_only=True, forbid_unknown_fields=T
     time: Literal["live"] | protocol.Count = "live"
     camera: protocol.ShortText | None = None
     """A camera of the rig, whose pose, lens and size the view has, and whose image it is scored by."""
-    mode: Annotated[str, one_of(*MODES, "error")] = "mended"
+    mode: Annotated[str, one_of(*protocol.MODES, "error")] = "mended"
     without: NameList = ""
     token: str = ""
 
@@ -262,8 +253,8 @@ def request_view(
         return None
     camera = view_camera(pose, playback.home, (asked.width, asked.height))
     eyes = (camera,) if stereo_m is None else stereo_pair(camera, stereo_m, playback.home.center)
-    quality = RenderQuality(mend=asked.mode in MENDED_MODES | {"error"}, top_k=asked.top_k)
-    return RenderRequest(index, eyes, quality, asked.error_rule, EXTRA_MODES & {asked.mode}, model=asked.model)
+    quality = RenderQuality(mend=asked.mode in protocol.MENDED_MODES | {"error"}, top_k=asked.top_k)
+    return RenderRequest(index, eyes, quality, asked.error_rule, protocol.EXTRA_MODES & {asked.mode}, model=asked.model)
 
 
 def draw_eyes(asked: ViewOptions, result: RenderResult) -> Image:

@@ -19,34 +19,15 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend import __version__
 from viewmend.geometry.orbit import coarse_surface
+from viewmend.live import render_jobs, responses
 from viewmend.live.assets import NOT_IN_TIME, AssetQuery, AssetStore, BusyError, wait_for_frame
 from viewmend.live.auth import AccessControl
 from viewmend.live.connection import Extension, SessionRegistry, ViewerConnection
 from viewmend.live.connection_limits import authenticate
 from viewmend.live.protocol import HEADER_BYTES, Limits, ProtocolError, read_message
 from viewmend.live.push import PushSource, receive_rig
-from viewmend.live.render_jobs import (
-    ImageJob,
-    ImageQuery,
-    PathJob,
-    RenderError,
-    RenderJob,
-    Result,
-    SourceImageQuery,
-    TurntableQuery,
-    frame_motion,
-    parse_path,
-    source_jpeg,
-)
-from viewmend.live.responses import (
-    HEADERS,
-    MAX_BODY_BYTES,
-    asset_response,
-    error_response,
-    metrics_text,
-    page_files,
-    read_body,
-)
+from viewmend.live.render_jobs import ImageQuery, PathJob, RenderJob, Result, SourceImageQuery, TurntableQuery
+from viewmend.live.responses import HEADERS, MAX_BODY_BYTES, asset_response, error_response, page_files
 from viewmend.live.service import RenderService
 from viewmend.live.video import video_codecs
 from viewmend.models.checkpoint import shipped_models
@@ -174,7 +155,7 @@ class LiveServer:
                 return error_response(400, str(error))
             except BusyError as error:
                 return error_response(429, str(error))
-            except (TimeoutError, RenderError) as error:
+            except (TimeoutError, render_jobs.RenderError) as error:
                 return error_response(503, str(error))
 
         return guarded
@@ -204,7 +185,8 @@ class LiveServer:
         return JSONResponse(health, 503 if failing else 200)
 
     async def _metrics(self, request: Request) -> Response:
-        return PlainTextResponse(metrics_text(self.registry), media_type="text/plain; version=0.0.4; charset=utf-8")
+        text = responses.metrics_text(self.registry)
+        return PlainTextResponse(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
     async def _image(self, request: Request) -> Response:
         asked: ImageQuery = read_message(dict(request.query_params), ImageQuery, strict=False)
@@ -219,7 +201,7 @@ class LiveServer:
             except ValueError as error:
                 raise ProtocolError(str(error)) from None
         async with self._image_slot():
-            image, result = await self._wait(request, ImageJob(asked), IMAGE_S, NOT_IN_TIME)
+            image, result = await self._wait(request, render_jobs.ImageJob(asked), IMAGE_S, NOT_IN_TIME)
         timing = ", ".join(f"{stage};dur={ms:.1f}" for stage, ms in vars(result.times).items())
         headers = {"Server-Timing": timing, "X-Viewmend-Time": str(result.time), "Cache-Control": "no-store"}
         if result.psnr_db is not None:
@@ -238,7 +220,7 @@ class LiveServer:
             source = self._service.source
             index = int(source.span.clamp(source.edge if asked.time == "live" else asked.time))
             frame = await wait_for_frame(source.read, index, SOURCE_IMAGE_S)
-            image = await asyncio.to_thread(source_jpeg, frame, asked.name)
+            image = await asyncio.to_thread(render_jobs.source_jpeg, frame, asked.name)
         headers = {"X-Viewmend-Time": str(index), "Cache-Control": "no-store"}
         return Response(image, media_type="image/jpeg", headers=headers)
 
@@ -259,7 +241,7 @@ class LiveServer:
                     return error_response(503, str(error))
                 if await request.is_disconnected():
                     break
-        fitted = frame_motion(asked, torch.cat(points), home)
+        fitted = render_jobs.frame_motion(asked, torch.cat(points), home)
         return JSONResponse(fitted, headers={"Cache-Control": "no-store"})
 
     async def _asset(self, request: Request) -> Response:
@@ -287,11 +269,11 @@ class LiveServer:
             return error_response(409, "another path is being rendered; try again later")
         self._is_exporting = True
         try:
-            body = await read_body(request)
+            body = await responses.read_body(request)
             if body is None:
                 return error_response(413, f"expected a body of at most {MAX_BODY_BYTES} bytes; send fewer poses")
             # Parsed on a thread, as a megabyte of JSON would block the event loop.
-            job = PathJob(await asyncio.to_thread(parse_path, body, self._config.limits))
+            job = PathJob(await asyncio.to_thread(render_jobs.parse_path, body, self._config.limits))
             self._path_job = job
             video = await self._wait(request, job, EXPORT_S, "the path took too long; request fewer poses")
         finally:
