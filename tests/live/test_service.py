@@ -9,6 +9,7 @@ from reference.ball import ring
 from viewmend.live.frame_source import FrameSource, RigInfo, SourceStatus, Span
 from viewmend.live.poses import home_view, view_camera
 from viewmend.live.protocol import Camera, FrameTimes
+from viewmend.live.render_jobs import RenderJob
 from viewmend.live.renderer import Renderer, RenderRequest, RenderResult
 from viewmend.live.service import RenderService
 from viewmend.models.base import RenderQuality, State
@@ -46,12 +47,11 @@ class FakeRenderer(Renderer):
         return RenderResult(request.time, (), State(), StageTimes(geometry=3.0, rendering=4.0))
 
 
-class Eager:
+class Eager(RenderJob):
     """A session that always requests a view."""
 
-    viewer = None
+    viewer = encode = None
     is_cancelled = False
-    wants_views = True
 
     def __init__(self, name, log, top_k=None, bad=False):
         self.name, self.log, self.top_k, self.bad = name, log, top_k, bad

@@ -5,13 +5,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from typing import Any
 
 from viewmend.live.budget import ResolutionLimit
 from viewmend.live.frame_source import FrameSource, Span
 from viewmend.live.poses import HomeView
 from viewmend.live.protocol import FrameTimes
+from viewmend.live.render_jobs import RenderJob
 from viewmend.live.renderer import FrameNotReadyError, Renderer, RenderRequest
-from viewmend.live.sessions import PlaybackState, Session, ViewerSession
+from viewmend.live.sessions import PlaybackState, ViewerSession
 from viewmend.utils.cancellation import CancelledError, cancellable
 from viewmend.utils.heap import HeapTrimmer
 
@@ -20,6 +22,8 @@ TICK_S = 0.004
 LOADING_S, IDLE_S = 0.05, 0.5
 """The same before the first frame, and while no session wants a view; the first that does wakes the thread."""
 AFTER_ERROR_S = 0.5
+Session = ViewerSession | RenderJob[Any]
+"""Requests views. The render thread makes all calls, with the service's lock but for `deliver` and `is_cancelled`."""
 
 log = logging.getLogger("viewmend.live")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import count
 from math import sqrt
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from viewmend.live.budget import CONTEXT_LADDER, FULL, Budget, Ladder, QualityLevel, ResolutionLimit
 from viewmend.live.encoding import Encoders, encode_frame
@@ -38,36 +38,6 @@ class PlaybackState:
     resolution_limit: ResolutionLimit = field(default_factory=ResolutionLimit)
     has_company: bool = False
     """Whether several viewers are connected, active or not."""
-
-
-@runtime_checkable
-class Session(Protocol):
-    """Requests views. All calls come from the render thread, and hold the service's lock except for `deliver`."""
-
-    viewer: State | None
-
-    @property
-    def wants_views(self) -> bool:
-        """Whether a view may be due: if not, `next_request` need not be called."""
-        ...
-
-    def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
-        """The view to render now; None for none."""
-
-    def deliver(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
-        """Encode and pass on a view; returns the times of all stages."""
-        ...
-
-    def fail(self, message: str) -> None:
-        """Report that the view could not be rendered."""
-
-    @property
-    def is_cancelled(self) -> bool:
-        """Whether the view that is being rendered is not needed any more; called often, without the lock."""
-        ...
-
-    def give_up(self) -> None:
-        """Note that the view was not rendered, because it was cancelled."""
 
 
 @dataclass(frozen=True)
