@@ -24,11 +24,13 @@ SPAN = Span(0, 20, 20, 10.0)
 class Desk:
     """A session, its clock, and the frames that are in memory."""
 
-    def __init__(self, budget_ms=None, has_frame=lambda index: True, ladder=CONTEXT_LADDER, span=SPAN):
+    def __init__(self, budget_ms=None, has_frame=lambda index: True, ladder=CONTEXT_LADDER, span=SPAN, paused=False):
         self.sent, self.errors, self.clock = [], [], FakeClock()
         self.session = ViewerSession(self.sent.append, self.errors.append, budget_ms, ladder, self.clock)
         self.has_frame, self.span, self.edge, self.active_viewers = has_frame, span, 0.0, 1
         self.limit = ResolutionLimit()
+        if paused:
+            self.change_clock(playing=False)
 
     def look(self, **values):
         self.session.look(Look(**values))
@@ -46,9 +48,6 @@ class Desk:
     def change_clock(self, **change):
         self.session.change_clock(ClockChange(**change), self.span, 0.0)
 
-    def pause(self):
-        self.change_clock(playing=False)
-
 
 def test_the_newest_look_wins():
     desk = Desk()
@@ -59,8 +58,7 @@ def test_the_newest_look_wins():
 
 
 def test_a_repeated_look_is_answered_again():
-    desk = Desk()
-    desk.pause()
+    desk = Desk(paused=True)
     for _ in range(3):
         desk.look(id=1)
         assert desk.due() is not None and desk.due() is None
@@ -87,8 +85,7 @@ def test_skipped_frames_are_counted():
 
 
 def test_a_moving_view_is_small_and_a_still_one_full():
-    desk = Desk()
-    desk.pause()
+    desk = Desk(paused=True)
     desk.look(id=1, moving=True, width=200, height=100)
     request = desk.due()
     assert desk.size(request) == (100, 50) and request.quality.context_times == 0
@@ -102,8 +99,7 @@ def test_a_moving_view_is_small_and_a_still_one_full():
 
 
 def test_a_client_that_draws_by_itself_gets_the_full_view_only():
-    desk = Desk(budget_ms=5.0)
-    desk.pause()
+    desk = Desk(budget_ms=5.0, paused=True)
     desk.look(id=1, full=True, width=200, height=100)
     request = desk.due()
     assert desk.size(request) == (200, 100) and request.quality.context_times == FULL.context_times
@@ -111,8 +107,7 @@ def test_a_client_that_draws_by_itself_gets_the_full_view_only():
 
 
 def test_a_cancelled_look_is_neither_rendered_nor_sent(ball_view):
-    desk = Desk()
-    desk.pause()
+    desk = Desk(paused=True)
     result = RenderResult(0, (ball_view,), State(), StageTimes())
     desk.look(id=1)
     request = desk.due()
@@ -125,8 +120,7 @@ def test_a_cancelled_look_is_neither_rendered_nor_sent(ball_view):
 
 
 def test_only_a_final_view_is_cancelled_by_what_replaces_it():
-    desk = Desk(budget_ms=50.0)
-    desk.pause()
+    desk = Desk(budget_ms=50.0, paused=True)
     desk.look(id=1)
     assert desk.due() is not None
     desk.look(id=2)
@@ -144,8 +138,7 @@ def test_only_a_final_view_is_cancelled_by_what_replaces_it():
 
 
 def test_a_still_view_is_refined_in_two_steps():
-    desk = Desk(budget_ms=50.0)
-    desk.pause()
+    desk = Desk(budget_ms=50.0, paused=True)
     desk.look(id=1, scale=0.5, top_k=100)
     first = desk.due()
     assert desk.size(first)[0] < 160 and first.quality.top_k == 100
@@ -159,13 +152,11 @@ def test_a_still_view_is_refined_in_two_steps():
 
 
 def test_a_model_that_predicts_errors_refines_less_of_a_moving_view():
-    desk = Desk(ladder=REFINE_LADDER)
-    desk.pause()
+    desk = Desk(ladder=REFINE_LADDER, paused=True)
     desk.look(id=1, moving=True, width=200, height=100)
     request = desk.due()
     assert desk.size(request) == (200, 100) and request.quality.refine_fraction == 0
-    desk = Desk(budget_ms=50.0, ladder=REFINE_LADDER)
-    desk.pause()
+    desk = Desk(budget_ms=50.0, ladder=REFINE_LADDER, paused=True)
     desk.look(id=1)
     assert desk.due().quality.refine_fraction is not None
     assert desk.due(STILL_S).quality.refine_fraction == REFINE_LADDER.still.refine_fraction
@@ -275,8 +266,7 @@ def test_the_header_describes_the_frame(ball_view, mode):
 
 
 def test_a_still_view_may_have_more_pixels_than_the_budget_counts():
-    desk = Desk(budget_ms=50.0)
-    desk.pause()
+    desk = Desk(budget_ms=50.0, paused=True)
     desk.look(id=1, moving=True, width=200, height=100)
     moving = desk.size(desk.due())
     desk.look(id=2, width=800, height=400)

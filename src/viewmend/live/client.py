@@ -143,7 +143,6 @@ class Client(Connection):
         return self
 
     def _connect(self) -> None:
-        """Connect and exchange the first messages."""
         self._socket = ServerSocket(f"{self.url}/ws", self.token)
         self.connections += 1
         self._max_per_s, self._credit, self._credited_at = math.inf, 1.0, time.monotonic()
@@ -155,7 +154,6 @@ class Client(Connection):
         self._max_per_s = RATE * self.messages["welcome"]["limits"]["messages_per_s"]
 
     def _reconnect(self) -> None:
-        """Connect again, and restore the view and the clock."""
         end = time.monotonic() + self.again_s
         self._socket.close()
         while True:

@@ -114,7 +114,6 @@ class RenderService:
                     self.lock.wait(TICK_S if self._is_wanted else IDLE_S if self.is_ready else LOADING_S)
 
     def _prepare(self) -> bool:
-        """Prepare the renderer for a new rig."""
         span = self.source.span
         if self.is_ready or span.end <= span.first:
             return False

@@ -243,7 +243,6 @@ class ViewerSession:
         return times
 
     def _record(self, look: Look, times: FrameTimes, size_bytes: int) -> None:
-        """Record what a view took."""
         self.recent.append(SentFrame(self._now(), times, size_bytes))
         if self.budget is not None:
             level = self.rendered_level
