@@ -54,8 +54,7 @@ def test_tables_are_means_of_frames_then_scenes_then_sets(cells):
             ("psnr_whole", 0, "hole_px"),
         ):
             expected = [reference_mean(own, method, score, enough, pixels) for own in sets]
-            got = [table.rows[n].scores.mean(*score.split("_", 1)) for table in per_set]
-            assert got == pytest.approx(expected)
+            assert [table.rows[n].scores.mean(*score.split("_", 1)) for table in per_set] == pytest.approx(expected)
             assert overall.rows[n].scores.mean(*score.split("_", 1)) == pytest.approx(statistics.fmean(expected))
 
 

@@ -35,8 +35,7 @@ class Snow(SmoothFill):
     background = "white"
 
     def step(self, view, context, state):
-        rgb = view.error + (1 - view.error) * view.rgb
-        return CompletedView(view, rgb, painted_alpha(view)), state
+        return CompletedView(view, view.error + (1 - view.error) * view.rgb, painted_alpha(view)), state
 
 
 @pytest.fixture

@@ -93,8 +93,7 @@ def test_the_page_is_self_contained_and_has_all_images(evaluated):
     assert sources and all(re.match(r"data:image/(png|jpeg);base64,", source) for source in sources)
     assert not re.search(r"url\(|@import|<script|<link", shown)
     assert shown.count("<img") == 2, "one of each scene"
-    twice = replace(report, cells=tuple(cells * 2))
-    assert page(twice, store, shown=1).count("<img") == 2, "one of each set"
+    assert page(replace(report, cells=tuple(cells * 2)), store, shown=1).count("<img") == 2, "one of each set"
 
 
 def test_every_scene_has_a_contact_sheet(evaluated, tmp_path):

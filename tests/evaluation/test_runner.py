@@ -7,6 +7,7 @@ import select
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -123,12 +124,17 @@ class ChangesEverything(Telea):
         return replace(completed, rgb=completed.rgb + 0.1), state
 
 
-@pytest.mark.parametrize(("inpainter", "message"), [(FailsLater, "no more"), (ChangesEverything, "pixels with E = 0")])
-def test_a_failed_cell_is_reported_and_tried_again(small_scenes, tmp_path, monkeypatch, whole, inpainter, message):
+@contextmanager
+def in_place_of_telea(inpainter):
     make = scene_run.make_method
-    broken = lambda name, *how: inpainter() if name == "telea" else make(name, *how)  # noqa: E731
-    with monkeypatch.context() as patch:
-        patch.setattr(scene_run, "make_method", broken)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "make_method", lambda name, *how: inpainter() if name == "telea" else make(name, *how))
+        yield
+
+
+@pytest.mark.parametrize(("inpainter", "message"), [(FailsLater, "no more"), (ChangesEverything, "pixels with E = 0")])
+def test_a_failed_cell_is_reported_and_tried_again(small_scenes, tmp_path, whole, inpainter, message):
+    with in_place_of_telea(inpainter):
         cells = run(small_scenes[:1], tmp_path)
     assert message in cells["s1", "telea"].error and cells["s1", "telea"].frames == ()
     assert cells["s1", "unfilled"].error is None
@@ -144,12 +150,10 @@ class Blackens(Telea):
 
 
 @pytest.mark.parametrize("rule", [None, "holes"])
-def test_each_method_has_its_own_error_rule(small_scenes, tmp_path, monkeypatch, whole, rule):
-    make = scene_run.make_method
-    own = lambda name, *how: Blackens() if name == "telea" else make(name, *how)  # noqa: E731
-    monkeypatch.setattr(scene_run, "make_method", own)
+def test_each_method_has_its_own_error_rule(small_scenes, tmp_path, whole, rule):
     settings = RunSettings(stream=StreamConfig(render=RenderConfig(error_rule=rule), memory_mb=None))
-    cells = run(small_scenes[:1], tmp_path, settings=settings)
+    with in_place_of_telea(Blackens):
+        cells = run(small_scenes[:1], tmp_path, settings=settings)
     black, unfilled = (cells["s1", name].frames[0] for name in METHODS)
     assert unfilled.psnr_whole == whole[1]["s1", "unfilled"].frames[0].psnr_whole
     assert (black.psnr_whole < unfilled.psnr_whole) == (rule is None), "its own rule includes coloured pixels"

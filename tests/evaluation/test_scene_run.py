@@ -119,10 +119,8 @@ def test_a_scored_view_is_what_a_stream_of_all_frames_gives(turning, monkeypatch
     torch.manual_seed(0)
     net = build(replace(paper_small(), widths=(8,) * 9, dim=32, heads=2, blocks=1, n_w=1, k_w=4)).eval()
     monkeypatch.setattr(scene_run, "make_method", lambda name, *how: net)
-    late, every = (
-        evaluate_scene(scene, ("x",), RunSettings(background="white")).runs[0]
-        for scene in (turning, replace(turning, scored_from=0))
-    )
+    scenes = turning, replace(turning, scored_from=0)
+    late, every = (evaluate_scene(scene, ("x",), RunSettings(background="white")).runs[0] for scene in scenes)
     assert late.error is None and every.error is None
     for one, other in zip(late.frames, every.frames[-2:], strict=True):
         assert one.hole_px == other.hole_px and one.psnr_holes == pytest.approx(other.psnr_holes, abs=1e-3)

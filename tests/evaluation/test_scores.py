@@ -119,8 +119,7 @@ def moving(rng):
     before, now = texture[:, 1:, 3:], texture[:, :-1, :-3]
     y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     source = torch.stack([x - 3, y - 1], -1)
-    inside = (source > 0).all(-1)
-    return before, now, torch.where(inside[..., None], source, torch.nan)
+    return before, now, torch.where((source > 0).all(-1)[..., None], source, torch.nan)
 
 
 def temporal(case, moving, ours_before, ours_now):

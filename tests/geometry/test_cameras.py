@@ -1,6 +1,7 @@
 """Pinhole cameras: projection and changes of the image grid."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -23,26 +24,22 @@ def test_skew_moves_points_sideways_by_their_height():
     skewed = camera.K.clone()
     skewed[0, 0, 1] = 7.0
     points = torch.tensor([[0.1, 0.2, 2.0]])
-    straight, _ = project(points, camera)
-    slanted, _ = project(points, type(camera)(camera.names, skewed, camera.camera_from_world, camera.size_px))
+    straight, slanted = (project(points, one)[0] for one in (camera, replace(camera, K=skewed)))
     torch.testing.assert_close(slanted - straight, torch.tensor([[[7 * 0.1, 0.0]]]))
 
 
 def test_a_point_behind_has_negative_depth_and_finite_pixels():
     uv, z = project(torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), pinhole(0.8, 40, 30, torch.eye(4)))
-    assert (z <= 0).all()
-    assert torch.isfinite(uv).all()
+    assert (z <= 0).all() and torch.isfinite(uv).all()
 
 
 def test_resizing_keeps_the_field_of_view():
-    cameras = concatenate_cameras(
-        [camera_at((2, 0, 0), width=40, height=30), camera_at((0, 0, 2), width=60, height=50)]
-    )
+    views = [camera_at((2, 0, 0), width=40, height=30), camera_at((0, 0, 2), width=60, height=50)]
+    cameras = concatenate_cameras(views)
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     before, _ = project(points, cameras)
     after, _ = project(points, cameras.resized(80, 100))
-    scale = torch.tensor([[[2.0, 100 / 30]], [[80 / 60, 2.0]]])
-    torch.testing.assert_close(after, before * scale)
+    torch.testing.assert_close(after, before * torch.tensor([[[2.0, 100 / 30]], [[80 / 60, 2.0]]]))
     assert cameras.resized(80, 100).max_size_px == (80, 100)
 
 
@@ -58,18 +55,13 @@ def test_selection_by_name_and_by_position():
     cameras = dome(4)
     assert cameras.select(["c2", "c0"]).names == ("c2", "c0")
     assert torch.equal(cameras.select(["c2"]).K, cameras[2].K)
-    assert cameras[1:3].names == ("c1", "c2")
-    assert cameras[-1].names == ("c3",)
-    assert len(cameras[[3, 3]]) == 2
+    assert cameras[1:3].names == ("c1", "c2") and cameras[-1].names == ("c3",) and len(cameras[[3, 3]]) == 2
     with pytest.raises(ValueError, match="spelling"):
         cameras.select(["c9"])
 
 
 def test_pixel_centers_start_at_a_half():
-    centers = pixel_centers(3, 2)
-    assert centers.shape == (2, 3, 2)
-    assert centers[0, 0].tolist() == [0.5, 0.5]
-    assert centers[1, 2].tolist() == [2.5, 1.5]
+    assert pixel_centers(3, 2).tolist() == [[[0.5, 0.5], [1.5, 0.5], [2.5, 0.5]], [[0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]]
 
 
 # Rigid motions.

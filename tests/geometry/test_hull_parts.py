@@ -56,15 +56,18 @@ def test_a_ball_that_one_camera_sees_on_its_own_stays():
     assert parts(before) == 3 and parts(after) == 2, "what nothing needs, out of sight from above"
 
 
+def without_parts(values, cameras):
+    return without_floating_parts(OccupancyGrid(values, torch.full((3,), -0.5), 0.025), cameras).values
+
+
 @pytest.mark.parametrize(("rows_covered", "stays"), [(8, False), (2, True)])
 def test_a_part_that_covers_a_strip_by_chance_is_dropped(rows_covered, stays):
     """Masks of real cameras disagree by strips at the outline, which a part behind the subject can cover."""
     values = torch.zeros(40, 40, 40)
     values[25:35, 5:25, 10:30] = 1.0
     values[5:10, 25 - rows_covered : 35 - rows_covered, 15:25] = 1.0
-    grid = OccupancyGrid(values, torch.full((3,), -0.5), 0.025)
     far = [camera_at((30.0, 0.0, z), width=1600, height=1600) for z in (-0.1, 0.0, 0.1)]
-    after = without_floating_parts(grid, concatenate_cameras(far)).values
+    after = without_parts(values, concatenate_cameras(far))
     assert torch.equal(after[20:], values[20:]) and bool(after[:20].any()) == stays
 
 
@@ -73,16 +76,14 @@ def test_a_speck_is_dropped_and_a_small_ball_stays(side, stays):
     values = torch.zeros(40, 40, 40)
     values[5:25, 5:25, 5:25] = 1.0
     values[32 : 32 + side, 32 : 32 + side, 32 : 32 + side] = 1.0
-    grid = OccupancyGrid(values, torch.full((3,), -0.5), 0.025)
-    after = without_floating_parts(grid, dome(5, width=800, height=800)).values
+    after = without_parts(values, dome(5, width=800, height=800))
     assert torch.equal(after[:30], values[:30]) and bool(after[30:].any()) == stays
 
 
 def test_the_largest_part_stays_even_if_it_is_a_speck():
     values = torch.zeros(40, 40, 40)
     values[10, 10, 10] = values[20:22, 20, 20] = 1.0
-    grid = OccupancyGrid(values, torch.full((3,), -0.5), 0.025)
-    after = without_floating_parts(grid, dome(5, width=800, height=800)).values
+    after = without_parts(values, dome(5, width=800, height=800))
     assert after.nonzero().tolist() == [[20, 20, 20], [21, 20, 20]]
 
 

@@ -17,8 +17,7 @@ def test_a_ball_comes_back():
     masks = ball_masks(cameras)
     proxy = reconstruct(masks, cameras, around(0.8), CONFIG)
     assert volume(proxy.mesh) == pytest.approx(4 / 3 * torch.pi * 0.5**3, rel=0.12)
-    radii = proxy.mesh.vertices.norm(dim=1)
-    assert radii.min() > 0.5 - 0.02
+    assert proxy.mesh.vertices.norm(dim=1).min() > 0.5 - 0.02
     held = camera_at((1.0, 1.2, 2.0), width=160, height=140)
     depth = proxy.depth(held)
     assert silhouette_iou(depth[0], ball_masks(held)[0]) > 0.96
@@ -53,14 +52,12 @@ def test_a_cropped_subject_is_closed_where_the_cameras_end():
     masks = ball_masks(cameras)
     assert masks[:, -1].any()
     mesh = reconstruct(masks, cameras, None, CONFIG).mesh
-    assert is_closed(mesh)
-    assert volume(mesh) > 0.1
+    assert is_closed(mesh) and volume(mesh) > 0.1
 
 
 def test_moving_to_a_device_keeps_everything():
     cameras = dome(4)
-    proxy = reconstruct(ball_masks(cameras), cameras, around(0.6), CONFIG)
-    moved = proxy.to("meta")
+    moved = reconstruct(ball_masks(cameras), cameras, around(0.6), CONFIG).to("meta")
     assert moved.mesh.vertices.device.type == moved.normals.device.type == moved.bounds.low.device.type == "meta"
 
 
@@ -74,5 +71,4 @@ def test_real_captures_overlap_their_masks(shared):
     others = frame.without([held])
     assert others.mask is not None
     proxy = reconstruct(others.mask, others.cameras)
-    depth = proxy.depth(frame.cameras.select([held]))
-    assert silhouette_iou(depth[0], frame.mask[8]) > 0.94
+    assert silhouette_iou(proxy.depth(frame.cameras.select([held]))[0], frame.mask[8]) > 0.94

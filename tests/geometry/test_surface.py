@@ -23,8 +23,7 @@ def ball_grid(cells: int = 24, radius: float = 0.8, center=(0.0, 0.0, 0.0)) -> O
 def test_a_ball_is_round_closed_and_outward():
     mesh = extract_surface(ball_grid())
     center = LOW + 1
-    radii = (mesh.vertices - center).norm(dim=1)
-    assert (radii - 0.8).abs().max() < 0.1 * 2 / 24
+    assert ((mesh.vertices - center).norm(dim=1) - 0.8).abs().max() < 0.1 * 2 / 24
     assert volume(mesh) == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=0.01)
     assert is_closed(mesh)
     outward = torch.nn.functional.normalize(mesh.vertices - center, dim=1)
@@ -35,8 +34,7 @@ def test_a_body_that_leaves_the_volume_is_capped():
     grid = ball_grid(center=(0.7, 0.0, -0.5))
     assert (grid.values[-1] > 0.5).any()
     mesh = extract_surface(grid)
-    assert is_closed(mesh)
-    assert volume(mesh) > 0
+    assert is_closed(mesh) and volume(mesh) > 0
     assert mesh.vertices[:, 0].max() <= LOW[0] + 2 + grid.voxel_m / 2
 
 
@@ -47,8 +45,7 @@ def test_noise_gives_a_closed_surface_too(seed):
     values = torch.rand(12, 10, 11, generator=rng)
     values[values > 0.9] = 0.5
     mesh = extract_surface(OccupancyGrid(values, LOW, 0.1))
-    assert is_closed(mesh)
-    assert torch.isfinite(mesh.vertices).all()
+    assert is_closed(mesh) and torch.isfinite(mesh.vertices).all()
 
 
 def test_numba_equals_torch():
@@ -63,13 +60,7 @@ def test_numba_equals_torch():
     assert agree.float().mean() > 0.99
 
 
-def test_an_empty_grid_gives_an_empty_mesh():
-    mesh = extract_surface(OccupancyGrid(torch.zeros(4, 5, 6), LOW, 0.1))
-    assert mesh.vertices.shape == (0, 3)
-    assert mesh.faces.shape == (0, 3)
-
-
-def test_a_full_grid_is_a_box():
-    mesh = extract_surface(OccupancyGrid(torch.ones(3, 4, 5), LOW, 0.1))
-    assert is_closed(mesh)
-    assert volume(mesh) == pytest.approx(0.3 * 0.4 * 0.5, rel=0.2)
+def test_an_empty_grid_gives_an_empty_mesh_and_a_full_one_a_box():
+    empty, full = (extract_surface(OccupancyGrid(of(3, 4, 5), LOW, 0.1)) for of in (torch.zeros, torch.ones))
+    assert empty.vertices.shape == empty.faces.shape == (0, 3)
+    assert is_closed(full) and volume(full) == pytest.approx(0.3 * 0.4 * 0.5, rel=0.2)

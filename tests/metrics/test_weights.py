@@ -133,8 +133,7 @@ def make_archive(path, content, monkeypatch, converted_sha256=""):
         sha256=hashlib.sha256(data).hexdigest(),
     )
     monkeypatch.setitem(conversion.PUBLISHED, "lpips-vgg", published)
-    known = replace(known_weights("lpips-vgg"), sha256=converted_sha256)
-    monkeypatch.setattr(weights_module, "KNOWN", (known,))
+    monkeypatch.setattr(weights_module, "KNOWN", (replace(known_weights("lpips-vgg"), sha256=converted_sha256),))
     return path
 
 

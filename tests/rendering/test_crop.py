@@ -64,10 +64,8 @@ def test_crops_are_on_the_grid_and_have_their_margin(scene):
     view = stream.render(view_camera(Camera(azimuth=frame.azimuth), frame, (700, 500)))
     found = subject_crop(view, 30)
     assert found != Crop.all_of(view.camera)
-    assert all(
-        side % crop.grid_px(30) == 0 or side in (500, 700)
-        for side in (found.left, found.top, found.right, found.bottom)
-    )
+    sides = found.left, found.top, found.right, found.bottom
+    assert all(side % crop.grid_px(30) == 0 or side in (500, 700) for side in sides)
     rows, columns = torch.nonzero(view.mask > 0).unbind(1)
     assert found.left <= int(columns.min()) - 30 and int(columns.max()) + 30 < found.right
     assert found.top <= max(0, int(rows.min()) - 30) and min(499, int(rows.max()) + 30) < found.bottom

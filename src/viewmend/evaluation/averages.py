@@ -6,7 +6,7 @@ and files are queries of records.
 
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
@@ -163,12 +163,10 @@ def _records_of_cell(cell: Cell) -> Iterator[Record]:
     past = [frame for frame in cell.frames if frame.past_px >= MIN_HOLE_PX]
     holes = frames_with_holes(cell.frames)
     enough = {"holes": holes, "masked": holes, "fg": inside, "past": past}  # by the last word of a field's name
+    names = [f.name for f in fields(ViewScores) if f.name != "time" and not f.name.endswith("_px")]
     figures = {
-        _metric_and_region(f.name): mean(
-            getattr(frame, f.name) for frame in enough.get(f.name.split("_")[-1], cell.frames)
-        )
-        for f in fields(ViewScores)
-        if f.name != "time" and not f.name.endswith("_px")
+        _metric_and_region(name): mean(getattr(frame, name) for frame in enough.get(name.split("_")[-1], cell.frames))
+        for name in names
     }
     figures["hole_fraction", "hull"] = mean(f.hole_px / f.hull_px if f.hull_px else 0.0 for f in cell.frames)
     figures["hole_fraction", "image"] = mean(f.hole_px / f.image_px for f in cell.frames)
@@ -194,8 +192,7 @@ def _table(title: str, cells: Sequence[Cell], methods: Sequence[str]) -> Table:
 
 
 def _row(method: str, cells: Sequence[Cell], scores: Records) -> Row:
-    done = [cell for cell in cells if cell.error is None]
-    own = scores.where(method=method)
+    done, own = [cell for cell in cells if cell.error is None], scores.where(method=method)
     gained = gains(own, scores.where(method=REFERENCE)).values()
     return Row(
         method=method,
@@ -232,13 +229,7 @@ def _overall(per_set: Sequence[Table], cells: Sequence[Cell]) -> Table:
 
 def _average_sets(per_set: Iterable[Records]) -> Records:
     """Records of each set's means, with the set in place of the scene."""
-    found: dict[tuple[str, str, str, str], list[float]] = {}
-    for own in per_set:
-        for r in own:
-            found.setdefault((r.set, r.method, r.region, r.metric), []).append(r.value)
-    return Records(
-        tuple(
-            Record(set_, set_, "", "", method, region, metric, statistics.fmean(values))
-            for (set_, method, region, metric), values in found.items()
-        )
-    )
+    found: dict[Record, list[float]] = {}
+    for r in (record for own in per_set for record in own):
+        found.setdefault(replace(r, scene=r.set, rig="", style="", value=0.0), []).append(r.value)
+    return Records(tuple(replace(record, value=statistics.fmean(values)) for record, values in found.items()))

@@ -69,16 +69,15 @@ class Mender:
     def add_frame(self, frame: MultiViewFrame | CachedFrame, carving: Silhouettes | None = None) -> CachedFrame:
         """Add a frame, with its proxy and depths if another stream computed them; `carving` as for `Stream`."""
         given = frame.frame if isinstance(frame, CachedFrame) else frame
-        if self.first_twice and not self.stream.times:
-            self._warm_up = Stream(
-                self.stream.inpainter, self.stream.config, self.stream.bounds, self.stream.error_model
-            )
-        for stream in (self._warm_up, self.stream):
-            if stream is not None and isinstance(frame, CachedFrame):
+        own = self.stream
+        if self.first_twice and not own.times:
+            self._warm_up = Stream(own.inpainter, own.config, own.bounds, own.error_model)
+        for stream in (own,) if self._warm_up is None else (self._warm_up, own):
+            if isinstance(frame, CachedFrame):
                 stream.add_frame(given, frame.proxy).depths.update(frame.depths)
-            elif stream is not None:
+            else:
                 stream.add_frame(given, carving=carving)
-        return self.stream.cached_frame(given.time)
+        return own.cached_frame(given.time)
 
     def view(
         self,
@@ -139,9 +138,9 @@ class Mender:
         holes = replace(view, error=view.holes.to(view.rgb))
         telea, _ = Telea().step_on(self.background, holes, ContextProvider(lambda *_: None), State())
         scores = FillScores(
-            unfilled=score_view(CompletedView(view, view.cut_rgb), true, psnr_only),
-            telea=score_view(telea, true, psnr_only),
-            ours=score_view(made.completed, true, self._scorers),
+            score_view(CompletedView(view, view.cut_rgb), true, psnr_only),
+            score_view(telea, true, psnr_only),
+            score_view(made.completed, true, self._scorers),
         )
         if scores.ours.hull_iou is not None:
             iou[truth.cameras.names[0]] = scores.ours.hull_iou
@@ -221,20 +220,15 @@ class MendSummary:
 
     def as_json(self) -> dict[str, object]:
         """The scores of `mend --json`; None where there are no such pixels, or no truth. Times are medians in ms."""
+        whole = ("frames", "protocol", "background", "hole_fraction", "mended_fraction")
         return {
-            "frames": self.frames,
-            "protocol": self.protocol,
-            "background": self.background,
-            "hole_fraction": self.hole_fraction,
-            "mended_fraction": self.mended_fraction,
+            **{name: getattr(self, name) for name in whole},
             "psnr_whole": self.mean("ours", "psnr_whole"),
             "psnr_whole_rendered": self.mean("unfilled", "psnr_whole"),
             "ssim_whole": self.mean("ours", "ssim_whole"),
             "lpips_whole": self.mean("ours", "lpips_alex_whole"),
             "lpips_subject": self.mean("ours", "lpips_alex_subject"),
-            "psnr_subject": self.mean("ours", "psnr_subject"),
-            "alpha_iou": self.mean("ours", "alpha_iou"),
-            "psnr_valid": self.mean("ours", "psnr_valid"),
+            **{name: self.mean("ours", name) for name in ("psnr_subject", "alpha_iou", "psnr_valid")},
             "psnr_holes": self.mean("ours", "psnr_holes"),
             "psnr_holes_telea": self.mean("telea", "psnr_holes"),
             "psnr_holes_fg": self.mean("ours", "psnr_holes_fg"),

@@ -33,8 +33,10 @@ class Provenance:
 def provenance(device: str, threads: int, jobs: int) -> Provenance:
     """The provenance of figures that are computed now."""
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else _processor()
-    load = round(os.getloadavg()[0], 1)
-    return Provenance(__version__, _commit(), platform.python_version(), torch.__version__, name, threads, jobs, load)
+    head, load = _git("rev-parse", "--short", "HEAD"), round(os.getloadavg()[0], 1)
+    changed = head and _git("status", "--porcelain", "--untracked-files=no", "--", ".")
+    commit, python = f"{head}{'+' if changed else ''}" or "unknown", platform.python_version()
+    return Provenance(__version__, commit, python, torch.__version__, name, threads, jobs, load)
 
 
 def _processor() -> str:
@@ -44,16 +46,9 @@ def _processor() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
-def _commit() -> str:
-    head = _git("rev-parse", "--short", "HEAD")
-    changed = head and _git("status", "--porcelain", "--untracked-files=no", "--", ".")
-    return head + ("+" if changed else "") if head else "unknown"
-
-
 def _git(*arguments: str) -> str:
-    folder = Path(__file__).parent
+    command, folder = ["git", *arguments], Path(__file__).parent
     try:
-        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=False)
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False).stdout.strip()
     except OSError:
         return ""
-    return done.stdout.strip()

@@ -7,19 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from statistics import stdev
 
-from viewmend.evaluation.averages import (
-    Record,
-    Records,
-    Row,
-    Table,
-    frames_with_holes,
-    records,
-    speed,
-    tables,
-)
+from viewmend.evaluation.averages import Record, Records, Row, Table, frames_with_holes, records, speed, tables
+from viewmend.evaluation.mending import SLOW_MS
 from viewmend.evaluation.provenance import Provenance
 from viewmend.evaluation.result_cache import PROTOCOL, Cell
-from viewmend.evaluation.scene_run import SLOW_MS, RunSettings
+from viewmend.evaluation.scene_run import RunSettings
 from viewmend.evaluation.scores import MIN_HOLE_PX
 from viewmend.models.registry import PRIVILEGED, REFERENCE, own_background
 from viewmend.utils.logging import printable
@@ -145,14 +137,11 @@ class Grid:
 
 def setting_lines(report: Report) -> list[str]:
     """The settings and the origin of the figures."""
-    settings = report.settings
-    rule = settings.stream.render.error_rule or "of each method"
+    settings, render = report.settings, report.settings.stream.render
     lines = [
         f"Protocol {settings.protocol}; version {report.protocol} of the scores; {settings.device}, "
-        f"{settings.precision}; "
-        f"{settings.stream.render.cameras} source cameras by {settings.stream.render.selection}; "
-        f"error rule {rule}; "
-        f"SSIM {settings.ssim}; scored on {settings.background}."
+        f"{settings.precision}; {render.cameras} source cameras by {render.selection}; error rule "
+        f"{render.error_rule or 'of each method'}; SSIM {settings.ssim}; scored on {settings.background}."
     ]
     return [*lines, *background_lines(report)] + [
         f"Computed by viewmend {o.viewmend}, commit {o.commit}, Python {o.python}, torch {o.torch}, on {o.device}; "
@@ -166,10 +155,8 @@ def background_lines(report: Report) -> list[str]:
     scored = report.settings.background
     made = {name: own_background(name) for name in report.methods if name not in report.missing}
     others = ", ".join(f"{name} ({own})" for name, own in made.items() if own not in (None, scored))
-    if not others:
-        return []
-    text = f"Made for another background than {scored}, on which they score lower: {others}"
-    return [f"{text}; see --score-background."]
+    text = f"Made for another background than {scored}, on which they score lower: {others}; see --score-background."
+    return [text] if others else []
 
 
 def holes_line(table: Table) -> str:
@@ -282,13 +269,8 @@ def blocks(report: Report) -> list[Block]:
 
 def markdown(parts: Iterable[Block]) -> str:
     """Blocks as Markdown."""
-    return "\n\n".join(map(_as_markdown, parts)) + "\n"
-
-
-def _as_markdown(block: Block) -> str:
-    if isinstance(block, Grid):
-        return markdown_table(block)
-    return bullets(block) if isinstance(block, list) else block
+    lists = (bullets(part) if isinstance(part, list) else part for part in parts)
+    return "\n\n".join(markdown_table(part) if isinstance(part, Grid) else part for part in lists) + "\n"
 
 
 def summary(report: Report) -> list[Block]:
@@ -304,15 +286,10 @@ def markdown_table(grid: Grid) -> str:
 
 def report_json(report: Report) -> str:
     """Settings, tables, and the means of each cell as JSON; the frames are in the cell's own file."""
+    same = {name: getattr(report, name) for name in ("methods", "identities", "missing", "missing_networks")}
     value = {
-        "protocol": report.settings.protocol,
-        "version": report.protocol,
-        "rules": RULES,
-        "settings": asdict(report.settings),
-        "methods": report.methods,
-        "identities": report.identities,
-        "missing": report.missing,
-        "missing_networks": report.missing_networks,
+        **{"protocol": report.settings.protocol, "version": report.protocol, "rules": RULES},
+        **{"settings": asdict(report.settings), **same},
         "origins": [asdict(origin) for origin in report.origins],
         "tables": [_table_values(table) for table in report.tables],
         "cells": [_cell_values(cell, report.scores) for cell in report.cells],
@@ -335,8 +312,7 @@ def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def _table_values(table: Table) -> dict[str, object]:
-    rows = [asdict(row) | {"scores": _means(row.scores)} for row in table.rows]
-    return {**asdict(table), "rows": rows}
+    return {**asdict(table), "rows": [asdict(row) | {"scores": _means(row.scores)} for row in table.rows]}
 
 
 def _means(scores: Records) -> dict[str, float | None]:
@@ -347,12 +323,8 @@ def _means(scores: Records) -> dict[str, float | None]:
 def _cell_values(cell: Cell, scores: Records) -> dict[str, object]:
     taken = speed([cell])
     return {
-        "scene": cell.key.scene,
-        "set": cell.set,
-        "rig": cell.rig,
-        "style": cell.style,
-        "method": cell.key.method,
-        "error": cell.error,
+        **{"scene": cell.key.scene, "set": cell.set, "rig": cell.rig, "style": cell.style},
+        **{"method": cell.key.method, "error": cell.error},
         **_means(scores.where(scene=cell.key.scene, method=cell.key.method)),
         **{name: getattr(taken, name, None) for name in ("fps", "ms_p50", "ms_p95")},
         "frames": len(cell.frames),
@@ -378,14 +350,10 @@ def _method_row(row: Row, width: int, best: dict[int, float | None]) -> tuple[st
     name = f"{row.method} (given the true past)" if row.method in PRIVILEGED else row.method
     return (
         name,
-        _signed(row.over_reference),
+        "-" if row.over_reference is None else f"{row.over_reference:+.2f}",
         *(_score_cell(row, column, best[column]) for column in range(len(COLUMNS))),
         number(row.vfid["whole_eval"], 1, 4, "n/a"),
         *(number(getattr(row.speed, name, None), 1, 1) for name in ("ms_p50", "ms_p95")),
         str(row.scenes) if row.scored_scenes == row.scenes else f"{row.scored_scenes} of {row.scenes}",
         f"**{row.failed}**" if row.failed else "0",
     )
-
-
-def _signed(value: float | None) -> str:
-    return "-" if value is None else f"{value:+.2f}"

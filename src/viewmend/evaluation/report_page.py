@@ -103,12 +103,11 @@ def _columns(cells: Sequence[Cell], shared: SceneImages, store: CellStore) -> li
     """A scene's images with labels: rendered, E, each method, truth; None for a method that failed."""
     shown: list[tuple[str, Picture | None]] = [("rendered", shared.rendered), ("E", shared.error)]
     for cell in cells:
-        if cell.error is None:
-            score = max(cell.frames, key=lambda frame: frame.hole_px).psnr_holes
-            label = cell.key.method if score is None else f"{cell.key.method} {score:.2f} dB"
-            shown.append((label, store.image(cell.key)))
-        else:
+        if cell.error is not None:
             shown.append((f"{cell.key.method}: failed", None))
+            continue
+        score = max(cell.frames, key=lambda frame: frame.hole_px).psnr_holes
+        shown.append((cell.key.method + ("" if score is None else f" {score:.2f} dB"), store.image(cell.key)))
     return [*shown, ("truth", shared.truth)]
 
 

@@ -18,7 +18,7 @@ from viewmend.data.errors import CaptureError
 from viewmend.data.holdout.scenes import LeaveOneOutScene
 from viewmend.data.images import read_rgb, write_image
 from viewmend.evaluation.provenance import Provenance
-from viewmend.evaluation.scene_run import MethodRun, RunSettings, SceneRun
+from viewmend.evaluation.scene_run import RunSettings, SceneRun
 from viewmend.evaluation.scores import FEATURES, KINDS, Features, ViewScores
 from viewmend.models.registry import identity, make_method
 from viewmend.rendering.error_mask import error_rule
@@ -105,9 +105,9 @@ class CellStore:
         except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError):
             return None
 
-    def save(self, cell: Cell, run: MethodRun) -> None:
-        """Store a cell; its JSON file comes last, so that a cell that is there is complete."""
-        self._write(cell.key.stem, run.image, run.features)
+    def save(self, cell: Cell, image: Picture | None) -> None:
+        """Store a cell with its image; its JSON file comes last, so that a cell that is there is complete."""
+        self._write(cell.key.stem, image, cell.features)
         values = asdict(replace(cell, features=None, true_features=None))
         text = json.dumps({name: values[name] for name in STORED}, indent=1, allow_nan=False) + "\n"
         write_text(self.folder / f"{cell.key.stem}.json", text)
@@ -176,30 +176,14 @@ def method_identities(names: tuple[str, ...], settings: RunSettings) -> dict[str
 
 
 def to_cells(
-    scene: LeaveOneOutScene,
-    run: SceneRun,
-    keys: tuple[CellKey, ...],
-    identities: dict[str, str],
-    provenance: Provenance,
-) -> list[tuple[Cell, MethodRun]]:
-    """The cells of a scene's run."""
+    scene: LeaveOneOutScene, run: SceneRun, keys: tuple[CellKey, ...], identities: dict[str, str], origin: Provenance
+) -> list[Cell]:
+    """The cells of a scene's run, in the order of its methods."""
     by_name = {key.method: key for key in keys}
     return [
-        (
-            Cell(
-                key=by_name[one.method],
-                set=scene.set,
-                rig=scene.rig,
-                style=scene.style,
-                identity=identities[one.method],
-                frames=one.frames,
-                step_ms=one.step_ms,
-                error=one.error,
-                provenance=provenance,
-                features=one.features,
-                true_features=run.features,
-            ),
-            one,
+        Cell(
+            *(by_name[one.method], scene.set, scene.rig, scene.style, identities[one.method]),
+            *(one.frames, one.step_ms, one.error, origin, one.features, run.features),
         )
         for one in run.runs
     ]

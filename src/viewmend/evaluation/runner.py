@@ -85,16 +85,15 @@ def run_evaluation(
     for task, run in runs:
         cells = to_cells(task.scene, run, keys[task.scene.name], identities, origin)
         store.save_scene(keys[task.scene.name][0], run)
-        for cell, one in cells:
-            store.save(cell, one)
-        yield [cell for cell, _ in cells]
+        for cell, one in zip(cells, run.runs, strict=True):
+            store.save(cell, one.image)
+        yield cells
 
 
 def process_pool(jobs: int, threads: int) -> ProcessPoolExecutor:
     """A pool of `jobs` processes with `threads` threads each; they end with this process, even if it is killed."""
     # Not forked: threads of torch and numba do not survive that.
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(jobs, context, _start_worker, (threads,))
+    return ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _start_worker, (threads,))
 
 
 def _check(names: list[str], jobs: int) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import torch
 
 from viewmend.data.holdout.scenes import LeaveOneOutScene, Protocol, revealed
-from viewmend.evaluation.mending import SLOW_MS, Mender
+from viewmend.evaluation.mending import Mender
 from viewmend.evaluation.scores import (
     Features,
     PreviousView,
@@ -29,8 +29,6 @@ from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView
 from viewmend.utils.contact_sheet import Picture, picture
 from viewmend.utils.tensors import to_device
-
-__all__ = ["SLOW_MS", "MethodRun", "RunSettings", "SceneRun", "evaluate_scene"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,10 +95,7 @@ class _Frame:
 
 
 def evaluate_scene(
-    scene: LeaveOneOutScene,
-    methods: Sequence[str],
-    settings: RunSettings,
-    loaded: dict[str, Inpainter] | None = None,
+    scene: LeaveOneOutScene, methods: Sequence[str], settings: RunSettings, loaded: dict[str, Inpainter] | None = None
 ) -> SceneRun:
     """Stream the held-out camera's view through the methods, one frame at a time, using past frames only.
 
@@ -126,8 +121,7 @@ def evaluate_scene(
             raise ValueError(f"{scene.name}: expected frames of the held-out camera, got none")
     except Exception as error:
         return SceneRun(scene.name, tuple(MethodRun(name, error=_message(error)) for name in methods))
-    runs = tuple(stream.result() for stream in streams)
-    return SceneRun(scene.name, runs, images, videos.features())
+    return SceneRun(scene.name, tuple(stream.result() for stream in streams), images, videos.features())
 
 
 def _frames(scene: LeaveOneOutScene, settings: RunSettings) -> Iterator[_Frame]:
@@ -178,8 +172,7 @@ class _MethodStream:
 
     def _make(self, bounds: Bounds | None) -> Mender:
         settings = self._settings
-        new = self.method not in self._loaded
-        if new:
+        if new := self.method not in self._loaded:
             self._loaded[self.method] = make_method(self.method, settings.device, settings.precision)
         inpainter = self._loaded[self.method]
         predicted = (settings.stream.render.error_rule or inpainter.error_rule) == "predicted"
@@ -191,10 +184,9 @@ class _MethodStream:
 
     def _score(self, mender: Mender, frame: _Frame) -> None:
         made = mender.view(frame.view.camera, frame.view.time, frame.view, frame.view.target_mask)
-        completed = made.completed
+        completed, previous = made.completed, None
         _check(completed)
         rgb = composite(self._settings.background, completed.rgb, completed.opacity)
-        previous = None
         if frame.previous is not None and self._previous is not None:
             previous = PreviousView(self._previous, frame.previous.truth.rgb)
         self._scores.append(score_view(completed, frame.truth, self._scorers, previous))
@@ -205,7 +197,6 @@ class _MethodStream:
             self._image = picture(rgb)
 
     def result(self) -> MethodRun:
-        """The result."""
         if self._error is not None:
             return MethodRun(self.method, error=self._error)
         scores, step_ms = tuple(self._scores), tuple(self._step_ms)
@@ -217,8 +208,7 @@ def _check(completed: CompletedView) -> None:
     rgb, view = completed.rgb, completed.view
     if rgb.shape != view.rgb.shape:
         raise ValueError(f"expected an image of {tuple(view.rgb.shape)}, got {tuple(rgb.shape)}; return the whole view")
-    changed = int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum())
-    if changed:
+    if changed := int(((rgb != view.cut_rgb).any(0) & (view.error == 0)).sum()):
         raise ValueError(f"expected pixels with E = 0 as they were rendered, got {changed} changed; blend by E")
 
 

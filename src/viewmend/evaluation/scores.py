@@ -14,7 +14,7 @@ from viewmend.metrics.image_quality import SsimWindow, change, mask_iou, psnr, s
 from viewmend.metrics.lpips import load_lpips
 from viewmend.metrics.vfid import MODES, I3d, load_i3d, video_features
 from viewmend.models.compositing import Background, composite
-from viewmend.types import CompletedView, MultiViewFrame
+from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.weight_files import MissingWeightsError
 
 MIN_HOLE_PX = 50
@@ -177,10 +177,7 @@ def true_view(
 
 
 def score_view(
-    completed: CompletedView,
-    truth: TrueView,
-    scorers: Scorers,
-    previous: PreviousView | None = None,
+    completed: CompletedView, truth: TrueView, scorers: Scorers, previous: PreviousView | None = None
 ) -> ViewScores:
     """All scores of one completed view; the temporal ones need the previous frame."""
     view, background = completed.view, scorers.background
@@ -195,7 +192,7 @@ def score_view(
     maps["ssim"] = None if scorers.ssim is None else partial(ssim_map, window=scorers.ssim)
     by_map: dict[str, float | None] = {}
     for name, score in maps.items():
-        by_map |= {} if score is None else _readings(name, score, (rgb, truth.rgb), holes, truth.mask)
+        by_map |= {} if score is None else _readings(name, score, rgb, truth, holes)
     return ViewScores(
         time=view.time,
         width_px=width,
@@ -215,7 +212,7 @@ def score_view(
         alpha_iou=mask_iou(completed.opacity > 0.5, truth.mask),
         hull_iou=mask_iou(hull, truth.mask),
         **by_map,
-        **({} if previous is None else _temporal(rgb, holes, (view.mask > 0) | truth.mask, truth, previous)),
+        **({} if previous is None else _temporal(rgb, view, truth, previous)),
     )
 
 
@@ -232,40 +229,31 @@ def mean_over_frames(values: Sequence[float | None], pixels: Sequence[int] | Non
 def _readings(
     name: str,
     score: ScoreMap,
-    images: tuple[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]],
+    rgb: Float[Tensor, "3 height width"],
+    truth: TrueView,
     holes: Bool[Tensor, "height width"],
-    true_mask: Bool[Tensor, "height width"],
 ) -> dict[str, float | None]:
     """The readings of a score that has a map; NaN values of the map do not count."""
-    image, truth = images
-    scored = score(image, truth)
+    scored = score(rgb, truth.rgb)
     if scored is None:
         return {}
-    masked = score(image * holes, truth * holes) if bool(holes.any()) else None
-    maps = {"whole": scored, "holes": scored[holes], "holes_fg": scored[holes & true_mask], "masked": masked}
+    masked = score(rgb * holes, truth.rgb * holes) if bool(holes.any()) else None
+    maps = {"whole": scored, "holes": scored[holes], "holes_fg": scored[holes & truth.mask], "masked": masked}
     if name != "ssim":
-        maps["subject"] = scored[true_mask]
-    return {f"{name}_{region}": _finite_mean(values) for region, values in maps.items()}
-
-
-def _finite_mean(values: Tensor | None) -> float | None:
-    finite = values if values is None else values[values.isfinite()]
-    return None if finite is None or not finite.numel() else float(finite.double().mean())
+        maps["subject"] = scored[truth.mask]
+    finite = {region: values[values.isfinite()] for region, values in maps.items() if values is not None}
+    return {f"{name}_{region}": float(own.double().mean()) for region, own in finite.items() if own.numel()}
 
 
 def _temporal(
-    now: Float[Tensor, "3 height width"],
-    holes: Bool[Tensor, "height width"],
-    shown: Bool[Tensor, "height width"],
-    truth: TrueView,
-    previous: PreviousView,
+    now: Float[Tensor, "3 height width"], view: IncompleteView, truth: TrueView, previous: PreviousView
 ) -> dict[str, float | None]:
-    then, true_now, true_then = previous.rgb, truth.rgb, previous.truth
+    then, true_now, true_then, shown = previous.rgb, truth.rgb, previous.truth, (view.mask > 0) | truth.mask
     still = shown & ((true_now - true_then).abs().amax(0) < STILL)
     found = {"change_still": change(now, then, still, MIN_HOLE_PX)}
     if (flow := truth.backward_flow_px) is not None:
         found["flicker_whole"] = warp_error(now - true_now, then - true_then, flow, shown)
-        found["flicker"] = warp_error(now - true_now, then - true_then, flow, holes, MIN_HOLE_PX)
+        found["flicker"] = warp_error(now - true_now, then - true_then, flow, view.holes, MIN_HOLE_PX)
     return found
 
 

@@ -349,8 +349,7 @@ def extract_points(completed: CompletedView, frame: MultiViewFrame, min_confiden
     height, width = depth.shape
     uv = pixel_centers(width, height, depth.device)[kept]
     world = unproject(uv[None], depth[kept][None], completed.view.camera)[0]
-    points = torch.cat([world, completed.straight_rgb[:, kept].mT], 1)
-    return points[_within_masks(world, frame)].float().cpu()
+    return torch.cat([world, completed.straight_rgb[:, kept].mT], 1)[_within_masks(world, frame)].float().cpu()
 
 
 def check_openexr() -> None:

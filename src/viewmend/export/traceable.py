@@ -192,8 +192,7 @@ class PackedSources(SourceCameras):
         found = []
         for images, cameras, mask in parts:
             packed = PackedPyramids.of(images.float(), cameras.size_px, mask)
-            levels = choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale)
-            found += map(packed.at, levels)
+            found += map(packed.at, choose_levels(cameras, packed.last, packed.subject_px, viewer, step_px, scale))
         return found
 
 

@@ -104,24 +104,22 @@ def judge(P, lens, x, y, z, radius, size, pool, tile, sums):
 
 
 @kernel
-def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, first, end, occupied):
-    """Mark the blocks of slabs [first, end) along x that no camera calls empty and enough cameras may see."""
+def occupied_blocks(P, lens, size, tile, sums, low, block_m, needed, slab, occupied):
+    """Mark the blocks of one slab along x that no camera calls empty and enough cameras may see."""
     radius = block_m * np.sqrt(3.0) / 2
-    for i in range(first, end):
-        x = low[0] + (i + 0.5) * block_m
-        for j in range(occupied.shape[1]):
-            y = low[1] + (j + 0.5) * block_m
-            for k in range(occupied.shape[2]):
-                z = low[2] + (k + 0.5) * block_m
-                seen = 0
-                for view in range(P.shape[0]):
-                    verdict = judge(P[view], lens[view], x, y, z, radius, size[view], 1, tile, sums[view])
-                    if verdict == EMPTY:
-                        seen = -1
-                        break
-                    if verdict != UNSEEN:
-                        seen += 1
-                occupied[i, j, k] = seen >= needed
+    x = low[0] + (slab + 0.5) * block_m
+    for j in range(occupied.shape[1]):
+        y = low[1] + (j + 0.5) * block_m
+        for k in range(occupied.shape[2]):
+            z = low[2] + (k + 0.5) * block_m
+            seen = 0
+            for view in range(P.shape[0]):
+                verdict = judge(P[view], lens[view], x, y, z, radius, size[view], 1, tile, sums[view])
+                if verdict == EMPTY:
+                    seen = -1
+                    break
+                seen += verdict != UNSEEN
+            occupied[slab, j, k] = seen >= needed
 
 
 @kernel

@@ -60,8 +60,7 @@ def shared_offset(
 
     def iou(x: float, y: float) -> float:
         moved = cameras.moved(x, y)
-        silhouettes = reconstruct(mask, moved, box, config).depth(moved) > 0
-        agreed = silhouette_iou(silhouettes, mask)
+        agreed = silhouette_iou(reconstruct(mask, moved, box, config).depth(moved) > 0, mask)
         return float(agreed.nanmean().nan_to_num(0.0))
 
     before = iou(0.0, 0.0)

@@ -36,5 +36,4 @@ class Bounds(OnDevice):
     @property
     def corners(self) -> Float[Tensor, "8 3"]:
         """All eight corners."""
-        axes = [torch.stack([low, high]) for low, high in zip(self.low, self.high, strict=True)]
-        return torch.cartesian_prod(*axes)
+        return torch.cartesian_prod(*[torch.stack([low, high]) for low, high in zip(self.low, self.high, strict=True)])

@@ -38,9 +38,7 @@ class Cameras(OnDevice):
 
     def __getitem__(self, views: int | slice | Sequence[int]) -> "Cameras":
         """The cameras at these positions; an int gives a `Cameras` of one view."""
-        index = (
-            range(len(self))[views] if isinstance(views, slice) else [views] if isinstance(views, int) else list(views)
-        )
+        index = [views] if isinstance(views, int) else range(len(self))[views] if isinstance(views, slice) else views
         names = tuple(self.names[view] for view in index)
         at = torch.tensor(list(index), dtype=torch.long, device=self.K.device)
         return Cameras(names, self.K[at], self.camera_from_world[at], self.size_px[at])
@@ -171,6 +169,5 @@ def pinhole(
     """
     f = 0.5 * height / float(torch.tan(torch.tensor(fov_y_rad / 2)))
     K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
-    size = torch.tensor([[width, height]])
-    device = camera_from_world.device
-    return Cameras((name,), K[None].to(device), camera_from_world[None], size.to(device))
+    cameras = Cameras((name,), K[None], camera_from_world[None], torch.tensor([[width, height]]))
+    return cameras.to(camera_from_world.device)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from types import ModuleType
+from functools import partial
 
 import numpy as np
 import torch
@@ -98,10 +98,10 @@ def visual_hull(
     check_masks(mask, cameras)
     voxels, needed = Cubes.of(bounds, config.resolution), needed_views(len(cameras), config)
     pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
-    if (kernels := _kernels(mask)) is None:
-        values = carve(soften(mask, cameras.size_px, pool), pool, cameras, voxels, needed)
+    if _has_kernels(mask):
+        values = _carve_cpu(mask, pool, cameras, voxels, needed)
     else:
-        values = _carve_cpu(kernels, mask, pool, cameras, voxels, needed)
+        values = carve(soften(mask, cameras.size_px, pool), pool, cameras, voxels, needed)
     return OccupancyGrid(values, bounds.low, voxels.side_m)
 
 
@@ -109,17 +109,14 @@ def occupied_bounds(
     mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds, config: HullConfig
 ) -> Bounds | None:
     """The part of `bounds` that the hull can fill, None where it is empty; nothing of the hull is outside it."""
-    needed = needed_views(len(cameras), config)
-    tile = max(1, min(mask.shape[1:]) // TILES)
-    kernels = _kernels(mask)
-    tiles = None if kernels is None else _count_tiles(kernels, mask, tile)
+    needed, tile = needed_views(len(cameras), config), max(1, min(mask.shape[1:]) // TILES)
+    if _has_kernels(mask):
+        find = partial(_occupied_cpu, _count_tiles(mask.numpy(), mask.shape[1], mask.shape[2], tile), tile, cameras)
+    else:
+        find = partial(occupied_blocks, count_tiles(mask, tile), tile, cameras)
     for _ in range(config.coarse_passes):
         blocks = Cubes.of(bounds, config.coarse_resolution)
-        if kernels is None or tiles is None:
-            occupied = occupied_blocks(mask, tile, cameras, blocks, needed)
-        else:
-            occupied = _occupied_cpu(kernels, tiles, tile, cameras, blocks, needed)
-        index = occupied.nonzero()
+        index = find(blocks, needed).nonzero()
         if not len(index):
             return None
         low = bounds.low + index.amin(0) * blocks.side_m
@@ -139,13 +136,8 @@ def _footprint_px(cameras: Cameras, bounds: Bounds, length_m: float) -> float:
     return float(size.median()) if len(size) else 1.0
 
 
-def _kernels(mask: Tensor) -> ModuleType | None:
-    """The fast path for CPU tensors."""
-    if mask.device.type != "cpu":
-        return None
-    from viewmend.geometry import _hull_numba
-
-    return _hull_numba
+def _has_kernels(mask: Tensor) -> bool:
+    return mask.device.type == "cpu"
 
 
 def _kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
@@ -156,67 +148,40 @@ def _kernel_arrays(cameras: Cameras, cubes: Cubes) -> tuple[np.ndarray, ...]:
     return P.numpy(), lens.numpy(), cameras.size_px.numpy(), cubes.low.double().numpy()
 
 
-def _tile_sums(views: int, height: int, width: int, tile: int) -> Int[Tensor, "view row column 2"]:
-    return torch.empty(views, -(-height // tile) + 1, -(-width // tile) + 1, 2, dtype=torch.int32)
-
-
 def _carve_cpu(
-    kernels: ModuleType,
-    mask: UInt8[Tensor, "view height width"],
-    pool: int,
-    cameras: Cameras,
-    voxels: Cubes,
-    needed: int,
+    mask: UInt8[Tensor, "view height width"], pool: int, cameras: Cameras, voxels: Cubes, needed: int
 ) -> Float[Tensor, "x y z"]:
+    from viewmend.geometry import _hull_numba as kernels
+
     views, height, width = mask.shape
-    soft_rows, soft_columns = -(-height // pool), -(-width // pool)
-    soft = torch.empty(views, soft_rows + 1, soft_columns + 1, dtype=torch.uint8)
-    sums = _tile_sums(views, soft_rows, soft_columns, BLOCK).numpy()
-    values = torch.empty(voxels.shape)
-    masks, images, out = mask.numpy(), soft.numpy(), values.numpy()
+    rows, columns = -(-height // pool), -(-width // pool)
+    masks, soft, values = mask.numpy(), np.empty((views, rows + 1, columns + 1), np.uint8), torch.empty(voxels.shape)
     P, lens, size, low = _kernel_arrays(cameras, voxels)
-
-    def prepare(view: int) -> None:
-        columns, rows = size[view]
-        kernels.soften(masks[view], rows, columns, pool, images[view])
-        kernels.count_tiles(images[view], soft_rows, soft_columns, BLOCK, sums[view])
-
-    def carve(slab: int) -> None:
-        kernels.carve_blocks(
-            P, lens, size, images, pool, BLOCK, sums, low, voxels.side_m, needed, BLOCK, slab * BLOCK, out
-        )
-
-    parallel_for(prepare, views)
-    parallel_for(carve, -(-voxels.shape[0] // BLOCK))
+    parallel_for(lambda view: kernels.soften(masks[view], *size[view, ::-1], pool, soft[view]), views)
+    sums, side_m, out = _count_tiles(soft, rows, columns, BLOCK), voxels.side_m, values.numpy()
+    given = P, lens, size, soft, pool, BLOCK, sums, low, side_m, needed, BLOCK
+    parallel_for(lambda slab: kernels.carve_blocks(*given, slab * BLOCK, out), -(-voxels.shape[0] // BLOCK))
     return values
 
 
-def _count_tiles(
-    kernels: ModuleType, mask: UInt8[Tensor, "view height width"], tile: int
-) -> Int[Tensor, "view row column 2"]:
-    views, height, width = mask.shape
-    sums = _tile_sums(views, height, width, tile)
-    masks, out = mask.numpy(), sums.numpy()
-    parallel_for(lambda view: kernels.count_tiles(masks[view], height, width, tile, out[view]), views)
+def _count_tiles(images: np.ndarray, height: int, width: int, tile: int) -> Int[np.ndarray, "view row column 2"]:
+    """Summed-area tables of the first rows and columns of each image."""
+    from viewmend.geometry._hull_numba import count_tiles
+
+    sums = np.empty((len(images), -(-height // tile) + 1, -(-width // tile) + 1, 2), np.int32)
+    parallel_for(lambda view: count_tiles(images[view], height, width, tile, sums[view]), len(images))
     return sums
 
 
 def _occupied_cpu(
-    kernels: ModuleType,
-    tiles: Int[Tensor, "view row column 2"],
-    tile: int,
-    cameras: Cameras,
-    blocks: Cubes,
-    needed: int,
+    sums: Int[np.ndarray, "view row column 2"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
 ) -> Bool[Tensor, "x y z"]:
+    from viewmend.geometry._hull_numba import occupied_blocks
+
     occupied = torch.empty(blocks.shape, dtype=torch.bool)
-    sums, out = tiles.numpy(), occupied.numpy()
     P, lens, size, low = _kernel_arrays(cameras, blocks)
-
-    def judge(slab: int) -> None:
-        kernels.occupied_blocks(P, lens, size, tile, sums, low, blocks.side_m, needed, slab, slab + 1, out)
-
-    parallel_for(judge, blocks.shape[0])
+    given, out = (P, lens, size, tile, sums, low, blocks.side_m, needed), occupied.numpy()
+    parallel_for(lambda slab: occupied_blocks(*given, slab, out), blocks.shape[0])
     return occupied
 
 
@@ -332,7 +297,7 @@ def carve(
 
 
 def occupied_blocks(
-    mask: UInt8[Tensor, "view height width"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
+    sums: Int[Tensor, "view row column"], tile: int, cameras: Cameras, blocks: Cubes, needed: int
 ) -> Bool[Tensor, "x y z"]:
     """Blocks that project to some foreground in all cameras and are visible to enough cameras."""
     centers, radius = blocks.centers, blocks.side_m * 3**0.5 / 2
@@ -349,22 +314,26 @@ def occupied_blocks(
         in_front = z - radius > NEAR_M
         outside = ((last < 0) | (first >= size)).any(-1)
         inside = ((first >= 0) & (last < size)).all(-1)
-        empty |= in_front & inside & (_foreground_tiles(mask[view], tile, first, last) == 0)
+        empty |= in_front & inside & (_foreground_tiles(sums[view], tile, first, last) == 0)
         seen += (z + radius > NEAR_M) & ~(in_front & outside)
     return (~empty & (seen >= needed)).view(blocks.shape)
 
 
+def count_tiles(mask: UInt8[Tensor, "view height width"], tile: int) -> Int[Tensor, "view row column"]:
+    """Summed-area tables: how many tiles have any foreground."""
+    height, width = mask.shape[1:]
+    padded = pad(mask, (0, -width % tile, 0, -height % tile))
+    some = padded.unflatten(2, (-1, tile)).unflatten(1, (-1, tile)).amax((2, 4)) > 0
+    return pad(some.int().cumsum(1).cumsum(2), (1, 0, 1, 0))
+
+
 def _foreground_tiles(
-    mask: UInt8[Tensor, "height width"], tile: int, first: Float[Tensor, "block 2"], last: Float[Tensor, "block 2"]
+    sums: Int[Tensor, "row column"], tile: int, first: Float[Tensor, "block 2"], last: Float[Tensor, "block 2"]
 ) -> Int[Tensor, "block"]:
     """How many tiles with any foreground each window of pixels, and one and a half pixels around it, touches."""
-    height, width = mask.shape
-    rows, columns = -(-height // tile), -(-width // tile)
-    padded = pad(mask, (0, columns * tile - width, 0, rows * tile - height))
-    some = padded.view(rows, tile, columns, tile).amax((1, 3)) > 0
-    sums = pad(some.int().cumsum(0).cumsum(1), (1, 0, 1, 0))
-    end = torch.tensor([columns, rows], device=mask.device) - 1
-    from_tile = ((first - 1.5).clamp(0, max(width, height)) / tile).long().minimum(end)
-    to_tile = ((last + 1.5).clamp(0, max(width, height)) / tile).long().minimum(end) + 1
+    end = torch.tensor([sums.shape[1], sums.shape[0]], device=sums.device) - 2
+    largest = tile * max(sums.shape)  # beyond the image
+    from_tile = ((first - 1.5).clamp(0, largest) / tile).long().minimum(end)
+    to_tile = ((last + 1.5).clamp(0, largest) / tile).long().minimum(end) + 1
     (left, top), (right, bottom) = from_tile.unbind(-1), to_tile.unbind(-1)
     return sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]

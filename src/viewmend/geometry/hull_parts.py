@@ -31,9 +31,12 @@ def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGr
 
     What a camera sees on its own, such as a second person or a ball in the air, stays unless it is a few voxels small.
     """
+    from scipy.ndimage import label
+
     inside = grid.values >= 0.5
     occupied = _any_in_blocks(inside)
-    labels, count = _labels(occupied)
+    # The number of each block's part, from 1; blocks that share a corner are connected.
+    labels, count = label(occupied.cpu().numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
     if count < 2:
         return grid
     index = _surface(inside).nonzero()
@@ -42,11 +45,9 @@ def without_floating_parts(grid: OccupancyGrid, cameras: Cameras) -> OccupancyGr
     if not dropped:
         return grid
     blocks = torch.from_numpy(np.isin(labels, dropped)).to(occupied.device)
-    # Around a part, soft values fade out.
-    faint = _grown(blocks)
-    kept = occupied & ~blocks
+    around = _grown(blocks) & ~(occupied & ~blocks)  # there soft values fade out
     x, y, z = grid.values.shape
-    remove = _to_voxels(blocks)[:x, :y, :z] | (_to_voxels(faint & ~kept)[:x, :y, :z] & (grid.values < 0.5))
+    remove = _to_voxels(blocks)[:x, :y, :z] | (_to_voxels(around)[:x, :y, :z] & (grid.values < 0.5))
     return replace(grid, values=grid.values.masked_fill(remove, 0.0))
 
 
@@ -78,14 +79,6 @@ def _to_voxels(blocks: Bool[Tensor, "x_block y_block z_block"]) -> Bool[Tensor, 
     for axis in range(3):
         blocks = blocks.repeat_interleave(BLOCK, axis)
     return blocks
-
-
-def _labels(occupied: Bool[Tensor, "x y z"]) -> tuple[Int[np.ndarray, "x y z"], int]:
-    """The number of each block's part, from 1, and how many there are; blocks that share a corner are connected."""
-    from scipy.ndimage import label
-
-    labels, count = label(occupied.cpu().numpy(), np.ones((3, 3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
-    return labels, count
 
 
 def _unneeded(
@@ -127,7 +120,6 @@ class _Cells:
 
     @classmethod
     def of(cls, part: Int[np.ndarray, "point"], y: Int[np.ndarray, "point"], x: Int[np.ndarray, "point"]) -> "_Cells":
-        """Of the cells that each part's points fall into."""
         width = int(x.max()) + 2
         place, count = y * width + x, np.zeros((int(y.max()) + 2) * width, np.int64)
         around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
@@ -149,7 +141,6 @@ class _Cells:
         return int((self.count[own] <= 1).sum()) <= max(speck, (1 - COVERED) * len(own))
 
     def drop(self, number: int) -> None:
-        """Take a part away."""
         if number in self.of_part:
             self.count[self.of_part[number][1]] -= 1
 

@@ -89,9 +89,9 @@ class LinesOfSight:
         for view, (w, h) in enumerate(cameras.size_px.tolist()):
             outline = _find_outline(mask[view, :h, :w].contiguous().cpu().numpy(), points)
             if outline is not None:
-                distances[view, :h, :w] = outline.outside_px
-                views.append(np.full(len(outline.points), view))
-                found.append(outline.points)
+                own, distances[view, :h, :w] = outline
+                views.append(np.full(len(own), view))
+                found.append(own)
         if not found:
             raise ValueError("expected a subject's outline in the masks, got none; choose other frames")
         return cls(
@@ -106,8 +106,7 @@ class LinesOfSight:
 
     def rays(self, rig: Rig) -> Float64[np.ndarray, "point 3"]:
         """Each point's direction in its own camera, z = 1."""
-        homogeneous = np.concatenate([self.uv_px, np.ones((len(self.uv_px), 1))], 1)
-        return np.einsum("pij,pj->pi", np.linalg.inv(rig.K)[self.view], homogeneous)
+        return np.einsum("pij,pj->pi", np.linalg.inv(rig.K)[self.view], np.insert(self.uv_px, 2, 1, 1))
 
     def sample(self, rig: Rig, depth: Float64[np.ndarray, "point place"]) -> LineSamples:
         """The places at these z-depths in their own cameras."""
@@ -127,8 +126,7 @@ class LinesOfSight:
     def search_depths(self, rig: Rig) -> Float64[np.ndarray, "point"]:
         """The z-depth at which each line of sight is least outside of the masks, of those within the box."""
         far = (rig.R @ self.middle + rig.t)[self.view, 2]
-        steps = np.linspace(-self.radius_m, self.radius_m, PLACES)
-        depth = np.maximum(far[:, None] + steps, NEAR_M)
+        depth = np.maximum(far[:, None] + np.linspace(-self.radius_m, self.radius_m, PLACES), NEAR_M)
         best = depth[np.arange(len(far)), self.sample(rig, depth).residuals.argmin(1)]
         return self.refine_depths(rig, best, halvings=2 + HALVINGS)
 
@@ -154,18 +152,13 @@ BORDER_PX = 3
 """An outline so near to its image's border is where the image ends, not the subject."""
 
 
-@dataclass(frozen=True)
-class Outline:
-    """The outline of one mask."""
+def _find_outline(
+    mask: UInt8[np.ndarray, "height width"], count: int
+) -> tuple[Float64[np.ndarray, "point 2"], Float32[np.ndarray, "height width"]] | None:
+    """About `count` points, evenly along the foreground's outline, and how far outside of it each pixel's centre is.
 
-    points: Float64[np.ndarray, "point 2"]
-    """Points along it, pixels."""
-    outside_px: Float32[np.ndarray, "height width"]
-    """How far outside of it each pixel's centre is; negative inside."""
-
-
-def _find_outline(mask: UInt8[np.ndarray, "height width"], count: int) -> Outline | None:
-    """The outline of the foreground with about `count` points, evenly along it; None without any foreground."""
+    Negative inside; None without an outline.
+    """
     import cv2
 
     height, width = mask.shape
@@ -178,12 +171,10 @@ def _find_outline(mask: UInt8[np.ndarray, "height width"], count: int) -> Outlin
     contours = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     along = np.concatenate([contour[:, 0] for contour in contours]).astype(np.float64)
     points = (along + 0.5) / FINER  # half a small pixel inside of the outline
-    clear = ((points > BORDER_PX) & (points < np.array([width, height]) - BORDER_PX)).all(1)
-    points = points[clear]
+    points = points[((points > BORDER_PX) & (points < np.array([width, height]) - BORDER_PX)).all(1)]
     points = points[:: max(1, len(points) // count)]
     value, slope = _interpolate(outside_px.ravel(), np.zeros(len(points), int), (width, height), points)
-    points = points - value[:, None] * slope / np.maximum((slope**2).sum(1, keepdims=True), 0.25)
-    return Outline(points, outside_px)
+    return points - value[:, None] * slope / np.maximum((slope**2).sum(1, keepdims=True), 0.25), outside_px
 
 
 def _interpolate(
@@ -192,13 +183,9 @@ def _interpolate(
     size: tuple[int, int],
     uv_px: Float64[np.ndarray, "*point 2"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bilinear values at pixel positions of images that lie one after the other, and their slopes in x and y.
+    """Bilinear values at pixel positions (beyond the border the nearest of it), and their slopes in x and y.
 
-    Args:
-        flat: all images' pixels.
-        first: where each position's image begins.
-        size: width and height of each image.
-        uv_px: positions; beyond the border the nearest of it.
+    `flat` has the pixels of all images; the image of a position begins at `first`, and `size` is its width and height.
     """
     width, height = size
     x, y = np.clip(uv_px[..., 0] - 0.5, 0, width - 1.001), np.clip(uv_px[..., 1] - 0.5, 0, height - 1.001)

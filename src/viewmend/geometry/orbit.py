@@ -101,8 +101,7 @@ def orbit_around(
     Args:
         center: the subject's middle, metres.
         cameras: the rig.
-        up: the world's up; by default the mean of the images' up directions or, where these disagree (images partly
-            upside down), the normal of the plane that the cameras lie in.
+        up: the world's up; by default `upright(cameras)`.
         views: how many cameras to give.
         frames_per_turn: length of a whole turn, or of a swing there and back.
         arc_rad: angle to swing over; a whole turn circles. By default what the rig covers.
@@ -114,17 +113,10 @@ def orbit_around(
     elevation = torch.asin((offsets @ up / distance).clamp(-1, 1)).mean()
     front, side = horizontal_axes(up)
     azimuths = _swing(torch.atan2(offsets @ side, offsets @ front).tolist(), views, frames_per_turn, arc_rad)
-    width, height = (int(side) for side in cameras.size_px[0].tolist())
-    visible_m = min(width, height) / float(cameras.K[0, 1, 1]) * float(distance.mean())
-    return orbit(
-        azimuths,
-        size_px or (width, height),
-        radius_m=float(distance.mean()),
-        elevation_rad=float(elevation),
-        center=center.cpu(),
-        up=up.cpu(),
-        visible_m=visible_m,
-    )
+    (width, height), radius_m = cameras.size_px[0].tolist(), float(distance.mean())
+    visible_m, size_px = min(width, height) / float(cameras.K[0, 1, 1]) * radius_m, size_px or (width, height)
+    where = {"radius_m": radius_m, "elevation_rad": float(elevation), "visible_m": visible_m}
+    return orbit(azimuths, size_px, **where, center=center.cpu(), up=up.cpu())
 
 
 def coarse_surface(

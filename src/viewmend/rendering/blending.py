@@ -72,31 +72,18 @@ def blend(
         bias_m: tolerance of the depth test, metres.
         config: exponents and tolerances.
     """
-    implementation = blend_numba if depth.device.type == "cpu" else blend_torch
-    return implementation(camera, depth, normals, sources, bias_m, config)
-
-
-def blend_numba(
-    camera: Cameras,
-    depth: Float[Tensor, "height width"],
-    normals: Float[Tensor, "height width 3"],
-    sources: ContextViews,
-    bias_m: float,
-    config: BlendConfig,
-) -> Blend:
-    """`blend` in numba, for the CPU."""
+    if depth.device.type != "cpu":
+        return blend_torch(camera, depth, normals, sources, bias_m, config)
     from viewmend.rendering._blend_numba import blend_rows
 
     frame, rig = sources.frame, sources.frame.cameras
-    height, width = depth.shape
-    rgb = torch.zeros(3, height, width)
-    weights = torch.zeros(len(rig), height, width)
-    disagreement = torch.zeros(height, width)
-
+    height = len(depth)
+    rgb, weights = torch.zeros(3, *depth.shape), torch.zeros(len(rig), *depth.shape)
+    disagreement = torch.zeros(depth.shape)
     pose = camera.world_from_camera[0].double()
     world_from_pixel = (pose[:3, :3] @ torch.linalg.inv(camera.K[0].double())).numpy()
     P = (rig.K.double() @ rig.camera_from_world[:, :3].double()).numpy()
-    mask = frame.mask if frame.mask is not None else torch.zeros(0, 0, 0, dtype=torch.uint8)
+    mask = torch.zeros(0, 0, 0, dtype=torch.uint8) if frame.mask is None else frame.mask
     inputs = (
         *(depth.numpy(), normals.numpy(), world_from_pixel, pose[:3, 3].numpy()),
         *(frame.rgb.numpy(), mask.numpy(), sources.depth.numpy()),
@@ -128,19 +115,13 @@ def blend_torch(
     normal = normalize(normals[row, column], dim=-1)
     to_viewer = normalize(camera.centers[0] - points, dim=-1)
 
-    weights, colours = [], []
-    for view in range(len(sources.frame.cameras)):
-        weight, colour = _sample(points, normal, to_viewer, sources, view, bias_m, config)
-        weights.append(weight)
-        colours.append(colour)
-    weight, colour = torch.stack(weights), torch.stack(colours)
-
+    views = range(len(sources.frame.cameras))
+    samples = [_sample(points, normal, to_viewer, sources, view, bias_m, config) for view in views]
+    weight, colour = (torch.stack(parts) for parts in zip(*samples, strict=True))
     total = weight.sum(0).clamp(min=torch.finfo(weight.dtype).tiny)
     mean = (weight[:, None] * colour).sum(0) / total
     variance = (weight * (colour - mean).square().mean(1)).sum(0) / total
-    height, width = depth.shape
-    rgb = depth.new_zeros(3, height, width)
-    raw = depth.new_zeros(len(weights), height, width)
+    rgb, raw = depth.new_zeros(3, *depth.shape), depth.new_zeros(len(views), *depth.shape)
     disagreement = torch.zeros_like(depth)
     rgb[:, row, column] = mean
     raw[:, row, column] = weight
@@ -175,6 +156,5 @@ def _sample(
             weight = weight * (frame.mask[view, row, column] / 255)
         usable = usable + weight
         colour = colour + weight * frame.rgb[view, :, row, column]
-    seen = in_view(uv[None], z[None], camera)[0]
-    weight = seen * usable * facing**config.normal_power * agreeing**config.view_power
+    weight = in_view(uv[None], z[None], camera)[0] * usable * facing**config.normal_power * agreeing**config.view_power
     return weight, colour / (255 * usable).clamp(min=1e-6)

@@ -107,8 +107,7 @@ def _draw(
         own, reach = sides == side, np.arange(side) - side // 2
         y, x = np.broadcast_arrays(rows[own, None, None] + reach[:, None], columns[own, None, None] + reach)
         inside = (y >= 0) & (y < image.shape[0]) & (x >= 0) & (x < image.shape[1])
-        dot = np.nonzero(inside)[0]
-        image[y[inside], x[inside]] = colours[own][dot]
+        image[y[inside], x[inside]] = colours[own][np.nonzero(inside)[0]]
 
 
 def _spread(colours: Float[Tensor, "vertex 3"], known: Bool[Tensor, "vertex"], mesh: Mesh) -> Float[Tensor, "vertex 3"]:
@@ -121,8 +120,7 @@ def _spread(colours: Float[Tensor, "vertex 3"], known: Bool[Tensor, "vertex"], m
         if not len(reached):
             return colours
         sums = colours.new_zeros(len(colours), 4)
-        ones = colours.new_ones(len(reached), 1)
-        sums.index_add_(0, reached[:, 1], torch.cat([colours[reached[:, 0]], ones], 1))
+        sums.index_add_(0, reached[:, 1], torch.cat([colours[reached[:, 0]], colours.new_ones(len(reached), 1)], 1))
         new = sums[:, 3] > 0
         colours = torch.where(new[:, None], sums[:, :3] / sums[:, 3:].clamp(min=1), colours)
         known = known | new

@@ -92,12 +92,7 @@ def render_depth(
 ) -> tuple[IncompleteView, Evidence]:
     """`render_view` for geometry that is known as depth maps: z-depth in metres, 0 where there is no surface.
 
-    Args:
-        frame: the cameras' images.
-        target: the novel view's camera (one view), on the same device.
-        depth: of the surface in the novel view.
-        source_depth: returns the surface's depth in the frame's cameras of given names.
-        config: number of source cameras and weights.
+    `depth` is that of the surface in the novel view; `source_depth` returns its depth in the frame's cameras.
 
     Raises:
         ValueError: there is no camera to colour the view.
@@ -131,7 +126,13 @@ def _colour(
     source_depth: SourceDepth,
 ) -> tuple[IncompleteView, Evidence]:
     """The view of a surface in the colours of the closest cameras."""
-    usable, (depth, normals, center, size_m) = _without(frame.cameras, exclude), surface
+    names = [name for name in frame.cameras.names if name not in exclude]
+    if not names:
+        count = len(frame.cameras)
+        raise ValueError(
+            f"expected a camera to colour the view, got {count} cameras with all of them excluded; exclude fewer"
+        )
+    usable, (depth, normals, center, size_m) = frame.cameras.select(names), surface
     mask = (depth > 0).to(depth)
     candidate_views = select_closest(target, usable, center, len(usable), config.selection)
     source_views = candidate_views[: config.cameras]
@@ -143,19 +144,12 @@ def _colour(
     weights = blended.weights / blended.weights.sum(0).clamp(min=torch.finfo(depth.dtype).tiny) * coloured
     used = frame if len(usable) == len(frame.cameras) else frame.select(usable.names)
     silhouettes = None if used.mask is None else Silhouettes(used.mask, used.cameras)
-    rgb, error = blended.rgb * coloured, holes(evidence)
-    view = IncompleteView(
-        target, rgb, mask, error, depth, source_views, weights, frame.time, candidate_views, silhouettes
-    )
-    return view, evidence
+    rgb, error, more = blended.rgb * coloured, holes(evidence), (frame.time, candidate_views, silhouettes)
+    return IncompleteView(target, rgb, mask, error, depth, source_views, weights, *more), evidence
 
 
 def select_closest(
-    target: Cameras,
-    cameras: Cameras,
-    subject_center: Float[Tensor, "3"],
-    k: int = 3,
-    selection: str = "angle",
+    target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "3"], k: int = 3, selection: str = "angle"
 ) -> tuple[str, ...]:
     """Names of the k cameras closest to the target, nearest first: the paper's selection (section 2).
 
@@ -178,12 +172,3 @@ def angles_to(target: Cameras, cameras: Cameras, subject_center: Float[Tensor, "
     # atan2 of the cross and the dot product: acos would lose precision at the small angles that matter.
     sine = torch.linalg.cross(to_cameras, to_target.expand_as(to_cameras)).norm(dim=-1)
     return torch.atan2(sine, to_cameras @ to_target)
-
-
-def _without(cameras: Cameras, exclude: Sequence[str]) -> Cameras:
-    left = [name for name in cameras.names if name not in exclude]
-    if not left:
-        raise ValueError(
-            f"expected a camera to colour the view, got {len(cameras)} cameras with all of them excluded; exclude fewer"
-        )
-    return cameras.select(left)

@@ -12,9 +12,11 @@ def printable(text: str) -> str:
 
 def escaped_traceback(error: BaseException) -> str:
     """Format a traceback with each error message escaped onto a single line."""
-    parts = traceback.TracebackException.from_exception(error)
-    lines = [line for part in parts.format() for line in _escaped(part)]
-    return "\n".join(lines)
+    ours, lines = ("File ", "Traceback ", "The above exception ", "During handling "), []
+    for part in traceback.TracebackException.from_exception(error).format():
+        whole = part.strip("\n")
+        lines += whole.split("\n") if whole.lstrip(" |+-").startswith(ours) else [whole]
+    return "\n".join(map(printable, lines))
 
 
 def log_to_terminal() -> None:
@@ -37,10 +39,3 @@ class _Lines(logging.Handler):
             print(text, file=sys.stderr, flush=True)
         except Exception:  # logging must never raise
             self.handleError(record)
-
-
-def _escaped(part: str) -> list[str]:
-    """Lines of one part of a traceback; an error message becomes one line."""
-    ours = ("File ", "Traceback ", "The above exception ", "During handling ")
-    whole = part.strip("\n")
-    return [printable(line) for line in (whole.split("\n") if whole.lstrip(" |+-").startswith(ours) else [whole])]

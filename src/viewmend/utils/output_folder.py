@@ -1,7 +1,6 @@
 """Output folders of commands: one run at a time, and only files that earlier runs wrote are ever replaced."""
 
 import contextlib
-import hashlib
 import json
 import shutil
 from collections.abc import Iterable, Iterator
@@ -12,6 +11,7 @@ import msgspec
 from filelock import FileLock, Timeout
 
 from viewmend.utils.atomic_writes import defer_signals, remove_partial_files, write_text
+from viewmend.utils.untrusted_input import file_sha256
 
 HIDDEN = ".viewmend"
 """Subfolder for the lock, the manifest and unfinished files."""
@@ -63,16 +63,13 @@ class OutputFolder:
 
     def __exit__(self, *_: object) -> None:
         with defer_signals():
-            self._end()
-
-    def _end(self) -> None:
-        shutil.rmtree(self.draft, ignore_errors=True)
-        # While still locked, so that files of the next run are never removed.
-        if self._new and [entry.name for entry in self.path.iterdir()] == [HIDDEN]:
-            shutil.rmtree(self.path, ignore_errors=True)
-        elif not self._manifest.exists():
-            shutil.rmtree(self.path / HIDDEN, ignore_errors=True)
-        self._lock.release()
+            shutil.rmtree(self.draft, ignore_errors=True)
+            # While still locked, so that files of the next run are never removed.
+            if self._new and [entry.name for entry in self.path.iterdir()] == [HIDDEN]:
+                shutil.rmtree(self.path, ignore_errors=True)
+            elif not self._manifest.exists():
+                shutil.rmtree(self.path / HIDDEN, ignore_errors=True)
+            self._lock.release()
 
     @property
     def listed(self) -> bool:
@@ -116,9 +113,8 @@ class OutputFolder:
             ValueError: a file that no run wrote is in the way.
         """
         self.check_own_files(*names)
-        known, new = self._read(), {}
-        for file in _below(self.draft, names):
-            new[file.relative_to(self.draft).as_posix()] = [_digest(file)]
+        known = self._read()
+        new = {file.relative_to(self.draft).as_posix(): [_digest(file)] for file in _below(self.draft, names)}
         # If killed in between, the folder holds files of both runs, all of them in the manifest.
         self._write({name: known.get(name, []) + new.get(name, []) for name in known | new})
         for name in names:
@@ -141,8 +137,7 @@ class OutputFolder:
             return {}  # no readable manifest: own nothing
 
     def _write(self, files: dict[str, list[str]]) -> None:
-        text = json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True)
-        write_text(self._manifest, text)
+        write_text(self._manifest, json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True))
 
 
 def _below(root: Path, names: Iterable[str]) -> Iterator[Path]:
@@ -156,7 +151,4 @@ def _below(root: Path, names: Iterable[str]) -> Iterator[Path]:
 
 
 def _digest(file: Path) -> str:
-    if file.is_symlink() or not file.is_file():
-        return "no file"
-    with file.open("rb") as data:
-        return hashlib.file_digest(data, "sha256").hexdigest()[:32]
+    return "no file" if file.is_symlink() or not file.is_file() else file_sha256(file)[:32]

@@ -28,8 +28,7 @@ def load_from_file(name: str) -> Callable[..., object]:
     path = Path(file)
     if not path.is_file():
         raise ValueError(f"expected FILE.py:NAME, got '{name}', and there is no such file; check the path")
-    stat = path.stat()
-    module_name = _module_name(path.resolve(), stat.st_mtime_ns, stat.st_size)
+    module_name = _module_name(path.resolve(), path.stat().st_mtime_ns, path.stat().st_size)
     if module_name not in sys.modules:
         spec = importlib.util.spec_from_file_location(module_name, path)
         assert spec is not None and spec.loader is not None, "the suffix is .py"

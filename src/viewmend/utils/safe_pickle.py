@@ -80,8 +80,7 @@ def numbers(value: Any, *shape: int) -> np.ndarray:
         if not pending or len(found) > count:
             break
         one = pending.pop()
-        if isinstance(one, Stored):
-            one = one.value
+        one = one.value if isinstance(one, Stored) else one
         if isinstance(one, list | tuple):
             pending += reversed(one[: count + 1])
         elif isinstance(one, np.ndarray):
@@ -159,9 +158,7 @@ _STAND_INS: dict[str, Callable[..., Any]] = {
     "numpy.dtype": _dtype,
     "numpy.core.multiarray._reconstruct": lambda *_: Stored(),
     "numpy.core.multiarray.scalar": lambda dtype, data: _make_array(data, dtype, (), "C").item(),
-    "numpy.core.numeric._frombuffer": lambda data, dtype, shape, order: Stored(
-        value=_make_array(data, dtype, shape, order)
-    ),
+    "numpy.core.numeric._frombuffer": lambda *given: Stored(value=_make_array(*given)),
     "_codecs.encode": lambda text, *_: _text(text).encode("latin-1"),
     "collections.OrderedDict": dict,
     "builtins.bytes": lambda: b"",

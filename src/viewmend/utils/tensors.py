@@ -45,8 +45,7 @@ def _copied(tensor: Tensor) -> Tensor:
     size = tensor.numel() * tensor.element_size()
     if tensor.device.type != "cpu" or size < LARGE_BYTES:
         return tensor
-    pages = mmap.mmap(-1, size, **PRIVATE)
-    return torch.frombuffer(pages, dtype=tensor.dtype).view(tensor.shape).copy_(tensor)
+    return torch.frombuffer(mmap.mmap(-1, size, **PRIVATE), dtype=tensor.dtype).view(tensor.shape).copy_(tensor)
 
 
 def _changed(value: Any, change: Callable[[Tensor], Tensor]) -> Any:

@@ -1,5 +1,6 @@
 """Untrusted input: bounded reading, and JSON as typed values (msgspec) with one-line error messages."""
 
+import hashlib
 import json
 import re
 from pathlib import Path
@@ -37,6 +38,12 @@ def bounded_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     if len(data) > most:
         raise ValueError(f"expected {path.name} to have at most {most} bytes, got more; is it the right file?")
     return data
+
+
+def file_sha256(path: Path) -> str:
+    """The SHA-256 of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 Kind = TypeVar("Kind")

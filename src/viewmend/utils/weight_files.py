@@ -49,15 +49,11 @@ def load_weights(network: Network, path: str | Path, device: torch.device | str 
         "missing": sorted(key for key in own.keys() - weights.keys() if not key.endswith(COUNTER)),
         "unknown": sorted(weights.keys() - own.keys()),
         "of another shape": [
-            f"{key} {tuple(value.shape)} for {tuple(wanted.shape)}"
-            for key, (value, wanted) in both.items()
-            if value.shape != wanted.shape
+            f"{key} {tuple(a.shape)} for {tuple(b.shape)}" for key, (a, b) in both.items() if a.shape != b.shape
         ],
         "of another kind of number": [key for key, (value, wanted) in both.items() if not _is_same_kind(value, wanted)],
         "not finite": [  # in the precision of the network's own tensor
-            key
-            for key, (value, wanted) in both.items()
-            if value.dtype in FLOATS and not bool(value.to(wanted.dtype).isfinite().all())
+            key for key, (a, b) in both.items() if a.dtype in FLOATS and not bool(a.to(b.dtype).isfinite().all())
         ],
     }
     if any(wrong.values()):

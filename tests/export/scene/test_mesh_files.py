@@ -31,9 +31,7 @@ def test_the_glb_keeps_to_the_specification(tmp_path):
     data = (tmp_path / "ball.glb").read_bytes()
     read = GLTF2.load_from_bytes(data)
     assert int.from_bytes(data[8:12], "little") == len(data) and len(data) % 4 == 0
-    assert read.extensionsUsed == ["KHR_materials_unlit"] and read.materials[0].extensions == {
-        "KHR_materials_unlit": {}
-    }
+    assert read.extensionsUsed == ["KHR_materials_unlit"] == list(read.materials[0].extensions)
     position, normal, colour = read.accessors[:3]
     assert (of_file(read, normal, "<f4", 3) == BALL.normals.numpy()).all()
     linear = of_file(read, colour, "<u2", 4)[:, :3] / 65535
@@ -61,8 +59,7 @@ def test_a_ply_holds_mesh_or_points(tmp_path):
 
 
 def seen_by(cameras):
-    frame = photograph(cameras)
-    return ContextViews(frame, BALL.depth(cameras))
+    return ContextViews(photograph(cameras), BALL.depth(cameras))
 
 
 def test_a_hidden_side_is_not_coloured_through_the_body():
@@ -74,5 +71,4 @@ def test_a_hidden_side_is_not_coloured_through_the_body():
 
 def test_unseen_meshes_are_grey():
     away = seen_by(ring(1, 96))
-    black = ContextViews(away.frame, torch.zeros_like(away.depth))
-    assert bool((vertex_colours(BALL, black) == 0.5).all())
+    assert bool((vertex_colours(BALL, ContextViews(away.frame, torch.zeros_like(away.depth))) == 0.5).all())
