@@ -21,14 +21,8 @@ from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.cancellation import CancelledError, cancellable
 
 CONFIG = StreamConfig(hull=HullConfig(resolution=32))
-
-
 SPARSE = ring(12)[[0, 1, 2, 4, 7, 9]]
-
-
 A, B = camera_at(140, "a"), camera_at(250, "b")
-
-
 TOLERANCE = 1e-4
 """Batches of different sizes round differently."""
 
@@ -52,10 +46,6 @@ def encoded(monkeypatch):
     return found
 
 
-def frames(count):
-    return [photograph(SPARSE, time) for time in range(count)]
-
-
 def walk(stream, times, *targets, quality=None):
     """The last images of viewers at `targets` that request each frame in turn."""
     viewers, images = [stream.viewer() for _ in targets], []
@@ -70,9 +60,9 @@ def test_a_stream_equals_direct_steps(model):
     """`Stream` against direct calls of `step` with a provider that caches nothing."""
     at, state, config = {}, model.initial_state(), CONFIG
     provider = ContextProvider(lambda time, names: at[time].context(names) if time in at else None)
-    for frame in frames(4):
-        at[frame.time] = cache_frame(frame, None, config.hull)
-        view, _ = render_view(frame, at[frame.time].proxy, A, config.render)
+    for time in range(4):
+        at[time] = cache_frame(photograph(SPARSE, time), None, config.hull)
+        view, _ = render_view(at[time].frame, at[time].proxy, A, config.render)
         plain, state = model.step(view, provider, state)
     (image,) = walk(Stream(model, CONFIG), range(4), A)
     assert (plain.rgb - plain.view.rgb).abs().max() > 0.05
@@ -84,9 +74,8 @@ def test_viewers_are_independent(model, inpainter):
     inpainter = model if inpainter == "model" else Telea()
     together = walk(Stream(inpainter, CONFIG), range(4), A, B, A)
     alone = [walk(Stream(inpainter, CONFIG), range(4), target)[0] for target in (A, B)]
-    assert (together[0] - alone[0]).abs().max() < TOLERANCE
-    assert (together[1] - alone[1]).abs().max() < TOLERANCE
-    assert (together[2] - alone[0]).abs().max() < TOLERANCE
+    for image, other in zip(together, (*alone, alone[0]), strict=True):
+        assert (image - other).abs().max() < TOLERANCE
     assert (together[0] - together[1]).abs().max() > 0.2
 
 
@@ -94,8 +83,7 @@ def test_viewers_are_independent(model, inpainter):
 def test_a_view_can_be_cancelled_at_any_step(model, name):
     """A cancelled view ends early, and leaves nothing behind that changes the next one."""
     inpainter = model if name == "model" else load_inpainter("views")
-    (frame,) = frames(1)
-    fresh, steps = Stream(inpainter, CONFIG), []
+    frame, fresh, steps = photograph(SPARSE), Stream(inpainter, CONFIG), []
     fresh.add_frame(frame)
     with cancellable(lambda: bool(steps.append(0))):
         expected = fresh.view(A).completed.rgb
@@ -140,7 +128,7 @@ def test_cameras_of_different_sizes_are_used(model, inpainter):
 
 def test_a_cached_frame_is_not_replaced(model):
     stream = Stream(model, CONFIG)
-    first = stream.add_frame(frames(1)[0])
+    first = stream.add_frame(photograph(SPARSE))
     assert stream.add_frame(photograph(SPARSE[[0, 1]], 0)) is first
     assert stream.times == (0,) and first.frame.depth is None
 
@@ -260,18 +248,14 @@ class Requester(Inpainter):
 
 
 def test_a_view_is_rendered_and_completed():
-    target = camera_at(140, "t")
-    stream = Stream(Requester(), CONFIG)
+    stream, truth = Stream(Requester(), CONFIG), photograph(A)
     stream.add_frame(photograph(SPARSE, 0))
-    mended = stream.view(target)
-    truth = photograph(target)
-    view, rgb = mended.completed.view, mended.completed.rgb
+    completed = stream.view(A).completed
+    view, rgb, known = completed.view, completed.rgb, completed.view.error == 0
     assert view.source_views == ("c4", "c7", "c2")
     assert 50 < view.error.sum() < 0.7 * view.mask.sum()
-    assert bool((rgb[:, view.error > 0] == 1).all()) and torch.equal(
-        rgb[:, view.error == 0], view.rgb[:, view.error == 0]
-    )
-    right = (view.mask > 0) & (view.error == 0) & (truth.mask[0] > 0)
+    assert bool((rgb[:, ~known] == 1).all()) and torch.equal(rgb[:, known], view.rgb[:, known])
+    right = (view.mask > 0) & known & (truth.mask[0] > 0)
     # A hull from six cameras is off by centimetres, so colours are; another camera's would be off by 0.2.
     assert (rgb - truth.rgb[0] / 255)[:, right].abs().mean() < 0.05
 
@@ -313,11 +297,8 @@ def test_excluded_cameras_reach_neither_renderer_nor_inpainter():
 
 
 def test_viewers_share_the_depth_of_the_cameras(monkeypatch):
-    rendered = []
-    depth = GeometryProxy.depth
-    monkeypatch.setattr(
-        GeometryProxy, "depth", lambda self, cameras: rendered.extend(cameras.names) or depth(self, cameras)
-    )
+    rendered, own = [], GeometryProxy.depth
+    monkeypatch.setattr(GeometryProxy, "depth", lambda self, at: rendered.extend(at.names) or own(self, at))
     stream = Stream(Requester((0, ("c0", "c1", "c2"))), CONFIG)
     stream.add_frame(photograph(SPARSE))
     for angle in (30, 32, 65):

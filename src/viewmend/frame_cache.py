@@ -104,14 +104,11 @@ class CachedFrame:
         """Bytes of all large tensors; recomputed only if something was added."""
         entries = len(self.depths), len(self.encoded)
         if self._counted[0] != entries:
-            self._counted = (entries, self._count())
+            made = [self.frame.rgb, self.frame.mask, *self.depths.values(), *self.encoded.values()]
+            if isinstance(self.proxy, GeometryProxy):
+                made += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
+            self._counted = (entries, size_bytes(made))
         return self._counted[1]
-
-    def _count(self) -> int:
-        made = [self.frame.rgb, self.frame.mask, *self.depths.values(), *self.encoded.values()]
-        if isinstance(self.proxy, GeometryProxy):
-            made += [self.proxy.mesh.vertices, self.proxy.mesh.faces, self.proxy.normals]
-        return size_bytes(made)
 
 
 def cache_frame(
@@ -137,8 +134,7 @@ def cache_frame(
     start = now_s(device)
     mask, cameras = frame.mask, frame.cameras
     if carving is not None:
-        sizes = zip(mask.shape[1:], carving.mask.shape[1:], strict=True)
-        height, width = (max(both) for both in sizes)
+        height, width = (max(both) for both in zip(mask.shape[1:], carving.mask.shape[1:], strict=True))
         padded = [F.pad(m, (0, width - m.shape[2], 0, height - m.shape[1])) for m in (mask, carving.mask)]
         mask, cameras = torch.cat(padded), concatenate_cameras([cameras, carving.cameras])
     proxy = to_mmap(reconstruct(mask, cameras, bounds if bounds is None else bounds.to(device), config))

@@ -24,14 +24,7 @@ from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.error_mask import Evidence, decide_error_mask
 from viewmend.rendering.view import RenderConfig, render_view
-from viewmend.types import (
-    CompletedView,
-    ContextViews,
-    IncompleteView,
-    MultiViewFrame,
-    Silhouettes,
-    check_target_mask,
-)
+from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes, check_target_mask
 from viewmend.utils.cancellation import stop_if_cancelled
 from viewmend.utils.timing import StageTimes, ms_since, now_s
 

@@ -33,14 +33,6 @@ def test_the_network_uses_its_context():
     assert (completed - alone)[:, holes].abs().mean() > 0.005
 
 
-def test_known_pixels_stay_bit_for_bit():
-    incomplete = view(5)
-    completed, _ = tiny().step(incomplete, Rig(), tiny().initial_state())
-    known = incomplete.error == 0
-    assert torch.equal(completed.rgb[:, known], incomplete.rgb[:, known])
-    assert not torch.equal(completed.rgb, incomplete.rgb)
-
-
 def test_decoded_patches_cover_all_incomplete_patches():
     incomplete = view(5)
     with torch.no_grad():
@@ -62,27 +54,6 @@ def test_cached_equals_uncached(times):
         assert close(completed.rgb, complete(net, time)), time
     if times == range(11):
         assert sorted(time for time, _ in rig.asked) == list(times), "each frame is encoded once"
-
-
-def test_two_interleaved_streams_equal_each_alone():
-    net = tiny()
-
-    def alone(times):
-        state, results, provider = net.initial_state(), [], ContextProvider(Rig())
-        for time in times:
-            completed, state = net.step(view(time), provider, state)
-            results.append(completed.rgb)
-        return results
-
-    first, second = range(0, 6), range(20, 26)
-    states, results = [net.initial_state(), net.initial_state()], [[], []]
-    shared = ContextProvider(Rig())
-    for pair in zip(first, second, strict=True):
-        for i, time in enumerate(pair):
-            completed, states[i] = net.step(view(time), shared, states[i])
-            results[i].append(completed.rgb)
-    for times, result in zip((first, second), results, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(alone(times), result, strict=True))
 
 
 def test_the_order_of_cameras_does_not_matter():

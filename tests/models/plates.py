@@ -19,15 +19,7 @@ NAMES = ("left", "right")
 OFFSETS_M = {"left": -0.2, "right": 0.25, "novel": 0.03, "third": 0.1}
 
 TINY = PaperConfig(
-    widths=(8, 8, 8, 16, 16, 16, 16, 16, 8),
-    dim=64,
-    heads=4,
-    groups=2,
-    blocks=2,
-    n_c=2,
-    n_w=2,
-    k_w=4,
-    num_source_views=2,
+    widths=(8,) * 3 + (16,) * 5 + (8,), dim=64, heads=4, groups=2, blocks=2, n_c=2, n_w=2, k_w=4, num_source_views=2
 )
 
 

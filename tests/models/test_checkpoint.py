@@ -73,15 +73,12 @@ def test_impossible_configs_are_refused(changes):
         PaperConfig.from_dict(paper().to_dict() | changes)
 
 
-def test_missing_files_are_named(saved, tmp_path):
+def test_missing_and_damaged_files_are_named(saved, tmp_path):
     with pytest.raises(MissingCheckpointError, match="nowhere"):
         load_inpainter(tmp_path / "nowhere")
     (saved / "config.json").unlink()
     with pytest.raises(MissingCheckpointError, match=r"config\.json missing"):
         load_inpainter(saved)
-
-
-def test_a_config_must_be_json(saved):
     (saved / "config.json").write_text('{"dim": 12')
     with pytest.raises(DamagedWeightsError, match=r"config\.json"):
         load_inpainter(saved)

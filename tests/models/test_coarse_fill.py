@@ -23,18 +23,12 @@ def test_a_hole_in_a_uniform_image_takes_its_colour():
     assert not pull_push(rgb, torch.zeros_like(known)).any()
 
 
-def picture_with_holes() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A grey subject on black, a thin hole along its right edge and a wide one at its left edge."""
-    subject = torch.zeros(40, 40, dtype=torch.bool)
-    subject[5:35, 8:32] = True
-    missing = torch.zeros_like(subject)
-    missing[10:30, 31] = True
-    missing[10:30, 8:20] = True
-    return 0.8 * (subject & ~missing).expand(3, -1, -1).float(), missing, subject
-
-
 def test_fill_treats_thin_and_wide_holes_differently():
-    rgb, missing, subject = picture_with_holes()
+    """Of a grey subject on black, with a thin hole along its right edge and a wide one at its left edge."""
+    subject, missing = torch.zeros(2, 40, 40, dtype=torch.bool)
+    subject[5:35, 8:32] = True
+    missing[10:30, 31], missing[10:30, 8:20] = True, True
+    rgb = 0.8 * (subject & ~missing).expand(3, -1, -1).float()
     filled = fill(rgb, missing, subject)
     assert torch.equal(filled[:, ~missing], rgb[:, ~missing])
     thin, wide = filled[:, 15:25, 31], filled[:, 12:28, 8:20]

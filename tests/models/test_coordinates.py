@@ -24,7 +24,7 @@ def test_depth_of_a_patch_is_the_mean_at_its_centre_or_the_median_of_its_foregro
 def test_a_context_patch_lands_on_the_same_point_of_the_plate():
     for frame in encode(tiny(), context(0)):
         uv, valid = reproject(frame.points_world, frame.valid, camera("novel"))
-        shift_px = (OFFSETS_M[frame.name] - OFFSETS_M["novel"]) * FOCAL_PX / DISTANCE_M
+        shift_px = (OFFSETS_M[frame.camera.names[0]] - OFFSETS_M["novel"]) * FOCAL_PX / DISTANCE_M
         expected = frame.uv_px + torch.tensor([shift_px, 0.0])
         assert valid.all() and frame.uv_px.shape[0] > 5
         assert torch.allclose(uv * torch.tensor([WIDTH, HEIGHT]), expected, atol=1e-3)

@@ -6,12 +6,7 @@ from reference.encoder_reference import encode_reference
 
 from viewmend.models.paper.config import paper
 from viewmend.models.paper.patches import PATCH_CELLS, STEP_CELLS, padded_size, split
-from viewmend.models.paper.tokenizer import (
-    Encoder,
-    Tokeniser,
-    build_context_input,
-    relative_depth,
-)
+from viewmend.models.paper.tokenizer import Encoder, Tokeniser, build_context_input, relative_depth
 
 
 def test_the_encoder_equals_the_reference(rng):

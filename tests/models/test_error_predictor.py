@@ -117,10 +117,8 @@ def test_a_quality_limits_the_predicted_part(scene, net):
     hull, holes = int((view.mask > 0).sum()), int(view.holes.sum())
 
     def completed(rule, fraction, **more):
-        own, quality = (
-            stream_of(net, scene, error_rule=rule, refine_fraction=0.5),
-            RenderQuality(refine_fraction=fraction, **more),
-        )
+        own = stream_of(net, scene, error_rule=rule, refine_fraction=0.5)
+        quality = RenderQuality(refine_fraction=fraction, **more)
         return [one.completed.view for one in (own.view(view.camera, quality=quality), own.mend(view, quality=quality))]
 
     for rule, allowed, most in [("all", 0.4, 0.4), ("predicted", 0.4, 0.4), ("predicted", 0.9, 0.5)]:

@@ -52,10 +52,8 @@ def test_detail_is_what_pixels_have_around_weighted_local_means(grad, rng):
         for radius in (finest, coarser):
             near = ((pixels - pixels[n]).abs() <= radius).all(1)
             means.append((weight[near, None, None] * colours[near]).sum(0) / weight[near].sum())
-        assert torch.allclose(bands[n], torch.stack([colours[n] - means[0], means[0] - means[1]]), atol=1e-5), (
-            row,
-            column,
-        )
+        expected = torch.stack([colours[n] - means[0], means[0] - means[1]])
+        assert torch.allclose(bands[n], expected, atol=1e-5), (row, column)
 
 
 def test_a_downsampled_view_has_the_means_of_covered_pixels(scene):

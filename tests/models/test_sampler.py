@@ -38,7 +38,7 @@ from viewmend.types import Silhouettes
 def rays_of(view):
     pixels = torch.nonzero(view.mask > 0)
     z = view.depth[tuple(pixels.T)][:, None] + SceneScale.of(view).size_m * torch.tensor(OFFSETS)
-    return pixels, Rays(view.camera, pixels.flip(1).double() + 0.5, z)
+    return Rays(view, SceneScale.of(view), pixels.flip(1).double() + 0.5, z)
 
 
 def rotated(cameras: Cameras, angle: float) -> Cameras:
@@ -75,9 +75,9 @@ def test_fill_samples_equal_the_reference(rng, kernels, monkeypatch):
 @pytest.mark.parametrize(("step_px", "cubic"), [(1.0, False), (1.0, True), (5.0, False)])
 def test_both_implementations_take_the_same_samples(scene, step_px, cubic):
     _, view, sources = scene
-    _, rays = rays_of(view)
+    rays = rays_of(view)
     rays = rays._replace(z_m=torch.where(torch.rand(rays.z_m.shape) < 0.1, 0.0, rays.z_m))
-    given = rays, sources, view.source_views, step_px, SceneScale.of(view)
+    given = rays, sources, step_px
     fast, slow = sample_rays(*given, cubic=cubic), sample_rays_torch(*given, cubic=cubic)
     levels = sources.levels(view.camera, step_px, SceneScale.of(view))
     assert min(level for part in levels for pair in part for level in pair) == {1.0: 0, 5.0: 2}[step_px]
@@ -102,7 +102,7 @@ def test_cubic_samples_keep_straight_lines_and_overshoot_none(rng):
 
 def test_positions_stay_exact_under_autocast(scene):
     _, view, sources = scene
-    given = rays_of(view)[1], sources, view.source_views, 2.0, SceneScale.of(view)
+    given = rays_of(view), sources, 2.0
     with torch.autocast("cpu", torch.bfloat16):
         again = sample_rays(*given)
     assert all(torch.equal(one, other) for one, other in zip(sample_rays(*given), again, strict=True))

@@ -160,11 +160,8 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
 @pytest.mark.parametrize(
     ("side", "alpha", "rendered", "stays"),
     [
-        (2, 1.0, False, False),
-        (6, 0.4, False, False),
-        (6, 1.0, False, True),
-        (16, 0.4, False, True),
-        (2, 1.0, True, True),
+        *((2, 1.0, False, False), (6, 0.4, False, False), (6, 1.0, False, True)),
+        *((16, 0.4, False, True), (2, 1.0, True, True)),
     ],
 )
 def test_remains_of_phantoms_are_small(side, alpha, rendered, stays):
@@ -174,9 +171,8 @@ def test_remains_of_phantoms_are_small(side, alpha, rendered, stays):
     coverage[64 : 64 + side, 64 : 64 + side] = alpha
     predicted[64, 64] = not rendered
     remains = remains_of_phantoms(0.5 * coverage, coverage, predicted)
-    assert torch.equal(
-        remains, torch.zeros_like(predicted) if stays else (coverage > 0) & (torch.arange(83) > 60)[:, None]
-    )
+    island = (coverage > 0) & (torch.arange(83) > 60)[:, None]
+    assert torch.equal(remains, torch.zeros_like(predicted) if stays else island)
 
 
 def test_remains_of_phantoms_are_removed_from_all_images(scene, monkeypatch):

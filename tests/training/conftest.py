@@ -1,5 +1,6 @@
 """Runs that take a second: tiny scenes and tiny models."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,13 @@ def studio_samples(seed: str = "0", scenes: SceneConfig = SCENES, **sampling: An
     """Samples of small studio scenes."""
     own = replace(SAMPLING, **sampling)
     return SampleScenes(StudioRigs(scenes, own.frames, seed), scenes, own)
+
+
+def log_of(out: Path) -> list[dict[str, Any]]:
+    """The whole lines of a run's log."""
+    log = out / "log.jsonl"
+    lines = log.read_text().splitlines(keepends=True) if log.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("\n")]
 
 
 @pytest.fixture(scope="session")

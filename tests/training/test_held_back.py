@@ -1,11 +1,10 @@
 """Fine-tuning holds back a camera and the last frames, and keeps the best weights."""
 
-import json
 from dataclasses import replace
 
 import pytest
 import torch
-from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING
+from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.native_writer import write_capture
@@ -83,8 +82,7 @@ def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
     )
     kept = []
     out = train(config, tmp_path / "run", report=lambda _: kept.append(first_weight(tmp_path / "run")))
-    log = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    assert max(entry["step"] for entry in log) == 4, "three validations after the best one"
+    assert max(entry["step"] for entry in log_of(out)) == 4, "three validations after the best one"
     assert all(float(value) == float(kept[0]) for value in kept), "step 1 was the best: step 2 gained too little"
     assert "1 steps of" in (out / "README.md").read_text()
     train(config, out)

@@ -1,6 +1,5 @@
 """Runs that are killed, and runs of several processes."""
 
-import json
 import os
 import signal
 import subprocess
@@ -11,15 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from training.conftest import log_of
 
 from viewmend.training.run_files import FILE
-
-
-def log_of(out):
-    log = out / "log.jsonl"
-    lines = log.read_text().splitlines(keepends=True) if log.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("\n")]
-
 
 SCRIPT = """
 import sys
@@ -34,8 +27,6 @@ objective = PaperObjectiveConfig(model=MODEL, sampling=SAMPLING, adversarial=0.0
 changes = dict(steps=int(sys.argv[3]), streams=int(sys.argv[4]), checkpoint_minutes=0.0)
 train(TrainConfig(name="tiny", objective=objective, shards=Path(sys.argv[5]), **(RUN | changes)), Path(sys.argv[2]))
 """
-
-
 LAST = """
 import sys, time
 from pathlib import Path

@@ -8,6 +8,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from training.conftest import log_of
 
 from viewmend.models.base import ContextProvider
 from viewmend.models.checkpoint import load_network
@@ -19,10 +20,6 @@ from viewmend.training.paper import PaperObjective
 from viewmend.training.run_files import FILE, RunError
 from viewmend.training.samples import true_image
 from viewmend.training.shards import sample_from_bytes
-
-
-def log_of(out):
-    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
 
 
 def same_weights(a, b):

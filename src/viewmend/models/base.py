@@ -97,10 +97,7 @@ class ContextProvider:
         return self._views(time, names) if names else None
 
     def encoded(
-        self,
-        times: Sequence[int],
-        names: Sequence[str],
-        encode: Callable[[list[ContextViews]], Sequence[Sequence[Any]]],
+        self, times: Sequence[int], names: Sequence[str], encode: Callable[[list[ContextViews]], Sequence[Sequence]]
     ) -> list[Any]:
         """The encodings of these cameras in these frames, in the order of frames and then of names.
 

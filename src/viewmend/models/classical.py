@@ -7,16 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.models.base import ContextProvider, Inpainter, State
-from viewmend.models.compositing import blend
+from viewmend.models.base import ContextProvider
 from viewmend.models.paper.config import PaperConfig
 from viewmend.models.paper.context import window_times
-from viewmend.models.smooth_fill import fill
+from viewmend.models.smooth_fill import Fill, fill
 from viewmend.models.views.config import NEAR
 from viewmend.models.views.pyramids import SourceCameras
 from viewmend.models.views.ray_fill import sample_behind_proxy
 from viewmend.models.views.sampler import CameraFeatures
-from viewmend.types import CompletedView, IncompleteView
+from viewmend.types import IncompleteView
 
 RADIUS_PX = 3.0
 """Neighbourhood of OpenCV's fills."""
@@ -26,28 +25,13 @@ FRONTAL_POWER = 8.0
 """Weight of a camera's colour is exp(this times the cosine of the angle to the viewer's ray)."""
 
 
-class ViewFill(Inpainter):
-    """Base class of fills that use nothing but the view itself."""
-
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        """The view with E filled; a view without E is returned as it is."""
-        if not bool((view.error > 0).any()):
-            return CompletedView(view, view.rgb), state
-        blended = view.error * self.fill(view) + (1 - view.error) * view.rgb
-        return CompletedView(view, torch.where(view.error > 0, blended, view.rgb)), state
-
-    def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
-        """Colours for the pixels of E; other pixels are ignored."""
-        raise NotImplementedError
-
-
-class Telea(ViewFill):
+class Telea(Fill):
     """OpenCV's fast-marching fill of E (Telea 2004), in 8 bits."""
 
     method = 1
     """`cv2.INPAINT_TELEA`."""
 
-    def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
         """The view filled by `cv2.inpaint`."""
         import cv2
 
@@ -64,18 +48,18 @@ class NavierStokes(Telea):
     """`cv2.INPAINT_NS`."""
 
 
-class Unfilled(ViewFill):
+class Unfilled(Fill):
     """The view as rendered."""
 
-    def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
         """The view's own colours, black in its holes."""
         return view.rgb
 
 
-class NearestColour(ViewFill):
+class NearestColour(Fill):
     """Each pixel of E takes the colour of the nearest pixel of the subject with E = 0."""
 
-    def fill(self, view: IncompleteView) -> Float[Tensor, "3 height width"]:
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
         """Colours of the nearest correct pixels; the view's own colours if there are none."""
         import cv2
 
@@ -91,7 +75,7 @@ class NearestColour(ViewFill):
         return view.rgb.flatten(1)[:, nearest]
 
 
-class ReprojectionFill(Inpainter):
+class ReprojectionFill(Fill):
     """Each pixel of E takes the colour that the cameras have at its point on the proxy.
 
     The cameras closest to the view are sampled first, in its own frame, then the source views in past frames, the
@@ -102,11 +86,9 @@ class ReprojectionFill(Inpainter):
         self.cameras = cameras
         self.config = PaperConfig()
 
-    def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        """Sample the cameras' images; a view without E is returned as it is."""
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
+        """Sample the cameras' images."""
         missing = view.error > 0
-        if not bool(missing.any()):
-            return CompletedView(view, view.rgb), state
         filled = fill(view.rgb, missing, view.mask > 0).movedim(0, -1).clone()
         left = torch.nonzero(missing & (view.depth > 0).any())
         nearest = view.closest_views(self.cameras)
@@ -124,5 +106,4 @@ class ReprojectionFill(Inpainter):
             found = total[:, 0] > 0
             filled[tuple(left[found].unbind(1))] = colour[found]
             left = left[~found]
-        rgb = blend(view.rgb, view.error, filled.movedim(-1, 0), torch.ones_like(view.error))
-        return CompletedView(view, rgb), state
+        return filled.movedim(-1, 0).clamp(0, 1)

@@ -13,22 +13,16 @@ from torch import Tensor
 from viewmend.types import CompletedView, IncompleteView
 
 Background = Literal["black", "white"]
+Image = Float[Tensor, "3 height width"]
+Plane = Float[Tensor, "height width"]
 
 
-def composite(
-    background: Background, rgb: Float[Tensor, "3 height width"], alpha: Float[Tensor, "height width"]
-) -> Float[Tensor, "3 height width"]:
+def composite(background: Background, rgb: Image, alpha: Plane) -> Image:
     """An image on black, of this alpha, composited on a background; in [0, 1]."""
     return rgb if background == "black" else (rgb + (1 - alpha)).clamp(0, 1)
 
 
-def blend(
-    known: Float[Tensor, "3 height width"],
-    error: Float[Tensor, "height width"],
-    inpainted: Float[Tensor, "3 height width"],
-    coverage: Float[Tensor, "height width"],
-    clamp: bool = True,
-) -> Float[Tensor, "3 height width"]:
+def blend(known: Image, error: Plane, inpainted: Image, coverage: Plane, clamp: bool = True) -> Image:
     """Fhat = E Ftilde + (1 - E) F (section 1). Bit-identical to F where E or the coverage of Ftilde is 0.
 
     With `clamp`, Ftilde is clamped to [0, 1] first.
@@ -37,7 +31,7 @@ def blend(
     return torch.where((error > 0) & (coverage > 0), completed, known)
 
 
-def painted_alpha(view: IncompleteView) -> Float[Tensor, "height width"]:
+def painted_alpha(view: IncompleteView) -> Plane:
     """Alpha of a view whose masked pixels were painted on white: M, and 1 on all of E.
 
     Where E lies on true background, the painted white counts as subject.

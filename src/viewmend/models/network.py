@@ -62,7 +62,5 @@ def bfloat16_speedup(device: torch.device) -> float:
             layer(image)
         return ms_since(start, device)
 
-    float32, bfloat16 = zip(
-        *((took_ms(torch.float32), took_ms(torch.bfloat16)) for _ in range(1 + ROUNDS)), strict=True
-    )
-    return min(float32[1:]) / min(bfloat16[1:])
+    rounds = [(took_ms(torch.float32), took_ms(torch.bfloat16)) for _ in range(1 + ROUNDS)]
+    return min(float32 for float32, _ in rounds[1:]) / min(bfloat16 for _, bfloat16 in rounds[1:])

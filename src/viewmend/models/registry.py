@@ -59,9 +59,8 @@ def method_names(selection: str) -> tuple[str, ...]:
         ValueError: the list is empty.
     """
     groups = {"all": (*shipped_models(), *METHODS), "baselines": BASELINES}
-    names = [
-        name for part in selection.split(",") if part.strip() for name in groups.get(part.strip(), (part.strip(),))
-    ]
+    parts = [part.strip() for part in selection.split(",") if part.strip()]
+    names = [name for part in parts for name in groups.get(part, (part,))]
     if not names:
         raise ValueError(f"expected --methods all, or names with commas, got '{selection}'")
     return tuple(dict.fromkeys(names))
@@ -153,18 +152,15 @@ def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[st
 def identity(inpainter: object) -> str:
     """Class, parameters and SHA-256 of the weights of an inpainter: a key of cached results. Code is not included."""
     if isinstance(inpainter, nn.Module):
-        own = {
-            name: value for name, value in vars(inpainter).items() if not name.startswith("_") and name != "training"
-        }
-        plain = {name: value for name, value in own.items() if not isinstance(value, nn.Module)}
+        own = {name: value for name, value in vars(inpainter).items() if not isinstance(value, nn.Module)}
+        plain = {name: value for name, value in own.items() if not name.startswith("_") and name != "training"}
         return f"{_class(inpainter)}({identity(dict(inpainter.state_dict()))}, {identity(plain)})"
     if isinstance(inpainter, Tensor):
         data = inpainter.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
         return f"{inpainter.dtype}{tuple(inpainter.shape)}:{hashlib.sha256(data).hexdigest()}"
     if isinstance(inpainter, dict):
-        text = ", ".join(
-            f"{key}={identity(value)}" for key, value in sorted(inpainter.items(), key=lambda i: str(i[0]))
-        )
+        items = sorted(inpainter.items(), key=lambda item: str(item[0]))
+        text = ", ".join(f"{key}={identity(value)}" for key, value in items)
         return hashlib.sha256(text.encode()).hexdigest() if len(text) > 1000 else f"{{{text}}}"
     if isinstance(inpainter, list | tuple):
         return f"[{', '.join(map(identity, inpainter))}]"

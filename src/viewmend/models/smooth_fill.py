@@ -7,53 +7,54 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.models.base import ContextProvider, RenderQuality, State
+from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
 from viewmend.models.compositing import blend
-from viewmend.models.network import Network
 from viewmend.types import CompletedView, IncompleteView
 
+Image = Float[Tensor, "channel height width"]
+Pixels = Bool[Tensor, "height width"]
 MARGIN_PX = 8
+"""More than the distance over which a fill depends on its surroundings: outside a crop, views are black."""
 REACH_PX = 2
 """Largest distance along an axis between a pixel near the edge of a hole and the pixels it is filled from."""
 THIN_PX = 2 * REACH_PX + 1
 """A hole is thin where no square of this side fits into it."""
 
 
-class CoarseFill(Network):
-    """A fill of all of E. On its own, it is an inpainter without state."""
+class Fill(Inpainter):
+    """Base class of inpainters without state that fill all of E."""
+
+    margin_px: int | None = None
+    """See `crop_margin_px`."""
 
     def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
-        """The view's image with all of E filled; other pixels are unchanged, bit for bit."""
+        """Colours for the pixels of E; other pixels are ignored."""
         raise NotImplementedError
 
-    def crop_margin_px(self, quality: RenderQuality) -> int:
-        """More than the distance over which a fill depends on its surroundings: outside a crop, views are black."""
-        return MARGIN_PX
+    def crop_margin_px(self, quality: RenderQuality) -> int | None:
+        """See `Inpainter.crop_margin_px`."""
+        return self.margin_px
 
     @torch.no_grad()
     def step(self, view: IncompleteView, context: ContextProvider, state: State) -> tuple[CompletedView, State]:
-        """The view with E filled."""
+        """The view with E filled; a view without E is returned as it is."""
         if not bool((view.error > 0).any()):
             return CompletedView(view, view.rgb), state
-        filled = self.fill_view(view, context).float()
-        return CompletedView(view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask))), state
+        filled = self.fill_view(view, context)
+        return CompletedView(view, blend(view.rgb, view.error, filled, torch.ones_like(view.mask), clamp=False)), state
 
 
-class SmoothFill(CoarseFill):
+class SmoothFill(Fill):
     """`fill` as an inpainter: it uses no camera."""
 
-    background = None
+    margin_px = MARGIN_PX
 
     def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
-        """The view's image with all of E filled; other pixels are unchanged, bit for bit."""
-        return fill(view.rgb, view.error > 0, view.mask > 0)
+        """The view's image with all of E filled."""
+        return fill(view.rgb, view.error > 0, view.mask > 0).clamp(0, 1)
 
 
-def fill(
-    rgb: Float[Tensor, "channel height width"],
-    missing: Bool[Tensor, "height width"],
-    subject: Bool[Tensor, "height width"],
-) -> Float[Tensor, "channel height width"]:
+def fill(rgb: Image, missing: Pixels, subject: Pixels) -> Image:
     """The image with every missing pixel filled from the others, which are unchanged, bit for bit.
 
     Pixels of thin holes become the mean of known pixels nearby, weighted by distance, background included: at a
@@ -71,11 +72,7 @@ def fill(
     return torch.where(wide, filled, near)
 
 
-def from_near(
-    rgb: Float[Tensor, "channel height width"],
-    known: Bool[Tensor, "height width"],
-    missing: Bool[Tensor, "height width"],
-) -> tuple[Float[Tensor, "channel height width"], Bool[Tensor, "height width"]]:
+def from_near(rgb: Image, known: Pixels, missing: Pixels) -> tuple[Image, Pixels]:
     """Missing pixels as the weighted mean of the known ones within reach; and which missing pixels have any."""
     near = _sum_around(torch.cat([rgb * known, known[None].to(rgb)]))
     colour, weight = near[:-1], near[-1]
@@ -83,7 +80,7 @@ def from_near(
     return torch.where(reached, colour / weight.clamp_min(1e-6), rgb), reached
 
 
-def _sum_around(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "channel height width"]:
+def _sum_around(image: Image) -> Image:
     """Sums over the pixels within reach, weighted by a Gaussian of distance with a sigma of one pixel.
 
     Shifts along each axis are faster than a convolution, which reorders memory.
@@ -98,7 +95,7 @@ def _sum_around(image: Float[Tensor, "channel height width"]) -> Float[Tensor, "
     return image
 
 
-def spread(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+def spread(pixels: Pixels) -> Pixels:
     """Where a square of `THIN_PX` around a pixel contains any of them; there are none outside the image."""
     for axis, pad in ((0, (0, 0, REACH_PX, REACH_PX)), (1, (REACH_PX, REACH_PX))):
         around, length = F.pad(pixels, pad), pixels.shape[axis]
@@ -106,9 +103,7 @@ def spread(pixels: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]
     return pixels
 
 
-def pull_push(
-    rgb: Float[Tensor, "channel height width"], known: Bool[Tensor, "height width"]
-) -> Float[Tensor, "channel height width"]:
+def pull_push(rgb: Image, known: Pixels) -> Image:
     """The image with every unknown pixel filled smoothly from the known ones, which are unchanged, bit for bit.
 
     Pull: means of the known pixels at halved resolutions, down to one pixel. Push: unknown pixels get the interpolated

@@ -72,16 +72,12 @@ class Discriminator(nn.Module):
                 [layer.weight for layer in self.convolutions]
             for shape in dict.fromkeys(image.shape for image in images):
                 indices = [index for index, image in enumerate(images) if image.shape == shape]
-                logits = self._convolve(torch.stack([images[index] for index in indices]))
-                for index, own in zip(indices, logits, strict=True):
+                x = 2 * torch.stack([images[index] for index in indices]) - 1
+                for number, layer in enumerate(self.convolutions):
+                    x = layer(x if number == 0 else nn.functional.leaky_relu(x, SLOPE))
+                for index, own in zip(indices, x, strict=True):
                     maps[index] = own
         return maps
-
-    def _convolve(self, batch: Tensor) -> Tensor:
-        x = 2 * batch - 1
-        for number, layer in enumerate(self.convolutions):
-            x = layer(x if number == 0 else nn.functional.leaky_relu(x, SLOPE))
-        return x
 
 
 @dataclass(frozen=True)

@@ -83,10 +83,9 @@ class DepthErrors:
         if self.step_m:
             depth = (depth / self.step_m).round() * self.step_m
         depth = torch.where(there, depth.clamp_min(1e-3), 0.0)
-        return self._splatted(depth) if self.points else depth
-
-    def _splatted(self, depth: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-        """Some of the pixels as squares; the nearest square wins."""
+        if not self.points:
+            return depth
+        # Some of the pixels as squares; the nearest square wins.
         kept = (depth > 0) & (torch.rand_like(depth) < self.points)
         nearest = -F.max_pool2d(-torch.where(kept, depth, torch.inf)[None], 3, 1, 1)[0]
         between = depth + 0.25 * (depth > 0) if self.behind else torch.zeros_like(depth)

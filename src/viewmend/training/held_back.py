@@ -91,8 +91,7 @@ class HeldBackView:
         everywhere = torch.ones_like(truth[0], dtype=torch.bool)
         found = psnr(rgb, truth, everywhere)
         assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
-        (top, bottom), (left, right) = (_span(own, length) for own, length in _box(self.truth.mask[0]))
-        box = slice(top, bottom), slice(left, right)
+        box = _subject_box(self.truth.mask[0])
         distance = float(metric(rgb[None, :, *box], truth[None, :, *box]))
         return ViewScore(self.camera, self.trained_on, found, distance), completed
 
@@ -115,18 +114,17 @@ class ViewScore:
     """LPIPS (AlexNet) in the subject's box."""
 
 
-def _box(mask: Tensor) -> list[tuple[Tensor, int]]:
-    """Rows and columns with foreground, and the number of all."""
-    return [((mask > 127).any(1).nonzero()[:, 0], mask.shape[0]), ((mask > 127).any(0).nonzero()[:, 0], mask.shape[1])]
-
-
-def _span(own: Tensor, length: int) -> tuple[int, int]:
-    """First and last (exclusive) index with a margin, at least as long as LPIPS needs where the image allows it."""
-    first, last = (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
-    short = max(0, MIN_PX["alex"] - (last - first))
-    first, last = first - (short + 1) // 2, last + (short + 1) // 2
-    first, last = (0, last - first) if first < 0 else (first, last)
-    return (max(0, first - (last - length)), length) if last > length else (first, last)
+def _subject_box(mask: Tensor) -> tuple[slice, slice]:
+    """Rows and columns of the subject with a margin, at least as many as LPIPS needs where the image allows it."""
+    box = []
+    for axis, length in enumerate(mask.shape):
+        own = (mask > 127).any(1 - axis).nonzero()[:, 0]
+        first, last = (0, length) if not len(own) else (int(own[0]) - PADDING_PX, int(own[-1]) + 1 + PADDING_PX)
+        short = max(0, MIN_PX["alex"] - (last - first))
+        first, last = first - (short + 1) // 2, last + (short + 1) // 2
+        first, last = (0, last - first) if first < 0 else (first, last)
+        box.append(slice(max(0, first - (last - length)), length) if last > length else slice(first, last))
+    return box[0], box[1]
 
 
 def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator[HeldBackView]:
@@ -150,10 +148,8 @@ def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator
     elif own.camera is None:
         wanted = [(names[n % len(names)], late[len(late) * n // MAX_VIEWS]) for n in range(MAX_VIEWS)]
     else:
-        frames = (
-            dict.fromkeys(count * n // MAX_VIEWS for n in range(1, MAX_VIEWS)) if count > MAX_VIEWS else range(count)
-        )
-        wanted = [(own.camera, time) for time in dict.fromkeys((*frames, late[-1]))]
+        times = [count * n // MAX_VIEWS for n in range(1, MAX_VIEWS)] if count > MAX_VIEWS else range(count)
+        wanted = [(own.camera, time) for time in (*times, late[-1])]
     for camera, time in dict.fromkeys(wanted):
         others = tuple(name for name in names if name != camera)
         prepared = prepare(capture, others)
@@ -186,14 +182,9 @@ class HeldBackValidation:
         made = [view.score(model, self._metric) for view in self._views]
         model.train(training)  # pyright: ignore
         background = model.background or "black"
-        rows = [
-            _row(view, [("tuned", completed)], background)
-            for view, (_, completed) in zip(self._views, made, strict=True)
-        ]
+        rows = [_row(view, [("tuned", own)], background) for view, (_, own) in zip(self._views, made, strict=True)]
         write_image(image, contact_sheet(rows[:4], *TILE_PX))
-        psnr_db, lpips = (
-            sum(values) / len(made) for values in zip(*((s.psnr_db, s.lpips) for s, _ in made), strict=True)
-        )
+        psnr_db, lpips = (sum(getattr(s, name) for s, _ in made) / len(made) for name in ("psnr_db", "lpips"))
         return {"psnr_whole": psnr_db, "lpips_subject": lpips, "score": psnr_db - LPIPS_DB * lpips}
 
 
@@ -219,7 +210,7 @@ def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, she
 
 def _row(view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], background: Background) -> list[Tile]:
     """The view as rendered, as completed, and the truth, cut to the subject."""
-    (top, bottom), (left, right) = (_span(own, length) for own, length in _box(view.truth.mask[0]))  # pyright: ignore
+    box = _subject_box(view.truth.mask[0])  # pyright: ignore[reportOptionalSubscript]
     images = [("rendered", completed[0][1].view.rgb), *((name, own.rgb) for name, own in completed)]
     images.append(("truth", view.true_image(background)))
-    return [Tile(f"{view.camera}: {name}", picture(image[:, top:bottom, left:right])) for name, image in images]
+    return [Tile(f"{view.camera}: {name}", picture(image[:, *box])) for name, image in images]

@@ -251,7 +251,6 @@ class Run:
                 rate = config.learning_rate * self.objective.learning_rate_factor(step, progress, config.warmup)
                 for group in self.optimizer.param_groups:
                     group["lr"] = rate
-                self.objective.progress = progress
                 losses = self._step(step, batches)
                 step += 1
                 pace = clock.pace(step, sum(map(len, batches)) * self.own.count)
@@ -275,7 +274,7 @@ class Run:
     def _validate(self, log: Log, step: int) -> None:
         """Log the scores of the averaged weights; in runs that keep the best weights, write them if they are."""
         assert self.validation is not None, "the caller checked"
-        scores = self.validation(self.averaged, self._image(step))
+        scores = self.validation(self.averaged, self.out / f"validation-{step:06d}.png")
         log.add_validation(step, scores)
         score, best = scores.get("score"), self.state.best_score
         if self.keeps_best and score is not None and (best is None or score >= best + MIN_GAIN_DB):
@@ -364,9 +363,6 @@ class Run:
             if not self.keeps_best:
                 self._write_model()
         clock.saved()
-
-    def _image(self, step: int) -> Path:
-        return self.out / f"validation-{step:06d}.png"
 
     def _write_model(self, step: int | None = None) -> None:
         state = self.state if step is None else replace(self.state, step=step)

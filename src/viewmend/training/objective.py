@@ -25,6 +25,8 @@ from viewmend.training.samples import Sample, true_image
 from viewmend.training.shards import ShardScenes
 from viewmend.utils.tensors import to_device
 
+Images = Sequence[Float[Tensor, "3 _h _w"]]
+Planes = Sequence[Float[Tensor, "_h _w"]]
 MIN_SQUARE = 1e-4
 """Added to squared errors before the logarithm: no gain beyond 40 dB."""
 WEIGHT_DECAY = 0.01
@@ -73,8 +75,6 @@ class Objective(nn.Module, Generic[Model]):
     adversary: Adversary | None = None
     """The discriminator, for objectives with an adversarial term."""
     validation: Validation | None = None
-    progress = 0.0
-    """Fraction of the run that is done, in [0, 1]; set by the loop before each step, for terms that are annealed."""
 
     def __init__(self, config: TrainConfig, model: Model) -> None:
         super().__init__()
@@ -114,11 +114,7 @@ class Objective(nn.Module, Generic[Model]):
 def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", optional: str = "") -> None:
     """Copy the weights of a model to start from, if there is one.
 
-    Args:
-        model: gets the weights.
-        start: has them.
-        kept: prefix of weights that the model keeps.
-        optional: prefix of weights that `start` may lack.
+    The model keeps its own weights with the prefix `kept`, and `start` may lack those with the prefix `optional`.
 
     Raises:
         ValueError: `start` lacks other weights, or has them in other sizes.
@@ -138,20 +134,12 @@ def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", option
 
 
 def image_loss(
-    predicted: Sequence[Float[Tensor, "3 _h _w"]],
-    counted: Sequence[Float[Tensor, "_h _w"]],
-    error: Sequence[Float[Tensor, "_h _w"]],
-    truth: Sequence[Float[Tensor, "3 _h _w"]],
-    channels: Literal["mean", "sum"] = "mean",
+    predicted: Images, counted: Planes, error: Planes, truth: Images, channels: Literal["mean", "sum"] = "mean"
 ) -> ImageLoss:
-    """The mean losses of a batch of images of any sizes.
+    """The mean losses of a batch of images of any sizes: of Ftilde, given E, and F* on the same background.
 
-    Args:
-        predicted: Ftilde of each image.
-        counted: above 0 at the pixels that L_out includes.
-        error: E.
-        truth: F*, on the same background as Ftilde.
-        channels: whether L_in and L_out take the mean over the channels or, as in the paper, the sum.
+    L_out includes pixels where `counted` is above 0. L_in and L_out take the mean over the `channels` or, as in the
+    paper, the sum.
     """
     losses = []
     for image, included, E, target in zip(predicted, counted, error, truth, strict=True):
@@ -173,7 +161,7 @@ def mean_loss(losses: Sequence[ImageLoss]) -> ImageLoss:
     return ImageLoss(*(torch.stack(term).mean() for term in terms))
 
 
-def write_rows(rows: Sequence[Float[Tensor, "3 _h _w"]], path: Path) -> None:
+def write_rows(rows: Images, path: Path) -> None:
     """Write the first rows of input, output and ground truth as one image, all scaled to one size."""
     size = (TILE_PX, 3 * TILE_PX)
     scaled = [F.interpolate(row[None], size, mode="bilinear", antialias=True)[0] for row in rows[:SHOWN_VIEWS]]
@@ -207,9 +195,8 @@ class HoleValidation:
         for sample in self._samples:
             truth, holes = true_image(sample, self.background), sample.view.error > 0
             completed = self.complete(model, to_device(sample, device)).float().clamp(0, 1).cpu()
-            filled, _ = telea.step_on(
-                self.background, sample.view, ContextProvider(lambda *_: None), telea.initial_state()
-            )
+            context = ContextProvider(lambda *_: None)
+            filled, _ = telea.step_on(self.background, sample.view, context, telea.initial_state())
             classical = composite(self.background, filled.rgb, filled.opacity)
             scores.append([psnr(rgb, truth, holes) for rgb in (completed, classical)])
             rows.append(torch.cat([sample.view.rgb, completed, truth], 2))

@@ -17,8 +17,6 @@ PROTOCOLS = ("target-mask", "hull-with-target-mask", "strict")
 """What the paper's model may know of the held-out mask in training."""
 SUBJECT_SIZES_PX = (224, 320, 416, 576)
 """Image sizes of `views` and `rays`; each is at most 1.5 times the one before, so subjects of all sizes occur."""
-
-
 CAPTURE_SIZES_PX = (320, 576, 832)
 """Image sizes of fine-tuning, up to those of real cameras."""
 

@@ -77,14 +77,9 @@ class HeldOutCamera:
         return self.stream.add_frame(self.rig.inputs(self.held, time), carving=carving)
 
     def sample(
-        self,
-        time: int,
-        context_times: Sequence[int],
-        render: RenderConfig,
-        sampling: SamplingConfig,
-        min_hole_px: int = 0,
+        self, time: int, times: Sequence[int], render: RenderConfig, sampling: SamplingConfig, min_hole_px: int = 0
     ) -> Sample | None:
-        """The sample at frame `time` with context of these frames, its own first; None if its holes are too small."""
+        """The sample at frame `time` with context of `times`, its own first; None if its holes are too small."""
         now = self.frame(time)
         target = self.rig.calibration(self.held, time).select([self.held])
         known = None if self.protocol == "strict" else self.rig.truth(self.held, time)  # rendered only if needed
@@ -93,7 +88,7 @@ class HeldOutCamera:
         if float(view.missing.sum()) < min_hole_px:
             return None
         names = view.closest_views(max(len(view.source_views), sampling.min_context_views))
-        context = [self.frame(past).context(names) for past in context_times]
+        context = [self.frame(past).context(names) for past in times]
         ray_views = now.context(view.closest_views(sampling.num_ray_views))
         truth = known or self.rig.truth(self.held, time)
         assert truth.mask is not None, "scenes for training have masks"

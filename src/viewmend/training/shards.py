@@ -186,8 +186,7 @@ def _put_together(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
     if isinstance(value, dict):
         name = value["kind"]
         kind = KINDS[name]
-        parts = {str(n): _put_together(part, tensors) for n, part in value["fields"].items()}
-        made = kind(**parts)
+        made = kind(**{str(n): _put_together(part, tensors) for n, part in value["fields"].items()})
         if wrong := [field for field, hint in _hints(kind).items() if not _fits(getattr(made, field), hint)]:
             raise TypeError(f"{wrong[0]} of {name} has another type")
         return made

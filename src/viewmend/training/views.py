@@ -408,7 +408,13 @@ class ViewsValidation:
     def __call__(self, model: nn.Module, image: Path) -> dict[str, float | None]:
         """Score a model."""
         assert isinstance(model, ViewSynthNet)
-        self._views = self._views or self._make_views()
+        if not self._views:
+            scenes = validation_scenes(self.config.scenes, self.options.sampling)
+            samples = StoredSamples(StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation")
+            net = initial_model(self.options, self.config.precision)
+            source = TrainingViews(samples, "validation", net, smooth_guess=0.0)
+            views = (view for number in count() for view in source.scene(number))
+            self._views = list(islice(views, self.config.validation_views))
         device = next(model.parameters()).device
         scores, rows = [], []
         for own in self._views:
@@ -428,14 +434,6 @@ class ViewsValidation:
         write_rows(rows, image)
         means = {name: float(torch.tensor([row[name] for row in scores]).nanmean()) for name in scores[0]}
         return {name: None if math.isnan(mean) else mean for name, mean in means.items()}
-
-    def _make_views(self) -> list[TrainingView]:
-        scenes = validation_scenes(self.config.scenes, self.options.sampling)
-        samples = StoredSamples(StoredSceneMaker(scenes.rigs, scenes.config), self.options.sampling, "validation")
-        net = initial_model(self.options, self.config.precision)
-        source = TrainingViews(samples, "validation", net, smooth_guess=0.0)
-        views = (view for number in count() for view in source.scene(number))
-        return list(islice(views, self.config.validation_views))
 
 
 def _psnr(

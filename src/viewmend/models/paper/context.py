@@ -38,11 +38,6 @@ class ContextFrame:
     keys_values: Float[Tensor, "block 2 patch dim"]
     """K and V of every block, before rotation."""
 
-    @property
-    def name(self) -> str:
-        """The camera's name."""
-        return self.camera.names[0]
-
     def lifted_by(self, other: "ContextFrame") -> tuple[Float[Tensor, "patch 3"], Bool[Tensor, "patch"]]:
         """This frame's patch centres at the depths of the same camera in `other`, and validity (section 5)."""
         rows, cols = other.depths.shape
@@ -120,7 +115,7 @@ def _carry(frame: ContextFrame, frames: Sequence[ContextFrame], view: Incomplete
     """C_G(x) of a frame's patches. Past frames use the current geometry, if their camera has a current frame."""
     points, valid = frame.points_world, frame.valid
     if frame.time != view.time:
-        current = [f for f in frames if f.name == frame.name and f.time == view.time]
+        current = [f for f in frames if f.camera.names == frame.camera.names and f.time == view.time]
         if current:
             points, valid = frame.lifted_by(current[0])
     uv, valid = reproject(points, valid, view.camera)

@@ -110,25 +110,23 @@ class PatchTransformer(Network):
         """Names of the cameras in a view's context, the closest first (section 2)."""
         return view.closest_views(self.config.num_source_views)
 
-    def select_window(
-        self, view: IncompleteView, context: Sequence[ContextFrame | ContextViews]
-    ) -> list[ContextFrame | ContextViews]:
-        """The context, with camera images restricted to the frames and cameras of the view's window (section 2)."""
-        names, times = self.source_names(view), window_times(view.time, self.config)
-        kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
-        kept = [c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept]
-        return [c for c in kept if isinstance(c, ContextFrame) or len(c.frame.cameras)]
-
     def encode_windows(
         self, views: Sequence[IncompleteView], contexts: Sequence[Sequence[ContextFrame | ContextViews]]
     ) -> list[list[ContextFrame]]:
-        """The views' contexts restricted to their windows, with all camera images encoded in one batch."""
-        contexts = [self.select_window(view, context) for view, context in zip(views, contexts, strict=True)]
-        images = [item for context in contexts for item in context if isinstance(item, ContextViews)]
+        """The views' contexts, with all camera images of their windows (section 2) encoded in one batch."""
+        windows = []
+        for view, context in zip(views, contexts, strict=True):
+            names, times = self.source_names(view), window_times(view.time, self.config)
+            kept = [c for c in context if isinstance(c, ContextFrame) or c.frame.time in times]
+            kept = [
+                c if isinstance(c, ContextFrame) or c.frame.cameras.names == names else c.select(names) for c in kept
+            ]
+            windows.append([c for c in kept if isinstance(c, ContextFrame) or len(c.frame.cameras)])
+        images = [item for window in windows for item in window if isinstance(item, ContextViews)]
         encoded = iter(self.encode_contexts(images))
         return [
-            [f for item in context for f in (next(encoded) if isinstance(item, ContextViews) else (item,))]
-            for context in contexts
+            [f for item in window for f in (next(encoded) if isinstance(item, ContextViews) else (item,))]
+            for window in windows
         ]
 
     def encode_contexts(self, many: Sequence[ContextViews]) -> list[tuple[ContextFrame, ...]]:
@@ -171,9 +169,8 @@ class PatchTransformer(Network):
         view = target.view
         alpha = painted_alpha(view) if self.config.background == "white" else None
         if patches is None:
-            return Prediction(
-                torch.zeros_like(view.rgb), torch.zeros_like(view.mask), view.rgb, alpha, view.target_mask
-            )
+            zeros = torch.zeros_like(view.rgb)
+            return Prediction(zeros, zeros[0], view.rgb, alpha, view.target_mask)
         height, width = view.mask.shape
         (inpainted,), (coverage,) = merge(patches, target.places[target.incomplete], (1, height, width), STEP_PX)
         completed = blend(view.rgb, view.error, inpainted, coverage, clamp=False)

@@ -12,6 +12,11 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras, project, unproject
 
+Places = Int[Tensor, "patch 3"]
+"""View, row and column of patches."""
+Maps = Float[Tensor, "view channel height width"]
+Patches = Float[Tensor, "patch channel size size"]
+Planes = Float[Tensor, "view height width"]
 CELL_PX = 4
 """Side of a cell of the feature map, in image pixels."""
 PATCH_CELLS = 7
@@ -39,14 +44,12 @@ def any_in_patch(pixels: Bool[Tensor, "view height width"]) -> Bool[Tensor, "vie
     return F.max_pool2d(padded[:, None], PATCH_PX, STEP_PX)[:, 0] > 0
 
 
-def centers_px(places: Int[Tensor, "patch 3"]) -> Float[Tensor, "patch 2"]:
+def centers_px(places: Places) -> Float[Tensor, "patch 2"]:
     """Image coordinates (u, v) of the patch centres, in pixels."""
     return places[:, [2, 1]].float() * STEP_PX + PATCH_PX / 2
 
 
-def split(
-    maps: Float[Tensor, "view channel height width"], places: Int[Tensor, "patch 3"], size: int, step: int
-) -> Float[Tensor, "patch channel size size"]:
+def split(maps: Maps, places: Places, size: int, step: int) -> Patches:
     """Cut patches of size x size at these places, `step` apart; the maps must be large enough to contain them."""
     channels, height, width = maps.shape[1:]
     offsets = torch.arange(size, device=maps.device)
@@ -56,19 +59,7 @@ def split(
     return pixels.unflatten(0, (-1, size, size)).movedim(-1, 1)
 
 
-def tent(size: int, device: torch.device | None = None) -> Float[Tensor, "size size"]:
-    """Blending weights that decrease linearly from the centre of a patch to its edges; positive everywhere."""
-    ramp = torch.arange(size, device=device) + 0.5
-    ramp = torch.minimum(ramp, size - ramp)
-    return ramp[:, None] * ramp / (size / 2) ** 2
-
-
-def merge(
-    patches: Float[Tensor, "patch channel size size"],
-    places: Int[Tensor, "patch 3"],
-    shape: tuple[int, int, int],
-    step: int,
-) -> tuple[Float[Tensor, "view channel height width"], Float[Tensor, "view height width"]]:
+def merge(patches: Patches, places: Places, shape: tuple[int, int, int], step: int) -> tuple[Maps, Planes]:
     """Put patches back in their places with linearly blended overlaps (section 7).
 
     `shape` is (views, height, width). Returns the images, 0 where no patch covers them, and the coverage, 1 or 0. The
@@ -82,7 +73,8 @@ def merge(
     inside = (v < height) & (u < width)
     flat = ((places[:, 0, None, None] * height + v) * width + u)[inside]
 
-    weights = tent(size, patches.device).to(patches).expand(len(patches), -1, -1)
+    ramp = torch.minimum(offsets + 0.5, size - (offsets + 0.5))  # falls from a patch's centre to its edges, above 0
+    weights = (ramp[:, None] * ramp / (size / 2) ** 2).to(patches).expand(len(patches), -1, -1)
     weighted = torch.cat([patches * weights[:, None], weights[:, None]], 1).movedim(1, -1)[inside]
     total = weighted.new_zeros(views * height * width, channels + 1).index_add(0, flat, weighted)
     total = total.unflatten(0, (views, height, width)).movedim(-1, 1)
@@ -103,9 +95,7 @@ def crop(
     return F.pad(inside, (before, after, above, below))
 
 
-def patch_depths(
-    depth: Float[Tensor, "view height width"], foreground: Bool[Tensor, "view height width"]
-) -> Float[Tensor, "view rows cols"]:
+def patch_depths(depth: Planes, foreground: Bool[Tensor, "view height width"]) -> Float[Tensor, "view rows cols"]:
     """z-depth of every patch's centre, in metres (section 5).
 
     A centre is where four pixels meet; its depth is the mean of those of the four that have one. Without any, it is
@@ -128,14 +118,12 @@ def patch_depths(
 
 
 def lift(
-    places: Int[Tensor, "patch 3"], depths: Float[Tensor, "view rows cols"], cameras: Cameras
+    places: Places, depths: Float[Tensor, "view rows cols"], cameras: Cameras
 ) -> tuple[Float[Tensor, "patch 3"], Bool[Tensor, "patch"]]:
     """World points of the patch centres at these depths (metres), and whether a patch has a depth (section 5)."""
     views, rows, cols = depths.shape
-    grid = torch.cartesian_prod(torch.zeros(1, dtype=torch.long), torch.arange(rows), torch.arange(cols)).to(
-        depths.device
-    )
-    uv = centers_px(grid).expand(views, -1, -1)
+    grid = torch.cartesian_prod(torch.zeros(1, dtype=torch.long), torch.arange(rows), torch.arange(cols))
+    uv = centers_px(grid.to(depths.device)).expand(views, -1, -1)
     points = unproject(uv, depths.flatten(1), cameras).unflatten(1, (rows, cols))
     index = tuple(places.unbind(1))
     return points[index], depths[index] > 0

@@ -82,18 +82,14 @@ def _stack_channels(
     return EncoderInput(torch.cat(channels, 1), foreground, any_in_patch(foreground))
 
 
-def reference_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view"]:
-    """Median depth of each image, in metres; 1 if it shows no surface."""
-    surfaces = (image[image > 0] for image in depth)
-    return torch.stack([z.median() if len(z) else z.new_ones(()) for z in surfaces])
-
-
 def relative_depth(depth: Float[Tensor, "view height width"]) -> Float[Tensor, "view height width"]:
-    """4 (z / z_ref - 1), with z_ref each image's `reference_depth`; 0 without a surface (section 3).
+    """4 (z / z_ref - 1), with z_ref the median depth of each image; 0 without a surface (section 3).
 
     It is independent of the rig's scale and of the target view, so features computed from it can be cached.
     """
-    return torch.where(depth > 0, 4 * (depth / reference_depth(depth)[:, None, None] - 1), 0.0)
+    surfaces = (image[image > 0] for image in depth)
+    reference = torch.stack([z.median() if len(z) else z.new_ones(()) for z in surfaces])
+    return torch.where(depth > 0, 4 * (depth / reference[:, None, None] - 1), 0.0)
 
 
 class Encoder(nn.Module):
@@ -181,15 +177,10 @@ def find_crop(kept: Bool[Tensor, "rows cols"]) -> tuple[tuple[int, int], tuple[i
 
     Returns its first (row, column) in patch steps, negative outside of the image, and its height and width in pixels.
     """
-    (row, rows), (col, cols) = (_find_span(kept.any(axis)) for axis in (1, 0))
-    return (row, col), padded_size(rows, cols)
-
-
-def _find_span(used: Bool[Tensor, "step"]) -> tuple[int, int]:
-    """First patch step of the crop along one axis, and their number."""
-    steps = torch.nonzero(used)[:, 0].tolist() or [0]
-    count = steps[-1] - steps[0] + 1 + 2 * MARGIN_STEPS
-    return steps[0] - MARGIN_STEPS, -(-count // CROP_STEPS) * CROP_STEPS
+    used = [torch.nonzero(kept.any(axis))[:, 0].tolist() or [0] for axis in (1, 0)]
+    row, col = (steps[0] - MARGIN_STEPS for steps in used)
+    counts = (steps[-1] - steps[0] + 1 + 2 * MARGIN_STEPS for steps in used)
+    return (row, col), padded_size(*(-(-count // CROP_STEPS) * CROP_STEPS for count in counts))
 
 
 class Decoder(nn.Module):

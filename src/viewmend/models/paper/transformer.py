@@ -15,6 +15,11 @@ from torch.nn import functional as F
 from viewmend.models.paper.config import PaperConfig
 from viewmend.utils.cancellation import stop_if_cancelled
 
+Queries = Float[Tensor, "sample head query channel"]
+Keys = Float[Tensor, "sample head key channel"]
+"""Keys, or the values that belong to them."""
+PerKey = Float[Tensor, "sample key"]
+Tokens = Float[Tensor, "sample query dim"]
 LONGEST = 2.0
 """Wavelength of the slowest rotation, in image widths (or temporal windows)."""
 SHORTEST = 0.1
@@ -23,15 +28,11 @@ CHUNK_ENTRIES = 1 << 22
 """Number of attention weights held in memory at once by `attend_and_sum`."""
 
 
-def pairs_per_axis(head_dim: int) -> tuple[int, int, int]:
-    """Pairs of channels of a head rotated by u, v and s: three eighths, three eighths and a quarter."""
-    pairs = head_dim // 2
-    return 3 * pairs // 8, 3 * pairs // 8, pairs - 2 * (3 * pairs // 8)
-
-
 def rope_frequencies(head_dim: int) -> Float[Tensor, "3 pair"]:
     """Radians per unit of (u, v, s) for each pair of channels: geometric along its axis, 0 for the other axes."""
-    octaves = (torch.linspace(0, 1, pairs, dtype=torch.float64) for pairs in pairs_per_axis(head_dim))
+    pairs = head_dim // 2
+    per_axis = 3 * pairs // 8, 3 * pairs // 8, pairs - 2 * (3 * pairs // 8)  # three eighths each of u and v, a quarter
+    octaves = (torch.linspace(0, 1, count, dtype=torch.float64) for count in per_axis)
     return torch.block_diag(*(2 * math.pi / LONGEST * (LONGEST / SHORTEST) ** x for x in octaves)).float()
 
 
@@ -53,13 +54,7 @@ def rotate(
     return torch.cat([first * cos - second * sin, second * cos + first * sin], -1)
 
 
-def attend(
-    Q: Float[Tensor, "sample head query channel"],
-    K: Float[Tensor, "sample head key channel"],
-    V: Float[Tensor, "sample head key channel"],
-    keep: Bool[Tensor, "sample key"] | None,
-    scale: float,
-) -> Float[Tensor, "sample head query channel"]:
+def attend(Q: Queries, K: Keys, V: Keys, keep: Bool[Tensor, "sample key"] | None, scale: float) -> Queries:
     """softmax(Q K^T scale) V over the keys to keep, by the fused kernel; 0 for a sample that keeps none."""
     if keep is None:
         return F.scaled_dot_product_attention(Q, K, V, scale=scale)
@@ -70,13 +65,8 @@ def attend(
 
 
 def attend_and_sum(
-    Q: Float[Tensor, "sample head query channel"],
-    K: Float[Tensor, "sample head key channel"],
-    V: Float[Tensor, "sample head key channel"],
-    keep: Bool[Tensor, "sample key"],
-    counted: Bool[Tensor, "sample query"],
-    scale: float,
-) -> tuple[Float[Tensor, "sample head query channel"], Float[Tensor, "sample key"]]:
+    Q: Queries, K: Keys, V: Keys, keep: Bool[Tensor, "sample key"], counted: Bool[Tensor, "sample query"], scale: float
+) -> tuple[Queries, PerKey]:
     """`attend`, and the attention that each key received, summed over heads and the counted queries.
 
     Queries are processed in chunks, so that the whole attention matrix is never in memory.
@@ -94,13 +84,7 @@ def attend_and_sum(
     return torch.cat(outs, 2), received
 
 
-def attend_weighted(
-    Q: Float[Tensor, "sample head query channel"],
-    K: Float[Tensor, "sample head key channel"],
-    V: Float[Tensor, "sample head key channel"],
-    weight: Float[Tensor, "sample key"],
-    scale: float,
-) -> Float[Tensor, "sample head query channel"]:
+def attend_weighted(Q: Queries, K: Keys, V: Keys, weight: PerKey, scale: float) -> Queries:
     """Attention with a weight per key (0 leaves it out) that has a gradient even where it is 0."""
     scores = (Q @ K.mT) * scale
     top = scores.masked_fill(weight[:, None, None] <= 0, -torch.inf).amax(-1, keepdim=True).detach()
@@ -109,14 +93,12 @@ def attend_weighted(
     return (odds / odds.sum(-1, keepdim=True).clamp_min(1e-20)) @ V
 
 
-def most_attended(received: Float[Tensor, "sample key"], k: int) -> Int[Tensor, "sample kept"]:
+def most_attended(received: PerKey, k: int) -> Int[Tensor, "sample kept"]:
     """Indices of the k keys that received most attention, in ascending order; all keys if there are fewer."""
     return received.topk(min(k, received.shape[1]), 1, sorted=False).indices.sort(1).values
 
 
-def straight_through(
-    received: Float[Tensor, "sample key"], keep: Bool[Tensor, "sample key"], k: int
-) -> Float[Tensor, "sample key"]:
+def straight_through(received: PerKey, keep: Bool[Tensor, "sample key"], k: int) -> PerKey:
     """1 for the k keys to keep that received most attention, 0 for the others.
 
     The gradient is that of received / (received + threshold), 1/2 where the hard mask steps from 0 to 1, so that
@@ -185,35 +167,24 @@ class Transformer(nn.Module):
 
     def forward(
         self,
-        tokens: Float[Tensor, "sample query dim"],
+        tokens: Tokens,
         at: TokenPositions,
         keys_values: Float[Tensor, "block 2 sample key dim"],
         context_at: TokenPositions,
         top_k: int | None,
-    ) -> Float[Tensor, "sample query dim"]:
+    ) -> Tokens:
         """The input tokens P after all blocks; each group prunes its context to `top_k` tokens, None for no pruning."""
-        context = self.place_context(at, keys_values, context_at)
+        rotations = [None, None]
+        if self.config.rope:
+            rotations = [rope_cos_sin(x.uvs, self.frequencies)[:, :, None] for x in (context_at, at)]
+        context = Context(keys_values, context_at.present, *rotations)
         for group in range(self.config.groups):
             tokens = self.run_group(group, tokens, at.present, context, top_k)
         return tokens
 
-    def place_context(
-        self, at: TokenPositions, keys_values: Float[Tensor, "block 2 sample key dim"], context_at: TokenPositions
-    ) -> Context:
-        """The context with the rotations of its keys and of the queries at these positions."""
-        rotations = [None, None]
-        if self.config.rope:
-            rotations = [rope_cos_sin(x.uvs, self.frequencies)[:, :, None] for x in (context_at, at)]
-        return Context(keys_values, context_at.present, *rotations)
-
     def run_group(
-        self,
-        group: int,
-        tokens: Float[Tensor, "sample query dim"],
-        counted: Bool[Tensor, "sample query"],
-        context: Context,
-        top_k: int | None,
-    ) -> Float[Tensor, "sample query dim"]:
+        self, group: int, tokens: Tokens, counted: Bool[Tensor, "sample query"], context: Context, top_k: int | None
+    ) -> Tokens:
         """The input tokens after one group. Attention of the counted tokens decides what its first block prunes."""
         kept: Tensor | None = None
         weight: Tensor | None = None
@@ -238,17 +209,8 @@ class Transformer(nn.Module):
         return tokens
 
     def project(
-        self,
-        index: int,
-        tokens: Float[Tensor, "sample query dim"],
-        context: Context,
-        kept: Int[Tensor, "sample kept"] | None = None,
-    ) -> tuple[
-        Float[Tensor, "sample head query channel"],
-        Float[Tensor, "sample head key channel"],
-        Float[Tensor, "sample head key channel"],
-        Bool[Tensor, "sample key"],
-    ]:
+        self, index: int, tokens: Tokens, context: Context, kept: Int[Tensor, "sample kept"] | None = None
+    ) -> tuple[Queries, Keys, Keys, Bool[Tensor, "sample key"]]:
         """RoPE(Q), RoPE(K) and V of a block, and which keys count; of the kept keys alone, if given."""
         block, heads = self.blocks[index], self.config.heads
         assert isinstance(block, Block)

@@ -58,20 +58,12 @@ class ErrorPredictor(Network):
     def __init__(self, features: int) -> None:
         """`features` is the number of channels at half the resolution."""
         super().__init__()
-        self.behind = nn.Sequential(
-            *(nn.Linear(len(BEHIND) * STATISTICS, 32), nn.ReLU(), nn.Linear(32, BEHIND_CHANNELS)),
-        )
+        self.behind = nn.Sequential(nn.Linear(len(BEHIND) * STATISTICS, 32), nn.ReLU(), nn.Linear(32, BEHIND_CHANNELS))
         self.unet = UNet(CELL_PX**2 * IMAGE_CHANNELS + STATISTICS + BEHIND_CHANNELS, features)
         self.head = nn.Conv2d(features, CELL_PX**2 * len(ErrorMap._fields), 1)
 
     def forward(self, view: IncompleteView, sources: SourceCameras, scale: SceneScale | None = None) -> ErrorMap:
-        """Predicted errors of a view's pixels; its E is not used.
-
-        Args:
-            view: the rendered view, or a crop of it.
-            sources: the source cameras.
-            scale: of the whole view; None if `view` is the whole.
-        """
+        """Predicted errors of a view's pixels; its E is not used. For a crop, `scale` is that of the whole view."""
         scale, depth = scale or SceneScale.of(view), rim_depth(view.depth)
         height, width = depth.shape
         depth = F.pad(depth, (0, -width % (2 * CELL_PX), 0, -height % (2 * CELL_PX)))
@@ -110,6 +102,6 @@ class ErrorPredictor(Network):
         """An image of the statistics of samples in cells of this side, `behind` their nearest depth."""
         cells = torch.nonzero(near > 0)
         z = near[tuple(cells.T)][:, None] + scale.size_m * near.new_tensor(behind)
-        rays = Rays(view.camera, cell_px * (cells.flip(1).double() + 0.5), z)
-        statistics = sample_rays(rays, sources, view.source_views, float(cell_px), scale).statistics.flatten(1)
+        rays = Rays(view, scale, cell_px * (cells.flip(1).double() + 0.5), z)
+        statistics = sample_rays(rays, sources, float(cell_px)).statistics.flatten(1)
         return scatter_to_image(statistics if layers is None else layers(statistics), cells, near.shape)

@@ -1,6 +1,7 @@
 """Images at full resolution and on a grid of 2 x 2 pixel cells, and the convolutions over them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -48,7 +49,7 @@ def downsample2x(view: IncompleteView) -> IncompleteView:
     """
     height, width = view.mask.shape
     right, below = width % 2, height % 2
-    camera = view.camera.cropped(0, 0, width + right, height + below)
+    camera = view.camera.cropped(0, 0, width + right, height + below).resized((width + 1) // 2, (height + 1) // 2)
     covered = F.pad(view.mask, (0, right, 0, below))[None]
     share = F.avg_pool2d(covered, 2).clamp(min=1e-6)
 
@@ -56,18 +57,9 @@ def downsample2x(view: IncompleteView) -> IncompleteView:
         return F.avg_pool2d(F.pad(images, (0, right, 0, below)) * covered, 2) / share
 
     mask = (share[0] > 1e-6).to(covered)
-    return IncompleteView(
-        camera.resized((width + right) // 2, (height + below) // 2),
-        mean(view.rgb),
-        mask,
-        mask,
-        nearest_depth(view.depth),
-        view.source_views,
-        mean(view.weights),
-        view.time,
-        view.candidate_views,
-        view.silhouettes,
-    )
+    rgb, weights, depth = mean(view.rgb), mean(view.weights), nearest_depth(view.depth)
+    small = replace(view, camera=camera, rgb=rgb, mask=mask, error=mask, depth=depth, weights=weights)
+    return replace(small, fade=None, target_mask=None)
 
 
 def upsample2x(
@@ -110,11 +102,7 @@ def detail_bands(
 ) -> Float[Tensor, "pixel band image 3"]:
     """What some images have around their own local means: a band for each of `BAND_PX`, the finest first.
 
-    Args:
-        colours: of each image at the pixels.
-        weight: of each pixel in the means, above 0.
-        pixels: row and column.
-        shape: height and width of the images.
+    The images have `shape`, and `colours` at the pixels (row, column). A pixel's `weight` in the means is above 0.
     """
     count = colours.shape[1]
     values = torch.cat([(weight[:, None, None] * colours).flatten(1), weight[:, None]], 1)
@@ -168,7 +156,10 @@ class UNet(nn.Module):
         self.first = nn.Sequential(
             nn.Conv2d(width, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, width, 3, padding=1)
         )
-        self.down = nn.ModuleList(_halving(fine, coarse) for fine, coarse in pairwise(widths))
+        self.down = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(fine, coarse, 3, 2, 1), nn.ReLU(), nn.Conv2d(coarse, coarse, 3, 1, 1), nn.ReLU())
+            for fine, coarse in pairwise(widths)
+        )
         self.up = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in pairwise(widths))
         self.join = nn.ModuleList(nn.Conv2d(fine, fine, 3, padding=1) for fine in widths[:-1])
 
@@ -205,13 +196,6 @@ class UNet(nn.Module):
         return x
 
 
-def _halving(fine: int, coarse: int) -> nn.Sequential:
-    return nn.Sequential(
-        *(nn.Conv2d(fine, coarse, 3, stride=2, padding=1), nn.ReLU()),
-        *(nn.Conv2d(coarse, coarse, 3, padding=1), nn.ReLU()),
-    )
-
-
 def run_tiled(
     layers: nn.Sequential,
     cells: Float[Tensor, "1 feature rows columns"],
@@ -221,14 +205,9 @@ def run_tiled(
 ) -> Float[Tensor, "pixel output"]:
     """The output of layers at some pixels of an image, from the tiles around these pixels only.
 
-    The image's first channels are `cells`, upsampled bilinearly; the others are `values` at the pixels, else zeros.
-
-    Args:
-        layers: convolutions of odd kernels that keep the size, and layers that act on single pixels.
-        cells: features at half the resolution.
-        values: of each pixel.
-        pixels: row and column.
-        shape: height and width of the image.
+    The image has `shape`. Its first channels are `cells`, at half its resolution, upsampled bilinearly; the others are
+    `values` at the pixels (row, column), else zeros. The layers are convolutions of odd kernels that keep the size, and
+    layers that act on single pixels.
     """
     halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))
     across = -(-shape[1] // TILE_PX)
@@ -242,9 +221,11 @@ def run_tiled(
     frame = _frame(cells.shape[2:], cell_halo, TILE_PX // CELL_PX)
     near = _windows(F.pad(cells, frame, mode="replicate")[0], cell_halo, TILE_PX // CELL_PX)
     values = F.pad(values, (0, 0, 0, 1))  # the last row stands for pixels without values
-    outputs = []
-    for part in _parts(len(tiles)):
+    outputs, first = [], 0
+    while first < len(tiles):
         stop_if_cancelled()
+        size = next(size for size in AT_ONCE if size <= len(tiles) - first)
+        part = slice(first, first := first + size)
         at = rows[part] // TILE_PX, columns[part] // TILE_PX
         fine = F.interpolate(near[:, *at].movedim(0, 1), scale_factor=CELL_PX, mode="bilinear", align_corners=False)
         cut = CELL_PX * cell_halo - halo
@@ -264,14 +245,6 @@ def _frame(shape: Sequence[int], halo: int, tile: int) -> tuple[int, int, int, i
 def _windows(image: Shaped[Tensor, "channel height width"], halo: int, tile: int) -> Tensor:
     """The windows of all tiles with their halos, [channel, tile row, tile column, height, width]."""
     return image.unfold(1, tile + 2 * halo, tile).unfold(2, tile + 2 * halo, tile)
-
-
-def _parts(count: int) -> Iterator[slice]:
-    first = 0
-    for size in AT_ONCE:
-        while count - first >= size:
-            yield slice(first, first + size)
-            first += size
 
 
 def _inside(

@@ -43,6 +43,11 @@ from viewmend.models.views.sampler import Rays, sample_rays
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
+Mask = Bool[Tensor, "height width"]
+Image = Float[Tensor, "3 height width"]
+Inputs = Float[Tensor, "7 height width"]
+Pixels = Int[Tensor, "pixel 2"]
+"""Row and column of pixels."""
 IMAGE_CHANNELS = 7
 """RGB of the first guess, M, whether a pixel is coloured, its largest source weight, and whether it is predicted."""
 CHOICES = 4
@@ -95,33 +100,25 @@ class ViewSynthNet(Network):
         view: IncompleteView,
         sources: SourceCameras,
         scale: SceneScale | None = None,
-        where: Bool[Tensor, "height width"] | None = None,
-        guess: Float[Tensor, "3 height width"] | None = None,
+        where: Mask | None = None,
+        guess: Image | None = None,
     ) -> ViewPrediction:
         """The prediction for pixels of a view; its E is not used.
 
-        Args:
-            view: the rendered view, or a crop of it.
-            sources: the source cameras.
-            scale: of the whole view; None if `view` is the whole.
-            where: pixels to predict, as far as they are on the proxy or its rim; None for all.
-            guess: the `coarse_guess` of the whole view, cropped likewise; None to make it from `view`.
+        For a crop, `scale` is that of the whole view, and `guess` the `coarse_guess` of the whole view, cropped. Pixels
+        are predicted `where` they are on the proxy or its rim; None for all of these.
         """
-        if guess is None:
-            guess = self.coarse_guess(view, sources)
+        guess = self.coarse_guess(view, sources) if guess is None else guess
         scale = scale or SceneScale.of(view)
         depth, coloured = rim_depth(view.depth), view.weights.sum(0) > 0
         where = depth > 0 if where is None else where & (depth > 0)
-        flags = torch.stack([view.mask, coloured.float(), view.weights.amax(0), where.float()])
-        image = torch.cat([guess, flags])
+        image = torch.cat([guess, torch.stack([view.mask, coloured.float(), view.weights.amax(0), where.float()])])
         view = replace(view, depth=depth)
         distribution = self._depth_distribution(view, sources, scale, where, image)
         return self._blend(view, sources, scale, torch.nonzero(where), image, distribution)
 
     @torch.no_grad()
-    def coarse_guess(
-        self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False
-    ) -> Float[Tensor, "3 height width"]:
+    def coarse_guess(self, view: IncompleteView, sources: SourceCameras | None, quick: bool = False) -> Image:
         """The whole view with its holes filled by the coarse fill; `quick` fills them from their surroundings only."""
         if quick or self.coarse is None:
             return fill(view.rgb, view.holes, view.mask > 0)
@@ -160,23 +157,17 @@ class ViewSynthNet(Network):
             return (CompletedView(view, view.rgb) if view.fade is None else fallback_view(view, fades)), state
         quick = context.quality.refine_fraction is not None
         guess = self.coarse_guess(view, sources, quick)
-        prediction = self(view, sources, where=where, guess=guess)
         ray_fill = guess if not quick and self.coarse is not None else None
-        return prediction.composite_into(view, where, fades, ray_fill), state
+        return self(view, sources, where=where, guess=guess).composite_into(view, where, fades, ray_fill), state
 
     def _depth_distribution(
-        self,
-        view: IncompleteView,
-        sources: SourceCameras,
-        scale: SceneScale,
-        where: Bool[Tensor, "height width"],
-        image: Float[Tensor, "7 height width"],
+        self, view: IncompleteView, sources: SourceCameras, scale: SceneScale, where: Mask, image: Inputs
     ) -> DepthDistribution:
         """Samples on the rays of all cells, judged by a U-Net over the view."""
         depth = nearest_depth(view.depth * where)
         cells = torch.nonzero(depth > 0)
         z = depth[tuple(cells.T)][:, None] + scale.size_m * depth.new_tensor(OFFSETS)
-        rays = Rays(view.camera, CELL_PX * (cells.flip(1).double() + 0.5), z).split(sources.rays_at_once)
+        rays = Rays(view, scale, CELL_PX * (cells.flip(1).double() + 0.5), z).split(sources.rays_at_once)
         front = nearest_depth(view.depth)
         beyond = torch.where(front > 0, ((front - scale.depth_m) / scale.size_m).tanh(), 0.0)
         means = cell_means(image)
@@ -184,8 +175,7 @@ class ViewSynthNet(Network):
             parts = []
             for part in rays:
                 stop_if_cancelled()
-                samples = sample_rays(part, sources, view.source_views, float(CELL_PX), scale)
-                parts.append(self.sample_aggregator(samples))
+                parts.append(self.sample_aggregator(sample_rays(part, sources, float(CELL_PX))))
             samples = AggregatedSamples(*map(torch.cat, zip(*parts, strict=True)))
             inputs = samples.features.flatten(1).to(self.compute_dtype)
             images = torch.cat([means, beyond[None], (front > 0)[None].to(means)]).to(inputs)
@@ -200,8 +190,8 @@ class ViewSynthNet(Network):
         view: IncompleteView,
         sources: SourceCameras,
         scale: SceneScale,
-        pixels: Int[Tensor, "pixel 2"],
-        image: Float[Tensor, "7 height width"],
+        pixels: Pixels,
+        image: Inputs,
         distribution: DepthDistribution,
     ) -> ViewPrediction:
         """Samples the cameras at the depth of each pixel, and blends them."""
@@ -211,8 +201,8 @@ class ViewSynthNet(Network):
         own, front = view.depth[tuple(pixels.T)], distribution.depth[tuple(distribution.cells.T)][cell]
         front = torch.where((own - front).abs() < JOINT * scale.size_m, own, front)
         depth = front + scale.size_m * offset
-        rays = Rays(view.camera, pixels.flip(1).double() + 0.5, depth.detach()[:, None])
-        samples = sample_rays(rays, sources, view.source_views, 1.0, scale, cubic=True)
+        rays = Rays(view, scale, pixels.flip(1).double() + 0.5, depth.detach()[:, None])
+        samples = sample_rays(rays, sources, 1.0, cubic=True)
         stop_if_cancelled()
         with self.autocast():
             blended = self.pixel_aggregator(samples, distribution.samples.trust[cell, hypothesis][:, None])
@@ -243,7 +233,7 @@ class ViewSynthNet(Network):
         return ViewPrediction(pixels, rgb, alpha, confidence, depth, trust, distribution)
 
     def _depth_offset(
-        self, pixels: Int[Tensor, "pixel 2"], distribution: DepthDistribution
+        self, pixels: Pixels, distribution: DepthDistribution
     ) -> tuple[Int[Tensor, "pixel"], Float[Tensor, "pixel"], Float[Tensor, "pixel"]]:
         """Each pixel's most probable hypothesis, the mean offset around it in subject sizes, and its probability."""
         shares = distribution.interpolate(distribution.logits.softmax(1), pixels)
@@ -256,7 +246,7 @@ class ViewSynthNet(Network):
     def _blending_layers(
         self,
         inputs: Float[Tensor, "pixel input"],
-        pixels: Int[Tensor, "pixel 2"],
+        pixels: Pixels,
         shape: torch.Size,
         features: Float[Tensor, "1 feature rows columns"],
     ) -> Float[Tensor, "pixel output"]:

@@ -14,11 +14,13 @@ from viewmend.models.views.aggregation import AggregatedSamples
 from viewmend.models.views.grid import CELL_PX, scatter_to_image
 from viewmend.types import CompletedView, IncompleteView
 
+Plane = Float[Tensor, "height width"]
+Image = Float[Tensor, "3 height width"]
+Mask = Bool[Tensor, "height width"]
 LEAST_MASK = 0.1
 """Lower bound of the mask by which colours on black are divided."""
 HOLE_GUESS = 0.7
 """Weight of `RayFill` in holes; `ViewSynthNet`, which saw few holes in training, has the rest."""
-
 VISIBLE = 1 / 16
 """Alpha or colour from which pixels belong to an island."""
 TINY, SMALL, FAINT = 0.001, 0.05, 0.6
@@ -72,21 +74,12 @@ class ViewPrediction(NamedTuple):
     distribution: DepthDistribution
 
     def composite_into(
-        self,
-        view: IncompleteView,
-        predicted: Bool[Tensor, "height width"],
-        fades: Bool[Tensor, "height width"],
-        fill: Float[Tensor, "3 height width"] | None = None,
-        keep_remains: bool = False,
+        self, view: IncompleteView, predicted: Mask, fades: Mask, fill: Image | None = None, keep_remains: bool = False
     ) -> CompletedView:
-        """The view with this prediction: Fhat = E Ftilde + (1 - E) F.
+        """The rendered view with this prediction: Fhat = E Ftilde + (1 - E) F.
 
-        Args:
-            view: the rendered view.
-            predicted: pixels of this prediction.
-            fades: pixels that are background in part; they are attenuated by E.
-            fill: the output of `RayFill`, to blend into holes; None without.
-            keep_remains: leave `remains_of_phantoms` in the view.
+        `predicted` are the pixels of this prediction. Those that are background in part, `fades`, are attenuated by E.
+        `fill` is the output of `RayFill`, to blend into holes. `keep_remains` leaves `remains_of_phantoms` in the view.
         """
         E = view.error
         rgb, alpha, confidence, depth = (
@@ -108,16 +101,8 @@ class ViewPrediction(NamedTuple):
         )
 
 
-def remains_of_phantoms(
-    colour: Float[Tensor, "height width"], alpha: Float[Tensor, "height width"], predicted: Bool[Tensor, "height width"]
-) -> Bool[Tensor, "height width"]:
-    """Small islands around the subject all of whose pixels are in `predicted`.
-
-    Args:
-        colour: the largest channel of each pixel, on black.
-        alpha: coverage by the subject.
-        predicted: pixels of which the model decides.
-    """
+def remains_of_phantoms(colour: Plane, alpha: Plane, predicted: Mask) -> Mask:
+    """Small islands around the subject all of whose pixels are `predicted`; `colour` is their largest channel."""
     visible, opacity = (torch.maximum(colour, alpha) > VISIBLE).cpu().numpy(), alpha.float().cpu().numpy()
     count, labels, stats, _ = cv2.connectedComponentsWithStats(visible.astype(np.uint8))
     if count <= 2:

@@ -96,15 +96,9 @@ def choose_levels(
     step_px: float,
     scale: SceneScale,
 ) -> tuple[Int[Tensor, "view"], Int[Tensor, "view"]]:
-    """The fine and the wide pyramid level of each camera.
+    """The fine and the wide pyramid level of each source camera, for rays that are `step_px` apart in the novel view.
 
-    Args:
-        cameras: the source cameras.
-        last: the coarsest level of each.
-        subject_px: root of the subject's area in each camera.
-        viewer: camera of the novel view (one view).
-        step_px: distance between neighbouring rays in the novel view, pixels.
-        scale: of the novel view.
+    `last` is the coarsest level of each camera, and `subject_px` the root of the subject's area in it.
     """
     pose, depth_m = viewer.world_from_camera[0].double(), torch.as_tensor(scale.depth_m, dtype=torch.double)
     distance_m = (cameras.centers - (pose[:3, 3] + depth_m * pose[:3, 2])).square().sum(-1).sqrt().clamp_min(1e-6)
@@ -138,13 +132,7 @@ class SourceCameras:
     def of(
         cls, views: ContextViews, silhouettes: Silhouettes | None, context: ContextProvider | None = None
     ) -> "SourceCameras":
-        """Cameras with their pyramids.
-
-        Args:
-            views: the source cameras.
-            silhouettes: masks of the whole rig; None takes those of `views`.
-            context: caches pyramids, and has those of earlier views of the frame.
-        """
+        """Cameras with their pyramids, which `context` caches; without `silhouettes`, those of `views` are taken."""
         if silhouettes is None:
             silhouettes = Silhouettes(_masks(views), views.frame.cameras)
         if context is None:
@@ -184,19 +172,13 @@ class SourceCameras:
         return self.views.frame.cameras
 
     @property
-    def depth(self) -> Float[Tensor, "view height width"]:
-        """z-depth of the proxy in each source camera, metres; 0 where it is not seen."""
-        return self.views.depth
-
-    @property
     def images(self) -> UInt8[Tensor, "view 5 height width"]:
         """RGB on black, mask and coverage by the proxy, of each source camera."""
         return source_images(self.views.frame.rgb, _masks(self.views), self.views.depth)
 
     def is_source(self, names: Sequence[str]) -> Bool[Tensor, "view"]:
         """Which source cameras have one of these names."""
-        own = self.cameras.names
-        return torch.tensor([name in names for name in own], device=self.silhouettes.mask.device)
+        return torch.tensor([name in names for name in self.cameras.names], device=self.silhouettes.mask.device)
 
     def levels(self, viewer: Cameras, step_px: float, scale: SceneScale) -> list[list[list[int]]]:
         """Fine and wide level of each source camera, and of each silhouette; see `choose_levels`."""

@@ -16,7 +16,8 @@ from torch.nn import functional as F
 
 from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.models.base import ContextProvider
-from viewmend.models.smooth_fill import CoarseFill, fill, pull_push
+from viewmend.models.network import Network
+from viewmend.models.smooth_fill import MARGIN_PX, Fill, fill, pull_push
 from viewmend.models.views.config import CONTRAST, RaysConfig
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.sampler import (
@@ -31,6 +32,14 @@ from viewmend.models.views.sampler import (
 from viewmend.types import IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
+Image = Float[Tensor, "3 height width"]
+Pixels = Int[Tensor, "pixel 2"]
+"""Row and column of pixels."""
+Features = Float[Tensor, "pixel point view 14"]
+"""`CameraFeatures`, stacked, of points on the rays of pixels."""
+Window = Float[Tensor, "pixel 8 11 11"]
+SmallestMasks = Float[Tensor, "pixel point 4"]
+"""The two smallest masks of the rig at a point, and the two smallest averaged masks."""
 OFFSETS = (-0.015, 0.0, 0.008, 0.016, 0.03, 0.055, 0.09, 0.15, 0.24, 0.36, 0.55)
 """Points on a ray: z-depth behind the proxy, in subject sizes."""
 RADIUS_PX = 5
@@ -58,11 +67,9 @@ be slow, and fragment the memory of a server."""
 class RayInputs(NamedTuple):
     """Inputs of the network for some missing pixels."""
 
-    features: Float[Tensor, "pixel point view 14"]
-    """`CameraFeatures`, stacked."""
-    smallest_masks: Float[Tensor, "pixel point 4"]
-    """The two smallest masks of the rig at a point, and the two smallest averaged masks."""
-    window: Float[Tensor, "pixel 8 11 11"]
+    features: Features
+    smallest_masks: SmallestMasks
+    window: Window
     """The view around each pixel: RGB, M, E, and RGB of the smooth fill."""
     neighbourhoods: Float[Tensor, "neighbourhood 12 11 11"]
     """Means over cells of both sizes in `CELLS` around each different cell: `CELL_CHANNELS` each."""
@@ -81,23 +88,19 @@ class RayInputs(NamedTuple):
         return RayInputs(*(torch.cat(values) for values in zip(*padded, strict=True)))
 
 
-class RayFill(CoarseFill):
+class RayFill(Network, Fill):
     """Weighs the candidates of each missing pixel."""
 
     config: RaysConfig  # pyright: ignore
+    margin_px = MARGIN_PX
 
     def __init__(self, config: RaysConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or RaysConfig()  # pyright: ignore[reportIncompatibleVariableOverride]
-        width = config.width
-        points = len(OFFSETS)
+        width, points = config.width, len(OFFSETS)
         self.look = nn.Sequential(nn.Linear(sum(CAMERA_CHANNELS), width), nn.GELU())
-        self.compare = nn.Sequential(
-            nn.Linear(width + sum(CAMERA_CHANNELS) + 2 * COLOUR_CHANNELS + 3, width),
-            nn.GELU(),
-            nn.Linear(width, width),
-            nn.GELU(),
-        )
+        inputs = width + sum(CAMERA_CHANNELS) + 2 * COLOUR_CHANNELS + 3
+        self.compare = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU())
         self.trust = nn.Linear(width, 1)
         self.point = nn.Sequential(
             nn.Linear(width + 2 * COLOUR_CHANNELS + 5, width), nn.GELU(), nn.Linear(width, POINT_FEATURES)
@@ -119,16 +122,16 @@ class RayFill(CoarseFill):
         self.choose = nn.Linear(20 * width, points + 2)
 
     @light_operations()
-    def forward(self, view: IncompleteView, sources: SourceCameras | None) -> Float[Tensor, "3 height width"]:
+    def forward(self, view: IncompleteView, sources: SourceCameras | None) -> Image:
         """The view's image with all of E filled; None for `sources` leaves the smooth fill."""
         guess = fill(view.rgb, view.error > 0, view.mask > 0)
         pixels = torch.nonzero((view.error > 0) & (view.depth > 0).any())
         colours = self.mix(gather_ray_inputs(view, sources, pixels, guess))
         return guess.movedim(0, -1).index_put(tuple(pixels.unbind(1)), colours).movedim(-1, 0)
 
-    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Float[Tensor, "3 height width"]:
-        """The view's image with all of E filled; other pixels are unchanged, bit for bit."""
-        return self(view, SourceCameras.closest_to(view, context, self.config.num_views))
+    def fill_view(self, view: IncompleteView, context: ContextProvider) -> Image:
+        """The mixed colours."""
+        return self(view, SourceCameras.closest_to(view, context, self.config.num_views)).float().clamp(0, 1)
 
     @heavy_operations()
     def mix(self, inputs: RayInputs) -> Float[Tensor, "pixel 3"]:
@@ -147,11 +150,7 @@ class RayFill(CoarseFill):
             return torch.cat(mixed)
 
     def _mix(
-        self,
-        features: Float[Tensor, "pixel point view 14"],
-        smallest_masks: Float[Tensor, "pixel point 4"],
-        window: Float[Tensor, "pixel 8 11 11"],
-        far: Float[Tensor, "pixel feature"],
+        self, features: Features, smallest_masks: SmallestMasks, window: Window, far: Float[Tensor, "pixel feature"]
     ) -> Float[Tensor, "pixel 3"]:
         colours, points = self._points(features, smallest_masks)
         hidden = self.head(torch.cat([points.flatten(1), self.around(window).flatten(1), far], 1))
@@ -161,7 +160,7 @@ class RayFill(CoarseFill):
         return (weights[..., None] * torch.cat([colours, smooth, 0 * smooth], 1)).sum(1)
 
     def _points(
-        self, features: Float[Tensor, "pixel point view 14"], smallest_masks: Float[Tensor, "pixel point 4"]
+        self, features: Features, smallest_masks: SmallestMasks
     ) -> tuple[Float[Tensor, "pixel point 3"], Float[Tensor, "pixel point feature"]]:
         """Each point's colour, by the cameras that seem to see it, and evidence for the surface being there."""
         at = CameraFeatures.unstack(features)
@@ -191,19 +190,9 @@ def _rounded_up(values: Float[Tensor, "pixel *feature"]) -> Float[Tensor, "more_
 
 
 def gather_ray_inputs(
-    view: IncompleteView,
-    sources: SourceCameras | None,
-    pixels: Int[Tensor, "pixel 2"],
-    guess: Float[Tensor, "3 height width"] | None = None,
+    view: IncompleteView, sources: SourceCameras | None, pixels: Pixels, guess: Image | None = None
 ) -> RayInputs:
-    """The network's inputs for pixels (row, column) of a view.
-
-    Args:
-        view: the rendered view.
-        sources: the source cameras; None if there are none.
-        pixels: to be filled.
-        guess: the view with E filled smoothly; None to make it here.
-    """
+    """The network's inputs for pixels (row, column) of a view; `guess` is the view with E filled smoothly, if made."""
     guess = fill(view.rgb, view.error > 0, view.mask > 0) if guess is None else guess
     if sources is None:
         shape = (len(pixels), len(OFFSETS))
@@ -211,12 +200,14 @@ def gather_ray_inputs(
     else:
         features, _, statistics = sample_behind_proxy(view, pixels, sources)
         smallest = statistics[..., -4:]
-    window = windows(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), pixels, RADIUS_PX)
+    image = F.pad(torch.cat([view.rgb, view.mask[None], view.error[None], guess]), (RADIUS_PX,) * 4)
+    rows, columns = (pixels[:, axis, None] + torch.arange(2 * RADIUS_PX + 1, device=image.device) for axis in (0, 1))
+    window = image[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()
     return RayInputs(features, smallest, window, *multi_scale_context(view, guess, pixels))
 
 
 def sample_behind_proxy(
-    view: IncompleteView, pixels: Int[Tensor, "pixel 2"], sources: SourceCameras, offsets: Sequence[float] = OFFSETS
+    view: IncompleteView, pixels: Pixels, sources: SourceCameras, offsets: Sequence[float] = OFFSETS
 ) -> RaySamples:
     """`sample_fill_rays` at points `offsets` behind the proxy, on the rays of pixels (row, column).
 
@@ -228,11 +219,11 @@ def sample_behind_proxy(
     elif not bool((depth > 0).all()):
         depth = pull_push(view.depth[None], view.depth > 0)[0][pixels[:, 0], pixels[:, 1]]
     z = depth[:, None] + scale.size_m * depth.new_tensor(offsets)
-    return sample_fill_rays(Rays(view.camera, pixels.flip(1) + 0.5, z), sources, view.source_views, scale)
+    return sample_fill_rays(Rays(view, scale, pixels.flip(1) + 0.5, z), sources)
 
 
 def multi_scale_context(
-    view: IncompleteView, guess: Float[Tensor, "3 height width"], pixels: Int[Tensor, "pixel 2"]
+    view: IncompleteView, guess: Image, pixels: Pixels
 ) -> tuple[Float[Tensor, "neighbourhood 12 11 11"], Int[Tensor, "pixel"]]:
     """`RayInputs.neighbourhoods` of pixels (row, column), and the index of each pixel's neighbourhood.
 
@@ -255,12 +246,3 @@ def multi_scale_context(
         rows, columns = ((cell[:, :, None] + reach) * side - (-middle % side)[:, None]).split(1, 1)
         means.append((sums.boxes(rows, columns)[:, 0] / side**2).float().movedim(-1, 1))
     return torch.cat(means, 1), index
-
-
-def windows(
-    image: Float[Tensor, "channel height width"], pixels: Int[Tensor, "pixel 2"], radius: int
-) -> Float[Tensor, "pixel channel window window"]:
-    """The square around each pixel, zeros outside the image."""
-    padded, reach = F.pad(image, (radius,) * 4), torch.arange(2 * radius + 1, device=image.device)
-    rows, columns = (pixels[:, axis, None] + reach for axis in (0, 1))
-    return padded[:, rows[:, :, None], columns[:, None, :]].movedim(0, 1).contiguous()

@@ -18,6 +18,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.threads import parallel_for
 from viewmend.models.views.config import AROUND, CONTRAST, FAR, FEATURES, NEAR, STATISTICS
 from viewmend.models.views.pyramids import MipLevels, Pyramid, SceneScale, SourceCameras
+from viewmend.types import IncompleteView
 
 CAMERA_CHANNELS = (3, 1, 1, 1, 1, 1, 1, 3, 1, 1)
 """Channels of each field of `CameraFeatures`."""
@@ -32,8 +33,10 @@ BAND = 128
 class Rays(NamedTuple):
     """Rays of a novel view, and sample positions on them."""
 
-    camera: Cameras
-    """Of the novel view (one view)."""
+    view: IncompleteView
+    """The novel view, or a crop of it."""
+    scale: SceneScale
+    """Of the whole view."""
     uv_px: Float[Tensor, "ray 2"]
     z_m: Float[Tensor, "ray sample"]
     """z-depth; a sample at 0 is in no view."""
@@ -43,17 +46,18 @@ class Rays(NamedTuple):
         if size is None:
             return [self]
         parts = zip(self.uv_px.split(size), self.z_m.split(size), strict=True)
-        return [Rays(self.camera, *part) for part in parts]
+        return [Rays(self.view, self.scale, *part) for part in parts]
 
     @property
     def origin(self) -> Float[Tensor, "3"]:
         """The viewer's position, metres."""
-        return self.camera.centers[0].double()
+        return self.view.camera.centers[0].double()
 
     @property
     def world_from_pixel(self) -> Float[Tensor, "3 3"]:
         """From (u, v, 1) to what a pixel's ray gains per metre of z-depth: R K^-1; ONNX has no inverse."""
-        K, rotation = self.camera.K[0].double(), self.camera.camera_from_world[0, :3, :3].double().T
+        camera = self.view.camera
+        K, rotation = camera.K[0].double(), camera.camera_from_world[0, :3, :3].double().T
         fx, skew, cx, fy, cy = K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]
         zero, one = torch.zeros_like(fx), torch.ones_like(fx)
         rows = (1 / fx, -skew / (fx * fy), (skew * cy - cx * fy) / (fx * fy)), (zero, 1 / fy, -cy / fy)
@@ -107,51 +111,31 @@ class CameraFeatures(NamedTuple):
         return cls(*stacked.split(CAMERA_CHANNELS, -1))
 
 
-def sample_rays(
-    rays: Rays,
-    sources: SourceCameras,
-    source_views: Sequence[str],
-    step_px: float,
-    scale: SceneScale,
-    cubic: bool = False,
-) -> RaySamples:
-    """Samples the pyramid levels of the source cameras that match the rays.
+def sample_rays(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
+    """Samples the pyramid levels of the source cameras that match rays which are `step_px` apart.
 
-    Args:
-        rays: of one novel view.
-        sources: the source cameras and the silhouettes of the rig.
-        source_views: names of the cameras that coloured the view.
-        step_px: distance between neighbouring rays, pixels.
-        scale: of the view.
-        cubic: interpolate colours and masks by Catmull-Rom splines, which are sharper than bilinear interpolation.
+    With `cubic`, colours and masks are interpolated by Catmull-Rom splines, which are sharper than bilinear ones.
     """
     if torch.compiler.is_exporting():
-        return sample_rays_torch(rays, sources, source_views, step_px, scale, cubic)
+        return sample_rays_torch(rays, sources, step_px, cubic)
     with torch.autocast(rays.z_m.device.type, enabled=False):  # positions need more than eight bits
         if not sources.use_kernels:
-            return sample_rays_torch(rays, sources, source_views, step_px, scale, cubic)
-        levels = sources.levels(rays.camera, step_px, scale)
+            return sample_rays_torch(rays, sources, step_px, cubic)
+        levels = sources.levels(rays.view.camera, step_px, rays.scale)
         images, outlines = map(_at_levels, (sources.pyramids, sources.silhouette_pyramids), levels)
-        return _sample_numba(rays, sources, source_views, scale, images, outlines, 0.0, cubic)
+        return _sample_numba(rays, sources, images, outlines, 0.0, cubic)
 
 
-def sample_rays_torch(
-    rays: Rays,
-    sources: SourceCameras,
-    source_views: Sequence[str],
-    step_px: float,
-    scale: SceneScale,
-    cubic: bool = False,
-) -> RaySamples:
+def sample_rays_torch(rays: Rays, sources: SourceCameras, step_px: float, cubic: bool = False) -> RaySamples:
     """The reference of `sample_rays`."""
-    fine, wide, outline, mean_outline = sources.mips(rays.camera, step_px, scale)
-    at, depth = project_rays(rays, sources.cameras), sources.depth
+    fine, wide, outline, mean_outline = sources.mips(rays.view.camera, step_px, rays.scale)
+    at, depth = project_rays(rays, sources.cameras), sources.views.depth
     rows, columns = depth.shape[1:]
     first = torch.arange(depth.shape[0], device=depth.device) * (rows * columns)
     surface = depth.flatten()[first + at.v_px.long() * columns + at.u_px.long()].double()
-    behind = torch.where(surface > 0, at.z_m - surface, 0.0) / scale.size_m
+    behind = torch.where(surface > 0, at.z_m - surface, 0.0) / rays.scale.size_m
     values = (sample_level_cubic if cubic else sample_level)(fine, at, 4), sample_level(wide, at, 5)
-    features = _camera_features(rays, sources, source_views, at, *values, behind, _softsign)
+    features = _camera_features(rays, sources, at, *values, behind, F.softsign)
     named = CameraFeatures.unstack(features)
     prior = named.in_view * (4 * named.viewing_cosine).exp() / (1 + (6 * named.depth_difference).exp())
     prior = prior / (prior.sum(2, keepdim=True) + 1e-6)
@@ -163,10 +147,10 @@ def sample_rays_torch(
     return RaySamples(torch.cat([features, difference, prior], -1), prior[..., 0], statistics)
 
 
-def sample_fill_rays(rays: Rays, sources: SourceCameras, source_views: Sequence[str], scale: SceneScale) -> RaySamples:
-    """Samples the source cameras at full resolution, with means over boxes. Arguments are those of `sample_rays`."""
+def sample_fill_rays(rays: Rays, sources: SourceCameras) -> RaySamples:
+    """Samples the source cameras at full resolution, with means over boxes."""
     if not sources.use_kernels:
-        return sample_fill_rays_torch(rays, sources, source_views, scale)
+        return _sample_fill_rays_torch(rays, sources)
     images, masks = ([p.levels[0] for p in own] for own in (sources.pyramids, sources.silhouette_pyramids))
     sums = (torch.tensor([int(i[..., c].sum(dtype=torch.long)) for i in own]) for own, c in ((images, 3), (masks, 0)))
     side, half, outline_side = map(int, _box_sides(*sums))
@@ -177,25 +161,22 @@ def sample_fill_rays(rays: Rays, sources: SourceCameras, source_views: Sequence[
     count, scales, outline_scales = len(images), (1.0, 0.5 / half, 1 / side), (1.0, 1 / outline_side)
     views = [((image.numpy(), means[n], means[count + n]), scales) for n, image in enumerate(images)]
     outlines = [((mask.numpy(), means[2 * count + n]), outline_scales) for n, mask in enumerate(masks)]
-    return _sample_numba(rays, sources, source_views, scale, views, outlines, LEAST_SHARE)
+    return _sample_numba(rays, sources, views, outlines, LEAST_SHARE)
 
 
-def sample_fill_rays_torch(
-    rays: Rays, sources: SourceCameras, source_views: Sequence[str], scale: SceneScale
-) -> RaySamples:
-    """The reference of `sample_fill_rays`."""
-    images, depth, masks = sources.images, sources.depth, sources.silhouettes.mask[:, None]
+def _sample_fill_rays_torch(rays: Rays, sources: SourceCameras) -> RaySamples:
+    images, depth, masks = sources.images, sources.views.depth, sources.silhouettes.mask[:, None]
     at = project_rays(rays, sources.cameras)
     fine = sample_level(MipLevels.full(images), at, 5)
     share, surface = fine[..., 4], 255 * sample_level(MipLevels.full(depth[:, None]), at, 1)[..., 0]
-    behind = torch.where(share > LEAST_SHARE, at.z_m - surface / share.clamp_min(LEAST_SHARE), 0.0) / scale.size_m
+    behind = torch.where(share > LEAST_SHARE, at.z_m - surface / share.clamp_min(LEAST_SHARE), 0.0) / rays.scale.size_m
     side, half, outline_side = _box_sides(images[:, 3].sum((1, 2)), masks.sum((1, 2, 3)))
     shapes = BoxSums.of(images[:, 3:]).means(at.u_px, at.v_px, side)
     for axis in (2, 3):  # gathered: `torch.export` does not know the strides of every second row and column
         images = images.index_select(axis, torch.arange(0, images.shape[axis], 2, device=images.device))
     colours = BoxSums.of(images[:, :3]).means(at.u_px / 2, at.v_px / 2, half)
     wide = torch.cat([colours, shapes], -1)
-    features = _camera_features(rays, sources, source_views, at, fine[..., :4], wide, behind, torch.tanh)
+    features = _camera_features(rays, sources, at, fine[..., :4], wide, behind, torch.tanh)
     at = project_rays(rays, sources.silhouettes.cameras)
     means = BoxSums.of(masks).means(at.u_px, at.v_px, outline_side)
     smallest = _smallest_masks(at, sample_level(MipLevels.full(masks), at, 1), means)
@@ -205,7 +186,6 @@ def sample_fill_rays_torch(
 def _camera_features(
     rays: Rays,
     sources: SourceCameras,
-    source_views: Sequence[str],
     at: "Projections",
     fine: Float[Tensor, "ray sample view 4"],
     wide: Float[Tensor, "ray sample view 5"],
@@ -214,7 +194,7 @@ def _camera_features(
 ) -> Float[Tensor, "ray sample view 14"]:
     """`CameraFeatures` stacked, of images sampled at the projections, and of distances behind the proxy."""
     single = [squash(behind / NEAR), squash(behind / FAR), viewing_cosines(rays, sources.cameras)]
-    single += [sources.is_source(source_views).expand_as(behind), torch.ones_like(behind)]
+    single += [sources.is_source(rays.view.source_views).expand_as(behind), torch.ones_like(behind)]
     features = torch.cat([fine, torch.stack([value.float() for value in single], -1), wide], -1)
     return torch.where(at.in_view[..., None], features, 0.0)
 
@@ -350,15 +330,9 @@ def _smallest_masks(
     return torch.stack(found, -1)
 
 
-def _softsign(x: Tensor) -> Tensor:
-    return x / (1 + x.abs())
-
-
 def _sample_numba(
     rays: Rays,
     sources: SourceCameras,
-    source_views: Sequence[str],
-    scale: SceneScale,
     images: Sequence[tuple],
     outlines: Sequence[tuple],
     least_share: float,
@@ -373,14 +347,14 @@ def _sample_numba(
     kernels: Any = _sampler_numba
     count, samples = rays.z_m.shape
     channels = sum(CAMERA_CHANNELS) if least_share > 0 else FEATURES
-    names, size_m = sources.cameras.names, float(scale.size_m)
+    names, size_m = sources.cameras.names, float(rays.scale.size_m)
     features = np.empty((count, samples, len(names), channels), np.float32)
     prior, statistics = np.zeros(features.shape[:3], np.float32), np.ones((count, samples, STATISTICS), np.float32)
     z, directions, rig = rays.z_m.float().numpy(), rays.directions.numpy(), sources.silhouettes.cameras
     offsets = (sources.cameras.centers.double() - rays.origin).numpy()
     views, silhouettes = _lines(rays, sources.cameras), _lines(rays, rig)
     depths = [depth.numpy() for depth in sources.views.per_camera("depth")]
-    more = [(depth, size_m, float(name in source_views)) for depth, name in zip(depths, names, strict=True)]
+    more = [(depth, size_m, float(name in rays.view.source_views)) for depth, name in zip(depths, names, strict=True)]
 
     def work(band: int) -> None:
         first, end = band * BAND, min(count, (band + 1) * BAND)
