@@ -114,13 +114,9 @@ class CachedFrame:
 def cache_frame(
     frame: MultiViewFrame, bounds: Bounds | None, config: HullConfig, carving: Silhouettes | None = None
 ) -> CachedFrame:
-    """Reconstruct the geometry proxy of one frame.
+    """Reconstruct the geometry proxy of one frame, within `bounds` or, without these, where its masks are.
 
-    Args:
-        frame: the cameras' images and masks; use `frame.without` to leave out a camera.
-        bounds: the volume that may contain the subject; None to find it from the masks.
-        config: parameters of the visual hull.
-        carving: masks of more cameras that carve the hull, although their images are not used.
+    The masks of more cameras, `carving`, carve the hull, although the images of these are not used.
 
     Raises:
         ValueError: the frame has no masks, no foreground, or a single camera.

@@ -296,11 +296,7 @@ class CompletedView:
     """Refined z-depth of the subject, metres, 0 where there is none. None if the model predicts none."""
 
     def check_finite(self, by: str) -> None:
-        """Check that all images contain finite numbers only.
-
-        Raises:
-            ValueError: one does not; the message names the model, `by`.
-        """
+        """ValueError unless all images contain finite numbers only; its message names the model, `by`."""
         if not all(bool(image.isfinite().all()) for image in self.images.values()):
             raise ValueError(f"expected finite colours from {by}, got others; use another model, or train it again")
 

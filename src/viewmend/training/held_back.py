@@ -189,11 +189,7 @@ class HeldBackValidation:
 
 
 def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, sheet: Path) -> str:
-    """A table of the scores before and after fine-tuning by camera, and the views as a contact sheet.
-
-    Returns:
-        Lines of Markdown.
-    """
+    """A Markdown table of the scores before and after fine-tuning by camera; writes the views as a contact sheet."""
     metric, lines, rows = load_lpips("alex"), [], []
     for view in held_back_views(place, hold_out, table=True):
         (old, old_view), (new, new_view) = view.score(before, metric), view.score(after, metric)

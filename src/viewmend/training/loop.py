@@ -241,7 +241,9 @@ class Run:
                 self._validate(log, step)  # the weights that the run starts from are kept if none are better
             while True:
                 progress = 1.0 if stopped() or self._is_done(step) else clock.progress(step)
-                progress, due = self.own.maximum(progress, float(self._checkpoint_due(step, clock)))
+                # A checkpoint that is older than the best weights would let worse ones replace them.
+                due = step > self.state.step and (clock.checkpoint_due() or self.state.best_step > self.state.step)
+                progress, due = self.own.maximum(progress, float(due))
                 if due:
                     self._save(step, clock)
                 if progress >= 1:
@@ -285,10 +287,6 @@ class Run:
         """Whether a run that keeps the best weights has not found better ones for `PATIENCE` validations."""
         waited = step - self.state.best_step
         return self.own.first and self.keeps_best and waited >= PATIENCE * self.config.validate_every
-
-    def _checkpoint_due(self, step: int, clock: Clock) -> bool:
-        """Whether to write a checkpoint: one that is older than the best weights would let worse ones replace them."""
-        return step > self.state.step and (clock.checkpoint_due() or self.state.best_step > self.state.step)
 
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """One step of all weights, by the mean gradient of the streams."""
