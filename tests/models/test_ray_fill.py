@@ -109,6 +109,5 @@ def test_inputs_of_several_views_are_padded_to_the_same_cameras(views):
     three = gather_ray_inputs(view(5), SourceCameras.of(context(5, ("left", "third", "right")), None), pixels)
     both = ray_fill.RayInputs.cat([one, three])
     assert both.features.shape[2] == 3 and not bool(both.features[:3, :, views:].any())
-    assert torch.equal(
-        both.neighbourhoods[both.neighbourhood_index[3:]], three.neighbourhoods[three.neighbourhood_index]
-    )
+    last = both.neighbourhoods[both.neighbourhood_index[3:]]
+    assert torch.equal(last, three.neighbourhoods[three.neighbourhood_index])

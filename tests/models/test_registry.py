@@ -67,11 +67,8 @@ def test_a_class_in_a_file_is_a_method_and_a_changed_file_another(tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        *(
-            ("{}:Other", "check FILE.py:NAME"),
-            ("{}:number", "check FILE.py:NAME"),
-            ("absent.py:Mine", "check the path"),
-        ),
+        *(("{}:Other", "check FILE.py:NAME"), ("{}:number", "check FILE.py:NAME")),
+        ("absent.py:Mine", "check the path"),
         ("{}:Bare", r"own\.py:Bare: expected a callable that takes the device"),
     ],
 )

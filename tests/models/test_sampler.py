@@ -149,9 +149,8 @@ def test_the_unit_of_length_does_not_matter(unit):
     pixels = torch.nonzero(incomplete.error > 0)[::40]
     other = replace(incomplete, camera=scaled(incomplete.camera), depth=incomplete.depth * unit)
     frame = replace(seen.frame, cameras=scaled(seen.frame.cameras))
-    after = sample_behind_proxy(
-        other, pixels, SourceCameras.of(replace(seen, frame=frame, depth=seen.depth * unit), None)
-    )
+    sources = SourceCameras.of(replace(seen, frame=frame, depth=seen.depth * unit), None)
+    after = sample_behind_proxy(other, pixels, sources)
     before = sample_behind_proxy(incomplete, pixels, SourceCameras.of(seen, None))
     assert torch.allclose(after.features, before.features, atol=1e-3)
 

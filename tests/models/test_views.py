@@ -54,9 +54,7 @@ def test_soft_e_blends(scene):
 def test_a_crop_has_the_scale_of_the_whole_view(scene):
     stream, view, sources = scene
     net, scale, crop = stream.inpainter, SceneScale.of(view), Crop(0, 16, 96, 83)
-    whole, part, other = (
-        net(v, sources, s) for v, s in ((view, scale), (crop.of_view(view), scale), (crop.of_view(view), None))
-    )
+    whole, (part, other) = net(view, sources), (net(crop.of_view(view), sources, s) for s in (scale, None))
     depth = scatter_to_image(whole.depth[:, None], whole.pixels, view.mask.shape)[0, 32:]
     own = scatter_to_image(part.depth[:, None], part.pixels, torch.Size((67, 96)))[0, 16:]
     assert float((depth - own).abs().median()) < 1e-3 * scale.size_m

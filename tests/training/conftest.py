@@ -23,17 +23,8 @@ VIEWS_SAMPLING = SamplingConfig(num_ray_views=4)
 VIEWS_MODEL = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_features=8, error_features=8)
 VIEWS_RENDER = RenderConfig(error_rule="all")
 RUN: dict[str, Any] = {
-    "steps": 4,
-    "batch": 2,
-    "new_per_batch": 1,
-    "replay_size": 3,
-    "warmup": 1,
-    "workers": 0,
-    "ema": 0.5,
-    "precision": "float32",
-    "checkpoint_minutes": 1e9,
-    "validate_every": 0,
-    "validation_views": 2,
+    **{"steps": 4, "batch": 2, "new_per_batch": 1, "replay_size": 3, "warmup": 1, "workers": 0, "ema": 0.5},
+    **{"precision": "float32", "checkpoint_minutes": 1e9, "validate_every": 0, "validation_views": 2},
 }
 
 

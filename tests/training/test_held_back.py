@@ -77,9 +77,8 @@ def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
     monkeypatch.setattr("viewmend.training.loop.PATIENCE", 3)
     scenes = replace(SCENES, captures=(place,), captures_fraction=1.0, hold_out=AUTO)
     options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
-    config = TrainConfig(
-        name="finetune", objective=options, scenes=scenes, **RUN | {"steps": 40, "validate_every": 1, "ema": 0.0}
-    )
+    run = RUN | {"steps": 40, "validate_every": 1, "ema": 0.0}
+    config = TrainConfig(name="finetune", objective=options, scenes=scenes, **run)
     kept = []
     out = train(config, tmp_path / "run", report=lambda _: kept.append(first_weight(tmp_path / "run")))
     assert max(entry["step"] for entry in log_of(out)) == 4, "three validations after the best one"

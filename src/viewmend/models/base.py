@@ -131,8 +131,7 @@ class ContextProvider:
         memory = self._memory(time)
         absent = [name for name in names if (kind, name) not in memory]
         if absent:
-            pairs = zip(absent, make(absent), strict=True)
-            memory.update({(kind, name): to_mmap(made) for name, made in pairs})
+            memory.update({(kind, n): to_mmap(made) for n, made in zip(absent, make(absent), strict=True)})
         return [memory[kind, name] for name in names]
 
     def _own_memory(self, time: int) -> Memory:

@@ -66,9 +66,8 @@ class NearestColour(Fill):
         correct = ((view.error == 0) & (view.mask > 0.5)).cpu().numpy()
         if not correct.any():
             return view.rgb
-        _, labels = cv2.distanceTransformWithLabels(
-            (~correct).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )
+        wrong = (~correct).astype(np.uint8)
+        _, labels = cv2.distanceTransformWithLabels(wrong, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
         pixel_of_label = np.zeros(int(labels.max()) + 1, np.int64)
         pixel_of_label[np.asarray(labels)[correct].astype(np.int64)] = np.flatnonzero(correct)
         nearest = torch.from_numpy(pixel_of_label[np.asarray(labels).astype(np.int64)]).to(view.rgb.device)

@@ -88,8 +88,7 @@ class HeldBackView:
         stream.add_frame(self.inputs.frame, self.inputs.proxy)
         completed = stream.view(self.truth.cameras).completed
         rgb, truth = composite(background, completed.rgb, completed.opacity), self.true_image(background)
-        everywhere = torch.ones_like(truth[0], dtype=torch.bool)
-        found = psnr(rgb, truth, everywhere)
+        found = psnr(rgb, truth, torch.ones_like(truth[0], dtype=torch.bool))
         assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
         box = _subject_box(self.truth.mask[0])
         distance = float(metric(rgb[None, :, *box], truth[None, :, *box]))
@@ -190,7 +189,8 @@ class HeldBackValidation:
 
 def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, sheet: Path) -> str:
     """A Markdown table of the scores before and after fine-tuning by camera; writes the views as a contact sheet."""
-    metric, lines, rows = load_lpips("alex"), [], []
+    metric, rows = load_lpips("alex"), []
+    lines = ["| camera | PSNR before, dB | after | LPIPS before | after |", "| --- | --- | --- | --- | --- |"]
     for view in held_back_views(place, hold_out, table=True):
         (old, old_view), (new, new_view) = view.score(before, metric), view.score(after, metric)
         note = " (its image was trained on)" if view.trained_on else ""
@@ -199,9 +199,7 @@ def compare(place: Path, hold_out: str, before: Inpainter, after: Inpainter, she
         )
         rows.append(_row(view, [("before", old_view), ("after", new_view)], after.background or "black"))
     write_image(sheet, contact_sheet(rows, *TILE_PX))
-    return "\n".join(
-        ["| camera | PSNR before, dB | after | LPIPS before | after |", "| --- | --- | --- | --- | --- |", *lines]
-    )
+    return "\n".join(lines)
 
 
 def _row(view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], background: Background) -> list[Tile]:

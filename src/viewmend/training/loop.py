@@ -364,8 +364,7 @@ class Run:
 
     def _write_model(self, step: int | None = None) -> None:
         state = self.state if step is None else replace(self.state, step=step)
-        card = model_card(self.config, state, self.objective.loss_summary)
-        self.objective.save(self.averaged, self.out, card)
+        self.objective.save(self.averaged, self.out, model_card(self.config, state, self.objective.loss_summary))
 
 
 def averaging(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:

@@ -15,8 +15,10 @@ from viewmend.utils.plugins import import_object
 
 PROTOCOLS = ("target-mask", "hull-with-target-mask", "strict")
 """What the paper's model may know of the held-out mask in training."""
-SUBJECT_SIZES_PX = (224, 320, 416, 576)
-"""Image sizes of `views` and `rays`; each is at most 1.5 times the one before, so subjects of all sizes occur."""
+SUBJECT_SCENES = SceneConfig(
+    sizes_px=(224, 320, 416, 576), num_holdout_views=5, imperfect_fraction=0.8, hard_fraction=0.5
+)
+"""Of `views` and `rays`. Each image size is at most 1.5 times the one before, so subjects of all sizes occur."""
 CAPTURE_SIZES_PX = (320, 576, 832)
 """Image sizes of fine-tuning, up to those of real cameras."""
 
@@ -26,13 +28,7 @@ def views() -> TrainConfig:
     return TrainConfig(
         name="views",
         objective=ViewsObjectiveConfig(),
-        scenes=SceneConfig(
-            sizes_px=SUBJECT_SIZES_PX,
-            num_holdout_views=5,
-            imperfect_fraction=0.8,
-            hard_fraction=0.5,
-            hull_resolution=128,
-        ),
+        scenes=replace(SUBJECT_SCENES, hull_resolution=128),
         steps=20_000,
         minutes=60.0,
         batch=4,
@@ -49,9 +45,7 @@ def rays() -> TrainConfig:
     return TrainConfig(
         name="rays",
         objective=RaysObjectiveConfig(),
-        scenes=SceneConfig(
-            sizes_px=SUBJECT_SIZES_PX, cameras=(6, 20), num_holdout_views=5, imperfect_fraction=0.8, hard_fraction=0.5
-        ),
+        scenes=replace(SUBJECT_SCENES, cameras=(6, 20)),
         steps=10_000,
         minutes=60.0,
         batch=16,

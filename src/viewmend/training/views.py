@@ -185,9 +185,8 @@ def recolour(sample: Sample, random: Random) -> Sample:
     assert sample.ray_views is not None, "stored scenes have cameras"
     channels, gain = random.sample(range(3), 3), random.uniform(MIN_GAIN, 1)
     frame = sample.ray_views.frame
-    rgb, truth = (
-        (gain * image.float()).round().to(torch.uint8) for image in (frame.rgb[:, channels], sample.truth[channels])
-    )
+    images = frame.rgb[:, channels], sample.truth[channels]
+    rgb, truth = ((gain * image.float()).round().to(torch.uint8) for image in images)
     view = replace(sample.view, rgb=gain * sample.view.rgb[channels])
     return replace(sample, view=view, ray_views=replace(sample.ray_views, frame=replace(frame, rgb=rgb)), truth=truth)
 

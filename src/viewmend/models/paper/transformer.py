@@ -128,13 +128,11 @@ class Block(nn.Module):
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
-        dim = config.dim
+        dim, hidden = config.dim, config.ffn_ratio * config.dim
         self.norm_query = nn.LayerNorm(dim)
         self.query = nn.Linear(dim, dim)
         self.norm_ffn = nn.LayerNorm(dim)
-        self.ffn = nn.Sequential(
-            nn.Linear(dim, config.ffn_ratio * dim), nn.GELU(), nn.Linear(config.ffn_ratio * dim, dim)
-        )
+        self.ffn = nn.Sequential(nn.Linear(dim, hidden), nn.GELU(), nn.Linear(hidden, dim))
 
 
 @dataclass(frozen=True)

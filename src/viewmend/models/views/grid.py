@@ -153,9 +153,7 @@ class UNet(nn.Module):
         super().__init__()
         widths = tuple(width + WIDER * scale for scale in range(4))
         self.enter = nn.Conv2d(channels, width, 1)
-        self.first = nn.Sequential(
-            nn.Conv2d(width, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, width, 3, padding=1)
-        )
+        self.first = nn.Sequential(nn.Conv2d(width, width, 3, 1, 1), nn.ReLU(), nn.Conv2d(width, width, 3, 1, 1))
         self.down = nn.ModuleList(
             nn.Sequential(nn.Conv2d(fine, coarse, 3, 2, 1), nn.ReLU(), nn.Conv2d(coarse, coarse, 3, 1, 1), nn.ReLU())
             for fine, coarse in pairwise(widths)

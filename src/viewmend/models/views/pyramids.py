@@ -103,9 +103,8 @@ def choose_levels(
     pose, depth_m = viewer.world_from_camera[0].double(), torch.as_tensor(scale.depth_m, dtype=torch.double)
     distance_m = (cameras.centers - (pose[:3, 3] + depth_m * pose[:3, 2])).square().sum(-1).sqrt().clamp_min(1e-6)
     footprint_px = step_px * depth_m / viewer.K[0, 0, 0] * cameras.K[:, 0, 0] / distance_m
-    fine, wide = (
-        torch.minimum(px.clamp_min(1).log2().round().long(), last) for px in (footprint_px, AROUND * subject_px)
-    )
+    wanted_px = footprint_px, AROUND * subject_px
+    fine, wide = (torch.minimum(px.clamp_min(1).log2().round().long(), last) for px in wanted_px)
     return fine, torch.maximum(fine, wide)
 
 
@@ -137,11 +136,9 @@ class SourceCameras:
             silhouettes = Silhouettes(_masks(views), views.frame.cameras)
         if context is None:
             return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
-        time, names, all_names = views.frame.time, views.frame.cameras.names, silhouettes.cameras.names
+        time, names, rig = views.frame.time, views.frame.cameras.names, silhouettes.cameras.names
         pyramids = context.remembered(time, "views", names, lambda new: view_pyramids(views.select(new)))
-        masks = context.remembered(
-            time, "silhouettes", all_names, lambda new: silhouette_pyramids(silhouettes.select(new))
-        )
+        masks = context.remembered(time, "silhouettes", rig, lambda new: silhouette_pyramids(silhouettes.select(new)))
         return cls(views, tuple(pyramids), silhouettes, tuple(masks))
 
     @classmethod

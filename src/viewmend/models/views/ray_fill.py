@@ -102,9 +102,8 @@ class RayFill(Network, Fill):
         inputs = width + sum(CAMERA_CHANNELS) + 2 * COLOUR_CHANNELS + 3
         self.compare = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width), nn.GELU())
         self.trust = nn.Linear(width, 1)
-        self.point = nn.Sequential(
-            nn.Linear(width + 2 * COLOUR_CHANNELS + 5, width), nn.GELU(), nn.Linear(width, POINT_FEATURES)
-        )
+        inputs = width + 2 * COLOUR_CHANNELS + 5
+        self.point = nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, POINT_FEATURES))
         widths = (WINDOW_CHANNELS, *(width,) * (RADIUS_PX - 1), 2 * width)
         layers = [(nn.Conv2d(before, after, 3), nn.GELU()) for before, after in pairwise(widths)]
         self.around = nn.Sequential(*(part for layer in layers for part in layer))
