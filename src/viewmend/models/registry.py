@@ -135,11 +135,7 @@ def default_method() -> str:
 
 
 def split_missing(names: tuple[str, ...], device: str = "cpu") -> tuple[tuple[str, ...], dict[str, str]]:
-    """The methods whose weights are installed, and for each of the others why it is missing.
-
-    Raises:
-        ValueError: a method is unknown or broken.
-    """
+    """The methods whose weights are installed, and why others are missing; ValueError if one is unknown or broken."""
     missing = {}
     for name in names:
         try:

@@ -53,13 +53,10 @@ class Discriminator(nn.Module):
         self.convolutions = nn.ModuleList([*(spectral_norm(layer) for layer in convolutions[:-1]), convolutions[-1]])
 
     def forward(self, images: Sequence[Float[Tensor, "3 ... _h _w"]]) -> list[Float[Tensor, "logit ..."]]:
-        """Logits of images, or of clips of any length, with values in [0, 1] and any size from 3 x 3 pixels.
+        """Logits of images, or of clips of any length, with values in [0, 1]; ValueError below 3 x 3 pixels.
 
         Images of one size are processed as one batch. In training mode each call makes one step of power iteration, so
         pass real and completed images in the same call.
-
-        Raises:
-            ValueError: an image is too small.
         """
         if small := [tuple(image.shape) for image in images if min(image.shape[-2:]) < MIN_SIZE_PX]:
             raise ValueError(

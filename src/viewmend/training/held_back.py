@@ -130,10 +130,7 @@ def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator
     """The views on which a run is validated, or with `table` those of its final table, the held-back camera first.
 
     A camera is rendered from all others, as `viewmend mend --leave-out` does. Without a held-back camera, all cameras
-    are rendered at frames that are held back.
-
-    Raises:
-        CaptureError: the capture cannot be used.
+    are rendered at frames that are held back. Raises CaptureError if the capture cannot be used.
     """
     capture = open_masked(place, held=1)
     own, names, count = HeldBack.of(capture, hold_out), capture.cameras.names, len(capture.frame_ids)

@@ -77,11 +77,7 @@ def train(
 
 @contextmanager
 def _claim(out: Path) -> Iterator[None]:
-    """Lock the folder for this run.
-
-    Raises:
-        ValueError: another run is writing there, or it holds other files and no run to resume.
-    """
+    """Lock the folder for this run; ValueError if another run writes there, or it has other files and no checkpoint."""
     with OutputFolder(out) as folder:
         if last_checkpoint(out) is None:
             folder.check_own_files(*WRITTEN)

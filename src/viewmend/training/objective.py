@@ -115,9 +115,7 @@ def load_start(model: nn.Module, start: nn.Module | None, kept: str = "", option
     """Copy the weights of a model to start from, if there is one.
 
     The model keeps its own weights with the prefix `kept`, and `start` may lack those with the prefix `optional`.
-
-    Raises:
-        ValueError: `start` lacks other weights, or has them in other sizes.
+    Raises ValueError if it lacks others, or has them in other sizes.
     """
     if start is None:
         return

@@ -88,11 +88,7 @@ def _ignore_signals(_: int) -> None:
 
 
 def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Iterator[tuple[int, int, Item]]:
-    """(scene, index, sample) of all scenes from number `first`.
-
-    Raises:
-        ValueError, OSError: a scene cannot be made; or many in a row are empty.
-    """
+    """(scene, index, sample) of all scenes from `first`. ValueError, OSError: one cannot be made, or many are empty."""
     numbered = _Numbered(scenes)
     if workers:
         # Through files: descriptors would run out with a buffer of samples.

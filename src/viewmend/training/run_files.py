@@ -83,11 +83,7 @@ def last_checkpoint(folder: Path) -> Path | None:
 def load_run(
     path: Path, config: TrainConfig, modules: dict[str, nn.Module], optimizers: dict[str, Optimizer]
 ) -> RunState:
-    """Load a checkpoint into the modules and optimisers that its config makes.
-
-    Raises:
-        RunError: the file is damaged, or the run has another config.
-    """
+    """Load a checkpoint into the modules and optimisers of its config; RunError if it is damaged or has another one."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata()

@@ -44,11 +44,7 @@ class Sample:
 
 
 def true_image(sample: Sample, background: Background) -> Float[Tensor, "3 height width"]:
-    """F* in [0, 1], composited on the background that the model paints.
-
-    Raises:
-        ValueError: the background is white, and the sample has no alpha.
-    """
+    """F* in [0, 1] on the background that the model paints; ValueError if it is white and the sample has no alpha."""
     rgb = sample.truth.float() / 255
     if background == "black":
         return rgb
@@ -100,11 +96,7 @@ class HeldOutCamera:
 def rig_samples(
     rig: LeaveOneOut, scenes: SceneConfig, sampling: SamplingConfig, random: Random, held_out: str | None = None
 ) -> list[Sample]:
-    """Hold out some cameras of a rig in turn (or only `held_out`), each at some of its frames.
-
-    Raises:
-        ValueError: the rig has too few frames.
-    """
+    """Hold out some cameras of a rig in turn (or only `held_out`), each at some frames; ValueError if too few."""
     times = sorted(rig.frames)
     ends = [t for t in times if all(t - back in rig.frames for back in range(sampling.clip_length))]
     ends = [t for t in ends if times.index(t) >= sampling.min_history]

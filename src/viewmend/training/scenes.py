@@ -49,8 +49,7 @@ class StudioRigs:
     def __init__(self, config: SceneConfig, frames: Sequence[int], seed: str, split: Split = "training") -> None:
         """`seed` determines everything random except the people, whose seeds belong to the split.
 
-        Raises:
-            ValueError: the split, or the config's characters or motions, are reserved for tests.
+        Raises ValueError if the split, or the config's characters or motions, are reserved for tests.
         """
         if split == "test":
             raise ValueError("expected the split training or validation, got test; use procedural_set")

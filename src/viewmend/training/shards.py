@@ -90,11 +90,7 @@ def shards_of(folder: Path) -> list[Path]:
 
 
 def read_shard(path: Path, member: int | None = None) -> list[Any]:
-    """All samples of a shard; or the one at index `member`, an empty list if there are fewer.
-
-    Raises:
-        ShardError: the file is damaged.
-    """
+    """All samples of a shard, or only the one at index `member`, if there is one; ShardError if it is damaged."""
     try:
         with tarfile.open(path, "r:") as tar:  # uncompressed, so that it cannot claim more than it holds
             members = tar.getmembers()

@@ -88,10 +88,8 @@ class StoredScene:
     ) -> Sample:
         """The sample of held-out view `number`, with this number of cameras near it.
 
-        With `errors`, and true depth, it is rendered from depth maps with such errors instead of the hull.
-
-        Raises:
-            ValueError: the stored scene is damaged.
+        With `errors`, and true depth, it is rendered from depth maps with such errors instead of the hull. Raises
+        ValueError if the stored scene is damaged.
         """
         if number >= len(self.held):
             raise ValueError(f"expected a scene of {number + 1} views or more, got {len(self.held)}; {ADVICE}")

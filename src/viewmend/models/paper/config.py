@@ -94,11 +94,7 @@ class PaperConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "PaperConfig":
-        """Inverse of `to_dict`; missing keys take their defaults.
-
-        Raises:
-            ValueError: a key is unknown, or a value is impossible.
-        """
+        """Inverse of `to_dict`. Raises ValueError for an unknown key or an impossible value."""
         unknown = sorted(set(values) - {f.name for f in fields(cls)})
         if unknown:
             raise ValueError(f"expected the keys of PaperConfig, got unknown {unknown}; use the version that wrote it")
