@@ -223,8 +223,8 @@ def test_validation_scores_the_averaged_weights_and_writes_an_image(tiny, tmp_pa
     with join_processes() as own:
         validation = Run(tiny, tmp_path / "other", None, own).objective.validation
     model, found, telea = load_network(tmp_path).eval(), [], Telea()
-    samples = [sample for number in range(9) for sample in validation.scenes.scene(number)][: tiny.validation_views]
-    for sample in samples:
+    samples = (sample for number in range(9) for sample in validation.scenes.scene(number))
+    for sample in islice(samples, tiny.validation_views):
         with torch.no_grad():
             completed = model([sample.view], [list(sample.context)])[0].composited.clamp(0, 1)
         filled, _ = telea.step_on("white", sample.view, ContextProvider(lambda *_: None), telea.initial_state())
