@@ -40,6 +40,8 @@ from viewmend.training.stored_scenes import StoredSamples, StoredScene, StoredSc
 from viewmend.types import IncompleteView
 from viewmend.utils.tensors import to_device
 
+Image = Float[Tensor, "3 height width"]
+Mask = Bool[Tensor, "height width"]
 CROP_PX = 112
 """Side of the square crops of a view that are trained on."""
 MARGIN_PX = 16
@@ -129,7 +131,7 @@ class TrainingView:
     view: IncompleteView
     sources: SourceCameras
     scale: SceneScale
-    guess: Float[Tensor, "3 height width"]
+    guess: Image
     """`ViewSynthNet.coarse_guess` of the whole view."""
     truth: UInt8[Tensor, "3 height width"]
     """F*, on black."""
@@ -157,7 +159,7 @@ class TrainingView:
         return replace(self, view=crop.of_view(self.view), guess=guess, truth=truth, alpha=alpha, depth=depth)
 
     @property
-    def wrong(self) -> Bool[Tensor, "height width"]:
+    def wrong(self) -> Mask:
         """Pixels of the proxy and its rim with an erroneous colour."""
         return ((self.view.rgb - self.truth / 255).abs().amax(0) > WRONG) & (rim_depth(self.view.depth) > 0)
 
@@ -206,7 +208,7 @@ def random_crop(whole: TrainingView) -> TrainingView:
     return crop
 
 
-def random_selection(crop: TrainingView) -> Bool[Tensor, "height width"] | None:
+def random_selection(crop: TrainingView) -> Mask | None:
     """Pixels to predict: sometimes only those around erroneous ones, as an error rule would select; None for all."""
     if float(torch.rand(())) > SPARSE:
         return None
@@ -435,11 +437,7 @@ class ViewsValidation:
         return {name: None if math.isnan(mean) else mean for name, mean in means.items()}
 
 
-def _psnr(
-    image: Float[Tensor, "3 height width"],
-    truth: Float[Tensor, "3 height width"],
-    where: Bool[Tensor, "height width"] | None = None,
-) -> float:
+def _psnr(image: Image, truth: Image, where: Mask | None = None) -> float:
     """NaN if there are no such pixels."""
     score = psnr(image, truth, torch.ones_like(truth[0], dtype=torch.bool) if where is None else where)
     return float("nan") if score is None else score

@@ -17,6 +17,9 @@ from viewmend.models.paper.tokenizer import Decoder, EncoderInput, Tokeniser, bu
 from viewmend.models.paper.transformer import Transformer
 from viewmend.types import CompletedView, ContextViews, IncompleteView
 
+Contexts = Sequence[Sequence[ContextFrame | ContextViews]]
+"""Per view, encoded frames and camera images."""
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -57,21 +60,13 @@ class PatchTransformer(Network):
         self.decoder = Decoder(config)
 
     def forward(
-        self,
-        views: Sequence[IncompleteView],
-        contexts: Sequence[Sequence[ContextFrame | ContextViews]],
-        top_k: int | None = None,
+        self, views: Sequence[IncompleteView], contexts: Contexts, top_k: int | None = None
     ) -> list[Prediction]:
-        """One prediction per view, each from its own context. Gradients reach every parameter.
+        """One prediction per view of any size, each from its own context. Gradients reach every parameter.
 
-        Args:
-            views: of any sizes.
-            contexts: per view, encoded frames (used as they are) and camera images, which are encoded here in one
-                batch. Images of frames and cameras outside the view's window are ignored, as in `step`.
-            top_k: context tokens kept by pruning; None for the config's.
-
-        Raises:
-            ValueError: the numbers of views and contexts differ.
+        Camera images are encoded here in one batch; those of frames and cameras outside the view's window are ignored,
+        as in `step`. Pruning keeps `top_k` context tokens; None for the config's. Raises ValueError if the numbers of
+        views and contexts differ.
         """
         if len(views) != len(contexts):
             raise ValueError(f"expected one context per view, got {len(views)} views and {len(contexts)} contexts")
@@ -110,9 +105,7 @@ class PatchTransformer(Network):
         """Names of the cameras in a view's context, the closest first (section 2)."""
         return view.closest_views(self.config.num_source_views)
 
-    def encode_windows(
-        self, views: Sequence[IncompleteView], contexts: Sequence[Sequence[ContextFrame | ContextViews]]
-    ) -> list[list[ContextFrame]]:
+    def encode_windows(self, views: Sequence[IncompleteView], contexts: Contexts) -> list[list[ContextFrame]]:
         """The views' contexts, with all camera images of their windows (section 2) encoded in one batch."""
         windows = []
         for view, context in zip(views, contexts, strict=True):

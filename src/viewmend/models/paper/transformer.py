@@ -18,6 +18,8 @@ from viewmend.utils.cancellation import stop_if_cancelled
 Queries = Float[Tensor, "sample head query channel"]
 Keys = Float[Tensor, "sample head key channel"]
 """Keys, or the values that belong to them."""
+KeysValues = Float[Tensor, "block 2 sample key dim"]
+"""K and V of every block, before rotation."""
 PerKey = Float[Tensor, "sample key"]
 Tokens = Float[Tensor, "sample query dim"]
 LONGEST = 2.0
@@ -139,8 +141,7 @@ class Block(nn.Module):
 class Context:
     """Keys and values of the context tokens, and the rotations shared by all blocks (None without RoPE)."""
 
-    keys_values: Float[Tensor, "block 2 sample key dim"]
-    """K and V of every block, before rotation."""
+    keys_values: KeysValues
     present: Bool[Tensor, "sample key"]
     key_rotation: Float[Tensor, "2 sample 1 key pair"] | None
     query_rotation: Float[Tensor, "2 sample 1 query pair"] | None
@@ -164,12 +165,7 @@ class Transformer(nn.Module):
         return rearrange(self.keys_values(tokens), "n (b two d) -> b two n d", two=2, d=self.config.dim)
 
     def forward(
-        self,
-        tokens: Tokens,
-        at: TokenPositions,
-        keys_values: Float[Tensor, "block 2 sample key dim"],
-        context_at: TokenPositions,
-        top_k: int | None,
+        self, tokens: Tokens, at: TokenPositions, keys_values: KeysValues, context_at: TokenPositions, top_k: int | None
     ) -> Tokens:
         """The input tokens P after all blocks; each group prunes its context to `top_k` tokens, None for no pruning."""
         rotations = [None, None]

@@ -13,6 +13,8 @@ from torch.nn import functional as F
 from viewmend.types import RIM_PX, IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
+Pixels = Int[Tensor, "pixel 2"]
+"""Row and column of pixels."""
 CELL_PX = 2
 """Side of the cells in which depth hypotheses are judged."""
 BEYOND_M = 1e30
@@ -95,14 +97,11 @@ def scatter_to_image(
 
 
 def detail_bands(
-    colours: Float[Tensor, "pixel image 3"],
-    weight: Float[Tensor, "pixel"],
-    pixels: Int[Tensor, "pixel 2"],
-    shape: torch.Size,
+    colours: Float[Tensor, "pixel image 3"], weight: Float[Tensor, "pixel"], pixels: Pixels, shape: torch.Size
 ) -> Float[Tensor, "pixel band image 3"]:
     """What some images have around their own local means: a band for each of `BAND_PX`, the finest first.
 
-    The images have `shape`, and `colours` at the pixels (row, column). A pixel's `weight` in the means is above 0.
+    The images have `shape`, and `colours` at the pixels. A pixel's `weight` in the means is above 0.
     """
     count = colours.shape[1]
     values = torch.cat([(weight[:, None, None] * colours).flatten(1), weight[:, None]], 1)
@@ -198,13 +197,13 @@ def run_tiled(
     layers: nn.Sequential,
     cells: Float[Tensor, "1 feature rows columns"],
     values: Float[Tensor, "pixel input"],
-    pixels: Int[Tensor, "pixel 2"],
+    pixels: Pixels,
     shape: torch.Size,
 ) -> Float[Tensor, "pixel output"]:
     """The output of layers at some pixels of an image, from the tiles around these pixels only.
 
     The image has `shape`. Its first channels are `cells`, at half its resolution, upsampled bilinearly; the others are
-    `values` at the pixels (row, column), else zeros. The layers are convolutions of odd kernels that keep the size, and
+    `values` at the pixels, else zeros. The layers are convolutions of odd kernels that keep the size, and
     layers that act on single pixels.
     """
     halo = sum(layer.kernel_size[0] // 2 for layer in layers if isinstance(layer, nn.Conv2d))

@@ -25,6 +25,7 @@ from viewmend.models.views.config import COLOUR, FEATURES, MASK, OFFSETS, RaysCo
 from viewmend.models.views.error_predictor import ErrorPredictor, fallback_view
 from viewmend.models.views.grid import (
     CELL_PX,
+    Pixels,
     UNet,
     cell_means,
     concatenate_channels,
@@ -46,8 +47,6 @@ from viewmend.utils.cancellation import stop_if_cancelled
 Mask = Bool[Tensor, "height width"]
 Image = Float[Tensor, "3 height width"]
 Inputs = Float[Tensor, "7 height width"]
-Pixels = Int[Tensor, "pixel 2"]
-"""Row and column of pixels."""
 IMAGE_CHANNELS = 7
 """RGB of the first guess, M, whether a pixel is coloured, its largest source weight, and whether it is predicted."""
 CHOICES = 4

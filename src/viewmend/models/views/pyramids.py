@@ -16,6 +16,7 @@ from viewmend.models.base import ContextProvider
 from viewmend.models.views.config import AROUND
 from viewmend.types import ContextViews, IncompleteView, Silhouettes
 
+Levels = Int[Tensor, "view"]
 SMALLEST_PX = 4
 """Levels are halved until a side is no longer than this."""
 AREA_LEVEL = 2
@@ -90,12 +91,12 @@ class MipLevels(NamedTuple):
 
 def choose_levels(
     cameras: Cameras,
-    last: Int[Tensor, "view"],
+    last: Levels,
     subject_px: Float[Tensor, "view"],
     viewer: Cameras,
     step_px: float,
     scale: SceneScale,
-) -> tuple[Int[Tensor, "view"], Int[Tensor, "view"]]:
+) -> tuple[Levels, Levels]:
     """The fine and the wide pyramid level of each source camera, for rays that are `step_px` apart in the novel view.
 
     `last` is the coarsest level of each camera, and `subject_px` the root of the subject's area in it.

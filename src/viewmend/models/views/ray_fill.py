@@ -19,6 +19,7 @@ from viewmend.models.base import ContextProvider
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import MARGIN_PX, Fill, fill, pull_push
 from viewmend.models.views.config import CONTRAST, RaysConfig
+from viewmend.models.views.grid import Pixels
 from viewmend.models.views.pyramids import SceneScale, SourceCameras
 from viewmend.models.views.sampler import (
     CAMERA_CHANNELS,
@@ -33,8 +34,6 @@ from viewmend.types import IncompleteView
 from viewmend.utils.cancellation import stop_if_cancelled
 
 Image = Float[Tensor, "3 height width"]
-Pixels = Int[Tensor, "pixel 2"]
-"""Row and column of pixels."""
 Features = Float[Tensor, "pixel point view 14"]
 """`CameraFeatures`, stacked, of points on the rays of pixels."""
 Window = Float[Tensor, "pixel 8 11 11"]

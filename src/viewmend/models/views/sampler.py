@@ -20,6 +20,8 @@ from viewmend.models.views.config import AROUND, CONTRAST, FAR, FEATURES, NEAR, 
 from viewmend.models.views.pyramids import MipLevels, Pyramid, SceneScale, SourceCameras
 from viewmend.types import IncompleteView
 
+Levels = Sequence[tuple]
+"""The images of each camera, and their scales."""
 CAMERA_CHANNELS = (3, 1, 1, 1, 1, 1, 1, 3, 1, 1)
 """Channels of each field of `CameraFeatures`."""
 PATCH = 0.08
@@ -331,17 +333,9 @@ def _smallest_masks(
 
 
 def _sample_numba(
-    rays: Rays,
-    sources: SourceCameras,
-    images: Sequence[tuple],
-    outlines: Sequence[tuple],
-    least_share: float,
-    cubic: bool = False,
+    rays: Rays, sources: SourceCameras, images: Levels, outlines: Levels, least_share: float, cubic: bool = False
 ) -> RaySamples:
-    """Samples with compiled kernels; `images` and `outlines` are the images of each camera, and their scales.
-
-    Those of `RayFill` have a `least_share` above 0.
-    """
+    """Samples with compiled kernels; for `RayFill`, `least_share` is above 0."""
     from viewmend.models.views import _sampler_numba
 
     kernels: Any = _sampler_numba
@@ -376,7 +370,7 @@ def _lines(rays: Rays, cameras: Cameras) -> list[tuple]:
     return list(zip(per_metre.numpy(), start.numpy(), map(tuple, cameras.size_px.tolist()), strict=True))
 
 
-def _at_levels(pyramids: Sequence[Pyramid], levels: Sequence[Sequence[int]]) -> list[tuple]:
+def _at_levels(pyramids: Sequence[Pyramid], levels: Sequence[Sequence[int]]) -> Levels:
     """Two levels of each pyramid, the wide one twice as `sample_camera` takes three images, and their scales."""
     found = []
     for pyramid, (fine, wide) in zip(pyramids, levels, strict=True):
