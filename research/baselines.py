@@ -27,15 +27,8 @@ from measure import RESULTS, summarise, synchronise, write
 from stream_adapter import STREAMED, Streamed
 from torch import Tensor
 
-from viewmend.contrib.baselines.framing import Canvas, Window, window_canvas, windows_over
-from viewmend.contrib.baselines.online import (
-    Clip,
-    OnlineConfig,
-    OnlineInpainter,
-    OnlineNetwork,
-    OnlineState,
-    Sampling,
-)
+from viewmend.contrib.baselines.framing import DILATION_PX, Canvas, Window, window_canvas, windows_over
+from viewmend.contrib.baselines.online import Clip, OnlineConfig, OnlineInpainter, OnlineNetwork, OnlineState, Sampling
 from viewmend.contrib.baselines.published import NETWORKS
 from viewmend.data.synthetic.rigs import orbit
 from viewmend.data.synthetic.stage import Studio, StudioConfig
@@ -195,7 +188,7 @@ def ratios(figures: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
 def setting(view: IncompleteView) -> dict[str, object]:
     holes = view.error > 0
     config = OnlineConfig()
-    canvas = window_canvas(view.rgb, holes, config.size_px, config.dilation_px)
+    canvas = window_canvas(view.rgb, holes, config.size_px, DILATION_PX)
     return {
         "size_px": [view.error.shape[1], view.error.shape[0]],
         "hole_px": int(holes.sum()),

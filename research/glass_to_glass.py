@@ -10,19 +10,24 @@ import argparse
 import json
 import multiprocessing
 import os
+import re
 import shutil
+import subprocess
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import torch
-from live_browser import NAMES, served
 from measure import summarise
 from playwright.sync_api import sync_playwright
 
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.live.client import Publisher
 
+NAMES = ("chromium", "chromium-browser", "google-chrome")
 LEVELS = (40, 140, 240)
 CODES = [(r, g, b) for r in LEVELS for g in LEVELS for b in LEVELS]
 STEP = 10
@@ -46,6 +51,19 @@ window.requestAnimationFrame = (work) => request.call(window, (now) => {
   if (pixel[0] + pixel[1] + pixel[2]) window.seen.push([at / 1000, ...pixel.subarray(0, 3)]);
 });
 """
+
+
+@contextmanager
+def served(options: list[str]) -> Iterator[str]:
+    """The address of `viewmend serve` in another process."""
+    command = [sys.executable, "-m", "viewmend", "serve", "--port", "0", *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            assert process.stdout is not None
+            found = (re.search(r"http://\S+", line) for line in process.stdout)
+            yield next(address.group() for address in found if address)
+        finally:
+            process.terminate()
 
 
 def send(address: str, options: argparse.Namespace, results: Connection) -> None:

@@ -10,7 +10,7 @@ from reference.baselines_twin import (
     patches_twin,
     window_keys_twin,
 )
-from torch.nn import functional as F
+from torch.autograd import gradcheck
 
 from viewmend.contrib.baselines.e2fgvi import FocalAttention, pooled_places, window_places
 from viewmend.contrib.baselines.e2fgvi_propagation import SPyNet, deform_conv2d, warp
@@ -27,29 +27,13 @@ def test_deformable_convolution_reads_where_it_is_told(rng):
         assert torch.allclose(out[number], twin, atol=2e-5)
 
 
-def test_deformable_convolution_without_offsets_is_a_convolution(rng):
-    x, weight = torch.randn(1, 32, 9, 7, generator=rng), torch.randn(8, 32, 3, 3, generator=rng)
-    out = deform_conv2d(x, torch.zeros(1, 16 * 18, 9, 7), torch.ones(1, 16 * 9, 9, 7), weight, None)
-    # Weights of 288 products of size 1.
-    assert torch.allclose(out, F.conv2d(x, weight, padding=1), atol=1e-4)
-
-
 def test_deformable_convolution_learns_its_offsets(rng):
-    x = torch.randn(1, 2, 4, 5, generator=rng, dtype=torch.float64)
+    x, weight = torch.randn(1, 2, 4, 5, generator=rng), torch.randn(2, 2, 3, 3, generator=rng)
     # Away from whole pixels, where bilinear reading has kinks.
-    offsets = (torch.rand(1, 18, 4, 5, generator=rng) * 0.8 + 0.1).double().requires_grad_()
-    masks = torch.rand(1, 9, 4, 5, generator=rng).double().requires_grad_()
-    weight = torch.randn(2, 2, 3, 3, generator=rng)
-    deform_conv2d(x.float(), offsets.float(), masks.float(), weight, None).square().sum().backward()
-    step = torch.zeros_like(offsets)
-    step[0, 7, 2, 3] = 1e-2
-    with torch.no_grad():
-        ahead, back = (
-            deform_conv2d(x.float(), (offsets + s).float(), masks.float(), weight, None).double().square().sum()
-            for s in (step, -step)
-        )
-    assert offsets.grad is not None and masks.grad is not None and bool(masks.grad.any())
-    assert float(offsets.grad[0, 7, 2, 3]) == pytest.approx(float((ahead - back) / 2e-2), rel=2e-2, abs=1e-2)
+    offsets = (torch.rand(1, 18, 4, 5, generator=rng) * 0.8 + 0.1).requires_grad_()
+    masks = torch.rand(1, 9, 4, 5, generator=rng).requires_grad_()
+    with pytest.warns(UserWarning, match="double precision"):
+        assert gradcheck(lambda o, m: deform_conv2d(x, o, m, weight, None), (offsets, masks), eps=1e-2, atol=1e-2)
 
 
 @pytest.mark.parametrize("size", [(9, 12), (10, 13)])

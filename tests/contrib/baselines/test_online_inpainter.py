@@ -124,12 +124,6 @@ def test_a_view_that_nobody_wants_filled_leaves_the_state_that_filling_leaves(fr
     assert sorted(filled.frames) == [0, 10, 20, 22, 23, 24]
 
 
-@pytest.mark.parametrize("wrong", [{"step": 0}, {"neighbours": -1}, {"references": -1}])
-def test_samplings_that_cannot_be_are_refused(wrong):
-    with pytest.raises(ValueError, match="expected neighbours and references of 0 or more"):
-        Sampling(**wrong)
-
-
 def test_another_size_starts_a_new_stream_and_going_back_in_time_forgets_the_future():
     network = Recorder()
     inpainter = OnlineInpainter(network, config(framing="win"))

@@ -4,7 +4,7 @@ import os
 
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from viewmend.contrib.baselines.e2fgvi import E2FGVIHQ
 from viewmend.contrib.baselines.online import OnlineInpainter
@@ -34,24 +34,21 @@ def places(weights, tmp_path, monkeypatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
 
 
-@pytest.mark.parametrize("framing", ["def", "win", "mul"])
-def test_a_name_says_how_a_network_is_run(framing):
-    inpainter = make_baseline(f"dstt-o-{framing}")
-    assert isinstance(inpainter, OnlineInpainter) and isinstance(inpainter.network, DSTT)
-    assert inpainter.config.framing == framing
-    assert inpainter.config.sampling.grid == "absolute" and inpainter.config.size_px == (240, 432)
-
-
-def test_names_say_which_weights(weights):
+def test_a_name_says_which_network_is_run_how_and_with_which_weights(weights):
     official = torch.load(weights / "DSTT.pth", weights_only=True)["netG"]["encoder.0.weight"]
-    tuned, relative = make_baseline("dstt-o-win-finetuned"), make_baseline("dstt-o-mul-relative-finetuned")
-    for inpainter in (tuned, relative):
-        assert not torch.equal(inpainter.network.encoder[0].weight, official)
-    assert relative.config.sampling.grid == "relative"
-    for name in ("dstt-o-def", f"dstt-o-def@{weights / 'DSTT.pth'}"):
-        assert torch.equal(make_baseline(name).network.encoder[0].weight, official)
-    by_folder = make_baseline(f"dstt-o-def@{weights / 'finetuned' / 'dstt'}")
-    assert torch.equal(by_folder.network.encoder[0].weight, tuned.network.encoder[0].weight)
+    tuned = load_file(weights / "finetuned/dstt/model.safetensors")["encoder.0.weight"]
+    for name, framing, grid, expected in (
+        ("dstt-o-def", "def", "absolute", official),
+        ("dstt-o-win-finetuned", "win", "absolute", tuned),
+        ("dstt-o-mul-relative-finetuned", "mul", "relative", tuned),
+        (f"dstt-o-mul@{weights / 'DSTT.pth'}", "mul", "absolute", official),
+        (f"dstt-o-def@{weights / 'finetuned/dstt'}", "def", "absolute", tuned),
+    ):
+        inpainter = make_baseline(name)
+        assert isinstance(inpainter, OnlineInpainter) and isinstance(inpainter.network, DSTT)
+        config = inpainter.config
+        assert (config.framing, config.sampling.grid, config.size_px) == (framing, grid, (240, 432))
+        assert torch.equal(inpainter.network.encoder[0].weight, expected) and not torch.equal(official, tuned)
     assert isinstance(make_baseline("e2fgvi-hq-o-win").network, E2FGVIHQ)
 
 

@@ -9,23 +9,13 @@ from torch import nn
 from torch.nn.functional import avg_pool2d
 
 from viewmend.contrib.baselines import rgvi
-from viewmend.contrib.baselines.rgvi import (
-    PAST_FRAMES,
-    RaftFlow,
-    Rgvi,
-    RgviState,
-    dis_flow,
-    disagreeing,
-    load_raft,
-    make_rgvi,
-    pull,
-)
+from viewmend.contrib.baselines.rgvi import PAST_FRAMES, Rgvi, RgviState, dis_flow, disagreeing, make_rgvi, pull
 from viewmend.geometry.cameras import Cameras
 from viewmend.metrics import weights
 from viewmend.metrics.weights import KnownWeights
 from viewmend.models.base import ContextProvider
 from viewmend.types import IncompleteView
-from viewmend.utils.weight_files import MissingWeightsError, WeightsError
+from viewmend.utils.weight_files import WeightsError
 
 SIZE = 96
 MOTION = (3, 2)
@@ -161,8 +151,6 @@ class Halves(nn.Module):
 
 def test_raft_is_used_where_its_weights_are(places, monkeypatch, rng):
     assert make_rgvi().flow is dis_flow
-    with pytest.raises(MissingWeightsError, match="raft_large"):
-        load_raft()
     (places / "raft.pth").write_bytes(b"none")
     with pytest.raises(WeightsError, match="damaged or another"):
         make_rgvi()
@@ -175,7 +163,7 @@ def test_raft_is_used_where_its_weights_are(places, monkeypatch, rng):
     for name in ("torchvision", "torchvision.models", "torchvision.models.optical_flow"):
         monkeypatch.setitem(sys.modules, name, module)
     flow = make_rgvi().flow
-    assert isinstance(flow, RaftFlow)
+    assert flow.func is rgvi.raft_flow
     for height, width in ((100, 130), (131, 1728)):
         scale = min(1.0, 864 / width)
         size = [max(128, 8 * round(side * scale / 8)) for side in (height, width)]

@@ -136,9 +136,8 @@ def test_all_watchers_get_the_same_bytes(on_air):
 
     with ThreadPoolExecutor(6) as watchers:
         videos = list(watchers.map(watch, range(6)))
-    assert len({data for video in videos for data in video.values()}) == len(
-        {name for video in videos for name in video}
-    )
+    files = {item for video in videos for item in video.items()}
+    assert len({data for _, data in files}) == len({name for name, _ in files})
     assert len(on_air.service._sessions) == 1, "one view is rendered for all"
 
 
@@ -177,23 +176,21 @@ def test_nothing_is_rendered_or_encoded_while_nothing_is_watched():
     wait_until(lambda: set(encoders()) <= set(others))
 
 
+PLAYBACK = PlaybackState(Span(0, 1, 1), 0.0, HOME, lambda index: True, 1)
+
+
 def idle_service(clock=None):
     """A service whose threads are not started."""
     source = LiveSource()
     return RenderService(Renderer(source, SmoothFill(), PIPELINE), source, clock or FakeClock())
 
 
-def playback(clock):
-    return PlaybackState(Span(0, 1, 1), 0.0, HOME, lambda index: True, 1)
-
-
 def test_an_image_that_is_rendered_while_the_video_ends_is_dropped(ball_view):
     """Otherwise the next video would begin with it."""
-    service = idle_service()
-    session = BroadcastSession(service, SIZE, None)
+    session = BroadcastSession(idle_service(), SIZE, None)
     result = RenderResult(0, (ball_view,), State(), StageTimes())
     session.open()
-    request = session.next_request(service.now(), playback(service.now))
+    request = session.next_request(0.0, PLAYBACK)
     session.deliver(request, result)
     assert session.image is not None
     session.close()
@@ -226,23 +223,15 @@ def test_a_slow_encoder_leaves_frames_out(monkeypatch):
     made = Broadcast(idle_service(clock), ServerConfig(budget_ms=None), SIZE)
     made._requested_at = clock()
 
-    class SlowSegments:
-        def __init__(self, size_px, fps):
-            self.start_s = clock()
+    start_s = clock()
 
-        def __enter__(self):
-            return self
+    def add_slowly(film, image, index):
+        frames.append((index, clock() - start_s))
+        clock.advance(0.25)
+        if len(frames) == 12:
+            made._stopped.set()
 
-        def __exit__(self, *exception):
-            pass
-
-        def add(self, image, index):
-            frames.append((index, clock() - self.start_s))
-            clock.advance(0.25)
-            if len(frames) == 12:
-                made._stopped.set()
-
-    monkeypatch.setattr(broadcast_module, "FilmSegments", SlowSegments)
+    monkeypatch.setattr(FilmSegments, "add", add_slowly)
     monkeypatch.setattr(made._stopped, "wait", clock.advance)
     made.session.image = np.zeros((64, 96, 3), np.uint8)
     made._encode(10)
@@ -270,10 +259,9 @@ def test_a_server_without_a_broadcast(ball):
 
 
 def test_of_two_compared_modes_the_first_is_on_air():
-    service = idle_service()
-    session = BroadcastSession(service, SIZE, None)
+    session = BroadcastSession(idle_service(), SIZE, None)
     session.look(Look(modes=("rendered", "mended"), moving=True, depth=True, scale=0.5))
-    request = session.next_request(service.now(), playback(service.now))
+    request = session.next_request(0.0, PLAYBACK)
     assert session.newest_look.modes == ("rendered",) and not request.quality.mend
     assert tuple(request.cameras[0].size_px[0].tolist()) == SIZE
 

@@ -24,11 +24,6 @@ def rig(tmp_path: Path) -> Path:
     return make_rig(tmp_path)
 
 
-def soon(true) -> None:
-    """Until something is so; the hull's kernels are compiled at first use."""
-    wait_until(true, seconds=60)
-
-
 def newest(supply):
     return supply.read(supply.span.newest)
 
@@ -52,7 +47,7 @@ def of_all(supply):
 def test_videos_as_if_live_are_masked_and_together_and_shown(rig):
     supply = RigSource(rig, align=False)
     with running(supply, ready=False) as server:
-        soon(lambda: server.service.is_ready and of_all(supply) is not None)
+        wait_until(lambda: server.service.is_ready and of_all(supply) is not None)
         frame, truth = of_all(supply), photograph(CAMERAS)
         inside, true = frame.mask > 127, truth.mask > 127
         assert float((inside & true).sum() / (inside | true).sum()) > 0.93
@@ -73,14 +68,14 @@ def test_the_rig_changes_while_the_other_cameras_go_on(rig, caplog):
     caplog.set_level(logging.WARNING)
     supply = RigSource(rig, align=False)
     with reading(supply):
-        soon(lambda: of_all(supply) is not None)
+        wait_until(lambda: of_all(supply) is not None)
         before = supply.rig.number
         rig.write_text("nonsense")
-        soon(lambda: "the rig stays as it was" in caplog.text)
+        wait_until(lambda: "the rig stays as it was" in caplog.text)
         assert supply.rig.number == before and len(supply.camera_counts()) == 6
         supply._aligner.counts["c0"]["used"] += 1000
         rig.write_text(rig_text(CAMERAS.names[:5]))
-        soon(lambda: supply.rig.number > before and newest(supply).cameras.names == CAMERAS.names[:5])
+        wait_until(lambda: supply.rig.number > before and newest(supply).cameras.names == CAMERAS.names[:5])
         counts = supply.camera_counts()
         assert all(c["connects"] == 1 and c["up"] for c in counts.values()) and "c5" not in counts
         assert counts["c0"]["used"] >= 1000 > counts["c1"]["used"], "what was counted goes on, too"
@@ -122,13 +117,13 @@ def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
 
     worker._connect = through_a_plug
     with reading(supply):
-        soon(lambda: of_all(supply) is not None)
+        wait_until(lambda: of_all(supply) is not None)
         unplugged.set()
-        soon(lambda: newest(supply).cameras.names == tuple(n for n in CAMERAS.names if n != "c2"))
-        soon(lambda: worker.error == "unplugged")
+        wait_until(lambda: newest(supply).cameras.names == tuple(n for n in CAMERAS.names if n != "c2"))
+        wait_until(lambda: worker.error == "unplugged")
         assert supply.status.state == "ready", "the others go on"
         unplugged.clear()
-        soon(lambda: "c2" in newest(supply).cameras.names)
+        wait_until(lambda: "c2" in newest(supply).cameras.names)
         assert worker.counts["connects"] == 2
 
 

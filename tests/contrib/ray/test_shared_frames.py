@@ -2,6 +2,7 @@
 
 import pickle
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,10 +67,8 @@ def test_a_stream_has_nothing_left_to_compute():
 
 def test_a_frame_without_a_hull():
     frame = photograph(CAMERAS, 0)
-    shared = SharedFrame.prepare(
-        type(frame)(frame.cameras, frame.rgb, 0 * frame.mask, 0), None, PIPELINE.hull, SmoothFill()
-    )
-    got, *_ = send(shared)
+    empty = replace(frame, mask=0 * frame.mask)
+    got, *_ = send(SharedFrame.prepare(empty, None, PIPELINE.hull, SmoothFill()))
     assert got.cached is None and torch.equal(got.frame.rgb, frame.rgb)
 
 
@@ -162,14 +161,12 @@ def test_a_rendering_process_renders_the_same_pixels(link, follow):
         camera = view_camera(Camera(azimuth=33.0), renderer.home, (64, 64))
         fetch(source, 2)
         result = renderer.render(RenderRequest(2, (camera,), RenderQuality()), None)
-        own = {
-            name: value for name, value in renderer.rig_json.items() if name != "assets"
-        }  # a version of each process
-        results.append((result.completed[0].rgb, result.times.geometry, own))
+        results.append((result.completed[0].rgb, result.times.geometry, renderer.rig_json))
     alone.stop()
-    assert torch.equal(results[0][0], results[1][0]) and results[0][0].any()
-    assert results[0][2] == results[1][2]
-    assert results[1][1] == 0 < results[0][1], "the ingest has carved the hull"
+    (rgb, geometry_ms, rig), (shared_rgb, shared_ms, shared_rig) = results
+    assert torch.equal(rgb, shared_rgb) and rgb.any()
+    assert rig | {"assets": shared_rig["assets"]} == shared_rig, "a version of each process"
+    assert shared_ms == 0 < geometry_ms, "the ingest has carved the hull"
 
 
 def test_an_ingest_that_ends_is_reported_and_its_successor_followed(link, follow):

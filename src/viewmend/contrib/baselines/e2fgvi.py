@@ -39,7 +39,10 @@ class FocalAttention(nn.Module):
         self.heads = heads
         self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
-        self.register_buffer("valid_ind_rolled", _outside_of_window())
+        # Tokens of the four rolled windows, one after the other, that lie outside of the own window: of the middle one
+        # of nine windows, whose rolled windows do not wrap around.
+        own, rolled = window_places((3, 3))
+        self.register_buffer("valid_ind_rolled", torch.nonzero(~torch.isin(rolled[4], own[4]))[:, 0])
 
     def forward(
         self,
@@ -96,12 +99,6 @@ def _around(count: int, size: int) -> tuple[Int[Tensor, "place neighbour"], Bool
     first = (at - size // 2).clamp(0, max(0, count - size))
     neighbours = first + torch.arange(min(size, count))
     return neighbours, (neighbours - at).abs() <= size // 2
-
-
-def _outside_of_window() -> Int[Tensor, "120"]:
-    """Indices, in the four rolled windows one after the other, of tokens that lie outside of the own window."""
-    own, rolled = window_places((3, 3))  # the middle one of nine: its rolled windows do not wrap around
-    return torch.nonzero(~torch.isin(rolled[4], own[4]))[:, 0]
 
 
 MULTIPLE_PX = (WINDOW[0] * STEP_PX, WINDOW[1] * STEP_PX)

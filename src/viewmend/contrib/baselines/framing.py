@@ -15,6 +15,8 @@ from viewmend.geometry.sampling import sample_bilinear
 from viewmend.types import ContextViews, IncompleteView
 
 Image = Float[Tensor, "3 height width"]
+DILATION_PX = 4
+"""Number of dilations of the holes by a 3 x 3 cross before a frame is input."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.contrib.baselines.framing import (
+    DILATION_PX,
     Canvas,
     Window,
     aim,
@@ -67,10 +68,6 @@ class Sampling:
     """References are the latest multiples of `step` (as Thiry et al. do), or `step`, 2 `step`, ... frames back (as the
     paper on multi-view inpainting writes)."""
 
-    def __post_init__(self) -> None:
-        if min(self.neighbours, self.references) < 0 or self.step < 1:
-            raise ValueError(f"expected neighbours and references of 0 or more and a step of 1 or more, got {self}")
-
     def neighbour_times(self, time: int) -> tuple[int, ...]:
         """The times just before `time`, latest first, none before 0."""
         return tuple(range(time - 1, max(time - self.neighbours, 0) - 1, -1))
@@ -106,8 +103,6 @@ class OnlineConfig:
     """Which past times are input."""
     size_px: tuple[int, int] = (240, 432)
     """Height and width that the network is run at."""
-    dilation_px: int = 4
-    """Number of dilations of the holes by a 3 x 3 cross before a frame is input."""
 
     @property
     def overlap_px(self) -> int:
@@ -172,7 +167,7 @@ class OnlineInpainter(Inpainter):
 
     def _canvas(self, view: IncompleteView) -> Canvas:
         make = resized_canvas if self.config.framing == "def" else window_canvas
-        return make(view.rgb, view.error > 0, self.config.size_px, self.config.dilation_px)
+        return make(view.rgb, view.error > 0, self.config.size_px, DILATION_PX)
 
     def _past(self, state: State, time: int, canvas: Canvas) -> OnlineState:
         """The part of the state that is past and of the canvas's size."""

@@ -7,6 +7,7 @@ its weights are available, otherwise OpenCV's. The smooth fill completes the flo
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -66,37 +67,15 @@ RAFT_MIN_PX, RAFT_MAX_PX = 128, 864
 """Sides of RAFT's input: the coarsest correlation needs 128 px; RGVI uses 480 x 864."""
 
 
-class RaftFlow:
-    """Optical flow by torchvision's RAFT (large), for images of any size."""
-
-    def __init__(self, network: nn.Module) -> None:
-        self.network = network
-
-    @torch.inference_mode()
-    def __call__(self, image: Image, other: Image) -> FlowMap:
-        """Where the image's pixels are in the other one, pixels; images in [0, 1]."""
-        height, width = image.shape[1:]
-        scale = min(1.0, RAFT_MAX_PX / max(height, width))
-        size = [max(RAFT_MIN_PX, round(s * scale / RAFT_CELL_PX) * RAFT_CELL_PX) for s in (height, width)]
-        pair = interpolate(torch.stack([image, other]) * 2 - 1, size, mode="bilinear", antialias=True)
-        flow = interpolate(self.network(pair[:1], pair[1:])[-1], (height, width), mode="bilinear")[0]
-        return flow * flow.new_tensor([width / size[1], height / size[0]])[:, None, None]
-
-
-def load_raft(device: torch.device | str = "cpu") -> RaftFlow:
-    """RAFT with torchvision's weights.
-
-    Raises:
-        MissingWeightsError: their file was not found.
-        WeightsError: it is damaged or holds another network.
-        ValueError: torchvision is not installed.
-    """
-    path = checked_weights(known_weights("raft"))
-    try:
-        from torchvision.models.optical_flow import raft_large  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise ValueError(f"expected torchvision to run {path}, found none; pip install torchvision") from None
-    return RaftFlow(load_weights(raft_large(), path, device))
+@torch.inference_mode()
+def raft_flow(network: nn.Module, image: Image, other: Image) -> FlowMap:
+    """Where the image's pixels are in the other one, by torchvision's RAFT (large); images in [0, 1], of any size."""
+    height, width = image.shape[1:]
+    scale = min(1.0, RAFT_MAX_PX / max(height, width))
+    size = [max(RAFT_MIN_PX, round(s * scale / RAFT_CELL_PX) * RAFT_CELL_PX) for s in (height, width)]
+    pair = interpolate(torch.stack([image, other]) * 2 - 1, size, mode="bilinear", antialias=True)
+    flow = interpolate(network(pair[:1], pair[1:])[-1], (height, width), mode="bilinear")[0]
+    return flow * flow.new_tensor([width / size[1], height / size[0]])[:, None, None]
 
 
 PAST_FRAMES = 10
@@ -180,4 +159,12 @@ def make_rgvi(device: torch.device | str = "cpu") -> Rgvi:
         WeightsError: the file of RAFT's weights is damaged or holds another network.
         ValueError: there are weights, but torchvision is not installed.
     """
-    return Rgvi(dis_flow if find_weights(known_weights("raft")) is None else load_raft(device))
+    weights = known_weights("raft")
+    if find_weights(weights) is None:
+        return Rgvi()
+    path = checked_weights(weights)
+    try:
+        from torchvision.models.optical_flow import raft_large  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise ValueError(f"expected torchvision to run {path}, found none; pip install torchvision") from None
+    return Rgvi(partial(raft_flow, load_weights(raft_large(), path, device)))

@@ -17,6 +17,7 @@ from torch.nn.functional import l1_loss
 
 from viewmend.contrib.baselines.e2fgvi import E2FGVI, LocalFlows
 from viewmend.contrib.baselines.framing import (
+    DILATION_PX,
     Window,
     aim,
     camera_windows,
@@ -86,9 +87,8 @@ def training_clip(
     """
     samples = sample.clip[-length:]
     make = resized_canvas if framing == "def" else window_canvas
-    dilation_px = OnlineConfig().dilation_px
     views = [to_background(background, s.view) for s in samples]
-    canvases = [make(view.rgb, view.error > 0, size_px, dilation_px) for view in views]
+    canvases = [make(view.rgb, view.error > 0, size_px, DILATION_PX) for view in views]
     nowhere = torch.zeros_like(sample.view.error, dtype=torch.bool)
     truths = [make(true_image(s, background), nowhere, size_px, 0).image for s in samples]
     window = Window(0, 0)
@@ -105,7 +105,7 @@ def training_clip(
         references = candidates[torch.randperm(len(candidates))[:MAX_REFERENCES]]
     return TrainingClip(
         frames=torch.stack([window.of(c.image, size_px) for c in canvases]),
-        holes=torch.stack([window.of(dilated(c.holes, dilation_px), size_px) for c in canvases]),
+        holes=torch.stack([window.of(dilated(c.holes, DILATION_PX), size_px) for c in canvases]),
         truth=torch.stack([window.of(image, size_px) for image in truths]),
         references=references,
     )

@@ -126,8 +126,10 @@ class CameraWorker:
                 with contextlib.closing(self._connect(self)) as pictures:
                     for picture in pictures:
                         if not self.up:
-                            self._is_up()
-                            pause_s = FIRST_PAUSE_S
+                            gone_s, pause_s = time.monotonic() - self._since_s, FIRST_PAUSE_S
+                            self.up, self.error, self._since_s = True, None, time.monotonic()
+                            self.counts["connects"] += 1
+                            log.warning("camera '%s' is there, after %.1f s", self.camera.name, gone_s)
                         self._offer(picture)
                         if self._stopped.is_set():
                             return
@@ -184,12 +186,6 @@ class CameraWorker:
             self._newest.get_nowait()
             self.counts["replaced"] += 1
         self._newest.put(picture)
-
-    def _is_up(self) -> None:
-        gone_s = time.monotonic() - self._since_s
-        self.up, self.error, self._since_s = True, None, time.monotonic()
-        self.counts["connects"] += 1
-        log.warning("camera '%s' is there, after %.1f s", self.camera.name, gone_s)
 
     def _is_down(self, reason: str) -> None:
         if self.up:

@@ -167,10 +167,8 @@ class Ingest:
             span, edge = source.span, self._advance_edge()
             if self._is_watched and span.first <= self._led < span.end:
                 edge = float(self._led)
-            counts = source.camera_counts()
-            return SourceState(
-                self._version, self._source_id, source.status, span, source.rig, edge, source.spread_ms, counts
-            )
+            now = source.status, span, source.rig, edge, source.spread_ms, source.camera_counts()
+            return SourceState(self._version, self._source_id, *now)
 
     def frame(self, index: int, wait_s: float) -> tuple[str, Any] | None:
         """As `IngestLink.frame`, with the reference that `put` returned instead of the frame."""
@@ -356,7 +354,9 @@ class SharedSource(FrameSource):
     def _fetch(self) -> None:
         while not self._stopped.is_set():
             with self._lock:
-                index = self._next_index()
+                oldest = self._now() - FRESH_S
+                self._wanted = {index: asked for index, asked in self._wanted.items() if asked > oldest}
+                index = next(iter(self._wanted), self._ahead)  # the frame that has waited longest
                 if index is None:
                     self._lock.wait(WAIT_S)
                     continue
@@ -368,12 +368,6 @@ class SharedSource(FrameSource):
             with self._lock:
                 self._keep(index, found)
             self.changed()
-
-    def _next_index(self) -> int | None:
-        """The frame that has waited longest among those still wanted; otherwise the one to fetch ahead."""
-        oldest = self._now() - FRESH_S
-        self._wanted = {index: asked for index, asked in self._wanted.items() if asked > oldest}
-        return next(iter(self._wanted), self._ahead)
 
     def _keep(self, index: int, found: tuple[str, SharedFrame] | None) -> None:
         was_wanted, self._ahead = self._wanted.pop(index, None) is not None, None
