@@ -138,10 +138,7 @@ BAD = {
         ["masks/b_000.png", B, "frame '000'", "8-bit mask", "uint16"],
     ),
     "empty masks": (every_mask(of_pixels(32, 40) * 0), ["masks/a_000.png", "frame '000'", "no value above 0"]),
-    "faint masks": (
-        every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))),
-        ["masks/a_000.png", "above 39"],
-    ),
+    "faint masks": (every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))), ["masks/a_000.png", "above 39"]),
     "no video": (lambda p: (video(2)(p), (p.path / "b.avi").unlink()), ["b.avi", B, "the camera's video"]),
     "video is text": (lambda p: (video(2)(p), write("b.avi", b"hello" * 99)(p)), ["b.avi", B, "a video"]),
     "depth of 8 bit": (depth_of_8_bit, ["depth.png", "camera 'a'", "frame '000'", "16-bit", "uint8"]),

@@ -16,11 +16,7 @@ from viewmend.data.checks import leave_one_out, synchronisation
 from viewmend.data.checks.colours import find_odd_images
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.leave_one_out import LeaveOneOut, find_outlier_by_hull, find_outlier_by_outlines
-from viewmend.data.checks.synchronisation import (
-    check_image_mask_sync,
-    describe_delay,
-    find_desynchronised_cameras,
-)
+from viewmend.data.checks.synchronisation import check_image_mask_sync, describe_delay, find_desynchronised_cameras
 from viewmend.data.native_capture import open_capture
 from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import prepare

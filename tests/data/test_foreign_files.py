@@ -229,10 +229,7 @@ def spoil(content, **changes):
     [
         (lambda c: spoil(c, time=None), "expected a 'time' in each frame"),
         (lambda c: [f.pop("time") for f in c["frames"]], "got image/c0_0000.png and image/c0_0005.png at the same"),
-        (
-            lambda c: spoil(c, file_path="image/other.png"),
-            "expected equal numbers in file_path",
-        ),
+        (lambda c: spoil(c, file_path="image/other.png"), "expected equal numbers in file_path"),
         (lambda c: c["frames"].pop(0) and c["frames"].pop(2), "only image/c0_0010.png"),
         (lambda c: c.update(rolling_shutter=[0, 0, 0.02, 0]), "got rolling_shutter"),
         (lambda c: c.update(from_na=True), "got from_na"),
@@ -331,11 +328,7 @@ def test_images_with_other_names_are_mentioned(tmp_path, caplog):
 
 @pytest.mark.parametrize(
     "clock",
-    [
-        "{second}.{milli:03d}",
-        "frame_{time:06d}_{second}{milli:03d}",
-        "2024-05-01T12-30-{second}.{milli:03d}",
-    ],
+    ["{second}.{milli:03d}", "frame_{time:06d}_{second}{milli:03d}", "2024-05-01T12-30-{second}.{milli:03d}"],
 )
 def test_names_with_several_numbers_are_matched_as_a_whole(tmp_path, clock):
     """Such as clocks across a second, and numbers with a clock; those of each camera's own are refused."""

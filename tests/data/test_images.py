@@ -11,14 +11,7 @@ import pytest
 
 from viewmend.data import images
 from viewmend.data.errors import CaptureError
-from viewmend.data.images import (
-    PNG_CHUNK_OVERHEAD,
-    PNG_START,
-    decode_image,
-    read_mask,
-    read_rgb,
-    read_run_lengths,
-)
+from viewmend.data.images import PNG_CHUNK_OVERHEAD, PNG_START, decode_image, read_mask, read_rgb, read_run_lengths
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (24, 32, 3), np.uint8)
 PNG = cv2.imencode(".png", IMAGE)[1].tobytes()

@@ -85,10 +85,8 @@ class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     @property
     def size_px(self) -> tuple[int, int] | None:
         """Width and height."""
-        if self.size is None:
-            return None
-        width, height = self.size.split("x")
-        return int(width), int(height)
+        width, _, height = (self.size or "").partition("x")
+        return (int(width), int(height)) if width else None
 
     def times(self, recorded: Sequence[int], fps: float | None) -> list[int]:
         """The frame of each view, from those of a capture with this rate."""
@@ -104,17 +102,13 @@ class Turntable(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 def parse_turntable(text: str) -> Turntable | None:
-    """A turntable from "orbit" or "orbit:arc=180,seconds=6"; None for any other text.
-
-    Raises:
-        ValueError: a key or a value is wrong.
-    """
+    """A turntable from "orbit" or "orbit:arc=180,seconds=6"; None for other text. ValueError if a value is wrong."""
     word, _, values = text.partition(":")
     if word != "orbit":
         return None
     pairs = [pair.partition("=") for pair in values.split(",") if pair.strip()]
+    given = {key.strip(): value.strip() for key, _, value in pairs}
     try:
-        given = {key.strip(): value.strip() for key, _, value in pairs}
         return typed(given, Turntable, "as in orbit:arc=180,seconds=6,fps=30,size=1280x720", strict=False)
     except ValueError as error:
         raise ValueError(f"--path {text}: {error}") from None
@@ -123,8 +117,7 @@ def parse_turntable(text: str) -> Turntable | None:
 def pair_with_frames(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:
     """Pair frames with poses: one frame from every pose, or every frame from its own pose or from a single one.
 
-    Raises:
-        ValueError: there are several frames and another number of poses.
+    ValueError if there are several frames and another number of poses.
     """
     if len(times) == 1:
         return [(times[0], path[n]) for n in range(len(path))]

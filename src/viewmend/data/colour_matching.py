@@ -53,6 +53,7 @@ MIN_DISAGREEMENT = 0.012
 TINY = 1e-9
 
 Maps = Float[Tensor, "view 3 4"]
+Colours = Float[Tensor, "view point 3"]
 
 
 @dataclass(frozen=True)
@@ -198,15 +199,13 @@ def _cross_validate(colours: SurfaceColours) -> tuple[float, float]:
     return float(torch.cat(before).mean()), float(torch.cat(after).mean())
 
 
-def _disagreement(
-    rgb: Float[Tensor, "view point 3"], weight: Shaped[Tensor, "view point"]
-) -> Float[Tensor, "view point"]:
+def _disagreement(rgb: Colours, weight: Shaped[Tensor, "view point"]) -> Float[Tensor, "view point"]:
     """Distance of each colour from the weighted mean of its point."""
     mean = (weight[..., None] * rgb).sum(0) / weight.sum(0).clamp(min=TINY)[:, None]
     return (rgb - mean).norm(dim=-1)
 
 
-def _fit(rgb: Float[Tensor, "view point 3"], seen: Bool[Tensor, "view point"]) -> Maps:
+def _fit(rgb: Colours, seen: Bool[Tensor, "view point"]) -> Maps:
     """The maps that minimise the disagreement of all points that two cameras or more see."""
     seen = seen & (seen.sum(0) > 1)
     values, weight = torch.cat([rgb, torch.ones_like(rgb[..., :1])], -1), seen.to(rgb)
@@ -232,5 +231,5 @@ def _solve(values: Float[Tensor, "view point 4"], weight: Float[Tensor, "view po
     return rearrange(identity[:, :3] + change, "(view k) channel -> view channel k", k=4)
 
 
-def _map(rgb: Float[Tensor, "view point 3"], maps: Maps) -> Float[Tensor, "view point 3"]:
+def _map(rgb: Colours, maps: Maps) -> Colours:
     return rgb @ maps[..., :3].mT + maps[..., 3][:, None]

@@ -42,9 +42,7 @@ def names_in(folder: Path) -> frozenset[str]:
 def read_bytes(path: Path, count: int | None = None) -> bytes:
     """Read all bytes of a file or data set, or the first `count`.
 
-    Raises:
-        OSError: it cannot be read.
-        ValueError: the HDF5 member is not an array of bytes.
+    OSError if it cannot be read, ValueError if the HDF5 member is not an array of bytes.
     """
     file = container_of(path)
     if file == path:
@@ -60,11 +58,7 @@ def read_bytes(path: Path, count: int | None = None) -> bytes:
 
 @contextmanager
 def open_container(file: Path) -> "Iterator[h5py.File]":
-    """Open an HDF5 file for reading.
-
-    Raises:
-        OSError: it is not an HDF5 file, or it is damaged.
-    """
+    """Open an HDF5 file for reading; OSError for another or a damaged file."""
     import h5py
 
     try:
@@ -75,11 +69,7 @@ def open_container(file: Path) -> "Iterator[h5py.File]":
 
 
 def member(root: Any, parts: tuple[str, ...]) -> Any:
-    """The group or data set at this path. Links and data outside the file are not followed.
-
-    Raises:
-        OSError: there is none.
-    """
+    """The group or data set at this path, OSError without one. Links and data outside the file are not followed."""
     import h5py
 
     for part in parts:

@@ -5,6 +5,8 @@ import io
 import struct
 from pathlib import Path
 
+import cv2
+import imagesize
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
@@ -34,14 +36,10 @@ RUN_LENGTH_SUFFIX = ".bin"
 def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Read an image file as 8-bit RGB, exactly as stored: EXIF rotation is ignored, as calibrations ignore it.
 
-    `where` starts the error messages: file, camera, frame.
-
-    Raises:
-        CaptureError: the file cannot be read or decoded.
+    All readers raise a CaptureError for a file that they cannot use, which `where` starts: file, camera, frame.
     """
-    import cv2
-
-    bgr = _read(path, where, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = _decode(_read_file(path, where), where, flags)
     if bgr.dtype == np.uint16 and not 0 < bgr.max() < FULL_16_BIT:
         bgr = (bgr >> 8).astype(np.uint8)
     if bgr.dtype != np.uint8:
@@ -52,8 +50,6 @@ def read_rgb(path: Path, where: str) -> UInt8[np.ndarray, "height width 3"]:
 
 def exif_rotation(path: Path) -> str | None:
     """How EXIF asks viewers to rotate the image, in words; None if it does not, or if this is not an image."""
-    import cv2
-
     small, data = cv2.IMREAD_REDUCED_COLOR_4, np.frombuffer(read_bytes(path), np.uint8)
     stored, turned = cv2.imdecode(data, small | cv2.IMREAD_IGNORE_ORIENTATION), cv2.imdecode(data, small)
     if stored is None or turned is None or (stored.shape == turned.shape and (stored == turned).all()):
@@ -65,14 +61,8 @@ def exif_rotation(path: Path) -> str | None:
 
 
 def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
-    """Read an image file with alpha, of 8 bit or of 16 bit in full range, as stored.
-
-    Raises:
-        CaptureError: the file cannot be read or decoded, or has other channels.
-    """
-    import cv2
-
-    bgra = _read(path, where, cv2.IMREAD_UNCHANGED)
+    """Read an image file with alpha, of 8 bit or of 16 bit in full range, as stored."""
+    bgra = _decode(_read_file(path, where), where, cv2.IMREAD_UNCHANGED)
     channels = 1 if bgra.ndim == 2 else bgra.shape[2]
     if bgra.dtype == np.uint16 and channels == 4 and bgra.max() >= FULL_16_BIT:
         bgra = (bgra >> 8).astype(np.uint8)
@@ -83,11 +73,7 @@ def read_rgba(path: Path, where: str) -> UInt8[np.ndarray, "height width 4"]:
 
 
 def read_alpha(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
-    """Read the alpha of an image as a mask.
-
-    Raises:
-        CaptureError: the file cannot be read or decoded, or its alpha cuts nothing out.
-    """
+    """Read the alpha of an image as a mask; CaptureError if it cuts nothing out."""
     alpha = read_rgba(path, where)[..., 3]
     if is_opaque(alpha):
         next_step = "export it with alpha, or leave the camera out"
@@ -116,12 +102,8 @@ def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
     """Read a mask file: grey or alpha (see `to_mask`), labels of several colours or a palette, or 16 bit.
 
     Background are index 0 of a coloured palette, black among other colours, and 0 among few values of 16 bit.
-
-    Raises:
-        CaptureError: the file cannot be read or decoded, its values have no known meaning, or no colour is black.
+    CaptureError if its values have no known meaning, or no colour is black.
     """
-    import cv2
-
     data = _read_file(path, where)
     mask = _decode(data, where, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if mask.dtype == np.uint16:
@@ -145,11 +127,7 @@ def _from_16_bit(mask: UInt16[np.ndarray, "height width *channel"]) -> np.ndarra
 
 
 def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes, where: str) -> tuple[int, ...] | None:
-    """The colour of the background if colours are labels; None if they are shades of one.
-
-    Raises:
-        CaptureError: there are several colours without a palette, none of them black.
-    """
+    """The colour of the background if colours are labels, one of them black; None if they are shades of one."""
     blue, green, red = (bgr[..., channel] for channel in range(3))
     if (blue == green).all() and (green == red).all():
         return None
@@ -167,8 +145,6 @@ def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes, where: st
 
 def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarray, "height width"]:
     """Convert an image of 1 to 4 channels to a mask: alpha if it cuts something out, else the largest channel."""
-    import cv2
-
     if image.ndim == 2:
         return image
     channels = cv2.split(image)
@@ -183,8 +159,7 @@ def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarr
 def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
     """Read a run-length mask as 0 and 255. The file does not store its size, which is (height, width).
 
-    Raises:
-        CaptureError: the file cannot be read, or its runs do not fill that size.
+    CaptureError if its runs do not fill that size.
     """
     height, width = size
     data = _read_file(path, where)
@@ -202,14 +177,8 @@ def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.
 
 
 def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
-    """Read a 16-bit PNG of millimetres as z-depth in metres; 0 means no surface.
-
-    Raises:
-        CaptureError: the file cannot be read or decoded, or is not one channel of 16 bit.
-    """
-    import cv2
-
-    depth = _read(path, where, cv2.IMREAD_UNCHANGED)
+    """Read a 16-bit PNG of millimetres as z-depth in metres; 0 means no surface."""
+    depth = _decode(_read_file(path, where), where, cv2.IMREAD_UNCHANGED)
     if depth.dtype != np.uint16 or depth.ndim != 2:
         got = f"{depth.dtype} of shape {depth.shape}"
         raise CaptureError(f"{where}: expected one channel of 16-bit millimetres, got {got}; write it as 16-bit PNG")
@@ -218,8 +187,6 @@ def read_depth(path: Path, where: str) -> Float32[np.ndarray, "height width"]:
 
 def size_from_header(data: bytes) -> tuple[int, int] | None:
     """Width and height from the header of image data, without decoding; None if they are not found."""
-    import imagesize
-
     try:
         width, height = imagesize.get(io.BytesIO(data))
     except Exception:  # imagesize raises almost anything for malformed bytes
@@ -232,10 +199,6 @@ def _read_file(path: Path, where: str) -> bytes:
         return read_bytes(path)
     except OSError as error:
         raise CaptureError(f"{where}: expected a readable file, got: {error.strerror}; check its permissions") from None
-
-
-def _read(path: Path, where: str, flags: int) -> np.ndarray:
-    return _decode(_read_file(path, where), where, flags)
 
 
 def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
@@ -255,8 +218,6 @@ def decode_image(data: bytes, flags: int) -> np.ndarray | None:
 
     The size in the header and the lengths of PNG chunks are checked before any memory is allocated for them.
     """
-    import cv2
-
     width, height = size_from_header(data) or (0, 0)
     if not data or width * height > MAX_PIXELS or not _is_complete(data):
         return None
@@ -284,17 +245,11 @@ def _is_complete(data: bytes) -> bool:
     return True
 
 
-def write_image(
-    path: Path, image: UInt8[np.ndarray, "height width"] | UInt8[np.ndarray, "height width channel"]
-) -> None:
+def write_image(path: Path, image: UInt8[np.ndarray, "height width *channel"]) -> None:
     """Write a grey image, RGB, or RGB with straight alpha; the suffix (.png, .jpg, ...) selects the format.
 
-    Raises:
-        ValueError: the suffix is not that of an image format.
-        OSError: the file cannot be written.
+    ValueError if that is no image format, OSError if the file cannot be written.
     """
-    import cv2
-
     # No chroma subsampling (4:4:4), which would blur coloured edges.
     jpeg = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
     options = jpeg if path.suffix.lower() in (".jpg", ".jpeg") else (cv2.IMWRITE_PNG_COMPRESSION, 3)
@@ -303,11 +258,7 @@ def write_image(
 
 
 def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> None:
-    """Write z-depth in metres as a 16-bit PNG of millimetres, rounded.
-
-    Raises:
-        CaptureError: a depth is negative, not a number, or beyond 65.535 m.
-    """
+    """Write z-depth in metres as a 16-bit PNG of millimetres, rounded; CaptureError beyond 0 to 65.535 m."""
     if not ((depth_m >= 0) & (depth_m <= MAX_DEPTH_M)).all():
         got = f"{np.nanmin(depth_m)} to {np.nanmax(depth_m)} m"
         raise CaptureError(f"{path}: expected depths of 0 to {MAX_DEPTH_M} m, got {got}; check the scene's units")
@@ -315,8 +266,6 @@ def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> Non
 
 
 def _write(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
-    import cv2
-
     if not path.suffix or not cv2.haveImageWriter(path.suffix):
         raise ValueError(f"expected the file name of an image, got {path}; use the suffix .png or .jpg")
     done, data = cv2.imencode(path.suffix, image, options)

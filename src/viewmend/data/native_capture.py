@@ -9,9 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from viewmend.data.containers import names_in
 from viewmend.data.errors import CaptureError, Issue
@@ -105,19 +106,14 @@ class NativeCapture:
         if alpha:
             self._entries = tuple(_with_alpha(camera, folder, calibration.frames) for camera in self._entries)
         self.cameras = pinhole_cameras(self._entries)
-        """All cameras, after undistortion, in metres."""
         self.clock = read_clock(calibration)
         """When the films' frames were taken; None for a capture of images."""
         self.frame_ids = calibration.frames[: None if self.clock is None else len(self.clock.times_s)]
-        """Frame ids in temporal order."""
         self._listed = len(calibration.frames)
         self.fps = calibration.fps
-        """Frames per second; None if unknown or static."""
         self.up = None if calibration.up is None else torch.tensor(calibration.up, dtype=torch.float32)
-        """World up, unit length; None if unknown."""
         corners = calibration.bounds_m
         self.bounds = None if corners is None else Bounds(*torch.tensor(corners, dtype=torch.float32).unbind(0))
-        """The volume that contains the subject, in metres; None if unknown."""
         self.metres_per_unit = calibration.metres_per_unit
         """Length of the folder's own unit. All values of this class are in metres."""
         self.has_masks = self._all_or_none("mask")
@@ -141,8 +137,7 @@ class NativeCapture:
             return ()
         listed, found = self._listed, len(self.frame_ids)
         text = f"expected {listed} frames as listed, got films with {found} common times; the other frames are left out"
-        short = (Issue(text),) if found < listed else ()
-        return short + self.clock.issues(self.cameras.names)
+        return ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
 
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
@@ -178,8 +173,7 @@ class NativeCapture:
     def undistort(self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
         """Undistort another image of this camera, such as a clean plate, as its frames are.
 
-        Raises:
-            ValueError: there is no such camera, or the image does not have its size.
+        ValueError if there is no such camera, or the image does not have its size.
         """
         self.cameras.select([camera])
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
@@ -225,8 +219,7 @@ class NativeCapture:
             logging.getLogger("viewmend").warning(f"{self.name}: {whose} have no values above {above}: {what}")
 
     def _warn_of_rotation(self) -> None:
-        rotated = [reader for reader in self._readers if reader.rotation and not reader.warned]
-        if rotated:
+        if rotated := [reader for reader in self._readers if reader.rotation and not reader.warned]:
             names = ", ".join(f"'{reader.camera.name}'" for reader in rotated)
             logging.getLogger("viewmend").warning(
                 f"{self.name}: EXIF says that images should be {rotated[0].rotation}, but pixels are used as stored "
@@ -318,10 +311,8 @@ def pinhole_cameras(cameras: Sequence[NativeCamera]) -> Cameras:
 def read_clock(calibration: NativeCalibration) -> VideoClock | None:
     """Match the films of a capture by time; None if it has no films and no offsets.
 
-    Numbered images count as films with the capture's frame rate, or else that of its first film.
-
-    Raises:
-        CaptureError: a film cannot be decoded, no two show the same time, or offsets lack a frame rate.
+    Numbered images count as films with the capture's frame rate, or else that of its first film. CaptureError if a film
+    cannot be decoded, no two show the same time, or offsets lack a frame rate.
     """
     cameras, folder = calibration.cameras, calibration.folder
     files = {(c.name, kind): path for c in cameras for kind, path in (("images", c.video), ("masks", c.mask)) if path}
@@ -370,15 +361,13 @@ class CameraReader:
         self._undistortion = Undistortion(camera)
         paths = (camera.video, camera.mask if camera.mask and is_video(camera.mask) else None)
         self._video, self._mask_video = (VideoFile(folder / path) if path else None for path in paths)
-        self._curves = None if camera.colour is None else _colour_curves(camera.colour)
+        curves = None if camera.colour is None else np.vander(np.arange(256.0), 3) @ camera.colour.T
+        self._curves = None if curves is None else np.rint(curves.clip(0, 255)).astype(np.uint8)[None]
         numbers = np.arange(len(frames))
         own = {} if clock is None else clock.frames
         images = own.get((camera.name, "images"), numbers)
         masks = images if camera.video is None or self._has_mask_per_image() else numbers
-        self._index: dict[TrackKind, np.ndarray] = {
-            "images": images,
-            "masks": own.get((camera.name, "masks"), masks),
-        }
+        self._index: dict[TrackKind, np.ndarray] = {"images": images, "masks": own.get((camera.name, "masks"), masks)}
 
     def _has_mask_per_image(self) -> bool:
         """Whether numbered masks are those of the film's own frames, of which some of the capture's are missing."""
@@ -396,10 +385,7 @@ class CameraReader:
     def read(self, time: int) -> CameraImages | None:
         """Read and undistort the images of the frame at index `time`, in which the camera is present.
 
-        Returns None if the camera's film is damaged there.
-
-        Raises:
-            CaptureError: a file is missing, unreadable, or does not have the camera's size.
+        None if its film is damaged there. CaptureError if a file is missing, unreadable, or not of the camera's size.
         """
         camera = self.camera
         path, where = self._locate("video" if camera.video else "image", time)
@@ -412,8 +398,7 @@ class CameraReader:
         mask, depth = None, None
         if camera.mask:
             path, where = self._locate("mask", time)
-            mask = self._read_mask(path, where, time)
-            if mask is None:
+            if (mask := self._read_mask(path, where, time)) is None:
                 return None
             self._check_size(mask, where)
         if camera.depth:
@@ -427,14 +412,11 @@ class CameraReader:
         return self._undistortion.apply(CameraImages(self._correct_colours(rgb), None, None)).rgb
 
     def _correct_colours(self, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        import cv2
-
         return rgb if self._curves is None else cv2.LUT(rgb, self._curves)
 
     def _read_mask(self, path: Path, where: str, time: int) -> UInt8[np.ndarray, "height width"] | None:
         if self._mask_video:
-            image = self._mask_video.read(int(self._index["masks"][time]), where)
-            if image is None:
+            if (image := self._mask_video.read(int(self._index["masks"][time]), where)) is None:
                 return None
             mask = to_mask(image)
         elif self.camera.mask == self.camera.image:
@@ -481,23 +463,17 @@ class Undistortion:
         Pixels that lie outside the distorted image (corners, with pincushion distortion) repeat its border, so that
         the mask of a subject cut off by the border continues and does not carve the hull. Depth there is 0, unknown.
         """
-        import cv2
-
         if not self._camera.dist.any():
             return images
-        first, second = self._map()
-        border = cv2.BORDER_REPLICATE
-        rgb = cv2.remap(images.rgb, first, second, cv2.INTER_LINEAR, borderMode=border)
-        mask, depth = images.mask, images.depth
+        smooth = functools.partial(cv2.remap, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        rgb, mask, depth = smooth(images.rgb, *self._map()), images.mask, images.depth
         if mask is not None:
-            mask = cv2.remap(mask, first, second, cv2.INTER_LINEAR, borderMode=border)
+            mask = smooth(mask, *self._map())
         if depth is not None:  # nearest: interpolated depths would be wrong at edges
-            depth = cv2.remap(depth, first, second, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+            depth = cv2.remap(depth, *self._map(), cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
         return CameraImages(rgb, mask, depth)
 
     def _map(self) -> tuple[np.ndarray, np.ndarray]:
-        import cv2
-
         with self._lock:
             if self._maps is None:
                 camera = self._camera
@@ -507,12 +483,6 @@ class Undistortion:
                 first, second = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, fixed)  # pyright: ignore
                 self._maps = first, second
             return self._maps
-
-
-def _colour_curves(colour: Float64[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "1 256 3"]:
-    """Lookup table of each channel's quadratic; see `NativeCamera.colour`."""
-    values = np.vander(np.arange(256.0), 3) @ colour.T
-    return np.rint(values.clip(0, 255)).astype(np.uint8)[None]
 
 
 def stack_images(images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:

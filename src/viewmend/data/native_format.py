@@ -147,13 +147,10 @@ class NativeCalibration:
 
 
 def read_calibration(folder: Path) -> NativeCalibration:
-    """Parse the `cameras.json` of a capture folder.
+    """Parse the `cameras.json` of a capture folder; CaptureError if it is missing or invalid.
 
     Converts K to this project's pixel convention (`first_pixel_center`) and t and bounds to metres
     (`metres_per_unit`). A rotation that is orthonormal to within 1e-3 is made exactly orthonormal.
-
-    Raises:
-        CaptureError: the file is missing, is not JSON, lacks a key, or has an invalid value.
     """
     path = folder / CALIBRATION
     if not path.is_file():
@@ -168,11 +165,7 @@ def read_calibration(folder: Path) -> NativeCalibration:
 
 
 def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
-    """Convert the content of a `cameras.json`; `path` is the file that it was read from.
-
-    Raises:
-        ValueError: a key is missing, or a value is invalid.
-    """
+    """Convert the content of a `cameras.json`, read from the file `path`; ValueError if it is invalid."""
     file = typed({"format": FORMAT, **read_json(json.dumps(content))}, NativeFile)
     shift_px = 0.5 - np.array(file.first_pixel_center)
     up = None if file.up is None else np.array(file.up)

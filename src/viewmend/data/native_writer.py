@@ -53,10 +53,7 @@ def write_capture(
 def atomic_folder(out: Path | str) -> Iterator[Path]:
     """Yield the path of a temporary folder, to be created and filled, which becomes `out` at the end.
 
-    So `out` is complete or absent.
-
-    Raises:
-        CaptureError: `out` exists and is not an empty folder.
+    So `out` is complete or absent. CaptureError if it exists and is not an empty folder.
     """
     out = Path(out)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):

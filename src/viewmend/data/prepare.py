@@ -62,10 +62,8 @@ class PreparedCapture(CaptureWrapper):
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` with the calibration of `cameras`.
 
-        A camera whose mask is inverted, or wrongly empty, is left out of the frame and reported once.
-
-        Raises:
-            CaptureError: the source cannot be read, half of the masks are inverted, or no camera is left.
+        A camera whose mask is inverted, or wrongly empty, is left out of the frame and reported once. CaptureError if
+        the source cannot be read, half of the masks are inverted, or no camera is left.
         """
         frame = self.source.read(time).without(self.left_out)
         inputs = self.cameras.names if self.inputs is None else self.inputs
@@ -174,8 +172,7 @@ def open_masked(
 ) -> NativeCapture:
     """Open a capture that has masks, and at least two input cameras besides `held` held-out cameras.
 
-    Raises:
-        CaptureError: it cannot be opened (see `open_capture`), has no masks, or has too few cameras.
+    CaptureError if it has not, or cannot be opened (see `open_capture`).
     """
     capture = open_capture(path, cameras, format)
     if not capture.has_masks:

@@ -8,7 +8,7 @@ from itertools import islice
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -113,7 +113,7 @@ class CaptureSubset(CaptureWrapper):
     @property
     def cameras(self) -> Cameras:
         """The cameras of the scaled images."""
-        return self._scaled(self.source.cameras)
+        return scale_cameras(self.source.cameras, self.scale)
 
     @property
     def frame_ids(self) -> tuple[str, ...]:
@@ -123,14 +123,8 @@ class CaptureSubset(CaptureWrapper):
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` of the subset; raises as `CaptureSource.read` does."""
         frame = self.source.read(self.times[time])
-        small = resize_frame(frame, self._scaled(frame.cameras))
+        small = resize_frame(frame, scale_cameras(frame.cameras, self.scale))
         return MultiViewFrame(small.cameras, small.rgb, small.mask, time, small.depth)
-
-    def _scaled(self, cameras: Cameras) -> Cameras:
-        if self.scale == 1:
-            return cameras
-        sizes = [[max(1, round(side * self.scale)) for side in size] for size in cameras.size_px.tolist()]
-        return concatenate_cameras([cameras[view].resized(*size) for view, size in enumerate(sizes)])
 
 
 def prefetch(source: CaptureSource, times: Iterable[int] | None = None) -> Iterator[MultiViewFrame]:
@@ -159,13 +153,18 @@ def limit_size(frame: MultiViewFrame, max_image_size: int | None) -> MultiViewFr
 
 def limit_camera_size(cameras: Cameras, max_image_size: int | None) -> Cameras:
     """Reduce each camera to at most this length of its longer side; returns `cameras` if none is larger."""
-    if max_image_size is None or int(cameras.size_px.max()) <= max_image_size:
+    if max_image_size is None:
         return cameras
-    resized = []
-    for view, size in enumerate(cameras.size_px.tolist()):
-        scale = min(1.0, max_image_size / max(size))
-        resized.append(cameras[view].resized(*(max(1, round(side * scale)) for side in size)))
-    return concatenate_cameras(resized)
+    return scale_cameras(cameras, *(min(1.0, max_image_size / max(size)) for size in cameras.size_px.tolist()))
+
+
+def scale_cameras(cameras: Cameras, *scales: float) -> Cameras:
+    """The cameras of images with scaled sides: one scale for all, or one for each; `cameras` if all scales are 1."""
+    if all(scale == 1 for scale in scales):
+        return cameras
+    sizes = zip(cameras.size_px.tolist(), scales * (len(cameras) // len(scales)), strict=True)
+    resized = [[max(1, round(side * scale)) for side in size] for size, scale in sizes]
+    return concatenate_cameras([cameras[view].resized(*size) for view, size in enumerate(resized)])
 
 
 def resize_frame(frame: MultiViewFrame, cameras: Cameras) -> MultiViewFrame:
@@ -180,13 +179,8 @@ def resize_frame(frame: MultiViewFrame, cameras: Cameras) -> MultiViewFrame:
     small = layers.new_zeros(*layers.shape[:2], height, width)
     sizes = zip(cameras.size_px.tolist(), frame.cameras.size_px.tolist(), strict=True)
     for view, ((w, h), (full_w, full_h)) in enumerate(sizes):
-        small[view, :, :h, :w] = _resize(layers[view, :, :full_h, :full_w], h, w)
+        full = layers[None, view, :, :full_h, :full_w].float()
+        resized = F.interpolate(full, (h, w), mode="bilinear", antialias=True, align_corners=False)
+        small[view, :, :h, :w] = resized[0].round().clamp(0, 255).to(torch.uint8)
     mask = None if frame.mask is None else small[:, 3]
     return MultiViewFrame(cameras, small[:, :3], mask, frame.time)
-
-
-def _resize(
-    image: UInt8[Tensor, "channel full_height full_width"], height: int, width: int
-) -> UInt8[Tensor, "channel height width"]:
-    small = F.interpolate(image[None].float(), (height, width), mode="bilinear", antialias=True, align_corners=False)
-    return small[0].round().clamp(0, 255).to(torch.uint8)

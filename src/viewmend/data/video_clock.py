@@ -54,11 +54,7 @@ class Track:
 
 
 def video_track(camera: str, kind: TrackKind, path: Path, offset_s: float = 0.0) -> Track:
-    """The track of a film.
-
-    Raises:
-        CaptureError: it cannot be decoded.
-    """
+    """The track of a film; CaptureError if it cannot be decoded."""
     try:
         video = video_properties(path)
     except CaptureError as error:
@@ -132,12 +128,11 @@ class VideoClock:
                 return []
         if (track.camera, track.kind) in self.moved:
             faults.append(f"{what} have no time in common with {than}; they are taken to start together")
-        if track.fps and track.fps < rate * (1 - RATE_TOLERANCE):
-            text = f"{what} have {track.fps:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+        own_rate, fastest = track.fps or rate, rate * (1 + RATE_TOLERANCE)
+        text = f"{what} have {own_rate:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+        if own_rate < rate * (1 - RATE_TOLERANCE):
             faults.append(f"{text}, and the camera is absent in between")
-        faster = [other for other in images if other.fps and other.fps > rate * (1 + RATE_TOLERANCE)]
-        if track.kind == "images" and len(faster) > 1 and any(track is other for other in faster):
-            text = f"{what} have {track.fps:.4g} frames per second, not {than} {rate:.4g}; they are matched by time"
+        if track.kind == "images" and own_rate > fastest and sum((other.fps or 0) > fastest for other in images) > 1:
             faults.append(f"{text}, and their frames in between are not used; leave out the slow cameras to use them")
         if track.gaps:
             lost, from_s = sum(count for _, count in track.gaps), track.gaps[0][0]
@@ -169,12 +164,9 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     """Match films by time. A film of the rate that at least half of the cameras have sets the times.
 
     Other films fill its gaps. Films of its rate that run with a constant distance of less than a frame are matched one
-    to one, and so are masks with as many frames as their images.
-
-    Raises:
-        ValueError: no two cameras have a frame at the same time.
+    to one, and so are masks with as many frames as their images. ValueError if no two cameras share a time.
     """
-    tracks = [_moved(track, -track.offset_s) for track in tracks]
+    tracks = [replace(track, times_s=track.times_s - track.offset_s) for track in tracks]
     images = {track.camera: track for track in tracks if track.kind == "images"}
     order = sorted(images.values(), key=lambda track: (round(track.fps or 0.0, 1), len(track.times_s)), reverse=True)
     rate = round(order[len(order) // 2].fps or 0.0, 1)
@@ -190,7 +182,7 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
             tracks[number] = replace(track, times_s=peer.times_s)
         elif max(early_s, late_s) > period_s:
             moved.add((track.camera, track.kind))
-            tracks[number] = _moved(track, float(peer.times_s[0] - track.times_s[0]))
+            tracks[number] = replace(track, times_s=track.times_s + float(peer.times_s[0] - track.times_s[0]))
         if track.kind == "images":
             images[track.camera] = tracks[number]
     centred = [track.times_s - _phase_s(track.times_s, reference.times_s, period_s) for track in tracks]
@@ -201,7 +193,9 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
             times = np.sort(np.concatenate([times, own[far]]))
     found: dict[tuple[str, TrackKind], np.ndarray] = {}
     for track, own in zip(tracks, centred, strict=True):
-        found[track.camera, track.kind] = _frames_at(times, own, period_s)
+        index = _nearest(own, times)
+        is_near = np.abs(own[index] - times) <= TOLERANCE * period_s + 1e-6
+        found[track.camera, track.kind] = np.where(is_near, index, ABSENT)
     complete = [np.min([found[key] for key in found if key[0] == camera], axis=0) != ABSENT for camera in images]
     kept = np.sum(complete, axis=0) >= min(2, len(images))
     if not kept.any():
@@ -210,10 +204,6 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     ends = [own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)]
     end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))
     return VideoClock(tuple(tracks), reference.fps, times, end, frames, frozenset(moved), frozenset(by_index))
-
-
-def _moved(track: Track, by_s: float) -> Track:
-    return replace(track, times_s=track.times_s + by_s)
 
 
 def _nearest(times: Float64[np.ndarray, "time"], wanted: Float64[np.ndarray, "frame"]) -> Int[np.ndarray, "frame"]:
@@ -228,11 +218,3 @@ def _phase_s(own: Float64[np.ndarray, "frame"], times: Float64[np.ndarray, "time
     if not len(mean) or abs(mean.mean()) < SAME_PHASE:
         return 0.0
     return float(np.angle(mean.mean())) / (2 * np.pi) * period_s
-
-
-def _frames_at(
-    times: Float64[np.ndarray, "time"], own: Float64[np.ndarray, "frame"], period_s: float
-) -> Int[np.ndarray, "time"]:
-    """Index of the film's frame at each time; `ABSENT` without one."""
-    index = _nearest(own, times)
-    return np.where(np.abs(own[index] - times) <= TOLERANCE * period_s + 1e-6, index, ABSENT)

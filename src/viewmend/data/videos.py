@@ -78,8 +78,7 @@ class VideoProperties:
 def video_properties(path: Path) -> VideoProperties:
     """Size, rate and frame times of a video. Reads its packets and decodes its start and its end.
 
-    Raises:
-        CaptureError: no decoder opens it, or it has no frames.
+    CaptureError if no decoder opens it, or it has no frames.
     """
     stat = path.stat() if path.is_file() else None
     return _measured(path, None if stat is None else (stat.st_mtime_ns, stat.st_size))
@@ -92,7 +91,8 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
         stream = container.streams.video[0]
         codec, base, frames = stream.codec_context, stream.time_base or Fraction(1, 25), stream.frames
         rate = stream.average_rate or stream.guessed_rate
-        packets = [(packet.pts, packet.is_keyframe) for packet in container.demux(stream) if _shows(packet)]
+        shown = (packet for packet in container.demux(stream) if packet.size > 0 and not packet.is_discard)
+        packets = [(packet.pts, packet.is_keyframe) for packet in shown]  # an edit list hides the others
         reordered, names = codec.has_b_frames, set(container.format.name.split(","))
     head = list(islice(_decoded(path), CHECKED_FRAMES))
     if not head:
@@ -114,11 +114,6 @@ def _measured(path: Path, _version: tuple[int, int] | None) -> VideoProperties:
     height, width = _upright(np.empty((head[0].height, head[0].width), np.uint8), head[0]).shape
     keys = tuple(sorted(time for time, key in packets if key and time is not None)) if timestamps else ()
     return VideoProperties(path, width, height, fps, tuple(seconds.tolist()), timestamps, keys)
-
-
-def _shows(packet: Any) -> bool:
-    """Whether a packet holds a frame that the edit list does not hide."""
-    return packet.size > 0 and not packet.is_discard
 
 
 def _timestamps(path: Path, packets: list[tuple[int | None, bool]], head: list[int | None]) -> tuple[int, ...] | None:
@@ -152,14 +147,10 @@ def _open_video(path: Path) -> "InputContainer":
 
     try:
         container = av.open(str(path), metadata_errors="ignore")
-    except (av.FFmpegError, OSError, ValueError) as error:
-        missing = isinstance(error, FileNotFoundError)
-        got = (
-            ": No such file or directory; check the path"
-            if missing
-            else " a file that no decoder opens; export it again"
-        )
-        raise CaptureError(f"{path}: expected a video, got{got}") from None
+    except FileNotFoundError:
+        raise CaptureError(f"{path}: expected a video, got: No such file or directory; check the path") from None
+    except (av.FFmpegError, OSError, ValueError):
+        raise CaptureError(f"{path}: expected a video, got a file that no decoder opens; export it again") from None
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{path}: expected a video, got a file without one; export it again")
@@ -213,10 +204,10 @@ def to_rgb(frame: "VideoFrame", size_px: tuple[int, int] | None = None) -> Image
 
     `size_px` is another width and height for the upright image.
     """
-    if size_px is None or size_px == ((frame.height, frame.width) if is_turned(frame) else (frame.width, frame.height)):
-        return np.ascontiguousarray(_upright(frame.to_ndarray(format="rgb24", interpolation=NO_CHROMA_FILTER), frame))
-    width, height = size_px[::-1] if is_turned(frame) else size_px
-    rgb = frame.to_ndarray(format="rgb24", width=width, height=height, interpolation="AREA")
+    stored_px = frame.width, frame.height
+    width, height = stored_px if size_px is None else size_px[::-1] if is_turned(frame) else size_px
+    how = NO_CHROMA_FILTER if (width, height) == stored_px else "AREA"
+    rgb = frame.to_ndarray(format="rgb24", width=width, height=height, interpolation=how)
     return np.ascontiguousarray(_upright(rgb, frame))
 
 
@@ -261,8 +252,7 @@ class VideoFile:
     def read(self, index: int, where: str) -> Image | None:
         """The frame at `index` as RGB, read-only; None if it is damaged. `where` starts the error messages.
 
-        Raises:
-            CaptureError: the video cannot be opened, or ends before this frame.
+        CaptureError if the video cannot be opened, or ends before this frame.
         """
         with self._lock:
             video = video_properties(self.path)

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -45,11 +46,7 @@ class CalibrationCheck:
 
 
 def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> CalibrationCheck:
-    """Compute the hull of a frame and compare it with the masks; `bounds` are those of the capture.
-
-    Raises:
-        ValueError: the masks have no hull.
-    """
+    """The hull of a frame compared with the masks; `bounds` are those of the capture. ValueError without a hull."""
     if frame.mask is None:
         return CalibrationCheck(frame, bounds or bounds_from_cameras(frame.cameras), None, None, {})
     proxy = reconstruct(frame.mask, frame.cameras, bounds)
@@ -72,8 +69,6 @@ def draw_check(
 
 
 def _draw(check: CalibrationCheck, view: int, up: Float[Tensor, "3"] | None) -> UInt8[np.ndarray, "height width 3"]:
-    import cv2
-
     width, height = (int(n) for n in check.frame.cameras.size_px[view])
     image = picture(check.frame.rgb[view, :, :height, :width])
     if check.frame.mask is not None and check.silhouettes is not None:

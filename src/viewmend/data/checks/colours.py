@@ -40,8 +40,8 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     small = limit_size(frame, LONGEST_PX)
     if small.mask is None or len(small.cameras) < 3:
         return ()
-    detail = _detail(small)
-    flat = (detail < FLAT * detail.nanmedian()) | (_brightness(small) < DARK)
+    brightness, detail, saturation = _measures(small)
+    flat = (detail < FLAT * detail.nanmedian()) | (brightness < DARK)
     if bool(flat.any()):  # these are not compared
         names = [name for name, empty in zip(small.cameras.names, flat.tolist(), strict=True) if empty]
         text = "camera '{}': its images are of one colour, or black; check its exposure and its files"
@@ -55,7 +55,6 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     typical, alike = distance.nanmedian(), correlation.nanmedian()
     suspects = [view for view, far in enumerate(distance.tolist()) if far > SUSPECT * typical]
     better = _find_better_fits(small, surface, colours, distance, suspects)
-    saturation = _saturation(small)
     grey = (saturation < PALE * saturation.nanmedian()) & (saturation.nanmedian() > COLOURFUL)
     farther = (distance > FARTHER * typical) & (correlation < LESS_ALIKE * alike)
     far = ((distance > FAR * typical) | (farther & (len(distance) >= MANY))) & (distance > FAR_AT_LEAST)
@@ -108,24 +107,14 @@ def _find_better_fits(
     return found
 
 
-def _brightness(frame: MultiViewFrame) -> Float[Tensor, "view"]:
-    """Mean of the subject's pixels in each camera, of 255; NaN without foreground."""
-    assert frame.mask is not None
-    grey, inside = frame.rgb.float().mean(1), frame.mask > FOREGROUND
-    return (grey * inside).sum((1, 2)) / inside.sum((1, 2))
+def _measures(frame: MultiViewFrame) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"], Float[Tensor, "view"]]:
+    """The subject's mean brightness of 255, difference of neighbouring pixels, and saturation; NaN without foreground.
 
-
-def _detail(frame: MultiViewFrame) -> Float[Tensor, "view"]:
-    """Mean difference of neighbouring pixels of the subject in each camera; NaN without foreground."""
-    assert frame.mask is not None
-    grey, inside = frame.rgb.float().mean(1), frame.mask > FOREGROUND
-    both = inside[:, :, 1:] & inside[:, :, :-1]
-    return ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))
-
-
-def _saturation(frame: MultiViewFrame) -> Float[Tensor, "view"]:
-    """Difference of the subject's colour channels, relative to brightness, in each camera; NaN without foreground."""
+    Saturation is the difference of the colour channels, relative to brightness.
+    """
     assert frame.mask is not None
     rgb, inside = frame.rgb.float(), frame.mask > FOREGROUND
-    difference = ((rgb.amax(1) - rgb.amin(1)) * inside).sum((1, 2))
-    return difference / (rgb.mean(1) * inside).sum((1, 2))
+    grey, both = rgb.mean(1), inside[:, :, 1:] & inside[:, :, :-1]
+    total = (grey * inside).sum((1, 2))
+    detail = ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))
+    return total / inside.sum((1, 2)), detail, ((rgb.amax(1) - rgb.amin(1)) * inside).sum((1, 2)) / total

@@ -52,11 +52,7 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue
     """Find the faults of one frame; empty for a good frame and for one without masks.
 
     If hull and masks disagree, common mistakes are undone one at a time, and the issue names the change that makes
-    them agree.
-
-    Args:
-        frame: the input cameras. A good frame costs one hull and a small one per camera.
-        bounds: the bounds of the capture.
+    them agree. A good frame costs one hull and a small one per camera.
     """
     frame = limit_size(frame, LONGEST_PX)
     if frame.mask is None or len(frame.cameras) < 2 or not bool((frame.mask > FOREGROUND).any()):
@@ -98,36 +94,24 @@ def find_bad_masks(frame: MultiViewFrame, inputs: Sequence[str], bounds: Bounds 
     if frame.mask is None:
         return ()
     names = frame.cameras.names
-    inverted = [name for view, name in enumerate(names) if _border_share(frame, view) > INVERTED_BORDER]
+    inverted: dict[str, tuple[str, str]] = {}
+    for view, (width, height) in enumerate(frame.cameras.size_px.tolist()):
+        own = (frame.mask[view, :height, :width] > FOREGROUND).float()
+        if float(torch.cat([own[0], own[-1], own[:, 0], own[:, -1]]).mean()) > INVERTED_BORDER:
+            full = float(own.mean()) > FULL
+            inverted[names[view]] = ("full", "segment it again") if full else ("inverted", "write 255 - mask")
     bad = [name for name in inverted if name in inputs]
-    faults = [
-        ("full", "segment it again") if _is_full(frame, names.index(name)) else ("inverted", "write 255 - mask")
-        for name in inverted
-    ]
     if bad and 2 * len(bad) >= sum(name in inputs for name in names):
-        what, next_step = faults[0]
+        what, next_step = next(iter(inverted.values()))
         got = f"foreground along the image borders in {len(bad)} of {len(inputs)} cameras: they are {what}"
         return (Issue(f"expected masks of 255 on the subject, got {got}; {next_step}", fatal=True),)
     issues = []
-    for name, (what, next_step) in zip(inverted, faults, strict=True):
+    for name, (what, next_step) in inverted.items():
         effect = "it is left out" if name in inputs else "scores against it are meaningless"
         text = f"camera '{name}': its mask is {what}, so {effect}; {next_step}"
         issues.append(Issue(text, camera=name if name in inputs else None))
     good = [name for name in names if name in inputs and name not in inverted]
     return (*issues, *(_find_empty_masks(frame.select(good), bounds) if len(good) > 2 else ()))
-
-
-def _border_share(frame: MultiViewFrame, view: int) -> float:
-    assert frame.mask is not None
-    width, height = frame.cameras.size_px[view].tolist()
-    mask = frame.mask[view, :height, :width] > FOREGROUND
-    return float(torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).float().mean())
-
-
-def _is_full(frame: MultiViewFrame, view: int) -> bool:
-    assert frame.mask is not None
-    width, height = frame.cameras.size_px[view].tolist()
-    return float((frame.mask[view, :height, :width] > FOREGROUND).float().mean()) > FULL
 
 
 def _find_empty_masks(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[Issue]:

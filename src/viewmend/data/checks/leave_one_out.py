@@ -58,12 +58,14 @@ number of times more."""
 AMBIGUOUS = 0.7
 """The second suspect is named too if the ratio of the best residual to its own is higher."""
 
+Silhouettes = Bool[Tensor, "view height width"]
+
 
 @dataclass(frozen=True)
 class LeaveOneOut:
     """Each camera compared with the hull of all others. That hull contains the subject, so it contains good masks."""
 
-    silhouettes: Bool[Tensor, "view height width"]
+    silhouettes: Silhouettes
     """Silhouette of the others' hull in each camera."""
     removed: Float[Tensor, "view"]
     """The share of the others' masks that this camera alone removes from the hull."""
@@ -72,10 +74,7 @@ class LeaveOneOut:
 
 
 def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig = HULL) -> LeaveOneOut | None:
-    """Compute a small hull without each camera in turn; None if too few cameras have any foreground.
-
-    The images should be small (`LONGEST_PX`).
-    """
+    """Compute a small hull without each camera in turn; None if too few cameras have any foreground."""
     names, mask = frame.cameras.names, frame.mask
     if mask is None or len(names) < MIN_CAMERAS:
         return None
@@ -96,9 +95,7 @@ def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig
     return LeaveOneOut(covered, torch.stack(removed).nan_to_num(0.0), missed_share(inside, covered).nan_to_num(0.0))
 
 
-def missed_share(
-    inside: Bool[Tensor, "view height width"], covered: Bool[Tensor, "view height width"]
-) -> Float[Tensor, "view"]:
+def missed_share(inside: Silhouettes, covered: Silhouettes) -> Float[Tensor, "view"]:
     """The share of each mask that a silhouette does not cover; NaN for an empty mask."""
     return (inside & ~covered).sum((1, 2)) / inside.sum((1, 2))
 

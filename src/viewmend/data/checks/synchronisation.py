@@ -34,14 +34,9 @@ MIN_OUTLINE_FRAMES = 3
 def find_desynchronised_cameras(
     source: CaptureSource, frame: MultiViewFrame, last: int | None = None
 ) -> tuple[Issue, ...]:
-    """Find cameras that are late or early around a frame, or else around a later one.
+    """Find cameras of a frame that are late or early around it, or else around a later one at index `last`.
 
     A camera that is in step in the first place only has lost frames on the way.
-
-    Args:
-        source: the capture.
-        frame: one of its frames, with the cameras to check.
-        last: index of a later frame to check too.
     """
     if frame.mask is None or len(frame.cameras) < MIN_CAMERAS:
         return ()
@@ -76,15 +71,10 @@ def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> t
 def find_desynchronised_camera(
     frames: Sequence[MultiViewFrame], middle: int, bounds: Bounds | None, fps: float | None = None
 ) -> tuple[Issue, ...]:
-    """Find the camera whose mask of another frame fits the others' masks of `frames[middle]` best.
+    """Find the camera whose mask of another one of consecutive frames fits the others' of `frames[middle]` best.
 
-    If the masks are in sync, looks for images that are out of sync with their own masks.
-
-    Args:
-        frames: consecutive frames.
-        middle: index of the frame to check.
-        bounds: the bounds of the capture.
-        fps: frames per second, to state delays in milliseconds.
+    If the masks are in sync, looks for images that are out of sync with their own masks. With `fps`, frames per second,
+    delays are stated in milliseconds too.
     """
     names = [name for name in frames[middle].cameras.names if all(name in frame.cameras.names for frame in frames)]
     if len(names) < MIN_CAMERAS:
@@ -119,11 +109,9 @@ def find_desynchronised_camera(
 
 def _with_mask_of(frames: Sequence[MultiViewFrame], middle: int, view: int, time: int) -> MultiViewFrame:
     """The frame in the middle, with one camera's mask from another frame."""
-    frame, other = frames[middle], frames[time]
-    assert frame.mask is not None and other.mask is not None
-    mask = frame.mask.clone()
-    mask[view] = other.mask[view]
-    return replace(frame, mask=mask)
+    own, other = frames[middle].mask, frames[time].mask
+    assert own is not None and other is not None
+    return replace(frames[middle], mask=torch.cat([own[:view], other[view, None], own[view + 1 :]]))
 
 
 def _unexplained(frame: MultiViewFrame, bounds: Bounds | None) -> float:
@@ -146,9 +134,9 @@ def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]
 
     `frames` are consecutive, of the same cameras, and should be small.
     """
-    if any(frame.mask is None for frame in frames):
-        return ()
     masks = [frame.mask for frame in frames if frame.mask is not None]
+    if len(masks) < len(frames):
+        return ()
     edges = torch.stack([_gradient(frame.rgb.float()) for frame in frames])
     outlines = torch.stack([_gradient((mask > FOREGROUND).float()[:, None]) for mask in masks])
     outlines = F.normalize(outlines, dim=3)  # unit normals of the outline; 0 elsewhere

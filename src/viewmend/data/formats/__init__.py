@@ -74,12 +74,8 @@ def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
 def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
     """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
 
-    Args:
-        path: the folder or file.
-        format: one of `FORMAT_NAMES`; by default the first one that matches.
-
-    Raises:
-        CaptureError: the format is unknown, the folder does not have it, or its calibration cannot be used.
+    `format` is one of `FORMAT_NAMES`; by default the first one that matches. CaptureError if the format is unknown, the
+    folder does not have it, or its calibration cannot be used.
     """
     if format not in (None, *FORMAT_NAMES):
         raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")

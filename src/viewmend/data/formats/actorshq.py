@@ -22,11 +22,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The cameras that have images. The bounds are those of all frames.
-
-    Raises:
-        ValueError: the table has other columns or an invalid number, or the folder has several scales.
-    """
+    """The cameras that have images, in a folder of one scale. The bounds are those of all frames."""
     prefix = "" if file.parent == folder else file.parent.name + "/"
     scales = [scale for scale in SCALES if prefix and (folder / scale / "calibration.csv").is_file()]
     if len(scales) > 1:

@@ -9,7 +9,6 @@ import numpy as np
 from viewmend.data.formats.files import (
     files_like,
     find_mask,
-    forward_slashes,
     names_from_paths,
     read_xml,
     xml_attributes,
@@ -37,9 +36,6 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     """The enabled and aligned images of the chunk that has most, in the folder or in `images`.
 
     The unit is that of the chunk: metres if it was scaled.
-
-    Raises:
-        ValueError: the file is not XML or lacks a number, or a lens is not supported.
     """
     chunks = [(chunk, _used_cameras(chunk)) for chunk in read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")]
     chunk, used = max(chunks, key=lambda pair: len(pair[1]), default=(None, []))
@@ -61,7 +57,7 @@ def _used_cameras(chunk: Element) -> list[Element]:
 
 def _find_image(folder: Path, label: str) -> str:
     """The path of the image with this label, which often lacks the suffix."""
-    label = forward_slashes(label)
+    label = label.replace("\\", "/")
     for place in ("", "images/"):
         for path in files_like(folder / place, "*") if (folder / place).is_dir() else ():
             if path.name == label or (path.stem == label and path.suffix.lower() not in (".xml", ".txt")):

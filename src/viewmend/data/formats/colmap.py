@@ -12,7 +12,6 @@ from viewmend.data.formats.files import (
     existing,
     find_mask,
     folders_containing,
-    forward_slashes,
     names_from_paths,
     warn,
 )
@@ -71,7 +70,7 @@ def _read(file: Path) -> tuple[dict[int, dict[str, Any]], list[ColmapImage]]:
             lenses, views = _text_lenses(decode_text(cameras, "cameras.txt")), _text_images(decode_text(images, IMAGES))
     except (struct.error, IndexError):
         raise ValueError("expected complete files of cameras and images, got less; export the model again") from None
-    return lenses, sorted((view._replace(name=forward_slashes(view.name)) for view in views), key=lambda v: v.name)
+    return lenses, sorted((view._replace(name=view.name.replace("\\", "/")) for view in views), key=lambda v: v.name)
 
 
 def _count_images(file: Path) -> int:
@@ -83,11 +82,7 @@ def _count_images(file: Path) -> int:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All images of the model. The unit is arbitrary, as in COLMAP.
-
-    Raises:
-        ValueError: a file is truncated or invalid, or a camera model is not in `MODELS`.
-    """
+    """All images of the model. The unit is arbitrary, as in COLMAP."""
     lenses, views = _read(file)
     prefix = "images/" if (folder / "images").is_dir() else ""
     known = {view.name for view in views}

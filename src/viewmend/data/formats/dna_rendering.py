@@ -30,11 +30,7 @@ def root(path: Path, file: Path) -> Path:
 
 
 def content(path: Path, file: Path) -> dict[str, Any]:
-    """The cameras that have images and parameters.
-
-    Raises:
-        ValueError: the folder has several sequences, the annotations are missing, or a file has other content.
-    """
+    """The cameras that have images and parameters, of a single sequence."""
     files = [file] if path.is_file() else _image_files(path)
     if len(files) > 1:
         raise ValueError(f"expected one sequence, got {len(files)} in {path}; open one of them, e.g. {files[0].name}")

@@ -23,11 +23,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras of the files.
-
-    Raises:
-        ValueError: a file is not OpenCV YAML or lacks a matrix, there are no images, or the cameras move.
-    """
+    """All cameras of the files; they may not move."""
     if file.parent != folder:
         raise ValueError("expected static cameras, got poses per frame; write intri.yml for the whole rig")
     intrinsics, extrinsics = read_storage(file), read_storage(file.with_name("extri.yml"))

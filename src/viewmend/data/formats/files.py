@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
+import cv2
 import numpy as np
 
 from viewmend.data.containers import read_bytes
@@ -54,17 +55,8 @@ def files_like(folder: Path, pattern: str) -> list[Path]:
     return sorted(path for path in folder.glob(pattern) if path.is_file() and not _is_hidden(path.name))
 
 
-def forward_slashes(path: str) -> str:
-    """A path that may have been written on Windows."""
-    return path.replace("\\", "/")
-
-
 def decode_text(data: bytes, name: str) -> str:
-    """The text of a file, without a byte order mark.
-
-    Raises:
-        ValueError: it is not UTF-8.
-    """
+    """The text of a file, without a byte order mark; ValueError if it is not UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -77,17 +69,11 @@ def warn(text: str) -> None:
 
 
 def image_size_px(folder: Path, name: str) -> tuple[int, int]:
-    """Width and height of an image in the folder, from its header.
-
-    Raises:
-        ValueError: the path leaves the folder, or there is no such image.
-    """
-    size = None
-    if stays_inside(name):
-        try:
-            size = size_from_header(read_bytes(folder / name, HEADER_BYTES))
-        except OSError:
-            size = None
+    """Width and height of an image in the folder, from its header; ValueError without one inside the folder."""
+    try:
+        size = size_from_header(read_bytes(folder / name, HEADER_BYTES)) if stays_inside(name) else None
+    except OSError:
+        size = None
     if size is None:
         raise ValueError(f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file")
     return size
@@ -103,7 +89,7 @@ def names_from_paths(paths: Sequence[str]) -> list[str]:
 
 def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:
     """The items whose image is in the folder, with a warning of the others; all of them if fewer than two exist."""
-    missing = [n for n, item in enumerate(items) if stays_inside(path(item)) and not _is_file(folder / path(item))]
+    missing = [n for n, item in enumerate(items) if stays_inside(path(item)) and not (folder / path(item)).is_file()]
     if not missing or len(items) - len(missing) < 2:
         return list(items)
     names = ", ".join(path(items[number]) for number in missing)
@@ -111,15 +97,10 @@ def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -
     return [item for number, item in enumerate(items) if number not in missing]
 
 
-def _is_file(path: Path) -> bool:
-    return "\0" not in str(path) and path.is_file()
-
-
 def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """A path with `{frame}`, and the id of each path: the part in which they differ, with all of its digits.
 
-    Raises:
-        ValueError: the paths differ in several parts.
+    ValueError if the paths differ in several parts.
     """
     if len(set(paths)) == 1:
         return paths[0], ("0",) * len(paths)
@@ -139,17 +120,11 @@ def find_mask(folder: Path, image: str) -> str | None:
     if not (folder / "masks").is_dir():
         return None
     replaced = f"masks/{image.rpartition('.')[0]}.png"
-    return replaced if "\0" not in image and (folder / replaced).is_file() else f"masks/{image}.png"
+    return replaced if (folder / replaced).is_file() else f"masks/{image}.png"
 
 
 def to_rotation(name: str, values: object) -> list[list[float]]:
-    """A rotation matrix from its nine numbers or from a Rodrigues vector.
-
-    Raises:
-        ValueError: the values are neither.
-    """
-    import cv2
-
+    """A rotation matrix from its nine numbers or from a Rodrigues vector; ValueError from anything else."""
     numbers = _to_array(values)
     if numbers.size not in (3, 9):
         raise ValueError(f"camera '{name}': expected a rotation of 3 or 9 numbers, got {numbers.size}; add it")
@@ -158,11 +133,7 @@ def to_rotation(name: str, values: object) -> list[list[float]]:
 
 
 def to_distortion(name: str, values: object) -> list[float]:
-    """OpenCV's k1 k2 p1 p2 k3 from 0, 4 or 5 numbers, or more if the others are 0.
-
-    Raises:
-        ValueError: there are other numbers.
-    """
+    """OpenCV's k1 k2 p1 p2 k3 from 0, 4 or 5 numbers, or more if the others are 0; ValueError from other numbers."""
     numbers = _to_array(values)
     if 0 < numbers.size < 4 or numbers[5:].any():
         got = f"{numbers.size} numbers"
@@ -193,11 +164,7 @@ class Footage:
     """The keys of a `cameras.json` for a camera's size, images and masks, by its name."""
 
     def entry(self, name: str, calibrated_px: Sequence[int | float] | None = None) -> dict[str, Any]:
-        """The keys of one camera, which was calibrated at this width and height if known.
-
-        Raises:
-            ValueError: its images have another size.
-        """
+        """The keys of one camera; ValueError unless its images have the size that it was calibrated at, if known."""
         entry = self.entries[name]
         size = entry["width"], entry["height"]
         if calibrated_px and any(not 0 <= a - b <= MAX_CROP_PX for a, b in zip(calibrated_px, size, strict=True)):
@@ -217,16 +184,11 @@ class ImageList:
     ignored: str = ""
     """How many images have other names, and an example; empty if none has."""
 
-    def first(self) -> str:
-        """The path of the first image."""
-        return self.pattern.replace("{frame}", min(self.frames, key=frame_order))
-
 
 def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLACES) -> Footage:
     """Find videos, or folders of images, that are named after the cameras; likewise their masks, if any.
 
-    Raises:
-        ValueError: no place has footage of every camera, or only some cameras have masks.
+    ValueError if no place has footage of every camera, or only some cameras have masks.
     """
     for place in places:
         only = [f"{place}/{name}" for name in _subfolders(folder / place)] if place == "recordings" else []
@@ -249,41 +211,37 @@ def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLA
 def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """Collect the footage of cameras whose videos or folders of images are known, by name, and find their masks.
 
-    Raises:
-        ValueError: there are fewer than two, a camera has none, or only some cameras have masks.
+    ValueError for fewer than two cameras, one without footage, and masks of only some.
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
-    entries, frames, fps, ids, ignored = {}, set(), None, {}, ""
+    entries, ids, ignored = {}, {}, []
     paths = {name: _only_video(folder, path) or path for name, path in paths.items()}
     videos = {name: video_properties(folder / path) for name, path in paths.items() if is_video(path)}
     for name, path in paths.items():
-        if name in videos:
-            video = videos[name]
+        if (video := videos.get(name)) is not None:
             entries[name] = {"width": video.width, "height": video.height, "video": path}
-            continue
-        images = list_images(folder, path)
-        if images is None:
+        elif (images := list_images(folder, path)) is None:
             raise ValueError(f"expected images of camera '{name}' in {path}, got none; add them")
-        width, height = image_size_px(folder, images.first())
-        entries[name] = {"width": width, "height": height, "image": images.pattern}
-        frames |= images.frames
-        ids[name] = images.frames
-        if images.ignored and not ignored:
-            ignored = f"{name}: {images.ignored}"
+        else:
+            first = images.pattern.replace("{frame}", min(images.frames, key=frame_order))
+            width, height = image_size_px(folder, first)
+            entries[name] = {"width": width, "height": height, "image": images.pattern}
+            ids[name] = images.frames
+            ignored += [f"{name}: {images.ignored}"] if images.ignored else []
     if ignored:
-        warn(f"images of {ignored}, are ignored, as their names follow another pattern than the others'")
+        warn(f"images of {ignored[0]}, are ignored, as their names follow another pattern than the others'")
     masks = _find_masks(folder, tuple(paths))
     _compare_ids(ids | {f"{name} (masks)": found for name, (_, found) in masks.items() if found and name in ids})
     for name, (mask, _) in masks.items():
         entries[name] |= mask
-    if videos:
-        tracks = [video_track(name, "images", folder / paths[name]) for name in videos]
-        films = {name: str(entry.get("mask", "")) for name, entry in entries.items()}
-        tracks += [video_track(name, "masks", folder / films[name]) for name in videos if is_video(films[name])]
-        clock = match_tracks(tracks)
-        frames, fps = {f"{time:06d}" for time in range(clock.end)}, clock.fps
-    return Footage(tuple(sorted(frames, key=frame_order)), fps, entries)
+    if not videos:
+        return Footage(tuple(sorted(frozenset().union(*ids.values()), key=frame_order)), None, entries)
+    tracks = [video_track(name, "images", folder / paths[name]) for name in videos]
+    films = {name: str(entry.get("mask", "")) for name, entry in entries.items()}
+    tracks += [video_track(name, "masks", folder / films[name]) for name in videos if is_video(films[name])]
+    clock = match_tracks(tracks)
+    return Footage(tuple(f"{time:06d}" for time in range(clock.end)), clock.fps, entries)
 
 
 def list_images(folder: Path, place: str) -> ImageList | None:
@@ -315,8 +273,7 @@ def list_images(folder: Path, place: str) -> ImageList | None:
 def _compare_ids(ids: dict[str, frozenset[str]]) -> None:
     """Compare the frame ids of cameras, which have to be equal for images of one moment.
 
-    Raises:
-        ValueError: a camera shares fewer than half of its ids with most others, as with each camera's own clock.
+    ValueError if a camera shares fewer than half of its ids with most others, as with each camera's own clock.
     """
     ids = {name: found for name, found in ids.items() if len(found) >= COMPARABLE}
     counts = Counter(frame for found in ids.values() for frame in found)
@@ -376,8 +333,7 @@ _KEYS: tuple[Callable[[str], Hashable], ...] = (str, _after_cam, _last_number)
 def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str, Any], frozenset[str]]]:
     """The keys of a `cameras.json` for each camera's masks, and the frame ids of images; empty if there are no masks.
 
-    Raises:
-        ValueError: only some cameras have masks.
+    ValueError if only some cameras have masks.
     """
     places = [place for place in MASK_PLACES if (folder / place).is_dir()]
     if not places:
@@ -423,11 +379,7 @@ def _is_hidden(name: str) -> bool:
 
 
 def read_xml(data: bytes) -> Element:
-    """Parse an XML document.
-
-    Raises:
-        ValueError: it is not XML, or declares a document type, whose entities can expand without limit.
-    """
+    """Parse an XML document. ValueError for one with a document type, whose entities can expand without limit."""
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise ValueError("expected XML without a document type, got one; export it again")
     try:
@@ -437,11 +389,7 @@ def read_xml(data: bytes) -> Element:
 
 
 def xml_number(what: str, text: str | None) -> float:
-    """Parse a finite number; `what` starts the error message.
-
-    Raises:
-        ValueError: it is missing or invalid.
-    """
+    """Parse a finite number, or raise a ValueError that `what` starts."""
     try:
         value = float(text or "")
     except ValueError:
@@ -452,10 +400,6 @@ def xml_number(what: str, text: str | None) -> float:
 
 
 def xml_attributes(camera: str, element: Element | None, keys: str) -> list[float]:
-    """Numbers that an element of a camera has as attributes.
-
-    Raises:
-        ValueError: one is missing or invalid.
-    """
+    """Numbers that an element of a camera has as attributes; ValueError if one is missing or invalid."""
     attributes = {} if element is None else element.attrib
     return [xml_number(f"camera '{camera}': {key}", attributes.get(key)) for key in keys.split()]

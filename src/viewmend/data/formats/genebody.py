@@ -15,11 +15,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The cameras that have images; some subjects lack some.
-
-    Raises:
-        ValueError: the annotations have other content, or a matrix is missing.
-    """
+    """The cameras that have images; some subjects lack some."""
     annotations = read_objects(file)
     cameras = annotations.get("cams") if isinstance(annotations, dict) else None
     if not isinstance(cameras, dict) or not all(isinstance(camera, dict) for camera in cameras.values()):

@@ -17,14 +17,9 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All images, in the folder or in `images`.
-
-    Raises:
-        ValueError: a line has another number of values, or an image is missing.
-    """
-    lines = [
-        line.split() for line in decode_text(bounded_bytes(file, MAX_BYTES), file.name).splitlines() if line.strip()
-    ]
+    """All images, in the folder or in `images`."""
+    text = decode_text(bounded_bytes(file, MAX_BYTES), file.name)
+    lines = [line.split() for line in text.splitlines() if line.strip()]
     wrong = [words for words in lines[1:] if len(words) != 1 + NUMBERS]
     if not lines or wrong or lines[0] != [str(len(lines) - 1)]:
         got = f"{len(wrong[0]) - 1} after {wrong[0][0][:40]!r}" if wrong else f"{max(0, len(lines) - 1)} lines"
@@ -34,7 +29,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     for words, name in zip(lines[1:], names_from_paths([words[0] for words in lines[1:]]), strict=True):
         numbers = [float(word) for word in words[1:]]
         rows = [numbers[start : start + 3] for start in range(0, NUMBERS, 3)]
-        place = "" if "\0" not in words[0] and (folder / words[0]).is_file() else "images/"
+        place = "" if (folder / words[0]).is_file() else "images/"
         width, height = image_size_px(folder, place + words[0])
         entry = {"name": name, "width": width, "height": height, "K": rows[:3], "R": rows[3:6], "t": rows[6]}
         entries.append(entry | {"image": place + words[0], "mask": find_mask(folder, words[0])})

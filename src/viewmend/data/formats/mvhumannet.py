@@ -37,11 +37,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The cameras that have images.
-
-    Raises:
-        ValueError: a file is missing or has other content, or images have another shape than the calibration.
-    """
+    """The cameras that have images, which have the calibration's shape."""
     poses = typed(read_json(bounded_bytes(file)), dict[str, Any])
     lens = typed(read_json(bounded_bytes(file.with_name("camera_intrinsics.json"))), Intrinsics)
     scale_file = file.with_name("camera_scale.pkl")

@@ -47,11 +47,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras, in the unit of their files.
-
-    Raises:
-        ValueError: a file is invalid, or a camera has no footage.
-    """
+    """All cameras, in the unit of their files."""
     cameras = _cameras(folder)
     footage = find_footage(folder, [name for name, _ in cameras])
     entries = []
@@ -108,8 +104,7 @@ def _calibration(name: str, values: dict[str, Any]) -> dict[str, Any]:
 def read_storage(file: Path) -> dict[str, Any]:
     """The matrices (flat), numbers and lists of names in a FileStorage file, YAML, XML or JSON; the rest is ignored.
 
-    Raises:
-        ValueError: it is another file, is too large, or the size of a matrix is wrong.
+    ValueError for another file, one that is too large, and a matrix of another size.
     """
     data = bounded_bytes(file, MAX_BYTES)
     if data.lstrip().startswith(b"<"):

@@ -39,11 +39,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The HD cameras that have footage; the VGA cameras if fewer than two have.
-
-    Raises:
-        ValueError: the file has other content, or no two cameras of a type have footage.
-    """
+    """The HD cameras that have footage; the VGA cameras if fewer than two have."""
     cameras = typed(read_json(bounded_bytes(file)), PanopticCalibration).cameras
     for kind, fps in FPS.items():
         entries = {camera.name: camera for camera in cameras if camera.type == kind}

@@ -37,11 +37,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras that are not marked as ignored. FreeMoCap's are in millimetres.
-
-    Raises:
-        ValueError: the file is not TOML, a camera lacks a number, is a fisheye, or has no footage.
-    """
+    """All cameras that are not marked as ignored. FreeMoCap's are in millimetres."""
     try:
         root = tomllib.loads(decode_text(bounded_bytes(file, MAX_BYTES), file.name))
     except (tomllib.TOMLDecodeError, RecursionError) as error:

@@ -23,11 +23,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras, in metres.
-
-    Raises:
-        ValueError: the file is not XML, a camera lacks a number, or has no footage.
-    """
+    """All cameras, in metres."""
     cameras = read_xml(bounded_bytes(file, MAX_BYTES)).findall("./cameras/camera")
     names = [camera.get("serial", "") for camera in cameras]
     footage = find_footage(folder, names)

@@ -97,31 +97,16 @@ def root(path: Path, file: Path) -> Path:
 
 
 def content(path: Path, file: Path) -> dict[str, Any]:
-    """All cameras; bounds, up and the range of frames are those of a meta file, if there is one.
-
-    Raises:
-        ValueError: a file has other content, or images are stored bottom-up.
-    """
-    folder, meta = root(path, file), _meta_of(path, file)
+    """All cameras; bounds, up and the range of frames are those of a meta file, if there is one."""
+    folder = root(path, file)
+    files = [file] if path.is_file() else sorted(json for json in folder.glob("*.json") if _is_meta(json))
+    meta = _read_meta(files[0]) if files else None  # in a folder, the first one
     place = meta.dataset.camera_path if meta and stays_inside(meta.dataset.camera_path) else CALIBRATION
     cameras = typed(read_json(bounded_bytes(folder / place)), RiftcastCalibration).cameras
     frames = _frames(folder, meta)
     entries = [_camera(folder, camera, frames) for camera in cameras]
     result = {"first_pixel_center": [0.5, 0.5], "frames": frames, "cameras": entries}
     return result | (_meta_keys(meta) if meta else {})
-
-
-def _stored_from_program(meta: MetaFile | None) -> np.ndarray:
-    """The 4 x 4 transform from the program's frame, y up, to that of `calibration.json`."""
-    if meta is None or meta.dataset.to_world is None:
-        return FLIP
-    return FLIP @ np.array(meta.dataset.to_world).reshape(4, 4)
-
-
-def _meta_of(path: Path, file: Path) -> MetaFile | None:
-    """The meta file that this path is, or the first one in the folder."""
-    files = [file] if path.is_file() else sorted(json for json in root(path, file).glob("*.json") if _is_meta(json))
-    return _read_meta(files[0]) if files else None
 
 
 def _frames(folder: Path, meta: MetaFile | None) -> list[str]:
@@ -148,7 +133,7 @@ def _camera(folder: Path, camera: RiftcastCameraEntry, frames: list[str]) -> dic
 def _pattern(folder: Path, stem: str, frames: list[str], suffixes: tuple[str, ...]) -> str:
     """The path of these files, with the first suffix that any of them has."""
     paths = ((suffix, folder / f"frame_{frame}/{stem}{suffix}") for suffix in suffixes for frame in frames)
-    suffix = next((suffix for suffix, path in paths if "\0" not in str(path) and path.is_file()), suffixes[0])
+    suffix = next((suffix for suffix, path in paths if path.is_file()), suffixes[0])
     return f"frame_{{frame}}/{stem}{suffix}"
 
 
@@ -156,7 +141,8 @@ def _meta_keys(meta: MetaFile) -> dict[str, Any]:
     """The keys `up` and `bounds` from a meta file."""
     if not (meta.dataset.flip_images and meta.dataset.flip_masks):
         raise ValueError("expected flip_images and flip_masks of true, got files stored bottom-up; flip the files")
-    stored = _stored_from_program(meta)
+    to_world = meta.dataset.to_world  # in the program's frame, y up
+    stored = FLIP if to_world is None else FLIP @ np.array(to_world).reshape(4, 4)
     result: dict[str, Any] = {"up": stored[:3, 1].tolist()}
     if meta.volume is not None:
         corners = np.c_[np.array(meta.volume.position) + meta.volume.scale * CORNERS, np.ones(8)] @ stored.T

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, structs
 
-from viewmend.data.formats.files import existing, forward_slashes, frame_pattern, image_size_px, names_from_paths, warn
+from viewmend.data.formats.files import existing, frame_pattern, image_size_px, names_from_paths, warn
 from viewmend.data.images import uses_alpha
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, bounded_bytes, read_json, typed
@@ -87,12 +87,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All frames. The alpha of the images is the mask if no frame names one, and an image is not opaque.
-
-    Raises:
-        ValueError: a value is invalid, a key's meaning is not supported, `time` does not fit the poses, or an image is
-            missing whose size is needed.
-    """
+    """All frames. The alpha of the images is the mask if no frame names one, and an image is not opaque."""
     parsed = read_json(bounded_bytes(file))
     read = typed(parsed, TransformsFile, "see docs/formats.md")
     _check_keys(file, parsed)
@@ -123,24 +118,18 @@ def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
     if any(part.get("transform_matrix_start") != part.get("transform_matrix_end") for part in parts):
         other.append("transform_matrix_start other than transform_matrix_end")
     if other:
-        raise ValueError(
-            f"expected perspective images of one moment, OpenGL axes, got {', '.join(other)}; convert them"
-        )
-    known = {
-        *TransformsFile.__struct_fields__,
-        *TransformsFrameEntry.__struct_fields__,
-        *OTHER_MEANING,
-        *WITHOUT_EFFECT,
-    }
-    unknown = sorted({key for part in parts for key in part} - known)
+        got = ", ".join(other)
+        raise ValueError(f"expected perspective images of one moment, OpenGL axes, got {got}; convert them")
+    fields = {*TransformsFile.__struct_fields__, *TransformsFrameEntry.__struct_fields__}
+    unknown = sorted({key for part in parts for key in part} - fields - {*OTHER_MEANING, *WITHOUT_EFFECT})
     if unknown:
         warn(f"{file}: these keys are not known and have no effect: {', '.join(unknown)[:200]}")
 
 
 def _with_local_paths(folder: Path, frame: TransformsFrameEntry) -> TransformsFrameEntry:
     """The frame with paths as on this system, and with the suffix of the image, which files of Blender omit."""
-    mask, depth = (path and forward_slashes(path) for path in (frame.mask_path, frame.depth_file_path))
-    image = str(PurePosixPath(forward_slashes(frame.file_path)))
+    mask, depth = (path and path.replace("\\", "/") for path in (frame.mask_path, frame.depth_file_path))
+    image = str(PurePosixPath(frame.file_path.replace("\\", "/")))
     if stays_inside(image) and not (folder / image).is_file() and (folder / f"{image}.png").is_file():
         image = f"{image}.png"
     return structs.replace(frame, file_path=image, mask_path=mask, depth_file_path=depth)

@@ -3,13 +3,7 @@
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from viewmend.data.formats.files import (
-    LABELS,
-    MASK_PLACES,
-    forward_slashes,
-    image_size_px,
-    to_distortion,
-)
+from viewmend.data.formats.files import LABELS, MASK_PLACES, image_size_px, to_distortion
 from viewmend.utils.safe_pickle import numbers, read_objects, unwrap
 
 MILLIMETRES = 0.001
@@ -22,11 +16,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """All cameras, named after the folders of their images.
-
-    Raises:
-        ValueError: the annotations have other content, or the images' names do not share frame ids.
-    """
+    """All cameras, named after the folders of their images."""
     annotations = read_objects(file)
     cams, ims = (annotations.get(key) for key in ("cams", "ims")) if isinstance(annotations, dict) else (None, None)
     lists = [_to_list(cams.get(key)) for key in ("K", "D", "R", "T")] if isinstance(cams, dict) else []
@@ -41,11 +31,11 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     for (pattern, ids), K, D, R, T in zip(patterns, *lists, strict=True):
         name = str(PurePosixPath(pattern).parent).removeprefix("images/").replace("/", "_")
         images = [pattern.replace("{frame}", frame) for frame in ids]
-        example = next((path for path in images if "\0" not in path and (folder / path).is_file()), images[0])
+        example = next((path for path in images if (folder / path).is_file()), images[0])
         width, height = image_size_px(folder, example)
-        entry = {"name": name, "width": width, "height": height, "K": numbers(K, 3, 3).tolist()}
+        entry = {"name": name, "width": width, "height": height, "image": pattern, "K": numbers(K, 3, 3).tolist()}
         entry |= {"R": numbers(R, 3, 3).tolist(), "t": numbers(T, 3).tolist()}
-        entry |= {"dist": to_distortion(name, numbers(D, 5)), "image": pattern}
+        entry |= {"dist": to_distortion(name, numbers(D, 5))}
         if place:
             entry |= {"mask": f"{place}/{pattern.rpartition('.')[0]}.png", "mask_labels": place in (*LABELS, "mask")}
         entries.append(entry)
@@ -62,7 +52,7 @@ def _paths(frame: Any, cameras: int) -> list[str]:
     found = _to_list(unwrap(frame.get("ims")) if isinstance(frame, dict) else None)
     if len(found) < cameras or not all(isinstance(path, str) and path for path in found[:cameras]):
         raise ValueError(f"expected paths of {cameras} images in each of 'ims', got others; is it ZJU-MoCap's file?")
-    return [forward_slashes(path) for path in found[:cameras]]
+    return [path.replace("\\", "/") for path in found[:cameras]]
 
 
 def _pattern(paths: list[str]) -> tuple[str, tuple[str, ...]]:

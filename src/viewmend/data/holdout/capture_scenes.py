@@ -63,15 +63,9 @@ def capture_set(
 ) -> tuple[CaptureScene, ...]:
     """Every camera of a capture left out in turn.
 
-    Args:
-        folder: of the capture.
-        inputs: "all" others, or a number of cameras, chosen by `evenly_around`, without the held-out one.
-        frames: how many from the first; None for all.
-        format: the capture's format, None to recognise it.
-
-    Raises:
-        CaptureError: the capture cannot be read, has no masks, or too few cameras.
-        ValueError: `inputs` or `frames` is no such number.
+    `inputs` are "all" others, or a number of cameras, chosen by `evenly_around`, without the held-out one. `frames` is
+    how many from the first, `format` the capture's, None to recognise it. CaptureError if the capture cannot be read,
+    or has no masks or too few cameras; ValueError if `inputs` or `frames` is no such number.
     """
     capture = open_masked(folder, held=1, format=format)
     names = capture.cameras.names
@@ -209,12 +203,7 @@ def is_splits(file: Path) -> bool:
 
 
 def read_splits(file: Path) -> SplitFile:
-    """A file that `make_splits` made.
-
-    Raises:
-        ValueError: it is none.
-        OSError: it cannot be read.
-    """
+    """A file that `make_splits` made; ValueError for another, OSError for one that cannot be read."""
     try:
         return typed(read_json(bounded_bytes(file)), SplitFile, "see viewmend splits --help")
     except ValueError as error:
@@ -224,8 +213,7 @@ def read_splits(file: Path) -> SplitFile:
 def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, ...]:
     """The test scenes of a file: each capture without its held-out camera, with all others as inputs.
 
-    Raises:
-        ValueError: it is none, or a capture is absent or was recalibrated.
+    ValueError if it is none, or a capture is absent or was recalibrated.
     """
     found = []
     for scene, path in _scenes_of(file, "test"):
@@ -237,8 +225,7 @@ def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, .
 def training_captures(file: Path) -> tuple[tuple[NativeCapture, str], ...]:
     """The captures of a file that are for training, each with the camera that it leaves out, the truth.
 
-    Raises:
-        ValueError: it is none, or a capture is absent, cannot be used, or was recalibrated.
+    ValueError if it is none, or a capture is absent, cannot be used, or was recalibrated.
     """
     scenes = _scenes_of(file, "training")
     return tuple((open_masked(path, held=1, format=scene.format), scene.left_out) for scene, path in scenes)

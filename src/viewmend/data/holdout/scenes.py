@@ -34,9 +34,7 @@ def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
 
     Validation is given none: whatever a model may have learned by heart, its scores are of procedural people that are
     new to it. What a model gains on recordings is measured on such that were put aside: `viewmend evaluate`.
-
-    Raises:
-        ValueError: training or validation would look at what is kept for tests.
+    ValueError if training or validation would look at what is kept for tests.
     """
     kept = [place for place in places if TEST_FOLDER in (place.resolve().name, place.resolve().parent.name)]
     if kept and split != "test":

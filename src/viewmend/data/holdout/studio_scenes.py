@@ -144,11 +144,7 @@ def lengthened(scenes: Sequence[StudioScene]) -> tuple[StudioScene, ...]:
 def performer_set(
     folder: Path, motions: Path | None = None, frames: int = FRAMES, size_px: int = SIZE_PX
 ) -> tuple[StudioScene, ...]:
-    """Q: every character with every motion, each with both rigs.
-
-    Raises:
-        CaptureError: there are no characters or no motions.
-    """
+    """Q: every character with every motion, each with both rigs; CaptureError without characters or motions."""
     people = _files((folder / TEST_FOLDER, folder), (".glb", ".gltf"), "characters")
     clips = _files(
         (motions,) if motions else (folder / "motions" / TEST_FOLDER, folder / "motions", folder), (".bvh",), "motions"

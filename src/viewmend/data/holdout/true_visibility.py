@@ -22,11 +22,8 @@ def backward_flow(
 ) -> Float[Tensor, "height width 2"]:
     """Where each pixel's surface point was in the image of the time before, pixels; NaN where it was not seen.
 
-    Args:
-        now: the true surface.
-        before: the same vertices and triangles at the time before.
-        depth_before: its z-depth in the camera, metres, 0 where there is none.
-        camera: one camera, which stands still.
+    `now` and `before` are the same triangles of the true surface, `depth_before` is its z-depth then, metres, 0 where
+    there is none. The camera, a single one, stands still.
     """
     raster = rasterize(now, camera)
     points = interpolate(before.vertices, now, camera, raster)[0]
@@ -72,13 +69,10 @@ class SurfaceSeen:
 
 
 def surface_seen(surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh: Mesh, target: Cameras) -> SurfaceSeen:
-    """What the cameras saw, at these times, of the surface that `target` shows.
+    """What the cameras saw, at these times, of the surface that the view of the camera `target` shows.
 
-    Args:
-        surfaces: by time; all with the same cameras.
-        times: which, the view's own first.
-        mesh: the true surface at the view's own time.
-        target: the view's camera.
+    `surfaces` are by time, and all have the same cameras. The view's own time is the first; `mesh` is the true surface
+    then.
     """
     raster = rasterize(mesh, target)
     pixels = torch.nonzero(raster.triangle[0] >= 0)

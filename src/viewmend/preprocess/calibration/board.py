@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float64, Int, UInt8
 
@@ -30,65 +31,37 @@ OUTLIER_PX = 1.5
 """Corners farther from the plane of the others are ignored."""
 
 
-@dataclass(frozen=True)
-class _Plane:
-    """The board's plane as an image shows it, by a homography."""
-
-    image_from_board: Float64[np.ndarray, "3 3"]
-
-    def pixels(self, on_board_m: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "point 2"]:
-        return _mapped(self.image_from_board, on_board_m)
-
-    def on_board_m(self, pixels: Float64[np.ndarray, "point 2"]) -> Float64[np.ndarray, "point 2"]:
-        return _mapped(np.linalg.inv(self.image_from_board), pixels)
-
-    def pixels_per_m(self, at_m: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "2 2"]:
-        """The homography's derivative."""
-        x, y, w = self.image_from_board @ [*at_m, 1.0]
-        top = self.image_from_board[:2, :2]
-        return (top - np.outer([x / w, y / w], self.image_from_board[2, :2])) / w
+Grey = UInt8[np.ndarray, "height width"]
+Points = Float64[np.ndarray, "point 2"]
 
 
-def refined(
-    grey: UInt8[np.ndarray, "height width"],
-    pixels: Float64[np.ndarray, "corner 2"],
-    on_board_m: Float64[np.ndarray, "corner 2"],
-    square_m: float,
-    marker_m: float,
-) -> Float64[np.ndarray, "corner 2"]:
-    """Corners of a board where its edges cross.
+def refined(grey: Grey, pixels: Points, on_board_m: Points, square_m: float, marker_m: float) -> Points:
+    """The pixels of a board's corners where its edges cross; those about which too little is seen stay.
 
-    Args:
-        grey: the image.
-        pixels: where the corners were found, to a pixel or two; the top-left pixel has its centre at (0.5, 0.5).
-        on_board_m: where they are on the board, along its edges, metres.
-        square_m: a square's side.
-        marker_m: a marker's side, in the middle of a white square.
-
-    Returns:
-        The pixels of each; those about whom too little is seen stay.
+    They were found at `pixels`, to a pixel or two; the top-left pixel has its centre at (0.5, 0.5). On the board, along
+    its edges, they are at `on_board_m`. `square_m` is a square's side, `marker_m` that of a marker in its middle.
     """
-    import cv2
-
     found = cv2.findHomography(on_board_m, pixels - 0.5, cv2.RANSAC, OUTLIER_PX)[0]
     if found is None:
         return pixels
-    plane = _Plane(np.asarray(found))
     clear_m = (square_m - marker_m) / 2
-    moved = [_crossing(grey, plane, one, square_m, clear_m) for one in pixels - 0.5]
+    moved = [_crossing(grey, np.asarray(found), one, square_m, clear_m) for one in pixels - 0.5]
     return np.array(moved).reshape(-1, 2) + 0.5
 
 
 def _crossing(
-    grey: UInt8[np.ndarray, "height width"],
-    plane: _Plane,
+    grey: Grey,
+    image_from_board: Float64[np.ndarray, "3 3"],
     start_px: Float64[np.ndarray, "2"],
     square_m: float,
     clear_m: float,
 ) -> Float64[np.ndarray, "2"]:
     """Where two edges cross, from where that was found; the top-left pixel is (0, 0)."""
-    start_m = plane.on_board_m(start_px[None])[0]
-    per_m = plane.pixels_per_m(start_m)
+    board_from_image = np.linalg.inv(image_from_board)
+    start_m = _mapped(board_from_image, start_px[None])[0]
+    x, y, w = image_from_board @ [*start_m, 1.0]
+    # The homography's derivative: pixels per metre.
+    per_m = (image_from_board[:2, :2] - np.outer([x / w, y / w], image_from_board[2, :2])) / w
     if not np.isfinite(per_m).all() or abs(np.linalg.det(per_m)) < 1e-9:
         return start_px
     per_px = np.linalg.norm(np.linalg.inv(per_m), axis=1)  # metres along x and y of the board, of one pixel
@@ -98,7 +71,7 @@ def _crossing(
     if (high - low < 3).any():
         return start_px
     pixels = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
-    away_m = plane.on_board_m(pixels.astype(np.float64)) - start_m
+    away_m = _mapped(board_from_image, pixels.astype(np.float64)) - start_m
     clear = np.maximum(clear_m - CLEAR_PX * per_px, LEAST_CLEAR * clear_m)
     used = (np.abs(away_m) < clear).any(1) & (np.abs(away_m) < ALONG * square_m).all(1)
     if used.sum() < LEAST_PIXELS:
@@ -106,10 +79,10 @@ def _crossing(
     moved_px = _fitted(away_m[used] / per_px, grey[pixels[used, 1], pixels[used, 0]].astype(np.float64))
     if not (np.abs(moved_px) < MOST_MOVE_PX).all():
         return start_px
-    return plane.pixels((start_m + moved_px * per_px)[None])[0]
+    return _mapped(image_from_board, (start_m + moved_px * per_px)[None])[0]
 
 
-def _fitted(at: Float64[np.ndarray, "pixel 2"], values: Float64[np.ndarray, "pixel"]) -> Float64[np.ndarray, "2"]:
+def _fitted(at: Points, values: Float64[np.ndarray, "point"]) -> Float64[np.ndarray, "2"]:
     """Where the edges x = x0 and y = y0 cross: Gauss and Newton's steps for place, softness, darkness and contrast.
 
     The picture is a + b tanh((x - x0) / s) tanh((y - y0) / s), with all lengths in pixels.
@@ -128,9 +101,7 @@ def _fitted(at: Float64[np.ndarray, "pixel 2"], values: Float64[np.ndarray, "pix
     return cross
 
 
-def _mapped(
-    matrix: Float64[np.ndarray, "3 3"], points: Float64[np.ndarray, "point 2"]
-) -> Float64[np.ndarray, "point 2"]:
+def _mapped(matrix: Float64[np.ndarray, "3 3"], points: Points) -> Points:
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1) @ matrix.T
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
@@ -172,27 +143,21 @@ class Board:
     @cached_property
     def opencv(self) -> Any:
         """The board as OpenCV has it; its `generateImage` is what is printed."""
-        import cv2
-
         return cv2.aruco.CharucoBoard(*self._layout)
 
     @cached_property
     def _layout(self) -> tuple[Any, ...]:
-        import cv2
-
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return (self.columns, self.rows), self.square_m, self.marker_m, dictionary
 
     @cached_property
     def _detectors(self) -> tuple[Any, Any]:
         """Detectors of today's pattern, and of that of OpenCV before 4.6 and calib.io, which differs for even rows."""
-        import cv2
-
         old = cv2.aruco.CharucoBoard(*self._layout)
         old.setLegacyPattern(True)
         return cv2.aruco.CharucoDetector(self.opencv), cv2.aruco.CharucoDetector(old)
 
-    def find(self, grey: UInt8[np.ndarray, "height width"]) -> Corners | None:
+    def find(self, grey: Grey) -> Corners | None:
         """The corners that an image shows, in either pattern; None where they are too few, or all in a line."""
         new, old = self._detectors
         pixels, ids, markers, marker_ids = new.detectBoard(grey)
@@ -209,13 +174,7 @@ class Board:
 
 
 def parse_board(text: str, dictionary: str) -> Board:
-    """A board of its words, COLUMNSxROWS:SQUARE_M:MARKER_M, and the name of OpenCV's dictionary.
-
-    Raises:
-        ValueError: they name none.
-    """
-    import cv2
-
+    """A board from COLUMNSxROWS:SQUARE_M:MARKER_M and the name of OpenCV's dictionary; ValueError from other text."""
     parts = re.fullmatch(r"(\d{1,2})x(\d{1,2}):(\d*\.?\d+):(\d*\.?\d+)", text)
     if parts is None:
         raise ValueError(
@@ -235,8 +194,7 @@ def parse_board(text: str, dictionary: str) -> Board:
 def open_footage(folder: Path) -> NativeCalibration:
     """The cameras of a folder of videos, or of folders of images, by name; with placeholder K and poses.
 
-    Raises:
-        CaptureError: there are not two or more, or a video cannot be read.
+    CaptureError if there are not two or more, or a video cannot be read.
     """
     entries = sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
     videos = {entry.stem: entry.name for entry in entries if entry.is_file() and is_video(entry.name)}
@@ -266,22 +224,15 @@ def look_for(
 ) -> dict[tuple[int, int], Corners]:
     """The board's corners, by camera and time, at these indices of the footage's frames.
 
-    `track` wraps the cameras that are iterated over, as a progress bar.
-
-    Raises:
-        CaptureError: an image cannot be read, or has another size than the camera's first.
+    `track` wraps the cameras that are iterated over, as a progress bar. CaptureError if an image cannot be read, or has
+    another size than the camera's first.
     """
-    import cv2
-
     seen, clock = {}, read_clock(footage)
     for view, camera in enumerate(track(footage.cameras)):
         reader = CameraReader(footage.folder, camera, footage.frames, clock)
         for time in times:
-            if not reader.has(time, lambda path: (footage.folder / path).is_file()):
-                continue
-            if (images := reader.read(time)) is None:
-                continue
-            grey = cv2.cvtColor(images.rgb, cv2.COLOR_RGB2GRAY)
-            if (corners := board.find(grey)) is not None:
+            images = reader.read(time) if reader.has(time, lambda path: (footage.folder / path).is_file()) else None
+            corners = None if images is None else board.find(cv2.cvtColor(images.rgb, cv2.COLOR_RGB2GRAY))
+            if corners is not None:
                 seen[view, time] = corners
     return seen

@@ -8,8 +8,12 @@ adjustment then moves all cameras and all poses of the board until corners lie w
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
-from jaxtyping import Float64, Int, UInt8
+from jaxtyping import Float64, UInt8
+from scipy.optimize import least_squares
+from scipy.sparse import lil_matrix
+from scipy.spatial.transform import Rotation
 
 from viewmend.data.native_format import NativeCalibration, NativeCamera
 from viewmend.geometry.cameras import Cameras
@@ -57,11 +61,8 @@ def calibrate(
 ) -> list[CalibratedCamera]:
     """The cameras of these names and image sizes (width, height) from what they saw of the board.
 
-    Raises:
-        ValueError: a camera saw the board too seldom, or never together with the others.
+    ValueError if a camera saw the board too seldom, or never together with the others.
     """
-    from scipy.optimize import least_squares
-
     alone = [_alone(seen, board, view, name, sizes[view]) for view, name in enumerate(names)]
     poses = {key: _board_pose(corners, board, *alone[key[0]]) for key, corners in seen.items()}
     cameras = _chained(poses, names)
@@ -89,8 +90,6 @@ def calibrate(
 def _alone(
     seen: Seen, board: Board, view: int, name: str, size: tuple[int, int]
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "5"]]:
-    import cv2
-
     own = sorted((corners for (v, _), corners in seen.items() if v == view), key=lambda c: -len(c.ids))
     if len(own) < LEAST_VIEWS:
         raise ValueError(
@@ -109,8 +108,6 @@ def _board_pose(
     corners: Corners, board: Board, K: Float64[np.ndarray, "3 3"], dist: Float64[np.ndarray, "5"]
 ) -> Float64[np.ndarray, "4 4"]:
     """camera_from_board by one image."""
-    import cv2
-
     _, turn, shift = cv2.solvePnP(board.corners_m[corners.ids], corners.pixels, K, dist, flags=cv2.SOLVEPNP_IPPE)
     return _matrix(np.concatenate([turn.ravel(), shift.ravel()]))
 
@@ -136,14 +133,10 @@ def _chained(
 
 
 def _vector(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
-    import cv2
-
     return np.concatenate([np.asarray(cv2.Rodrigues(pose[:3, :3])[0]).ravel(), pose[:3, 3]])
 
 
 def _matrix(vector: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
-    import cv2
-
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(vector[:3])[0], vector[3:]
     return pose
@@ -157,17 +150,12 @@ class _Rows:
         self.views, self.times, self.size = len(sizes), len(times), np.array(sizes, float)
         self.pixels = np.concatenate([seen[key].pixels for key in keys])
         self.points = np.concatenate([board.corners_m[seen[key].ids] for key in keys])
-        self.view = self._of_each(keys, seen, [view for view, _ in keys])
-        self.time = self._of_each(keys, seen, [times.index(time) for _, time in keys])
-
-    @staticmethod
-    def _of_each(keys: Sequence[tuple[int, int]], seen: Seen, what: Sequence[int]) -> Int[np.ndarray, "corner"]:
-        return np.repeat(what, [len(seen[key].ids) for key in keys])
+        counts = [len(seen[key].ids) for key in keys]
+        self.view = np.repeat([view for view, _ in keys], counts)
+        self.time = np.repeat([times.index(time) for _, time in keys], counts)
 
     def residuals(self, x: Float64[np.ndarray, "parameter"]) -> Float64[np.ndarray, "residual"]:
         """From where corners were found to where they are projected, pixels; at the end the prior's."""
-        from scipy.spatial.transform import Rotation
-
         camera, pose = self._split(x)
         turns = Rotation.from_rotvec(pose[:, :3]).as_matrix()[self.time]
         world = np.einsum("pij,pj->pi", turns, self.points) + pose[self.time, 3:]
@@ -182,8 +170,6 @@ class _Rows:
 
     def sparsity(self) -> object:
         """Which residual depends on which parameter; the first camera stays where it is."""
-        from scipy.sparse import lil_matrix
-
         corners = len(self.view)
         sparsity = lil_matrix((2 * (corners + self.views), CAMERA * self.views + POSE * self.times), dtype=int)
         rows = np.arange(corners)
@@ -203,9 +189,8 @@ class _Rows:
         found = []
         for view, (fx, fy, cx, cy, k1, k2) in enumerate(camera[:, :6]):
             own = self.view == view
-            K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-            pose = _matrix(camera[view, 6:])
-            found.append(CalibratedCamera(K, np.array([k1, k2, 0, 0, 0]), pose, self.pixels[own], off[own]))
+            K, dist = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, 0, 0, 0])
+            found.append(CalibratedCamera(K, dist, _matrix(camera[view, 6:]), self.pixels[own], off[own]))
         return found
 
     def _split(self, x: Float64[np.ndarray, "parameter"]) -> tuple[np.ndarray, np.ndarray]:
@@ -245,8 +230,6 @@ def residual_picture(
 
 
 def _draw(camera: NativeCamera, found: CalibratedCamera) -> UInt8[np.ndarray, "height width 3"]:
-    import cv2
-
     scale = TILE_PX / camera.width
     image = np.full((max(1, round(camera.height * scale)), TILE_PX, 3), 32, np.uint8)
     for corner, off in zip(found.corners * scale, found.off * scale * ENLARGED, strict=True):

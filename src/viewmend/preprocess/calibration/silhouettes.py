@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from viewmend.data.errors import CaptureError
@@ -28,15 +29,10 @@ from viewmend.types import MultiViewFrame
 def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "point 3"]) -> Cameras:
     """The rig turned, moved and scaled as a whole, so that its cameras agree with `reference` on the points.
 
+    `reference` has the same cameras in the frame that is wanted, in which `points_world` are where the subject may be.
     The rotation, translation and scale are Umeyama's, of the points in each camera's own frame (PAMI 1991).
-
-    Args:
-        rig: cameras in a frame of their own.
-        reference: the same cameras, in the frame that is wanted.
-        points_world: some points there, where the subject may be.
     """
-    ones = torch.ones_like(points_world[:, :1])
-    there = torch.cat([points_world, ones], 1).double()
+    there = torch.cat([points_world, torch.ones_like(points_world[:, :1])], 1).double()
     in_cameras = there @ reference.camera_from_world.double().mT
     here = in_cameras @ invert_rigid(rig.camera_from_world.double()).mT
     source = here[..., :3].reshape(-1, 3).cpu().numpy()
@@ -90,17 +86,11 @@ class Refinement:
 
 
 def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds], hold: float) -> Refinement:
-    """Refine poses and focal lengths of cameras; several times tell more than one.
+    """Refine poses and focal lengths of `LEAST_CAMERAS` or more by some frames; several times tell more than one.
 
-    The rig as a whole stays where it was, and as large.
-
-    Args:
-        frames: some times with masks, of the same cameras, `LEAST_CAMERAS` or more.
-        bounds: a box around the subject at each time.
-        hold: one of `HOLDS`.
-
-    Raises:
-        CaptureError: a frame has no masks, or none has any foreground.
+    The rig as a whole stays where it was, and as large. `bounds` are boxes around the subject, one for each frame;
+    `hold` is one of `HOLDS`. Here and below, a CaptureError is raised for frames without masks, and a ValueError for
+    masks without outlines or without a common subject.
     """
     cameras = frames[0].cameras
     sights = [lines_of_sight(frame, box) for frame, box in zip(frames, bounds, strict=True)]
@@ -123,12 +113,7 @@ def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bou
 
 
 def lines_of_sight(frame: MultiViewFrame, bounds: Bounds) -> LinesOfSight:
-    """The lines of sight through the outlines of one frame's masks.
-
-    Raises:
-        CaptureError: the frame has no masks.
-        ValueError: no mask has an outline.
-    """
+    """The lines of sight through the outlines of one frame's masks."""
     if frame.mask is None:
         raise CaptureError("expected frames with masks, got none; make them with viewmend masks")
     return LinesOfSight.from_masks(frame.mask, frame.cameras, bounds)
@@ -151,8 +136,6 @@ class _Problem:
 
     def rig(self, x: Moves) -> Rig:
         """The cameras, moved by `x`."""
-        from scipy.spatial.transform import Rotation
-
         by = x * self.units
         turn = Rotation.from_rotvec(by[:, :3]).as_matrix()
         K = self.start.K.copy()
@@ -266,48 +249,27 @@ class HeldOutIou:
 
 
 def refined_without(frames: Sequence[MultiViewFrame], name: str, bounds: Bounds | None, hold: float) -> HeldOutIou:
-    """Refine all cameras but one, and look at the hull through that one.
-
-    Raises:
-        CaptureError: the frames have no masks.
-        ValueError: the masks agree on no subject.
-    """
-    others = [frame.without([name]) for frame in frames]
+    """Refine all cameras but one, and look at the hull through that one."""
+    others, held = [frame.without([name]) for frame in frames], [frame.select([name]) for frame in frames]
     refined = refined_all(others, bounds, hold).cameras
-    held = [frame.select([name]) for frame in frames]
     before, after = (_iou(others, held, cameras, bounds) for cameras in (others[0].cameras, refined))
     return HeldOutIou(name, before, after)
 
 
 def missed_px(frames: Sequence[MultiViewFrame], left: int, bounds: Bounds | None, hold: float) -> float:
-    """What outlines miss at the time `frames[left]`, pixels, root mean square, with all cameras refined by the others.
-
-    Raises:
-        CaptureError: the frames have no masks.
-        ValueError: the masks agree on no subject.
-    """
+    """What outlines miss at the time `frames[left]`, pixels, root mean square, with cameras refined by the others."""
     refined = refined_all([frame for time, frame in enumerate(frames) if time != left], bounds, hold).cameras
     sight = lines_of_sight(frames[left], _around_subject(frames[left], bounds))
     return float(np.sqrt(sight.least_residuals(Rig.from_cameras(refined)).mean()))
 
 
 def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None, hold: float) -> Refinement:
-    """Refine all cameras of the frames; `bounds` are the capture's, where it has any, `hold` one of `HOLDS`.
-
-    Raises:
-        CaptureError: the frames have no masks.
-        ValueError: the masks agree on no subject.
-    """
+    """Refine all cameras of the frames; `bounds` are the capture's, where it has any, `hold` one of `HOLDS`."""
     return refine_by_silhouettes(frames, [_around_subject(frame, bounds) for frame in frames], hold)
 
 
 def best_hold(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> float:
-    """Which of `HOLDS` serves times best that the refinement has not seen, or of a single time, cameras.
-
-    Raises:
-        CaptureError: the frames have no masks.
-        ValueError: the masks agree on no subject.
-    """
+    """Which of `HOLDS` serves times best that the refinement has not seen, or of a single time, cameras."""
     if len(frames) > 1:
         times = range(min(LEFT_OUT_TIMES, len(frames)))
         return min(HOLDS, key=lambda hold: sum(missed_px(frames, time, bounds, hold) for time in times))

@@ -2,11 +2,15 @@
 
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 Rgb = UInt8[np.ndarray, "height width 3"]
 Mask = UInt8[np.ndarray, "height width"]
+Inside = Bool[np.ndarray, "height width"]
+Values = Float32[np.ndarray, "height width"]
+Colours = Float32[np.ndarray, "height width 3"]
 
 SPECK = 1e-3
 """Parts of the foreground smaller than this share of the image are dropped."""
@@ -27,11 +31,7 @@ class MaskMaker(Protocol):
     """
 
     def mask(self, rgb: Rgb) -> Mask:
-        """Foreground of the camera's next image, 0 to 255.
-
-        Raises:
-            ValueError: the image is not of the size that the maker was made for.
-        """
+        """Foreground of the camera's next image, 0 to 255; ValueError for another size than the maker was made for."""
         ...
 
 
@@ -42,15 +42,14 @@ def demand_size(rgb: Rgb, expected: np.ndarray, what: str) -> None:
         raise ValueError(f"expected an image of {width} x {height} pixels as {what} has, got {w} x {h}; resize it")
 
 
-def soft_mask(distance: Float32[np.ndarray, "height width"], sure: float, possible: float) -> Mask:
+def soft_mask(distance: Values, sure: float, possible: float) -> Mask:
     """Mask from the colour distance to the background, with hysteresis.
 
     Pixels above `possible` count if connected to one above `sure`; specks are dropped and pinholes filled. Along the
     outline, opacity is the distance relative to the largest one nearby.
     """
-    import cv2
-
-    inside = tidied(_connected(distance >= possible, distance >= sure))
+    inside = _connected(distance >= possible, distance >= sure)
+    inside = _large(~_large(~inside, PINHOLE * inside.size), SPECK * inside.size)
     near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * OUTLINE_PX + 1, 2 * OUTLINE_PX + 1))
     largest = np.asarray(cv2.dilate(np.where(inside, distance, 0), near))
     share = distance / np.maximum(largest, possible)
@@ -59,18 +58,8 @@ def soft_mask(distance: Float32[np.ndarray, "height width"], sure: float, possib
     return np.where(core, 255, np.where(inside, 255 * opacity, 0)).round().astype(np.uint8)
 
 
-def tidied(inside: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """The same without specks of foreground and pinholes in it."""
-    filled = ~_large(~inside, PINHOLE * inside.size)
-    return _large(filled, SPECK * inside.size)
-
-
-def _connected(
-    possible: Bool[np.ndarray, "height width"], sure: Bool[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
+def _connected(possible: Inside, sure: Inside) -> Inside:
     """The parts of `possible` that have anything `sure` in them."""
-    import cv2
-
     count, found = cv2.connectedComponents(possible.view(np.uint8), connectivity=8)
     labels, kept = np.asarray(found, np.int32), np.zeros(count, bool)
     kept[labels[sure & possible]] = True
@@ -78,10 +67,8 @@ def _connected(
     return kept[labels]
 
 
-def _large(inside: Bool[np.ndarray, "height width"], least_px: float) -> Bool[np.ndarray, "height width"]:
+def _large(inside: Inside, least_px: float) -> Inside:
     """Connected parts of `inside` with at least this many pixels (4-connected)."""
-    import cv2
-
     _, labels, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=4)
     kept = np.asarray(stats)[:, cv2.CC_STAT_AREA] >= least_px
     kept[0] = False
@@ -94,18 +81,13 @@ MOVES = 1 / 60
 
 def lasting(mask: Mask, before: Mask | None, after: Mask | None) -> Mask:
     """The mask without parts that neither the time before nor the time after has anything of; None is no such time."""
-    import cv2
-
     others = [other for other in (before, after) if other is not None]
     if not others:
         return mask
     reach = 2 * max(1, round(MOVES * max(mask.shape))) + 1
     near = np.maximum.reduce(others) > 127
     near = np.asarray(cv2.dilate(near.astype(np.uint8), np.ones((reach, reach), np.uint8))) > 0
-    count, found = cv2.connectedComponents((mask > 0).astype(np.uint8), connectivity=8)
-    labels, kept = np.asarray(found, np.int32), np.zeros(count, bool)
-    kept[labels[near]] = True
-    return np.where(kept[labels], mask, 0).astype(np.uint8)
+    return np.where(_connected(mask > 0, near), mask, 0).astype(np.uint8)
 
 
 KEYS = {"green": 1, "blue": 2}
@@ -131,8 +113,6 @@ class ChromaMasks:
 
     def mask(self, rgb: Rgb) -> Mask:
         """Foreground of an image, 0 to 255."""
-        import cv2
-
         image = np.asarray(cv2.GaussianBlur(rgb, (0, 0), 0.7), np.float32)
         brightest = image.max(-1)
         excess = _excess(image, self._channel) / np.maximum(brightest, 1)
@@ -143,14 +123,12 @@ class ChromaMasks:
         return soft_mask(distance.astype(np.float32), SURE, POSSIBLE)
 
 
-def without_spill(rgb: Rgb, mask: Mask, screen: UInt8[np.ndarray, "height width 3"]) -> Rgb:
+def without_spill(rgb: Rgb, mask: Mask, screen: Rgb) -> Rgb:
     """Remove green or blue light of the `screen` from the outline of the subject.
 
     Near the outline, where the screen's image has more green (or blue) than any other colour, the subject keeps no more
     of it than of its larger other colour. What lies farther inside keeps its colours.
     """
-    import cv2
-
     reach = max(1, round(EDGE * max(rgb.shape[:2])))
     inside = (mask > 127).astype(np.uint8)
     deep = np.asarray(cv2.distanceTransform(inside, cv2.DIST_L2, 5), np.float32)
@@ -163,6 +141,6 @@ def without_spill(rgb: Rgb, mask: Mask, screen: UInt8[np.ndarray, "height width 
     return image.round().clip(0, 255).astype(np.uint8)
 
 
-def _excess(image: Float32[np.ndarray, "height width 3"], channel: int) -> Float32[np.ndarray, "height width"]:
+def _excess(image: Colours, channel: int) -> Values:
     others = [c for c in range(3) if c != channel]
     return image[..., channel] - np.maximum(image[..., others[0]], image[..., others[1]])

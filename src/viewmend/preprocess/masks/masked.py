@@ -1,21 +1,24 @@
 """A capture whose masks are made as it is read, and their clean-up across cameras."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
-from viewmend.data.source import CaptureSource, CaptureWrapper
+from viewmend.data.source import CaptureSource, CaptureWrapper, scale_cameras
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.proxy import reconstruct
-from viewmend.preprocess.masks.maker import MaskMaker, Rgb, lasting, without_spill
+from viewmend.preprocess.masks.maker import Inside, Mask, MaskMaker, Rgb, lasting, without_spill
 from viewmend.types import MultiViewFrame
+
+Masks = UInt8[Tensor, "view height width"]
 
 CARVED_PX = 480
 """Silhouettes are compared in images of this longer side."""
@@ -27,9 +30,7 @@ GROUP = 3
 """Cameras per group; a pixel is kept if any group supports it, so that one bad mask has no effect."""
 
 
-def agreed(
-    mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds | None
-) -> UInt8[Tensor, "view height width"]:
+def agreed(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
     """Clean the masks of one frame, each with the hull of the others.
 
     A pixel is dropped where the hull of no group of the others is seen; it is filled where those of all groups are, and
@@ -38,56 +39,32 @@ def agreed(
     """
     if len(cameras) < 3:
         return mask
-    small, small_cameras = _reduced(mask, cameras)
     cleaned = mask.clone()
-    for view in range(len(cameras)):
-        width, height = (int(side) for side in cameras.size_px[view])
-        votes = _votes(small, small_cameras, view, bounds)
+    for view, votes in enumerate(_votes(mask, cameras, bounds)):
         if votes is not None:
-            some, all_ = (_enlarged(vote, width, height) for vote in votes)
-            cleaned[view, :height, :width] = torch.from_numpy(_judged(mask[view, :height, :width].numpy(), some, all_))
+            _put(cleaned, view, _judged(_cut(mask, cameras, view), *votes))
     return cleaned
 
 
-def supported(
-    mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds | None
-) -> list[Bool[np.ndarray, "height width"] | None]:
-    """Silhouette of the hull of the other cameras in each camera, dilated; None without a hull."""
+def _votes(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Iterator[tuple[Inside, Inside] | None]:
+    """In each camera, silhouettes of the hulls of any group of the others (dilated) and of all; None without a hull."""
     small, small_cameras = _reduced(mask, cameras)
-    found: list[Bool[np.ndarray, "height width"] | None] = []
-    for view in range(len(cameras)):
-        votes = _votes(small, small_cameras, view, bounds)
-        width, height = (int(side) for side in cameras.size_px[view])
-        found.append(None if votes is None else _enlarged(votes[0], width, height))
-    return found
+    there = [view for view in range(len(cameras)) if bool((small[view] > FOREGROUND).any())]
+    for view, size_px in enumerate(cameras.size_px.tolist()):
+        others = [other for other in there if other != view]
+        groups, seen = max(1, len(others) // GROUP), []
+        for group in (others[first::groups] for first in range(groups if len(others) > 1 else 0)):
+            hull = reconstruct(small[group], small_cameras[group], bounds)
+            seen.append(hull.depth(small_cameras[view])[0].numpy() > 0)
+        if any(one.any() for one in seen):
+            votes = (_widened(np.any(seen, 0)), np.all(seen, 0))
+            some, all_ = (np.asarray(cv2.resize(vote.astype(np.float32), size_px)) > 0.5 for vote in votes)
+            yield some, all_
+        else:
+            yield None
 
 
-def _votes(
-    mask: UInt8[Tensor, "view height width"], cameras: Cameras, view: int, bounds: Bounds | None
-) -> tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]] | None:
-    """Silhouettes of the hulls of any group of the others (dilated) and of all groups; None without a hull."""
-    others = [v for v in range(len(cameras)) if v != view and bool((mask[v] > FOREGROUND).any())]
-    groups = max(1, len(others) // GROUP)
-    width, height = (int(side) for side in cameras.size_px[view])
-    seen = []
-    for first in range(groups):
-        group = others[first::groups]
-        if len(group) < 2:
-            return None
-        proxy = reconstruct(mask[group], cameras[group], bounds)
-        seen.append(proxy.depth(cameras[view])[0, :height, :width].numpy() > 0)
-    if not any(s.any() for s in seen):
-        return None
-    return _widened(np.any(seen, 0), MARGIN_PX), np.all(seen, 0)
-
-
-def _judged(
-    own: UInt8[np.ndarray, "height width"],
-    some: Bool[np.ndarray, "height width"],
-    all_: Bool[np.ndarray, "height width"],
-) -> UInt8[np.ndarray, "height width"]:
-    import cv2
-
+def _judged(own: Mask, some: Inside, all_: Inside) -> Mask:
     radius = max(1, round(GAP * max(own.shape) / 2))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     kept = np.where(some, own, 0).astype(np.uint8)
@@ -95,40 +72,19 @@ def _judged(
     return np.where(all_, np.maximum(kept, around), kept).astype(np.uint8)
 
 
-def _reduced(
-    mask: UInt8[Tensor, "view height width"], cameras: Cameras
-) -> tuple[UInt8[Tensor, "view small_height small_width"], Cameras]:
+def _reduced(mask: Masks, cameras: Cameras) -> tuple[UInt8[Tensor, "view small_height small_width"], Cameras]:
     """Masks and cameras at the size that they are compared in, silhouettes widened."""
-    import cv2
-
-    scale = min(1.0, CARVED_PX / int(cameras.size_px.max()))
-    sizes = [[max(1, round(side * scale)) for side in size] for size in cameras.size_px.tolist()]
-    parts = [cameras[view].resized(*size) for view, size in enumerate(sizes)]
-    small = Cameras(
-        cameras.names,
-        torch.cat([part.K for part in parts]),
-        cameras.camera_from_world,
-        torch.cat([part.size_px for part in parts]),
-    )
+    small = scale_cameras(cameras, min(1.0, CARVED_PX / int(cameras.size_px.max())))
     width, height = small.max_size_px
     masks = torch.zeros(len(mask), height, width, dtype=torch.uint8)
-    for view, (w, h) in enumerate(sizes):
-        full_w, full_h = cameras.size_px[view].tolist()
-        own = cv2.resize(mask[view, :full_h, :full_w].numpy(), (w, h), interpolation=cv2.INTER_AREA)
-        masks[view, :h, :w] = torch.from_numpy(_widened(np.asarray(own) > FOREGROUND, MARGIN_PX).astype(np.uint8)) * 255
+    for view, size_px in enumerate(small.size_px.tolist()):
+        own = np.asarray(cv2.resize(_cut(mask, cameras, view), size_px, interpolation=cv2.INTER_AREA))
+        _put(masks, view, 255 * _widened(own > FOREGROUND).astype(np.uint8))
     return masks, small
 
 
-def _enlarged(inside: Bool[np.ndarray, "height width"], width: int, height: int) -> Bool[np.ndarray, "h w"]:
-    import cv2
-
-    return np.asarray(cv2.resize(inside.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)) > 0.5
-
-
-def _widened(inside: Bool[np.ndarray, "height width"], by_px: int) -> Bool[np.ndarray, "height width"]:
-    import cv2
-
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
+def _widened(inside: Inside) -> Inside:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1))
     return np.asarray(cv2.dilate(inside.astype(np.uint8), disc)) > 0
 
 
@@ -153,13 +109,7 @@ class MaskedCapture(CaptureWrapper):
     """Frames around the last one, with the masks of the makers."""
 
     def read(self, time: int) -> MultiViewFrame:
-        """The source's frame, with masks.
-
-        Raises:
-            CaptureError: the source cannot read it.
-            IndexError: `time` is not in the source.
-            ValueError: an image has another size than its maker's plate.
-        """
+        """The source's frame, with masks; raises what the source and the makers do."""
         reach = 1 if self.clean_up == "pixels" else 0
         around = range(max(time - reach, 0), min(time + reach + 1, len(self.frame_ids)))
         self._near = {t: self._near[t] if t in self._near else self._made(t) for t in around}
@@ -178,39 +128,34 @@ class MaskedCapture(CaptureWrapper):
             _put(mask, view, self.makers[name].mask(view_rgb(frame, view)))
         return replace(frame, mask=mask)
 
-    def _lasting(self, frame: MultiViewFrame) -> UInt8[Tensor, "view height width"]:
+    def _lasting(self, frame: MultiViewFrame) -> Masks:
         mask = torch.zeros_like(_mask_of(frame))
         for view, name in enumerate(frame.cameras.names):
-            neighbours = [self._near.get(frame.time + step) for step in (-1, 1)]
             before, after = (
                 None if other is None or name not in other.cameras.names else _own_mask(other, name)
-                for other in neighbours
+                for other in (self._near.get(frame.time + step) for step in (-1, 1))
             )
             _put(mask, view, lasting(_own_mask(frame, name), before, after))
         return mask
 
 
-def _supported_parts(
-    mask: UInt8[Tensor, "view height width"], cameras: Cameras, bounds: Bounds | None
-) -> UInt8[Tensor, "view height width"]:
+def _supported_parts(mask: Masks, cameras: Cameras, bounds: Bounds | None) -> Masks:
     """The masks without connected parts that lie outside the hull of the other cameras; at least one part stays."""
-    import cv2
-
     kept = mask.clone()
-    for view, hull in enumerate(supported(mask, cameras, bounds)):
+    for view, votes in enumerate(_votes(mask, cameras, bounds)):
         own = _cut(mask, cameras, view)
         count, found = cv2.connectedComponents((own > 0).astype(np.uint8), connectivity=8)
-        if hull is None or count <= 2:
+        if votes is None or count <= 2:
             continue
         labels = np.asarray(found, np.int32)
         weight = np.bincount(labels.ravel(), own.ravel(), count)
-        share = np.bincount(labels.ravel(), (own * hull).ravel(), count) / np.maximum(weight, 1)
+        share = np.bincount(labels.ravel(), (own * votes[0]).ravel(), count) / np.maximum(weight, 1)
         if bool((share[1:] >= MIN_SUPPORT).any()):
             _put(kept, view, np.where((share >= MIN_SUPPORT)[labels], own, 0).astype(np.uint8))
     return kept
 
 
-def view_rgb(frame: MultiViewFrame, view: int) -> UInt8[np.ndarray, "height width 3"]:
+def view_rgb(frame: MultiViewFrame, view: int) -> Rgb:
     """One camera's image without its padding."""
     width, height = (int(side) for side in frame.cameras.size_px[view])
     return frame.rgb[view, :, :height, :width].permute(1, 2, 0).contiguous().cpu().numpy()
@@ -225,19 +170,19 @@ def _without_spill(frame: MultiViewFrame, screens: Mapping[str, Rgb]) -> MultiVi
     return replace(frame, rgb=rgb)
 
 
-def _mask_of(frame: MultiViewFrame) -> UInt8[Tensor, "view height width"]:
+def _mask_of(frame: MultiViewFrame) -> Masks:
     assert frame.mask is not None, "masks were made"
     return frame.mask
 
 
-def _own_mask(frame: MultiViewFrame, name: str) -> UInt8[np.ndarray, "height width"]:
+def _own_mask(frame: MultiViewFrame, name: str) -> Mask:
     return _cut(_mask_of(frame), frame.cameras, frame.cameras.names.index(name))
 
 
-def _cut(mask: UInt8[Tensor, "view height width"], cameras: Cameras, view: int) -> UInt8[np.ndarray, "rows columns"]:
+def _cut(mask: Masks, cameras: Cameras, view: int) -> UInt8[np.ndarray, "rows columns"]:
     width, height = (int(side) for side in cameras.size_px[view])
     return mask[view, :height, :width].numpy()
 
 
-def _put(mask: UInt8[Tensor, "view height width"], view: int, own: UInt8[np.ndarray, "rows columns"]) -> None:
+def _put(mask: Masks, view: int, own: UInt8[np.ndarray, "rows columns"]) -> None:
     mask[view, : own.shape[0], : own.shape[1]] = torch.from_numpy(own)

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -20,9 +21,7 @@ class NetworkMasks:
 
     Images are given as (1, 3, height, width) in float32, in the size that the file fixes. Where it fixes none, two
     inputs (BackgroundMattingV2) come at full size, one (MODNet) reduced. Two are in [0, 1], one is in [-1, 1].
-
-    Raises:
-        ValueError: the file is no such network, or it needs a plate and there is none.
+    ValueError if the file is no such network, or needs a plate and there is none.
     """
 
     def __init__(self, file: Path, plate: Rgb | None = None):
@@ -41,13 +40,7 @@ class NetworkMasks:
         self._file, self._image, self._plate = file, images[0], plate
 
     def mask(self, rgb: Rgb) -> Mask:
-        """Foreground of an image, 0 to 255.
-
-        Raises:
-            ValueError: the image is not of the plate's size, or the network gives no matte.
-        """
-        import cv2
-
+        """Foreground of an image, 0 to 255; ValueError for another size than the plate's, or without a matte."""
         height, width = rgb.shape[:2]
         size = self._size(width, height)
         given = {self._image.name: _tensor(rgb, size, self._plate_name is None)}
@@ -64,8 +57,7 @@ class NetworkMasks:
         if self._plate_name is not None:
             return width, height
         scale = min(1.0, MODNET_PX / min(width, height))
-        sides = (max(MODNET_STEP, round(side * scale / MODNET_STEP) * MODNET_STEP) for side in (width, height))
-        wide, high = sides
+        wide, high = (max(MODNET_STEP, round(side * scale / MODNET_STEP) * MODNET_STEP) for side in (width, height))
         return wide, high
 
     def _matte(self, given: dict[str, Float32[np.ndarray, "1 3 height width"]]) -> Float32[np.ndarray, "height width"]:
@@ -96,8 +88,6 @@ def _session(file: Path):
 
 
 def _tensor(rgb: Rgb, size: tuple[int, int], signed: bool) -> Float32[np.ndarray, "1 3 rows columns"]:
-    import cv2
-
     smaller = size[0] * size[1] < rgb.shape[0] * rgb.shape[1]
     image = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
     values = np.asarray(image, np.float32) / 255

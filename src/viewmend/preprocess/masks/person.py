@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -131,8 +132,6 @@ def _steps(length: int, side: int) -> list[int]:
 
 def _detect_in(rgb: Rgb, left: int, top: int, side: int) -> list[Roi]:
     """The squares around the people in a square part of an image; what lies beyond the image is black."""
-    import cv2
-
     part = rgb[top : top + side, left : left + side]
     scale = DETECTOR_PX / side
     x, y = ((DETECTOR_PX - scale * length) / 2 for length in (part.shape[1], part.shape[0]))
@@ -172,19 +171,15 @@ def _iou(a: np.ndarray, b: np.ndarray) -> float:
 
 def _segment(rgb: Rgb, roi: Roi) -> tuple[Float32[np.ndarray, "height width"], Roi] | None:
     """Opacity of the person in a square, at the image's size, and the square for the next image; None if none there."""
-    import cv2
-
     height, width = rgb.shape[:2]
     image_from_roi = roi.image_from_roi()
     shrink = cv2.INTER_AREA if roi.side > SEGMENTER_PX else cv2.INTER_LINEAR
-    size = SEGMENTER_PX, SEGMENTER_PX
-    crop = cv2.warpAffine(rgb, image_from_roi, size, flags=shrink | cv2.WARP_INVERSE_MAP)
+    crop = cv2.warpAffine(rgb, image_from_roi, (SEGMENTER_PX, SEGMENTER_PX), flags=shrink | cv2.WARP_INVERSE_MAP)
     landmarks, presence, logits, *_ = _run("segmenter", np.asarray(crop, np.float32) / 255)
     if float(presence[0, 0]) < MIN_SCORE:
         return None
     opacity = 1 / (1 + np.exp(-np.clip(logits[0, :, :, 0] + OUTWARD, -30, 30)))
     # Landmarks 33 and 34 are the centre of the body and a point on the circle around it.
     points = landmarks[0].reshape(39, 5)[33:35, :2] @ image_from_roi[:, :2].T + image_from_roi[:, 2]
-    return cv2.warpAffine(opacity, image_from_roi, (width, height), flags=cv2.INTER_LINEAR), Roi.around(
-        *points.tolist()
-    )
+    mask = cv2.warpAffine(opacity, image_from_roi, (width, height), flags=cv2.INTER_LINEAR)
+    return mask, Roi.around(*points.tolist())

@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats.files import match_names
@@ -12,7 +13,7 @@ from viewmend.data.images import read_rgb
 from viewmend.data.native_capture import NativeCapture
 from viewmend.data.source import CaptureSource
 from viewmend.data.videos import VideoFile, is_video, video_properties
-from viewmend.preprocess.masks.maker import Mask, Rgb, demand_size, soft_mask
+from viewmend.preprocess.masks.maker import Colours, Mask, Rgb, Values, demand_size, soft_mask
 from viewmend.preprocess.masks.masked import view_rgb
 
 SURE, POSSIBLE = 28.0, 14.0
@@ -37,27 +38,20 @@ class PlateMasks:
         self._square = np.maximum(_dot(self._plate, self._plate), 1e-4)
 
     def mask(self, rgb: Rgb) -> Mask:
-        """Foreground of an image, 0 to 255.
-
-        Raises:
-            ValueError: the image is not of the plate's size.
-        """
+        """Foreground of an image, 0 to 255; ValueError if it is not of the plate's size."""
         demand_size(rgb, self._plate, "the plate")
         image = _smooth(rgb)
         image = np.minimum(image * exposure_gain(image, self._plate), 1)
         lit = (_dot(image, self._plate) / self._square).clip(DEEPEST_SHADOW, 1).astype(np.float32)
         shaded, lab = _lab(self._plate * lit[..., None]), _lab(image)
-        darkening = self._lab[..., 0] - shaded[..., 0]
-        as_shadow = _length(lab - shaded) + SHADOW_COST * darkening
-        distance = np.minimum(as_shadow, _length(lab - self._lab))
-        return soft_mask(distance, SURE, POSSIBLE)
+        as_shadow = _length(lab - shaded) + SHADOW_COST * (self._lab[..., 0] - shaded[..., 0])
+        return soft_mask(np.minimum(as_shadow, _length(lab - self._lab)), SURE, POSSIBLE)
 
 
 def median_plate(images: Iterable[Rgb]) -> Rgb:
     """The median of some images, pixel by pixel: the plate, where less than half of them show the subject.
 
-    Raises:
-        ValueError: there is no image.
+    ValueError without an image.
     """
     stack = list(images)
     if not stack:
@@ -65,9 +59,7 @@ def median_plate(images: Iterable[Rgb]) -> Rgb:
     return np.median(np.stack(stack), axis=0).astype(np.uint8)
 
 
-def exposure_gain(
-    image: Float32[np.ndarray, "height width 3"], plate: Float32[np.ndarray, "height width 3"]
-) -> Float32[np.ndarray, "3"]:
+def exposure_gain(image: Colours, plate: Colours) -> Float32[np.ndarray, "3"]:
     """What each channel of an image is multiplied by to be as bright as its plate: medians, the subject is the less."""
     image, plate = image[::4, ::4], plate[::4, ::4]
     usable = ((image > 0.05) & (image < 0.95) & (plate > 0.05) & (plate < 0.95)).all(-1)
@@ -77,28 +69,22 @@ def exposure_gain(
     return gain if gain.min() > 1 / MOST_GAIN and gain.max() < MOST_GAIN else np.ones(3, np.float32)
 
 
-def _dot(
-    one: Float32[np.ndarray, "height width 3"], other: Float32[np.ndarray, "height width 3"]
-) -> Float32[np.ndarray, "height width"]:
+def _dot(one: Colours, other: Colours) -> Values:
     """Products of each pixel's channels, added up: several times as fast as `sum` along so short an axis."""
     return np.einsum("hwc,hwc->hw", one, other)
 
 
-def _length(difference: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width"]:
+def _length(difference: Colours) -> Values:
     return np.sqrt(_dot(difference, difference))
 
 
-def _smooth(rgb: UInt8[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+def _smooth(rgb: Rgb) -> Colours:
     """In [0, 1], without the noise of single pixels."""
-    import cv2
-
     return np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), np.float32) / 255
 
 
-def _lab(rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+def _lab(rgb: Colours) -> Colours:
     """CIELAB with L from 0 to 255, like OpenCV's of 8 bits."""
-    import cv2
-
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.float32) * np.array([2.55, 1, 1], np.float32)
 
 
@@ -111,10 +97,7 @@ MOST_FRAMES = 25
 def plates_from_files(capture: NativeCapture, place: str) -> dict[str, Rgb]:
     """The plate of each camera, undistorted: `place` is a path with `{camera}`, or a folder of files named after them.
 
-    Of a video the median is taken.
-
-    Raises:
-        CaptureError: a camera has no plate, or one that cannot be read or is not of its images' size.
+    Of a video the median is taken. CaptureError if a camera has no plate that can be read and is of its images' size.
     """
     plates = {}
     for name, path in zip(capture.cameras.names, _paths(capture.cameras.names, place), strict=True):
@@ -131,19 +114,18 @@ def plates_from_files(capture: NativeCapture, place: str) -> dict[str, Rgb]:
 
 
 def read_plate(path: Path, where: str) -> Rgb:
-    """The plate that an image is, or the median of a video; `where` begins the messages.
-
-    Raises:
-        CaptureError: the file cannot be read.
-    """
-    return median_plate(_video_frames(path, where)) if is_video(path.name) else read_rgb(path, where)
+    """The plate that an image is, or the median of a video; CaptureError, which `where` begins, for other files."""
+    if not is_video(path.name):
+        return read_rgb(path, where)
+    video = VideoFile(path)
+    images = (video.read(index, where) for index in spread(range(video_properties(path).frames)))
+    return median_plate(image for image in images if image is not None)
 
 
 def plates_from_frames(source: CaptureSource, times: range) -> dict[str, Rgb]:
     """The plate of each camera as the median of its images at some of these times.
 
-    Raises:
-        CaptureError: a camera is there at none of them, or the source cannot be read.
+    CaptureError if a camera is there at none of them, or the source cannot be read.
     """
     images: dict[str, list[Rgb]] = {name: [] for name in source.cameras.names}
     for time in spread(times):
@@ -166,16 +148,9 @@ def _paths(names: Sequence[str], place: str) -> list[Path]:
         return [Path(place.replace(CAMERA, name)) for name in names]
     folder = Path(place)
     found = {path.stem: path for path in sorted(folder.iterdir()) if path.is_file()} if folder.is_dir() else {}
-    chosen = match_names(names, found)
-    if chosen is None:
+    if (chosen := match_names(names, found)) is None:
         raise CaptureError(
             f"{place}: expected a folder with one image or video named after each camera ({', '.join(names)[:80]}), "
             f"or a path with {CAMERA} in it, got neither; rename the files"
         )
     return [found[stem] for stem in chosen]
-
-
-def _video_frames(path: Path, where: str) -> list[Rgb]:
-    video = VideoFile(path)
-    images = [video.read(index, where) for index in spread(range(video_properties(path).frames))]
-    return [image for image in images if image is not None]
