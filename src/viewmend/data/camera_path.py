@@ -115,10 +115,7 @@ def parse_turntable(text: str) -> Turntable | None:
 
 
 def pair_with_frames(path: Cameras, times: Sequence[int]) -> list[tuple[int, Cameras]]:
-    """Pair frames with poses: one frame from every pose, or every frame from its own pose or from a single one.
-
-    ValueError if there are several frames and another number of poses.
-    """
+    """Frames with poses: one from every pose, or each from its own or a single one; ValueError for other counts."""
     if len(times) == 1:
         return [(times[0], path[n]) for n in range(len(path))]
     if len(path) not in (1, len(times)):

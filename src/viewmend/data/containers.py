@@ -40,10 +40,7 @@ def names_in(folder: Path) -> frozenset[str]:
 
 
 def read_bytes(path: Path, count: int | None = None) -> bytes:
-    """Read all bytes of a file or data set, or the first `count`.
-
-    OSError if it cannot be read, ValueError if the HDF5 member is not an array of bytes.
-    """
+    """Read all bytes of a file or data set, or the first `count`; OSError or ValueError if it has no readable bytes."""
     file = container_of(path)
     if file == path:
         with path.open("rb") as stream:

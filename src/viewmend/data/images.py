@@ -157,10 +157,7 @@ def to_mask(image: UInt8[np.ndarray, "height width *channel"]) -> UInt8[np.ndarr
 
 
 def read_run_lengths(path: Path, where: str, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
-    """Read a run-length mask as 0 and 255. The file does not store its size, which is (height, width).
-
-    CaptureError if its runs do not fill that size.
-    """
+    """Read a run-length mask of a known size (height, width) as 0 and 255; CaptureError if its runs do not fill it."""
     height, width = size
     data = _read_file(path, where)
     numbers = np.frombuffer(data[: len(data) // 4 * 4], "<i4")

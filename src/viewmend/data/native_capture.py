@@ -171,10 +171,7 @@ class NativeCapture:
         return frame
 
     def undistort(self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        """Undistort another image of this camera, such as a clean plate, as its frames are.
-
-        ValueError if there is no such camera, or the image does not have its size.
-        """
+        """Undistort another image of this camera, such as a clean plate; ValueError for another camera or size."""
         self.cameras.select([camera])
         return self._readers[self.cameras.names.index(camera)].undistort(rgb)
 
@@ -463,33 +460,27 @@ class Undistortion:
         Pixels that lie outside the distorted image (corners, with pincushion distortion) repeat its border, so that
         the mask of a subject cut off by the border continues and does not carve the hull. Depth there is 0, unknown.
         """
-        if not self._camera.dist.any():
+        camera = self._camera
+        if not camera.dist.any():
             return images
-        smooth = functools.partial(cv2.remap, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        rgb, mask, depth = smooth(images.rgb, *self._map()), images.mask, images.depth
-        if mask is not None:
-            mask = smooth(mask, *self._map())
-        if depth is not None:  # nearest: interpolated depths would be wrong at edges
-            depth = cv2.remap(depth, *self._map(), cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
-        return CameraImages(rgb, mask, depth)
-
-    def _map(self) -> tuple[np.ndarray, np.ndarray]:
         with self._lock:
             if self._maps is None:
-                camera = self._camera
                 K = camera.K.copy()
                 K[:2, 2] -= 0.5  # in OpenCV the centre of the first pixel is at 0
                 size, fixed = (camera.width, camera.height), cv2.CV_16SC2  # 1/32 pixel, three times as fast as floats
                 first, second = cv2.initUndistortRectifyMap(K, camera.dist, None, K, size, fixed)  # pyright: ignore
                 self._maps = first, second
-            return self._maps
+        smooth = functools.partial(cv2.remap, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        rgb, mask, depth = smooth(images.rgb, *self._maps), images.mask, images.depth
+        if mask is not None:
+            mask = smooth(mask, *self._maps)
+        if depth is not None:  # nearest: interpolated depths would be wrong at edges
+            depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+        return CameraImages(rgb, mask, depth)
 
 
 def stack_images(images: Sequence[CameraImages], cameras: Cameras, time: int) -> MultiViewFrame:
-    """Stack the images of several cameras, padded right and below to the largest.
-
-    Masks are kept only if all cameras have one; likewise depth.
-    """
+    """Stack the images of several cameras, padded right and below; masks and depth only if all cameras have them."""
     width, height = cameras.max_size_px
     masks, depths = (all(getattr(image, key) is not None for image in images) for key in ("mask", "depth"))
     rgb = torch.zeros(len(images), 3, height, width, dtype=torch.uint8)

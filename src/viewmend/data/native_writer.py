@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from viewmend.data.errors import CaptureError
 from viewmend.data.images import write_depth, write_image
 from viewmend.data.native_format import (
     CALIBRATION,
+    FILE_KINDS,
     FileKind,
     NativeCalibration,
     NativeCamera,
@@ -86,7 +87,7 @@ class _Writer:
         self.source = source
         self.folder = folder
         self.suffix = suffix
-        self.kinds = set[FileKind]()
+        self.kinds: set[FileKind] = {"image"}
         names = source.cameras.names
         self.folder_names = {name: _folder_name(name, index) for index, name in enumerate(names)}
         if len({name.lower() for name in self.folder_names.values()}) < len(names):
@@ -121,34 +122,21 @@ class _Writer:
         return f"{kind}/{self.folder_names[camera]}/{{frame}}{self.suffix if kind == 'image' else '.png'}"
 
     def _calibration(self) -> NativeCalibration:
-        source, bounds = self.source, self.source.bounds
+        source, bounds, cameras = self.source, self.source.bounds, self.source.cameras.to("cpu")
+        K, pose, entries = cameras.K.double().numpy(), cameras.camera_from_world.double().numpy(), []
+        for view, (name, (width, height)) in enumerate(zip(cameras.names, cameras.size_px.tolist(), strict=True)):
+            files: Any = {kind: self._path(name, kind) if kind in self.kinds else None for kind in FILE_KINDS}
+            R, t_m = pose[view, :3, :3], pose[view, :3, 3]
+            entries.append(NativeCamera(name, width, height, K[view], R, t_m, np.zeros(5), **files))
         return NativeCalibration(
             frames=tuple(source.frame_ids),
-            cameras=tuple(self._camera(view) for view in range(len(source.cameras))),
+            cameras=tuple(entries),
             up=None if source.up is None else source.up.double().cpu().numpy(),
             fps=source.fps,
             bounds_m=None if bounds is None else torch.stack([bounds.low, bounds.high]).double().cpu().numpy(),
             metres_per_unit=1.0,
             file=self.folder / CALIBRATION,
             folder=self.folder,
-        )
-
-    def _camera(self, view: int) -> NativeCamera:
-        camera = self.source.cameras[view].to("cpu")
-        name, pose = camera.names[0], camera.camera_from_world[0].double().numpy()
-        width, height = camera.max_size_px
-        return NativeCamera(
-            name=name,
-            width=width,
-            height=height,
-            K=camera.K[0].double().numpy(),
-            R=pose[:3, :3],
-            t_m=pose[:3, 3],
-            dist=np.zeros(5),
-            image=self._path(name, "image"),
-            video=None,
-            mask=self._path(name, "mask") if "mask" in self.kinds else None,
-            depth=self._path(name, "depth") if "depth" in self.kinds else None,
         )
 
 

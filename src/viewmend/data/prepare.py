@@ -170,10 +170,7 @@ def _raise_or_warn(where: str, issues: Sequence[Issue], reported: set[str]) -> N
 def open_masked(
     path: Path | str, cameras: Sequence[str] | None = None, held: int = 0, format: str | None = None
 ) -> NativeCapture:
-    """Open a capture that has masks, and at least two input cameras besides `held` held-out cameras.
-
-    CaptureError if it has not, or cannot be opened (see `open_capture`).
-    """
+    """Open a capture; CaptureError unless it has masks and, besides `held` held-out cameras, two inputs or more."""
     capture = open_capture(path, cameras, format)
     if not capture.has_masks:
         raise CaptureError(

@@ -41,6 +41,8 @@ SEEK_FRAMES = 8
 RATE_TOLERANCE = 0.01
 NO_CHROMA_FILTER = "POINT"
 """Interpolation of chroma, as ffmpeg has it for 8 bit whatever is asked for; other bit depths follow this choice."""
+ALPHA_OPTIONS = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
+"""Alpha is encoded as a second image. VP9's hidden reference frames would separate the two."""
 
 Image = UInt8[np.ndarray, "height width 3"]
 ImageWithAlpha = UInt8[np.ndarray, "height width 4"]
@@ -76,10 +78,7 @@ class VideoProperties:
 
 
 def video_properties(path: Path) -> VideoProperties:
-    """Size, rate and frame times of a video. Reads its packets and decodes its start and its end.
-
-    CaptureError if no decoder opens it, or it has no frames.
-    """
+    """Size, rate and frame times of a video, by its packets, start and end; CaptureError for a file without frames."""
     stat = path.stat() if path.is_file() else None
     return _measured(path, None if stat is None else (stat.st_mtime_ns, stat.st_size))
 
@@ -200,10 +199,7 @@ def decode(video: VideoProperties, start: int = 0, threads: int = 0) -> "Iterato
 
 
 def to_rgb(frame: "VideoFrame", size_px: tuple[int, int] | None = None) -> Image:
-    """A decoded frame as an upright RGB image, by the matrix and the range that it declares, BT.601 by default.
-
-    `size_px` is another width and height for the upright image.
-    """
+    """A decoded frame as upright RGB, by the matrix and range that it declares, at its own or another upright size."""
     stored_px = frame.width, frame.height
     width, height = stored_px if size_px is None else size_px[::-1] if is_turned(frame) else size_px
     how = NO_CHROMA_FILTER if (width, height) == stored_px else "AREA"
@@ -250,10 +246,7 @@ class VideoFile:
         self._image: Image | None = None
 
     def read(self, index: int, where: str) -> Image | None:
-        """The frame at `index` as RGB, read-only; None if it is damaged. `where` starts the error messages.
-
-        CaptureError if the video cannot be opened, or ends before this frame.
-        """
+        """The frame at `index` as RGB, read-only; None if damaged, a CaptureError that `where` starts if absent."""
         with self._lock:
             video = video_properties(self.path)
             if index >= video.frames:
@@ -281,19 +274,28 @@ class VideoFile:
 
 
 class VideoWriter:
-    """Writes an H.264 MP4 of RGB frames, which all have the size of the first. A context manager.
+    """Writes a film of frames that all have the size of the first. A context manager.
 
-    The video plays everywhere (4:2:0); an odd last row or column is dropped. `threads` is the number of encoder
-    threads, 0 for one per core.
+    RGB becomes an H.264 MP4 that plays everywhere (4:2:0); an odd last row or column is dropped. RGB with `alpha`
+    becomes a VP9 WebM, which browsers and editors composite. `threads` is the number of encoder threads, 0 for one per
+    core.
     """
 
-    def __init__(self, file: Path | BytesIO, fps: float, threads: int = 0):
-        self._container, self._stream = _open_output(file, "mp4", "libx264", fps)
-        self._stream.pix_fmt = "yuv420p"
+    def __init__(self, file: Path | BytesIO, fps: float, threads: int = 0, alpha: bool = False):
+        import av
+
+        if isinstance(file, Path):
+            file.parent.mkdir(parents=True, exist_ok=True)
+        self._container: Any = av.open(file, "w", format="webm" if alpha else "mp4")
+        codec, rate = "libvpx-vp9" if alpha else "libx264", Fraction(fps).limit_denominator(1001)
+        self._stream: Any = self._container.add_stream(codec, rate=rate)
+        self._stream.pix_fmt = "yuva420p" if alpha else "yuv420p"
         tag_colours(self._stream.codec_context)
-        self._stream.options = {"crf": "18", "preset": "veryfast"}
+        self._stream.options = ALPHA_OPTIONS if alpha else {"crf": "18", "preset": "veryfast"}
+        if alpha:
+            self._stream.metadata["alpha_mode"] = "1"
         self._stream.codec_context.thread_count = threads
-        self._started = False
+        self._started, self._alpha = False, alpha
 
     def __enter__(self) -> "VideoWriter":
         return self
@@ -301,15 +303,16 @@ class VideoWriter:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def add(self, rgb: Image) -> None:
+    def add(self, image: Image | ImageWithAlpha) -> None:
         """Append a frame."""
         from av import VideoFrame
 
-        rgb = rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2]
+        if not self._alpha:
+            image = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
         if not self._started:
-            self._stream.height, self._stream.width = rgb.shape[:2]
+            self._stream.height, self._stream.width = image.shape[:2]
             self._started = True
-        frame = VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+        frame = VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgba" if self._alpha else "rgb24")
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
@@ -337,28 +340,7 @@ def write_mp4(file: Path | BytesIO, frames: Iterable[Image], fps: float) -> None
 
 
 def write_webm(file: Path, frames: Iterable[ImageWithAlpha], fps: float) -> None:
-    """Write frames as a VP9 WebM with alpha, which browsers and editors composite."""
-    container, stream = _open_output(file, "webm", "libvpx-vp9", fps)
-    with container:
-        from av import VideoFrame
-
-        stream.pix_fmt = "yuva420p"
-        tag_colours(stream.codec_context)
-        # Alpha is encoded as a second image. VP9's hidden reference frames would separate the two.
-        stream.options = {"crf": "18", "b:v": "0", "auto-alt-ref": "0", "deadline": "realtime", "cpu-used": "5"}
-        stream.metadata["alpha_mode"] = "1"
-        for number, rgba in enumerate(frames):
-            if number == 0:
-                stream.height, stream.width = rgba.shape[:2]
-            container.mux(stream.encode(VideoFrame.from_ndarray(np.ascontiguousarray(rgba), format="rgba")))
-        container.mux(stream.encode(None))
-
-
-def _open_output(file: Path | BytesIO, format: str, codec: str, fps: float) -> tuple[Any, Any]:
-    """A PyAV container that is open for writing, and its video stream."""
-    import av
-
-    if isinstance(file, Path):
-        file.parent.mkdir(parents=True, exist_ok=True)
-    container = av.open(file, "w", format=format)
-    return container, container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+    """Write frames as a WebM with alpha."""
+    with VideoWriter(file, fps, alpha=True) as video:
+        for frame in frames:
+            video.add(frame)

@@ -1,7 +1,4 @@
-"""Finds faults in the masks and the calibration of a frame, and explains them.
-
-`viewmend check` prints the issues; `prepare` raises an error or warns about them.
-"""
+"""Finds and explains faults in the masks and the calibration of a frame, for `viewmend check` and `prepare`."""
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence

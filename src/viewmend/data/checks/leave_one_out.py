@@ -1,7 +1,4 @@
-"""Finds a camera whose masks or pose are inconsistent with the others'.
-
-Each test leaves cameras out in turn and looks at how well the others agree.
-"""
+"""Finds a camera whose masks or pose do not fit: without it, the others agree better."""
 
 from dataclasses import dataclass
 

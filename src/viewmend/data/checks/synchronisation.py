@@ -130,10 +130,7 @@ def describe_delay(frames: int) -> str:
 
 
 def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]:
-    """Find cameras whose images have stronger edges along the outlines of their own masks in another frame.
-
-    `frames` are consecutive, of the same cameras, and should be small.
-    """
+    """Find cameras whose images have stronger edges along the outlines of their own masks in another small frame."""
     masks = [frame.mask for frame in frames if frame.mask is not None]
     if len(masks) < len(frames):
         return ()

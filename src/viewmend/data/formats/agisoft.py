@@ -33,10 +33,7 @@ def find(folder: Path) -> Path | None:
 
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
-    """The enabled and aligned images of the chunk that has most, in the folder or in `images`.
-
-    The unit is that of the chunk: metres if it was scaled.
-    """
+    """The aligned images of the chunk that has most, in the folder or in `images`, in the chunk's unit."""
     chunks = [(chunk, _used_cameras(chunk)) for chunk in read_xml(bounded_bytes(file, MAX_BYTES)).findall("chunk")]
     chunk, used = max(chunks, key=lambda pair: len(pair[1]), default=(None, []))
     if chunk is None or not used:

@@ -98,10 +98,7 @@ def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -
 
 
 def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """A path with `{frame}`, and the id of each path: the part in which they differ, with all of its digits.
-
-    ValueError if the paths differ in several parts.
-    """
+    """A path with `{frame}`, and the part in which each path differs, with all digits; ValueError for several parts."""
     if len(set(paths)) == 1:
         return paths[0], ("0",) * len(paths)
     same = [takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False)) for step in (1, -1)]
@@ -331,10 +328,7 @@ _KEYS: tuple[Callable[[str], Hashable], ...] = (str, _after_cam, _last_number)
 
 
 def _find_masks(folder: Path, names: Sequence[str]) -> dict[str, tuple[dict[str, Any], frozenset[str]]]:
-    """The keys of a `cameras.json` for each camera's masks, and the frame ids of images; empty if there are no masks.
-
-    ValueError if only some cameras have masks.
-    """
+    """Keys and frame ids of each camera's masks; empty without masks, ValueError if only some cameras have them."""
     places = [place for place in MASK_PLACES if (folder / place).is_dir()]
     if not places:
         return {}

@@ -30,7 +30,6 @@ class CaptureScene(LeaveOneOutScene):
 
     folder: Path
     inputs: tuple[str, ...]
-    """Input cameras."""
     count: int
     """Frames from the first."""
     fingerprint: str
@@ -211,10 +210,7 @@ def read_splits(file: Path) -> SplitFile:
 
 
 def split_scenes(file: Path, frames: int | None = None) -> tuple[CaptureScene, ...]:
-    """The test scenes of a file: each capture without its held-out camera, with all others as inputs.
-
-    ValueError if it is none, or a capture is absent or was recalibrated.
-    """
+    """Test scenes of a file, with all cameras but one as inputs; ValueError if a capture has changed or is absent."""
     found = []
     for scene, path in _scenes_of(file, "test"):
         held = next(one for one in capture_set(path, frames=frames, format=scene.format) if one.held == scene.left_out)

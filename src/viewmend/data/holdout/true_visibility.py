@@ -58,7 +58,6 @@ class SurfaceSeen:
     """Which cameras saw, at some times, the surface point that each pixel of a true view shows."""
 
     names: tuple[str, ...]
-    """The cameras."""
     seen: Bool[Tensor, "time view height width"]
     """The view's own time first; False where the view shows no surface."""
 

@@ -125,13 +125,9 @@ class Board:
     """A ChArUco board: a chessboard with markers in its white squares, of which a camera may see a part."""
 
     columns: int
-    """Squares across."""
     rows: int
-    """Squares downwards."""
     square_m: float
-    """A square's side."""
     marker_m: float
-    """A marker's side."""
     dictionary: str
     """Which of OpenCV's dictionaries the markers are of."""
 
@@ -192,10 +188,7 @@ def parse_board(text: str, dictionary: str) -> Board:
 
 
 def open_footage(folder: Path) -> NativeCalibration:
-    """The cameras of a folder of videos, or of folders of images, by name; with placeholder K and poses.
-
-    CaptureError if there are not two or more, or a video cannot be read.
-    """
+    """The cameras of two or more videos or folders of images in a folder, by name, with placeholder K and poses."""
     entries = sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
     videos = {entry.stem: entry.name for entry in entries if entry.is_file() and is_video(entry.name)}
     chosen = videos or {

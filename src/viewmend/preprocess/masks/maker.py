@@ -25,10 +25,7 @@ LEAST_SHARE = 0.2
 
 @runtime_checkable
 class MaskMaker(Protocol):
-    """Makes the masks of one camera, image by image, offline or live.
-
-    A maker belongs to one camera and gets its images in order, from one thread at a time.
-    """
+    """Makes the masks of one camera, whose images it gets in order, from one thread at a time, offline or live."""
 
     def mask(self, rgb: Rgb) -> Mask:
         """Foreground of the camera's next image, 0 to 255; ValueError for another size than the maker was made for."""

@@ -49,10 +49,7 @@ class PlateMasks:
 
 
 def median_plate(images: Iterable[Rgb]) -> Rgb:
-    """The median of some images, pixel by pixel: the plate, where less than half of them show the subject.
-
-    ValueError without an image.
-    """
+    """The median of one or more images: the plate, where less than half of them show the subject."""
     stack = list(images)
     if not stack:
         raise ValueError("expected at least one image to make a plate of, got none; choose other frames")
@@ -123,10 +120,7 @@ def read_plate(path: Path, where: str) -> Rgb:
 
 
 def plates_from_frames(source: CaptureSource, times: range) -> dict[str, Rgb]:
-    """The plate of each camera as the median of its images at some of these times.
-
-    CaptureError if a camera is there at none of them, or the source cannot be read.
-    """
+    """The plate of each camera, as the median of its images at some of these times; CaptureError if it has none."""
     images: dict[str, list[Rgb]] = {name: [] for name in source.cameras.names}
     for time in spread(times):
         frame = source.read(time)
