@@ -159,10 +159,6 @@ def test_one_line_says_what_is_wrong(plain, capfd, spoil, words):
     assert not out.exists()
 
 
-def test_the_folder_before_it_is_spoiled_is_right(plain, capfd):
-    assert main(["check", str(plain.path)]) == 0
-
-
 def test_a_time_that_is_not_there(plain, capfd):
     assert main(["check", str(plain.path), "--frame", "2"]) == 2
     assert "0 to 1, got 2" in capfd.readouterr().err

@@ -117,24 +117,6 @@ def test_transforms_may_share_a_lens(tmp_path):
     assert_same(read_any_calibration(tmp_path), rig)
 
 
-def test_blender_files_have_an_angle_and_alpha_and_omit_the_suffix(tmp_path):
-    """The focal length is 0.5 W / tan(angle / 2), the centre W / 2, and alpha is the mask."""
-    image = np.zeros((20, 30, 4), np.uint8)
-    image[5:9, 6:12] = 255
-    frames = []
-    for name, z in (("a", 4.0), ("b", 5.0)):
-        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
-        matrix = np.eye(4)
-        matrix[2, 3] = z
-        frames.append({"file_path": f"./{name}", "transform_matrix": matrix.tolist()})
-    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames}))
-    capture = open_capture(tmp_path)
-    assert capture.cameras.K[0, 0, 0].item() == pytest.approx(15 / np.tan(0.4))
-    assert capture.cameras.K[0, :2, 2].tolist() == [15.0, 10.0]
-    assert capture.cameras.centers[1].tolist() == pytest.approx([0, 0, 5])
-    assert int((capture.read(0).mask > 0).sum()) == 48
-
-
 def test_frames_are_sorted_by_number_and_missing_images_are_gaps(tmp_path):
     rig = random_rig(1, 3)
     write_images(tmp_path, rig, "9")

@@ -2,17 +2,10 @@
 
 import pytest
 import torch
-from torch import Tensor
 
 from viewmend.data.native_capture import open_capture
 from viewmend.data.source import prefetch
-from viewmend.geometry.proxy import GeometryProxy, reconstruct
-from viewmend.types import MultiViewFrame
-
-
-def silhouette_iou(frame: MultiViewFrame, proxy: GeometryProxy) -> Tensor:
-    covered, foreground = proxy.depth(frame.cameras) > 0, frame.mask > 127
-    return (covered & foreground).sum((1, 2)) / (covered | foreground).sum((1, 2))
+from viewmend.geometry.proxy import reconstruct
 
 
 @pytest.mark.parametrize(
@@ -28,7 +21,8 @@ def test_calibration_masks_and_lenses_agree(shared, name, cameras, mean, lowest,
     frame = capture.read(0)
     assert len(capture.cameras) == len(frame.cameras) == cameras
     proxy = reconstruct(frame.mask, frame.cameras, capture.bounds)
-    iou = silhouette_iou(frame, proxy)
+    covered, foreground = proxy.depth(frame.cameras) > 0, frame.mask > 127
+    iou = (covered & foreground).sum((1, 2)) / (covered | foreground).sum((1, 2))
     assert iou.mean() > mean and iou.min() > lowest, iou
     up = torch.tensor([0.0, 1.0, 0.0]) if capture.up is None else capture.up
     along = proxy.mesh.vertices @ up

@@ -108,11 +108,8 @@ def test_colours_are_those_that_the_film_declares(tmp_path, full_range, bt709, p
     bits, kind = (10, np.uint16) if pix_fmt.endswith("10le") else (8, np.uint8)
     planes = [np.frombuffer(bytes(p), kind).reshape(p.height, -1)[:, : p.width] for p in frame.planes]
     y, u, v = (plane.astype(float) / 2 ** (bits - 8) for plane in planes)
-    y, u, v = (
-        (y / 255, (u - 128) / 255, (v - 128) / 255)
-        if full_range
-        else ((y - 16) / 219, (u - 128) / 224, (v - 128) / 224)
-    )
+    black, luma, chroma = (0, 255, 255) if full_range else (16, 219, 224)
+    y, u, v = (y - black) / luma, (u - 128) / chroma, (v - 128) / chroma
     red, blue = (0.2126, 0.0722) if bt709 else (0.299, 0.114)
     r, b = y + 2 * (1 - red) * v, y + 2 * (1 - blue) * u
     expected = 255 * np.stack([r, (y - red * r - blue * b) / (1 - red - blue), b], -1).clip(0, 1)

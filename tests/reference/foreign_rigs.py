@@ -16,7 +16,11 @@ def write_toml(file, cameras, style="pose2sim"):
         if style == "pyxy3d":
             rotation = camera["R"]
             lines += ["ignore = false"]
-        size = [float(camera["width"]), float(camera["height"])] if style == "pose2sim" else _size(camera)
+        size = (
+            [float(camera["width"]), float(camera["height"])]
+            if style == "pose2sim"
+            else [camera["width"], camera["height"]]
+        )
         dist = camera["dist"][:4] if style == "pose2sim" else camera["dist"]
         lines += [f"size = {size}", f"matrix = {camera['K'].tolist()}", f"distortions = {dist.tolist()}"]
         lines += [f"rotation = {np.asarray(rotation).tolist()}", f"translation = {camera['t'].tolist()}"]
@@ -24,10 +28,6 @@ def write_toml(file, cameras, style="pose2sim"):
     lines += ["[metadata]", "adjusted = false", "error = 0.0"]
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("\n".join(lines) + "\n")
-
-
-def _size(camera):
-    return [camera["width"], camera["height"]]
 
 
 def write_qualisys(file, cameras):

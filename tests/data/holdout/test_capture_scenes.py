@@ -75,10 +75,9 @@ def test_no_seed_is_in_two_splits():
 def test_what_is_kept_for_tests_is_for_tests_alone(place):
     places = (Path("motions/train"), Path(place))
     assert recordings("test", places) == places
+    message = "not kept for tests, got a folder named 'test'; give the one for training"
     for split in ("training", "validation"):
-        with pytest.raises(
-            ValueError, match="not kept for tests, got a folder named 'test'; give the one for training"
-        ):
+        with pytest.raises(ValueError, match=message):
             recordings(split, places)
 
 
@@ -180,11 +179,9 @@ def test_what_cannot_be_split_is_refused(captures, tmp_path, capsys):
 
 
 def test_by_default_7_of_79_are_for_tests_and_scenes_are_a_random_subset(captures, monkeypatch):
-    def scene(path, base, seed, subject, format):
-        return SplitScene(
-            name=path.name, path=path.name, subject=path.name, split="training", left_out="a", closest=(),
-            calibration_sha256="",
-        )  # fmt: skip
+    def scene(path, *_):
+        same = dict.fromkeys(("name", "path", "subject"), path.name)
+        return SplitScene(**same, split="training", left_out="a", closest=(), calibration_sha256="")
 
     monkeypatch.setattr(capture_scenes, "_scene", scene)
     paths = [captures / f"{number:04d}" for number in range(100)]

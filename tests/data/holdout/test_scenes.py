@@ -51,9 +51,8 @@ def test_definitions_tell_scenes_apart_and_know_no_paths(tmp_path):
     assert [s.name for s in scenes] == ["Q-a-m-12", "Q-a-m-8", "Q-b-m-12", "Q-b-m-8"]
     assert not any(str(tmp_path) in s.definition for s in scenes)
     (tmp_path / "a.glb").write_text("changed")
-    assert [s.definition != t.definition for s, t in zip(scenes, performer_set(tmp_path), strict=True)] == [
-        True, True, False, False,
-    ]  # fmt: skip
+    changed = [s.definition != t.definition for s, t in zip(scenes, performer_set(tmp_path), strict=True)]
+    assert changed == [True, True, False, False]
 
 
 def test_no_people_is_an_error_that_names_the_places(tmp_path):
