@@ -43,10 +43,8 @@ def read_camera_path(file: Path, like: Cameras) -> Cameras:
     """Read camera poses from a JSON file, with the intrinsics and image size of the first camera of `like`.
 
     The file holds a list of 4 x 4 matrices world_from_camera (metres, OpenCV axes), or an object with that list as
-    "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and "height".
-
-    Raises:
-        ValueError: the file has other content.
+    "world_from_camera" and optionally "K" (3 x 3, pixels, first pixel centre at 0.5), "width" and "height". ValueError
+    if it has other content.
     """
     try:
         content = read_json(bounded_bytes(file))

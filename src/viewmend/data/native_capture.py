@@ -86,11 +86,9 @@ class NativeCapture:
 
     A camera whose image or mask is missing is absent from that frame (a gap). Films are matched by the times of their
     frames. Images and masks are undistorted to pinhole images with the same K, and padded right and below to the
-    largest of the frame. The arguments are those of `open_capture`, which logs `issues`.
-
-    Raises:
-        CaptureError: `cameras.json` is invalid; a camera has no files in any frame, or a frame has no camera; only
-            some cameras have masks or depth; a file lies outside the folder; a camera name is unknown.
+    largest of the frame. The arguments are those of `open_capture`, which logs `issues`. CaptureError if `cameras.json`
+    is invalid; a camera has no files in any frame, or a frame has no camera; only some cameras have masks or depth; a
+    file lies outside the folder; or a camera name is unknown.
     """
 
     def __init__(
@@ -142,11 +140,8 @@ class NativeCapture:
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
 
-        A camera whose film is damaged at this time is absent.
-
-        Raises:
-            CaptureError: a file is unreadable or has the wrong size, or no mask has any foreground.
-            IndexError: `time` is not in the capture.
+        A camera whose film is damaged at this time is absent. CaptureError if a file is unreadable or has the wrong
+        size, or no mask has any foreground; IndexError if `time` is not in the capture.
         """
         if not 0 <= time < len(self.frame_ids):
             raise IndexError(f"{self._file}: expected a frame index of 0 to {len(self.frame_ids) - 1}, got {time}")

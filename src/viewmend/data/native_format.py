@@ -29,9 +29,7 @@ Positive = Annotated[float, Meta(gt=0, le=1e300)]
 Matrix = tuple[Triple, Triple, Triple]
 
 
-class NativeCameraEntry(Struct, frozen=True, kw_only=True):
-    """One entry of `cameras` in the file."""
-
+class _CameraEntry(Struct, frozen=True, kw_only=True):
     name: Text
     width: Pixels
     height: Pixels
@@ -66,9 +64,7 @@ class NativeCameraEntry(Struct, frozen=True, kw_only=True):
                 raise _invalid(kind, "a path inside the capture folder", shown(path), next_step)
 
 
-class NativeFile(Struct, frozen=True, kw_only=True):
-    """The whole file."""
-
+class _File(Struct, frozen=True, kw_only=True):
     format: str
     first_pixel_center: tuple[Number, Number] = (0.0, 0.0)
     metres_per_unit: Positive = 1.0
@@ -76,7 +72,7 @@ class NativeFile(Struct, frozen=True, kw_only=True):
     fps: Positive | None = None
     bounds: tuple[Triple, Triple] | None = None
     frames: Annotated[tuple[Text, ...], Meta(min_length=1)]
-    cameras: tuple[NativeCameraEntry, ...]
+    cameras: tuple[_CameraEntry, ...]
 
     def __post_init__(self) -> None:
         if self.bounds is not None and not all(low < high for low, high in zip(*self.bounds, strict=True)):
@@ -166,7 +162,7 @@ def read_calibration(folder: Path) -> NativeCalibration:
 
 def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalibration:
     """Convert the content of a `cameras.json`, read from the file `path`; ValueError if it is invalid."""
-    file = typed({"format": FORMAT, **read_json(json.dumps(content))}, NativeFile)
+    file = typed({"format": FORMAT, **read_json(json.dumps(content))}, _File)
     shift_px = 0.5 - np.array(file.first_pixel_center)
     up = None if file.up is None else np.array(file.up)
     return NativeCalibration(
@@ -181,7 +177,7 @@ def calibration_from_content(content: dict[str, Any], path: Path) -> NativeCalib
     )
 
 
-def _camera(entry: NativeCameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> NativeCamera:
+def _camera(entry: _CameraEntry, shift_px: Float64[np.ndarray, "2"], scale: float) -> NativeCamera:
     K = np.array(entry.K)
     K[:2, 2] += shift_px
     u, _, vt = np.linalg.svd(np.array(entry.R))  # the nearest rotation: calibrations are often rounded
@@ -228,10 +224,10 @@ def _check_keys(content: dict[str, Any]) -> None:
     if version != FORMAT:
         got = "nothing" if version is None else shown(version)
         raise _invalid("format", f'"{FORMAT}"', got, "convert the capture, or use a version of viewmend that reads it")
-    _check_spelling(content, NativeFile.__struct_fields__)
+    _check_spelling(content, _File.__struct_fields__)
     for entry in content["cameras"] if isinstance(content.get("cameras"), list) else ():
         if isinstance(entry, dict):
-            _check_spelling(entry, NativeCameraEntry.__struct_fields__)
+            _check_spelling(entry, _CameraEntry.__struct_fields__)
 
 
 def _check_spelling(entry: dict[str, Any], known: Sequence[str]) -> None:

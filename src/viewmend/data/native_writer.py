@@ -40,10 +40,8 @@ def write_capture(
 
     With PNG, reading the folder returns the same frames bit for bit (depth to half a millimetre). JPEG (quality 95,
     no chroma subsampling) is smaller; masks and depth are always PNG. The folder is complete or absent, see
-    `atomic_folder`. `progress` wraps the iterated frame indices.
-
-    Raises:
-        CaptureError: `out` exists and is not an empty folder, or the source cannot be read.
+    `atomic_folder`. `progress` wraps the iterated frame indices. CaptureError if `out` exists and is not empty, or
+    the source cannot be read.
     """
     with atomic_folder(out) as unfinished:
         writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png")

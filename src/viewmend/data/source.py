@@ -57,9 +57,7 @@ class CaptureSource(Protocol):
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` of `frame_ids`. Cameras without an image in this frame are absent.
 
-        Raises:
-            CaptureError: a file is missing for every camera, is unreadable or has the wrong size.
-            IndexError: `time` is not in the capture.
+        CaptureError if all files are missing, or one is unreadable or has the wrong size; IndexError without that time.
         """
         ...
 

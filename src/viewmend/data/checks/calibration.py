@@ -21,6 +21,8 @@ from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.types import MultiViewFrame
 from viewmend.utils.contact_sheet import Tile, contact_sheet, in_rows, picture
 
+Point = Float[Tensor, "3"]
+Picture = UInt8[np.ndarray, "height width 3"]
 MASK_ONLY, HULL_ONLY = (255, 0, 255), (0, 255, 255)
 BOX, AXES, UP = (255, 255, 255), {"x": (255, 60, 60), "y": (60, 255, 60), "z": (90, 120, 255)}, (255, 220, 0)
 LEGEND = (
@@ -56,9 +58,7 @@ def check_calibration(frame: MultiViewFrame, bounds: Bounds | None) -> Calibrati
     return CalibrationCheck(frame, bounds or proxy.bounds, proxy, covered.float(), scores, diagnose(frame, bounds))
 
 
-def draw_check(
-    check: CalibrationCheck, up: Float[Tensor, "3"] | None, tile_width: int = 400
-) -> UInt8[np.ndarray, "height width 3"]:
+def draw_check(check: CalibrationCheck, up: Point | None, tile_width: int = 400) -> Picture:
     """Draw all cameras with bounds, axes, up, and the disagreement of hull and mask; see `LEGEND`."""
     names = check.frame.cameras.names
     captions = [f"{name}   IoU {check.iou[name]:.3f}" if name in check.iou else name for name in names]
@@ -68,7 +68,7 @@ def draw_check(
     return np.concatenate([sheet, legend])
 
 
-def _draw(check: CalibrationCheck, view: int, up: Float[Tensor, "3"] | None) -> UInt8[np.ndarray, "height width 3"]:
+def _draw(check: CalibrationCheck, view: int, up: Point | None) -> Picture:
     width, height = (int(n) for n in check.frame.cameras.size_px[view])
     image = picture(check.frame.rgb[view, :, :height, :width])
     if check.frame.mask is not None and check.silhouettes is not None:
@@ -88,9 +88,7 @@ def _draw(check: CalibrationCheck, view: int, up: Float[Tensor, "3"] | None) -> 
     return image
 
 
-def _lines(
-    check: CalibrationCheck, up: Float[Tensor, "3"] | None
-) -> Iterator[tuple[Float[Tensor, "3"], Float[Tensor, "3"], tuple[int, int, int], str]]:
+def _lines(check: CalibrationCheck, up: Point | None) -> Iterator[tuple[Point, Point, tuple[int, int, int], str]]:
     """The edges of the bounds, and axes and up at the centre of the subject: both ends, colour and label."""
     low, high = check.bounds.low, check.bounds.high
     for axis in range(3):
@@ -108,9 +106,7 @@ def _lines(
         yield subject.center, subject.center + 1.3 * length * up, UP, "up"
 
 
-def _visible_pixels(
-    check: CalibrationCheck, view: int, start: Float[Tensor, "3"], end: Float[Tensor, "3"]
-) -> list[tuple[int, int] | None]:
+def _visible_pixels(check: CalibrationCheck, view: int, start: Point, end: Point) -> list[tuple[int, int] | None]:
     """Pixels along a line in the world; None where it is behind the camera or far outside the image."""
     camera = check.frame.cameras[view]
     fractions = torch.linspace(0, 1, 65)[:, None]

@@ -6,14 +6,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from viewmend.data.formats.files import (
-    files_like,
-    find_mask,
-    names_from_paths,
-    read_xml,
-    xml_attributes,
-    xml_number,
-)
+from viewmend.data.formats.files import files_like, find_mask, names_from_paths, read_xml, xml_attributes, xml_number
 from viewmend.utils.untrusted_input import bounded_bytes
 
 MAX_BYTES = 2**24

@@ -15,7 +15,7 @@ Row = Annotated[list[Number], Meta(min_length=1, max_length=1)] | Number
 """The file has t as a column or as a row."""
 
 
-class PanopticCameraEntry(Struct, kw_only=True):
+class _Camera(Struct, kw_only=True):
     """One of the file's cameras, camera_from_world in OpenCV axes."""
 
     name: Annotated[str, Meta(pattern=r"^\d\d_\d\d\Z")]
@@ -27,10 +27,8 @@ class PanopticCameraEntry(Struct, kw_only=True):
     t: tuple[Row, Row, Row]
 
 
-class PanopticCalibration(Struct, kw_only=True):
-    """The whole file."""
-
-    cameras: list[PanopticCameraEntry]
+class _Calibration(Struct, kw_only=True):
+    cameras: list[_Camera]
 
 
 def find(folder: Path) -> Path | None:
@@ -40,7 +38,7 @@ def find(folder: Path) -> Path | None:
 
 def content(folder: Path, file: Path) -> dict[str, Any]:
     """The HD cameras that have footage; the VGA cameras if fewer than two have."""
-    cameras = typed(read_json(bounded_bytes(file)), PanopticCalibration).cameras
+    cameras = typed(read_json(bounded_bytes(file)), _Calibration).cameras
     for kind, fps in FPS.items():
         entries = {camera.name: camera for camera in cameras if camera.type == kind}
         paths = {name: path for name in entries if (path := _footage(folder, kind, name))}

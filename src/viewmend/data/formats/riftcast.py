@@ -38,23 +38,17 @@ class Intrinsics(Struct, kw_only=True):
     distortion_coefficients: list[Number] = []
 
 
-class RiftcastCameraEntry(Struct, kw_only=True):
-    """One of the cameras."""
-
+class _Camera(Struct, kw_only=True):
     camera_id: int | str
     extrinsics: Extrinsics
     intrinsics: Intrinsics
 
 
-class RiftcastCalibration(Struct, kw_only=True):
-    """The content of `calibration.json`."""
-
-    cameras: list[RiftcastCameraEntry]
+class _Calibration(Struct, kw_only=True):
+    cameras: list[_Camera]
 
 
-class Dataset(Struct, kw_only=True):
-    """The data set in a meta file."""
-
+class _Dataset(Struct, kw_only=True):
     path: str = "."
     camera_path: str = CALIBRATION
     frame_count: Annotated[int, Meta(ge=1)] | None = None
@@ -76,7 +70,7 @@ class MetaFile(Struct, kw_only=True):
 
     type: str
     version: str
-    dataset: Dataset
+    dataset: _Dataset
     volume: Volume | None = None
 
 
@@ -102,7 +96,7 @@ def content(path: Path, file: Path) -> dict[str, Any]:
     files = [file] if path.is_file() else sorted(json for json in folder.glob("*.json") if _is_meta(json))
     meta = _read_meta(files[0]) if files else None  # in a folder, the first one
     place = meta.dataset.camera_path if meta and stays_inside(meta.dataset.camera_path) else CALIBRATION
-    cameras = typed(read_json(bounded_bytes(folder / place)), RiftcastCalibration).cameras
+    cameras = typed(read_json(bounded_bytes(folder / place)), _Calibration).cameras
     frames = _frames(folder, meta)
     entries = [_camera(folder, camera, frames) for camera in cameras]
     result = {"first_pixel_center": [0.5, 0.5], "frames": frames, "cameras": entries}
@@ -118,7 +112,7 @@ def _frames(folder: Path, meta: MetaFile | None) -> list[str]:
     return [frame for frame in frames if first <= int(frame) < first + meta.dataset.frame_count]
 
 
-def _camera(folder: Path, camera: RiftcastCameraEntry, frames: list[str]) -> dict[str, Any]:
+def _camera(folder: Path, camera: _Camera, frames: list[str]) -> dict[str, Any]:
     name, view = str(camera.camera_id), np.array(camera.extrinsics.view_matrix).reshape(4, 4)
     K, size = np.array(camera.intrinsics.camera_matrix).reshape(3, 3), camera.intrinsics.resolution
     entry = {"name": name, "width": size[0], "height": size[1], "K": K.tolist()}

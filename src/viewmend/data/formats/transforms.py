@@ -61,9 +61,7 @@ class Lens(Struct, kw_only=True):
     rolling_shutter: list[Number] | None = None
 
 
-class TransformsFrameEntry(Lens, kw_only=True):
-    """One of the file's `frames`."""
-
+class _Entry(Lens, kw_only=True):
     file_path: Annotated[str, Meta(min_length=1)]
     transform_matrix: Annotated[tuple[Row, ...], Meta(min_length=3, max_length=4)]
     """world_from_camera, OpenGL axes."""
@@ -72,10 +70,8 @@ class TransformsFrameEntry(Lens, kw_only=True):
     time: Number | None = None
 
 
-class TransformsFile(Lens, kw_only=True):
-    """The whole file."""
-
-    frames: list[TransformsFrameEntry]
+class _File(Lens, kw_only=True):
+    frames: list[_Entry]
     from_na: bool = False
     integer_depth_scale: Number = MILLIMETRES
     depth_unit_scale_factor: Number = MILLIMETRES
@@ -89,7 +85,7 @@ def find(folder: Path) -> Path | None:
 def content(folder: Path, file: Path) -> dict[str, Any]:
     """All frames. The alpha of the images is the mask if no frame names one, and an image is not opaque."""
     parsed = read_json(bounded_bytes(file))
-    read = typed(parsed, TransformsFile, "see docs/formats.md")
+    read = typed(parsed, _File, "see docs/formats.md")
     _check_keys(file, parsed)
     frames = [_with_local_paths(folder, frame) for frame in read.frames]
     if len({frame.time for frame in frames}) <= 1:
@@ -120,13 +116,13 @@ def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
     if other:
         got = ", ".join(other)
         raise ValueError(f"expected perspective images of one moment, OpenGL axes, got {got}; convert them")
-    fields = {*TransformsFile.__struct_fields__, *TransformsFrameEntry.__struct_fields__}
+    fields = {*_File.__struct_fields__, *_Entry.__struct_fields__}
     unknown = sorted({key for part in parts for key in part} - fields - {*OTHER_MEANING, *WITHOUT_EFFECT})
     if unknown:
         warn(f"{file}: these keys are not known and have no effect: {', '.join(unknown)[:200]}")
 
 
-def _with_local_paths(folder: Path, frame: TransformsFrameEntry) -> TransformsFrameEntry:
+def _with_local_paths(folder: Path, frame: _Entry) -> _Entry:
     """The frame with paths as on this system, and with the suffix of the image, which files of Blender omit."""
     mask, depth = (path and path.replace("\\", "/") for path in (frame.mask_path, frame.depth_file_path))
     image = str(PurePosixPath(frame.file_path.replace("\\", "/")))
@@ -135,11 +131,9 @@ def _with_local_paths(folder: Path, frame: TransformsFrameEntry) -> TransformsFr
     return structs.replace(frame, file_path=image, mask_path=mask, depth_file_path=depth)
 
 
-def _cameras_of(
-    frames: list[TransformsFrameEntry],
-) -> tuple[list[tuple[TransformsFrameEntry, TransformsFrameEntry]], tuple[str, ...]]:
+def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tuple[str, ...]]:
     """Each camera's entry with patterns as paths and its first frame's entry, and the frame ids in order of time."""
-    by_pose: dict[bytes, dict[float | None, TransformsFrameEntry]] = {}
+    by_pose: dict[bytes, dict[float | None, _Entry]] = {}
     for frame in frames:
         pose = (np.round(frame.transform_matrix, POSE_DIGITS) + 0.0).tobytes()
         at_pose = by_pose.setdefault(pose, {})
@@ -205,7 +199,7 @@ def _intrinsics(folder: Path, path: str, default: Lens, frame: Lens) -> dict[str
     return {"width": width, "height": height, "K": K, "dist": dist}
 
 
-def _pose(frame: TransformsFrameEntry) -> dict[str, Any]:
+def _pose(frame: _Entry) -> dict[str, Any]:
     world_from_camera = np.array(frame.transform_matrix, float)[:3]
     R = np.diag([1.0, -1.0, -1.0]) @ world_from_camera[:, :3].T  # from OpenGL to OpenCV axes
     return {"R": R.tolist(), "t": (-R @ world_from_camera[:, 3]).tolist()}

@@ -163,10 +163,8 @@ def make_splits(
     """Split captures so that no subject is in both parts, and choose the camera that each leaves out.
 
     The order of subjects and the cameras follow from hashes of their names and the seed alone: the same on every
-    machine, and adding a capture does not change the cameras of the others.
-
-    Raises:
-        ValueError: fewer than two subjects, a name without a subject, two scenes of one name, or fewer than 4 cameras.
+    machine, and adding a capture does not change the cameras of the others. ValueError for fewer than two subjects, a
+    name without a subject, two scenes of one name, or fewer than 4 cameras.
     """
     made = [_scene(path, base, seed, subject, format) for path in captures]
     names = [scene.name for scene in made]
@@ -255,9 +253,8 @@ def _scene(path: Path, base: Path, seed: int, subject: str, format: str | None) 
     names = capture.cameras.names
     matched = re.search(subject, capture.name)
     if matched is None or not matched.groups() or not matched[1]:
-        raise ValueError(
-            f"expected a subject by --subject '{subject}' in '{capture.name}', got none; (..) is its group"
-        )
+        expected = f"a subject by --subject '{subject}' in '{capture.name}'"
+        raise ValueError(f"expected {expected}, got none; (..) is its group")
     if len(names) < CLOSEST + 1:
         raise ValueError(f"{path}: expected {CLOSEST + 1} cameras or more, got {len(names)}; leave the capture out")
     held = names[_hash(seed, "camera", capture.name) % len(names)]

@@ -34,17 +34,22 @@ STEPS = 60
 
 Seen = Mapping[tuple[int, int], Corners]
 """What was found, by camera and time."""
+Size = tuple[int, int]
+Matrix = Float64[np.ndarray, "3 3"]
+Distortion = Float64[np.ndarray, "5"]
+Pose = Float64[np.ndarray, "4 4"]
+Picture = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
 class CalibratedCamera:
     """One camera, and what its calibration misses."""
 
-    K: Float64[np.ndarray, "3 3"]
+    K: Matrix
     """Pixels; the top-left pixel has its centre at (0.5, 0.5)."""
-    dist: Float64[np.ndarray, "5"]
+    dist: Distortion
     """k1 k2 0 0 0 of Brown and Conrady."""
-    camera_from_world: Float64[np.ndarray, "4 4"]
+    camera_from_world: Pose
     corners: Float64[np.ndarray, "corner 2"]
     """Where corners were found, pixels."""
     off: Float64[np.ndarray, "corner 2"]
@@ -56,9 +61,7 @@ class CalibratedCamera:
         return float(np.sqrt((self.off**2).sum(1).mean()))
 
 
-def calibrate(
-    seen: Seen, board: Board, names: Sequence[str], sizes: Sequence[tuple[int, int]]
-) -> list[CalibratedCamera]:
+def calibrate(seen: Seen, board: Board, names: Sequence[str], sizes: Sequence[Size]) -> list[CalibratedCamera]:
     """The cameras of these names and image sizes (width, height) from what they saw of the board.
 
     ValueError if a camera saw the board too seldom, or never together with the others.
@@ -87,9 +90,7 @@ def calibrate(
     return rows.cameras(found.x)
 
 
-def _alone(
-    seen: Seen, board: Board, view: int, name: str, size: tuple[int, int]
-) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "5"]]:
+def _alone(seen: Seen, board: Board, view: int, name: str, size: Size) -> tuple[Matrix, Distortion]:
     own = sorted((corners for (v, _), corners in seen.items() if v == view), key=lambda c: -len(c.ids))
     if len(own) < LEAST_VIEWS:
         raise ValueError(
@@ -104,17 +105,13 @@ def _alone(
     return np.asarray(K), np.asarray(dist).ravel()[:5]
 
 
-def _board_pose(
-    corners: Corners, board: Board, K: Float64[np.ndarray, "3 3"], dist: Float64[np.ndarray, "5"]
-) -> Float64[np.ndarray, "4 4"]:
+def _board_pose(corners: Corners, board: Board, K: Matrix, dist: Distortion) -> Pose:
     """camera_from_board by one image."""
     _, turn, shift = cv2.solvePnP(board.corners_m[corners.ids], corners.pixels, K, dist, flags=cv2.SOLVEPNP_IPPE)
     return _matrix(np.concatenate([turn.ravel(), shift.ravel()]))
 
 
-def _chained(
-    poses: Mapping[tuple[int, int], Float64[np.ndarray, "4 4"]], names: Sequence[str]
-) -> dict[int, Float64[np.ndarray, "4 4"]]:
+def _chained(poses: Mapping[tuple[int, int], Pose], names: Sequence[str]) -> dict[int, Pose]:
     """camera_from_world of all, world being the first: each is joined to the known one with most times in common."""
     known = {0: np.eye(4)}
     times = [{time for v, time in poses if v == view} for view in range(len(names))]
@@ -132,11 +129,11 @@ def _chained(
     return known
 
 
-def _vector(pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
+def _vector(pose: Pose) -> Float64[np.ndarray, "6"]:
     return np.concatenate([np.asarray(cv2.Rodrigues(pose[:3, :3])[0]).ravel(), pose[:3, 3]])
 
 
-def _matrix(vector: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
+def _matrix(vector: Float64[np.ndarray, "6"]) -> Pose:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(vector[:3])[0], vector[3:]
     return pose
@@ -145,7 +142,7 @@ def _matrix(vector: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
 class _Rows:
     """The residuals of all corners, x and y of each, as one vector of the parameters."""
 
-    def __init__(self, seen: Seen, board: Board, sizes: Sequence[tuple[int, int]], times: Sequence[int]):
+    def __init__(self, seen: Seen, board: Board, sizes: Sequence[Size], times: Sequence[int]):
         keys = sorted(seen)
         self.views, self.times, self.size = len(sizes), len(times), np.array(sizes, float)
         self.pixels = np.concatenate([seen[key].pixels for key in keys])
@@ -215,9 +212,7 @@ def with_cameras(calibration: NativeCalibration, cameras: Cameras) -> NativeCali
     return replace(calibration, cameras=tuple(changed))
 
 
-def residual_picture(
-    cameras: Sequence[NativeCamera], found: Sequence[CalibratedCamera]
-) -> UInt8[np.ndarray, "height width 3"]:
+def residual_picture(cameras: Sequence[NativeCamera], found: Sequence[CalibratedCamera]) -> Picture:
     """A tile a camera: a line from each of the board's corners, `ENLARGED` times as long as what is missed."""
     tiles = [
         Tile(f"{camera.name}   {one.rms_px:.3f} px, {len(one.corners)} corners", _draw(camera, one))
@@ -229,7 +224,7 @@ def residual_picture(
     return np.concatenate([sheet, legend])
 
 
-def _draw(camera: NativeCamera, found: CalibratedCamera) -> UInt8[np.ndarray, "height width 3"]:
+def _draw(camera: NativeCamera, found: CalibratedCamera) -> Picture:
     scale = TILE_PX / camera.width
     image = np.full((max(1, round(camera.height * scale)), TILE_PX, 3), 32, np.uint8)
     for corner, off in zip(found.corners * scale, found.off * scale * ENLARGED, strict=True):

@@ -25,6 +25,8 @@ from viewmend.geometry.proxy import reconstruct
 from viewmend.geometry.rigid import invert_rigid, rigid
 from viewmend.types import MultiViewFrame
 
+Places = Float64[np.ndarray, "point 3"]
+
 
 def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "point 3"]) -> Cameras:
     """The rig turned, moved and scaled as a whole, so that its cameras agree with `reference` on the points.
@@ -44,9 +46,7 @@ def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "po
     return replace(rig, camera_from_world=rigid(turned, moved).to(rig.camera_from_world))
 
 
-def _similarity(
-    source: Float64[np.ndarray, "point 3"], target: Float64[np.ndarray, "point 3"]
-) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], float]:
+def _similarity(source: Places, target: Places) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], float]:
     """R, t and s for which s R x + t is nearest to the targets."""
     a, b = source - source.mean(0), target - target.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
@@ -184,9 +184,7 @@ class _Problem:
         looks = zip(self.sights, depths, strict=True)
         return [float(sight.sample(rig, depth[:, None]).residuals.sum()) for sight, depth in looks]
 
-    def normal_equations(
-        self, x: Moves, depths: Depths
-    ) -> tuple[Float64[np.ndarray, "unknown unknown"], Float64[np.ndarray, "unknown"]]:
+    def normal_equations(self, x: Moves, depths: Depths) -> tuple[Float64[np.ndarray, "n n"], Float64[np.ndarray, "n"]]:
         """Gauss and Newton's, without the places' own depths, which follow."""
         rig = self.rig(x)
         H, g = self.hold * np.eye(x.size), self.hold * x.ravel()
