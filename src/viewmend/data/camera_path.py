@@ -28,10 +28,9 @@ class PathFile(Struct, frozen=True):
         poses = torch.tensor(self.world_from_camera)
         good = is_rotation(poses[:, :3, :3]) & (poses[:, 3] == torch.tensor([0.0, 0.0, 0.0, 1.0])).all(-1)
         if not bool(good.all()):
-            raise ValueError(
-                f"pose {int((~good).nonzero()[0])}: expected a rotation and translation with the last row 0 0 0 1, got "
-                "another matrix; write rigid motions world_from_camera"
-            )
+            pose, expected = int((~good).nonzero()[0]), "a rotation and translation with the last row 0 0 0 1"
+            next_step = "write rigid motions world_from_camera"
+            raise ValueError(f"pose {pose}: expected {expected}, got another matrix; {next_step}")
         if self.K is not None and not bool(is_intrinsics(torch.tensor(self.K))):
             expected = "[[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0"
             raise ValueError(f"expected 'K' as {expected}, got {shown(self.K)}; correct it")

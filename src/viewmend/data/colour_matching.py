@@ -103,10 +103,8 @@ def best_agreement(colours: SurfaceColours) -> tuple[Float[Tensor, "view"], Floa
     Returns the smallest RMS distance of RGB and the highest correlation, over the points that both cameras see; NaN if
     no other camera shares enough points. A faulty camera disagrees with all others; a correct one does not.
     """
-    best = [
-        agreement(own, both, colours, view)
-        for view, (own, both) in enumerate(zip(colours.rgb, colours.seen[:, None] & colours.seen, strict=True))
-    ]
+    shared = zip(colours.rgb, colours.seen[:, None] & colours.seen, strict=True)
+    best = [agreement(own, both, colours, view) for view, (own, both) in enumerate(shared)]
     distance, correlation = torch.tensor(best, device=colours.rgb.device).unbind(1)
     return distance, correlation
 

@@ -200,10 +200,8 @@ def _read_file(path: Path, where: str) -> bytes:
 
 def _decode(data: bytes, where: str, flags: int) -> np.ndarray:
     if (size := size_from_header(data)) is not None and size[0] * size[1] > MAX_PIXELS:
-        raise CaptureError(
-            f"{where}: expected an image of at most {MAX_PIXELS / 1e6:.0f} million pixels, got {size[0]} x {size[1]}; "
-            "reduce its size"
-        )
+        most, got = f"{MAX_PIXELS / 1e6:.0f} million pixels", f"{size[0]} x {size[1]}"
+        raise CaptureError(f"{where}: expected an image of at most {most}, got {got}; reduce its size")
     if (image := decode_image(data, flags)) is None:
         got = f"{len(data)} bytes that are not an image or are truncated"
         raise CaptureError(f"{where}: expected an image, got {got}; copy or export the file again")

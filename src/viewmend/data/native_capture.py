@@ -223,10 +223,8 @@ class NativeCapture:
     def _all_or_none(self, kind: FileKind) -> bool:
         missing = [f"camera '{camera.name}'" for camera in self._entries if getattr(camera, kind) is None]
         if missing and len(missing) < len(self._entries):
-            raise CaptureError(
-                f"{self._file}: expected '{kind}' for every camera or for none, got none for {', '.join(missing)}; "
-                "add it, or leave these cameras out"
-            )
+            expected, got = f"'{kind}' for every camera or for none", f"none for {', '.join(missing)}"
+            raise CaptureError(f"{self._file}: expected {expected}, got {got}; add it, or leave these cameras out")
         return not missing
 
     def _find_files(self) -> Bool[np.ndarray, "view time"]:
@@ -247,10 +245,9 @@ class NativeCapture:
                 ]
                 wanted = f"{' and '.join(camera.file_kinds)} of the camera in the same frame"
                 wanted = f"the camera's {absent[0]} in one frame or more" if absent else wanted
-                raise CaptureError(
-                    f"{self._example(camera, absent)}: expected {wanted}, found in none of "
-                    f"{len(self.frame_ids)}; correct the paths in {self._file}, or leave the camera out"
-                )
+                where, next_step = self._example(camera, absent), f"correct the paths in {self._file}"
+                got = f"found in none of {len(self.frame_ids)}"
+                raise CaptureError(f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out")
         for frame, column in zip(self.frame_ids, present.T, strict=True):
             if not column.any():
                 raise CaptureError(
@@ -279,9 +276,8 @@ def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file
 def _with_alpha(camera: NativeCamera, folder: Path, frames: Sequence[str]) -> NativeCamera:
     """The camera with its images as masks; raises a CaptureError if none of its images has alpha."""
     if camera.image is None:
-        raise CaptureError(
-            f"{folder}: camera '{camera.name}': expected images with alpha, got a video; use another --method"
-        )
+        where = f"{folder}: camera '{camera.name}'"
+        raise CaptureError(f"{where}: expected images with alpha, got a video; use another --method")
     files = [folder / camera.file("image", frame) for frame in frames]
     if not any(uses_alpha(file) for file in files) and (file := next(filter(Path.is_file, files), None)):
         read_alpha(file, f"{file}: camera '{camera.name}'")
@@ -435,10 +431,8 @@ class CameraReader:
             advice = "correct width, height and K in the calibration, or replace the file"
             if rotation:
                 advice = f"EXIF says that it should be {rotation}: make it upright (exiftran -ai), or {advice}"
-            raise CaptureError(
-                f"{where}: expected {self.camera.width} x {self.camera.height} pixels as in the calibration, "
-                f"got {width} x {height}; {advice}"
-            )
+            expected = f"{self.camera.width} x {self.camera.height} pixels as in the calibration"
+            raise CaptureError(f"{where}: expected {expected}, got {width} x {height}; {advice}")
 
 
 class Undistortion:

@@ -70,12 +70,10 @@ class PreparedCapture(CaptureWrapper):
         absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
         text = "camera '{}' has no image or no mask in this frame and is absent; viewmend check lists all gaps"
         issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
-        _raise_or_warn(f"{self.name}: frame '{self.frame_ids[time]}'", issues, self._reported)
-        bad = [issue.camera for issue in issues if issue.camera]
+        where, bad = f"{self.name}: frame '{self.frame_ids[time]}'", [issue.camera for issue in issues if issue.camera]
+        _raise_or_warn(where, issues, self._reported)
         if len(bad) == len(frame.cameras):
-            raise CaptureError(
-                f"{self.name}: frame '{self.frame_ids[time]}': expected at least one correct mask, got none; redo them"
-            )
+            raise CaptureError(f"{where}: expected at least one correct mask, got none; redo them")
         frame = limit_size(frame.without(bad), self.max_image_size)
         frame = replace(frame, cameras=self.cameras.select(frame.cameras.names))
         return frame if self.colours is None else self.colours.apply(frame)

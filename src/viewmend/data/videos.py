@@ -250,10 +250,9 @@ class VideoFile:
         with self._lock:
             video = video_properties(self.path)
             if index >= video.frames:
-                raise CaptureError(
-                    f"{where}: expected at least {index + 1} frames in the video, got {video.frames}; "
-                    "shorten 'frames' in cameras.json, or export the video again"
-                )
+                expected, got = f"at least {index + 1} frames in the video", video.frames
+                next_step = "shorten 'frames' in cameras.json, or export the video again"
+                raise CaptureError(f"{where}: expected {expected}, got {got}; {next_step}")
             if self._frames is None or index <= self._before or self._skips(video, index):
                 self._frames = decode(video, index)
                 self._before, self._at, self._last = index - 1, index - 1, None

@@ -98,9 +98,7 @@ def _find_better_fits(
         images = torch.stack(list(candidates.values())).float() / 255
         sampled = sample_bilinear(images, surface.uv_px[view].expand(len(candidates), -1, -1), "border")
         shared = surface.seen[view] & surface.seen
-        distances = {
-            name: agreement(rgb, shared, colours, view)[0] for name, rgb in zip(candidates, sampled, strict=True)
-        }
+        distances = dict(zip(candidates, (agreement(rgb, shared, colours, view)[0] for rgb in sampled), strict=True))
         best = min(distances, key=distances.__getitem__)
         if distances[best] < FITS * float(distance[view]):
             found[view] = best

@@ -83,16 +83,12 @@ def find_desynchronised_camera(
     found = leave_one_out(small[middle], bounds)
     if found is None or len(frames) < 2:
         return ()
-    outside = torch.stack(
-        [missed_share(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None]
-    ).nan_to_num(1.0)
+    shares = [missed_share(frame.mask > FOREGROUND, found.silhouettes) for frame in small if frame.mask is not None]
+    outside = torch.stack(shares).nan_to_num(1.0)
     gain, best = outside[middle] - outside.amin(0), outside.argmin(0).tolist()
     views = gain.argsort(descending=True)[:MAX_DELAY_CANDIDATES].tolist()
-    unexplained = {
-        view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds)
-        for view in views
-        if float(gain[view]) > MIN_DELAY_GAIN
-    }
+    tried = [view for view in views if float(gain[view]) > MIN_DELAY_GAIN]
+    unexplained = {view: _unexplained(_with_mask_of(small, middle, view, best[view]), bounds) for view in tried}
     if unexplained:
         view = min(unexplained, key=lambda view: unexplained[view])
         before = _unexplained(small[middle], bounds)
@@ -153,9 +149,8 @@ def check_image_mask_sync(frames: Sequence[MultiViewFrame]) -> tuple[Issue, ...]
 def _gradient(image: Float[Tensor, "view channel height width"]) -> Float[Tensor, "view channel 2 height width"]:
     """Central differences in x and y."""
     padded = F.pad(image, (1, 1, 1, 1), mode="replicate")
-    return torch.stack(
-        [padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]], 2
-    )
+    x, y = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
+    return torch.stack([x, y], 2)
 
 
 def _edge_ratio(

@@ -106,9 +106,8 @@ def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     after = paths[0][len(paths[0]) - min(after, min(map(len, paths)) - len(before)) :].lstrip("0123456789")
     ids = tuple(path[len(before) : len(path) - len(after)] for path in paths)
     if not all(ids) or any("/" in name for name in ids):
-        raise ValueError(
-            f"expected paths that differ in a number, got {paths[0][:80]!r} and {paths[-1][:80]!r}; rename"
-        )
+        got = f"{paths[0][:80]!r} and {paths[-1][:80]!r}"
+        raise ValueError(f"expected paths that differ in a number, got {got}; rename")
     return f"{before}{{frame}}{after}", ids
 
 
@@ -199,10 +198,8 @@ def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLA
     if trials:
         raise ValueError(f"expected one recording, got a folder with {', '.join(trials)[:200]}; open one of these")
     searched = ", ".join(place or "the folder" for place in places)
-    raise ValueError(
-        f"expected a video or a folder of images named after each camera ({', '.join(names)[:80]}) in {searched}, "
-        "got none; rename them"
-    )
+    expected = f"a video or a folder of images named after each camera ({', '.join(names)[:80]})"
+    raise ValueError(f"expected {expected} in {searched}, got none; rename them")
 
 
 def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
@@ -278,10 +275,9 @@ def _compare_ids(ids: dict[str, frozenset[str]]) -> None:
     strangers = [name for name, found in ids.items() if 2 * len(found & usual) < len(found)]
     if strangers:
         example = ", ".join(f"{min(ids[name], key=frame_order)} of {name}" for name in list(ids)[:3])
-        raise ValueError(
-            f"expected the same frame ids in the names of all cameras' images, got others for "
-            f"{', '.join(strangers)[:200]} (first ids: {example}); rename images of one moment alike"
-        )
+        expected = "the same frame ids in the names of all cameras' images"
+        got = f"others for {', '.join(strangers)[:200]} (first ids: {example})"
+        raise ValueError(f"expected {expected}, got {got}; rename images of one moment alike")
     numbers = {name: sorted(map(int, found)) for name, found in ids.items() if all(map(str.isdecimal, found))}
     spans = Counter((found[0], found[-1]) for found in numbers.values())
     if len(spans) > 1:

@@ -52,9 +52,8 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
             result.append(footage.entry(camera.name, camera.resolution) | lens | {"t": t})
         rig = {"metres_per_unit": CENTIMETRES, "up": [0.0, -1.0, 0.0], "fps": footage.fps or fps}
         return rig | {"frames": footage.frames, "cameras": result}
-    raise ValueError(
-        "expected hdVideos/hd_00_00.mp4 or hdImgs/00_00 of two cameras or more, or the same for vga, got none; add them"
-    )
+    expected = "hdVideos/hd_00_00.mp4 or hdImgs/00_00 of two cameras or more, or the same for vga"
+    raise ValueError(f"expected {expected}, got none; add them")
 
 
 def _footage(folder: Path, kind: str, name: str) -> str | None:

@@ -38,10 +38,9 @@ def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
     """
     kept = [place for place in places if TEST_FOLDER in (place.resolve().name, place.resolve().parent.name)]
     if kept and split != "test":
-        raise ValueError(
-            f"{kept[0]}: expected people, motions and captures that are not kept for tests, got a folder named "
-            f"'{TEST_FOLDER}'; give the one for training"
-        )
+        expected = "people, motions and captures that are not kept for tests"
+        got = f"a folder named '{TEST_FOLDER}'"
+        raise ValueError(f"{kept[0]}: expected {expected}, got {got}; give the one for training")
     return () if split == "validation" else tuple(places)
 
 

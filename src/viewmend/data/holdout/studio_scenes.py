@@ -146,9 +146,8 @@ def performer_set(
 ) -> tuple[StudioScene, ...]:
     """Q: every character with every motion, each with both rigs; CaptureError without characters or motions."""
     people = _files((folder / TEST_FOLDER, folder), (".glb", ".gltf"), "characters")
-    clips = _files(
-        (motions,) if motions else (folder / "motions" / TEST_FOLDER, folder / "motions", folder), (".bvh",), "motions"
-    )
+    places = (motions,) if motions else (folder / "motions" / TEST_FOLDER, folder / "motions", folder)
+    clips = _files(places, (".bvh",), "motions")
     sha256 = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*people, *clips)}
     scenes = []
     for seed, (person, clip) in zip(Q_SEEDS, itertools.product(people, clips), strict=False):

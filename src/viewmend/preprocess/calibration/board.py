@@ -173,15 +173,12 @@ def parse_board(text: str, dictionary: str) -> Board:
     """A board from COLUMNSxROWS:SQUARE_M:MARKER_M and the name of OpenCV's dictionary; ValueError from other text."""
     parts = re.fullmatch(r"(\d{1,2})x(\d{1,2}):(\d*\.?\d+):(\d*\.?\d+)", text)
     if parts is None:
-        raise ValueError(
-            f"expected --board COLUMNSxROWS:SQUARE_M:MARKER_M, got '{text}'; "
-            "write 8x6:0.06:0.045 for 8 x 6 squares of 6 cm with markers of 4.5 cm"
-        )
+        example = "8x6:0.06:0.045 for 8 x 6 squares of 6 cm with markers of 4.5 cm"
+        raise ValueError(f"expected --board COLUMNSxROWS:SQUARE_M:MARKER_M, got '{text}'; write {example}")
     columns, rows, square_m, marker_m = int(parts[1]), int(parts[2]), float(parts[3]), float(parts[4])
     if not (min(columns, rows) >= 4 and 0 < marker_m < square_m):
-        raise ValueError(
-            f"expected at least 4 x 4 squares, and markers smaller than squares, got '{text}'; measure again"
-        )
+        expected = "at least 4 x 4 squares, and markers smaller than squares"
+        raise ValueError(f"expected {expected}, got '{text}'; measure again")
     if not re.fullmatch(r"DICT_\w+", dictionary) or not hasattr(cv2.aruco, dictionary):
         raise ValueError(f"expected a dictionary of OpenCV, got '{dictionary}'; choose one such as DICT_5X5_1000")
     return Board(columns, rows, square_m, marker_m, dictionary)
@@ -195,10 +192,8 @@ def open_footage(folder: Path) -> NativeCalibration:
         entry.name: entry.name for entry in entries if entry.is_dir() and list_images(folder, entry.name)
     }
     if len(chosen) < 2:
-        raise CaptureError(
-            f"{folder}: expected two or more videos, or folders of images, got {len(chosen)}; put one for each camera "
-            "there, named after it"
-        )
+        expected, got = "two or more videos, or folders of images", len(chosen)
+        raise CaptureError(f"{folder}: expected {expected}, got {got}; put one for each camera there, named after it")
     try:
         footage = collect_footage(folder, chosen)
     except ValueError as error:

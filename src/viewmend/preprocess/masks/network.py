@@ -31,10 +31,8 @@ class NetworkMasks:
         images = [i for i in inputs if i.name != self._plate_name]
         if len(images) != 1 or any(len(i.shape) != 4 or i.shape[1] not in (3, None) for i in inputs):
             shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)[:200]
-            raise ValueError(
-                f"{file}: expected a network of an image (1, 3, height, width), and a plate named 'bgr' or none, got "
-                f"{shapes}; export it so"
-            )
+            expected = "a network of an image (1, 3, height, width), and a plate named 'bgr' or none"
+            raise ValueError(f"{file}: expected {expected}, got {shapes}; export it so")
         if self._plate_name is not None and plate is None:
             raise ValueError(f"{file}: expected clean plates for this network, got none; give --plate")
         self._file, self._image, self._plate = file, images[0], plate
@@ -82,9 +80,8 @@ def _session(file: Path):
     try:
         return onnxruntime.InferenceSession(str(file), providers=onnxruntime.get_available_providers())
     except Exception as error:  # onnxruntime's own classes, one a cause
-        raise ValueError(
-            f"{file}: expected a network as an ONNX file, got: {str(error)[:200]}; export it again"
-        ) from None
+        got = str(error)[:200]
+        raise ValueError(f"{file}: expected a network as an ONNX file, got: {got}; export it again") from None
 
 
 def _tensor(rgb: Rgb, size: tuple[int, int], signed: bool) -> Float32[np.ndarray, "1 3 rows columns"]:
