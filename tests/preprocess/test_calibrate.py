@@ -138,7 +138,7 @@ def disturbed(folder, px=1.5):
 @pytest.fixture(scope="module")
 def studio(tmp_path_factory):
     folder = tmp_path_factory.mktemp("studio") / "take"
-    source = Studio(StudioConfig(seed=5, cameras=6, frames=2, fps=2, size_px=96))
+    source = Studio(StudioConfig(seed=5, cameras=8, frames=2, fps=2, size_px=96))
     write_capture(source, folder, images="png")
     return folder, source.cameras
 
