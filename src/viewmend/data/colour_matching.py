@@ -224,8 +224,7 @@ def _solve(values: Float[Tensor, "view point 4"], weight: Float[Tensor, "view po
     identity, mean = torch.eye(4).to(normal).repeat(views, 1), torch.eye(4).to(normal).repeat(1, views)
     constraint = torch.cat([mean, mean.new_zeros(4, 4)], 1)  # the mean map is the identity
     system = torch.cat([torch.cat([normal + regularisation, mean.mT], 1), constraint])
-    right = torch.cat([-normal @ identity[:, :3], identity.new_zeros(4, 3)])
-    change = torch.linalg.solve(system, right)[: 4 * views]
+    change = torch.linalg.solve(system, torch.cat([-normal @ identity[:, :3], identity.new_zeros(4, 3)]))[: 4 * views]
     return rearrange(identity[:, :3] + change, "(view k) channel -> view channel k", k=4)
 
 

@@ -133,8 +133,7 @@ def _background(bgr: UInt8[np.ndarray, "height width 3"], data: bytes, where: st
         return None
     if data.startswith(PNG_START) and data[25] == PNG_PALETTE and (at := data.find(b"PLTE")) > 0:
         return tuple(data[at + 6 : at + 3 : -1])
-    packed = bgr.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
-    colours = np.unique(packed)
+    colours = np.unique(bgr.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32))
     if len(colours) > MAX_LABELS or np.linalg.matrix_rank(colours[:, None] >> [16, 8, 0] & 255) < 2:
         return None
     if colours[0]:

@@ -180,5 +180,4 @@ def resize_frame(frame: MultiViewFrame, cameras: Cameras) -> MultiViewFrame:
         full = layers[None, view, :, :full_h, :full_w].float()
         resized = F.interpolate(full, (h, w), mode="bilinear", antialias=True, align_corners=False)
         small[view, :, :h, :w] = resized[0].round().clamp(0, 255).to(torch.uint8)
-    mask = None if frame.mask is None else small[:, 3]
-    return MultiViewFrame(cameras, small[:, :3], mask, frame.time)
+    return MultiViewFrame(cameras, small[:, :3], None if frame.mask is None else small[:, 3], frame.time)

@@ -64,8 +64,7 @@ def draw_check(check: CalibrationCheck, up: Point | None, tile_width: int = 400)
     captions = [f"{name}   IoU {check.iou[name]:.3f}" if name in check.iou else name for name in names]
     tiles = [Tile(caption, _draw(check, view, up)) for view, caption in enumerate(captions)]
     sheet = contact_sheet(in_rows(tiles, math.ceil(math.sqrt(1.25 * len(tiles)))), tile_width)
-    legend = contact_sheet([[Tile(LEGEND, None)]], sheet.shape[1] - 8, tile_height=0)
-    return np.concatenate([sheet, legend])
+    return np.concatenate([sheet, contact_sheet([[Tile(LEGEND, None)]], sheet.shape[1] - 8, tile_height=0)])
 
 
 def _draw(check: CalibrationCheck, view: int, up: Point | None) -> Picture:

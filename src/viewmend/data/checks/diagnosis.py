@@ -177,8 +177,7 @@ def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[flo
     """Common mistakes: the IoU after each is undone, and the issue that it would be."""
     for mistake, pose in _poses(frame.cameras):
         text = f"{mistake}; cameras.json needs R and t that map world to camera in OpenCV axes: convert them"
-        cameras = replace(frame.cameras, camera_from_world=pose)
-        yield _agreement(frame, cameras, bounds)[0], Issue(text, fatal=True)
+        yield _agreement(frame, replace(frame.cameras, camera_from_world=pose), bounds)[0], Issue(text, fatal=True)
     for factor in (0.5, 2.0):
         text = f"K is for images {factor:g} times as large; scale fx, fy, cx, cy and the skew by {1 / factor:g}"
         K = frame.cameras.K.clone()

@@ -25,8 +25,7 @@ def find(path: Path) -> Path | None:
 
 def root(path: Path, file: Path) -> Path:
     """The folder that contains both files of a pair."""
-    pair = [file.absolute().parent, (_annotations_of(file) or file).absolute().parent]
-    return Path(os.path.commonpath(pair))
+    return Path(os.path.commonpath([one.absolute().parent for one in (file, _annotations_of(file) or file)]))
 
 
 def content(path: Path, file: Path) -> dict[str, Any]:

@@ -124,8 +124,7 @@ def to_rotation(name: str, values: object) -> list[list[float]]:
     numbers = _to_array(values)
     if numbers.size not in (3, 9):
         raise ValueError(f"camera '{name}': expected a rotation of 3 or 9 numbers, got {numbers.size}; add it")
-    matrix = cv2.Rodrigues(numbers)[0] if numbers.size == 3 else numbers.reshape(3, 3)
-    return np.asarray(matrix).tolist()
+    return np.asarray(cv2.Rodrigues(numbers)[0] if numbers.size == 3 else numbers.reshape(3, 3)).tolist()
 
 
 def to_distortion(name: str, values: object) -> list[float]:

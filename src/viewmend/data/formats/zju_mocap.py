@@ -66,5 +66,5 @@ def _pattern(paths: list[str]) -> tuple[str, tuple[str, ...]]:
     columns = enumerate(zip(*stems, strict=False))
     same = next((n for n, characters in columns if len(set(characters)) > 1), min(map(len, stems)))
     prefix = stems[0][:same].rstrip("0123456789")
-    pattern = str(pure[0].parent / f"{prefix}{{frame}}{pure[0].suffix}")
-    return pattern, tuple(stem[len(prefix) :] for stem in stems)
+    ids = tuple(stem[len(prefix) :] for stem in stems)
+    return str(pure[0].parent / f"{prefix}{{frame}}{pure[0].suffix}"), ids

@@ -108,8 +108,8 @@ def procedural_set(
 
 
 def _scene(name: str, set: str, cameras: int, style: str, config: StudioConfig, **more: Any) -> StudioScene:
-    """A scene seen by a ring of cameras, of which the seed leaves out one."""
-    held = held_camera(config.seed, cameras)
+    """A scene seen by a ring of cameras, of which the seed leaves out one: any, but not in step with the seed."""
+    held = f"cam{int(np.random.SeedSequence([config.seed, cameras]).generate_state(1)[0]) % cameras:02d}"
     return StudioScene(name=name, set=set, rig=f"ring of {cameras}", style=style, config=config, held=held, **more)
 
 
@@ -158,11 +158,6 @@ def performer_set(
             name = f"Q-{person.stem}-{clip.stem}-{cameras}"
             scenes.append(_scene(name, "Q", cameras, clip.stem, config, files_sha256=hashes))
     return tuple(scenes)
-
-
-def held_camera(seed: int, cameras: int) -> str:
-    """The name of the studio's camera that is left out: any, by the seed, but not in step with it."""
-    return f"cam{int(np.random.SeedSequence([seed, cameras]).generate_state(1)[0]) % cameras:02d}"
 
 
 def _files(places: Sequence[Path], suffixes: tuple[str, ...], what: str) -> list[Path]:

@@ -79,17 +79,12 @@ def surface_seen(surfaces: Mapping[int, TrueSurface], times: Sequence[int], mesh
     names, (height, width) = surfaces[times[0]].cameras.names, raster.triangle.shape[1:]
     seen = torch.zeros(len(times), len(names), height, width, dtype=torch.bool, device=pixels.device)
     for n, time in enumerate(times):
-        points = interpolate(surfaces[time].vertices, mesh, target, raster)[0][index]
-        visible = _visible(points, surfaces[time])
+        surface = surfaces[time]
+        uv, z = project(interpolate(surface.vertices, mesh, target, raster)[0][index], surface.cameras)
+        inside = in_view(uv, z, surface.cameras)
+        column, row = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)
+        there = surface.depth[torch.arange(len(uv), device=uv.device)[:, None], row, column].float()
+        visible = inside & (there > 0) & (z - there < VISIBLE_M)
         for view in range(len(names)):
             seen[n, view][index] = visible[view]
     return SurfaceSeen(names, seen)
-
-
-def _visible(points: Float[Tensor, "point 3"], surface: TrueSurface) -> Bool[Tensor, "view point"]:
-    """Which cameras see points of the surface."""
-    uv, z = project(points, surface.cameras)
-    inside = in_view(uv, z, surface.cameras)
-    column, row = torch.where(inside[..., None], uv, 0.0).long().unbind(-1)
-    there = surface.depth[torch.arange(len(uv), device=uv.device)[:, None], row, column].float()
-    return inside & (there > 0) & (z - there < VISIBLE_M)

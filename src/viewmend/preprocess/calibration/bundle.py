@@ -220,8 +220,7 @@ def residual_picture(cameras: Sequence[NativeCamera], found: Sequence[Calibrated
     ]
     sheet = contact_sheet(in_rows(tiles, int(np.ceil(np.sqrt(len(tiles))))), TILE_PX)
     text = f"from where each corner was found to where the calibration has it, {ENLARGED} times as long"
-    legend = contact_sheet([[Tile(text, None)]], sheet.shape[1] - 8, tile_height=0)
-    return np.concatenate([sheet, legend])
+    return np.concatenate([sheet, contact_sheet([[Tile(text, None)]], sheet.shape[1] - 8, tile_height=0)])
 
 
 def _draw(camera: NativeCamera, found: CalibratedCamera) -> Picture:

@@ -35,11 +35,9 @@ def brought_to(rig: Cameras, reference: Cameras, points_world: Float[Tensor, "po
     The rotation, translation and scale are Umeyama's, of the points in each camera's own frame (PAMI 1991).
     """
     there = torch.cat([points_world, torch.ones_like(points_world[:, :1])], 1).double()
-    in_cameras = there @ reference.camera_from_world.double().mT
-    here = in_cameras @ invert_rigid(rig.camera_from_world.double()).mT
+    here = there @ reference.camera_from_world.double().mT @ invert_rigid(rig.camera_from_world.double()).mT
     source = here[..., :3].reshape(-1, 3).cpu().numpy()
-    target = points_world.double().repeat(len(rig), 1).cpu().numpy()
-    R, t, scale = _similarity(source, target)
+    R, t, scale = _similarity(source, points_world.double().repeat(len(rig), 1).cpu().numpy())
     pose = rig.camera_from_world.double()
     turned = pose[:, :3, :3] @ torch.from_numpy(R.T).to(pose)
     moved = scale * pose[:, :3, 3] - turned @ torch.from_numpy(t).to(pose)
