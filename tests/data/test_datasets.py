@@ -11,18 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.foreign_studios import (
-    save_object,
-    write_actorshq,
-    write_dna,
-    write_easyvolcap,
-    write_genebody,
-    write_mvhumannet,
-    write_panoptic,
-    write_riftcast,
-    write_take,
-    write_zju,
-)
+from reference import foreign_studios as studios
 from reference.random_rigs import (
     COUNTS,
     SEEDS,
@@ -68,7 +57,7 @@ def check_rig(folder, rig, frames, gaps, ids=None):
 @given(SEEDS, COUNTS, st.booleans(), st.booleans(), st.sampled_from([2, 3, 4, 5]))
 def test_zju_mocap_round_trip(seed, count, stamps, arrays, protocol):
     with random_folder(seed, count, "Camera_B{}", "{:06d}") as (folder, rig, frames, gaps):
-        write_zju(folder, opencv(rig), frames, gaps, stamps, arrays, protocol)
+        studios.write_zju(folder, opencv(rig), frames, gaps, stamps, arrays, protocol)
         ids = [f"{f}_2019-08-23_16-08-{int(f[-4:]):02d}.592" for f in frames] if stamps else frames
         check_rig(folder, rig, frames, gaps, ids if len(frames) > 1 else ["0"])
 
@@ -77,7 +66,7 @@ def test_zju_mocap_round_trip(seed, count, stamps, arrays, protocol):
 @given(SEEDS, COUNTS, st.sampled_from([2, 4, 5]))
 def test_genebody_round_trip(seed, count, protocol):
     with random_folder(seed, count, "{:02d}", "{:04d}") as (folder, rig, frames, gaps):
-        write_genebody(folder, opencv(rig), frames, gaps, protocol)
+        studios.write_genebody(folder, opencv(rig), frames, gaps, protocol)
         check_rig(folder, rig, frames, gaps)
 
 
@@ -87,7 +76,7 @@ def test_mvhumannet_round_trip(seed, count, sizes):
     scale, full, size = sizes
     with random_folder(seed, count, "CC32871A0{:02d}", "{:04d}", 0) as (folder, rig, frames, gaps):
         rig = [c | {"width": size[0], "height": size[1], "K": rig[0]["K"]} for c in rig]
-        write_mvhumannet(folder, rig, frames, gaps, scale, full)
+        studios.write_mvhumannet(folder, rig, frames, gaps, scale, full)
         check_rig(folder, rig, frames, gaps)
 
 
@@ -96,7 +85,7 @@ def test_mvhumannet_round_trip(seed, count, sizes):
 def test_actorshq_round_trip(seed, count, scale, inside):
     boxes = np.sort(np.random.default_rng(seed).uniform(-2, 2, (3, 2, 3)), 1)
     with random_folder(seed, count, "Cam{:03d}", "{:06d}", 0) as (folder, rig, frames, gaps):
-        write_actorshq(folder, rig, frames, gaps, scale, boxes.reshape(3, 6))
+        studios.write_actorshq(folder, rig, frames, gaps, scale, boxes.reshape(3, 6))
         capture = check_rig(folder / scale if inside else folder, rig, frames, gaps)
         np.testing.assert_allclose(capture.bounds.low, boxes[:, 0].min(0), rtol=1e-6)
         np.testing.assert_allclose(capture.bounds.high, boxes[:, 1].max(0), rtol=1e-6)
@@ -107,7 +96,7 @@ def test_actorshq_round_trip(seed, count, scale, inside):
 def test_panoptic_round_trip(seed, count, type_):
     kind, pattern, fps = type_
     with random_folder(seed, count, pattern, "{:08d}") as (folder, rig, frames, gaps):
-        write_panoptic(folder, opencv(rig), frames, gaps, kind)
+        studios.write_panoptic(folder, opencv(rig), frames, gaps, kind)
         assert check_rig(folder, rig, frames, gaps).fps == fps
 
 
@@ -116,7 +105,7 @@ def test_panoptic_round_trip(seed, count, type_):
 def test_easyvolcap_round_trip(seed, count, quoted):
     bounds = [[-1.0, -2.0, 0.0], [1.0, 2.0, 3.5]]
     with random_folder(seed, count, "{:02d}", "{:06d}") as (folder, rig, frames, gaps):
-        write_easyvolcap(folder, opencv(rig), frames, gaps, bounds, quoted)
+        studios.write_easyvolcap(folder, opencv(rig), frames, gaps, bounds, quoted)
         assert check_rig(folder, rig, frames, gaps).bounds.high.tolist() == bounds[1]
 
 
@@ -124,7 +113,7 @@ def test_easyvolcap_round_trip(seed, count, quoted):
 @given(SEEDS, COUNTS, st.booleans(), st.booleans())
 def test_dna_rendering_round_trip(seed, count, apart, opened_as_file):
     with random_folder(seed, count, "{:02d}", "{}") as (folder, rig, frames, gaps):
-        main = write_dna(folder, opencv(rig), frames, gaps, apart)
+        main = studios.write_dna(folder, opencv(rig), frames, gaps, apart)
         check_rig(main if opened_as_file else folder, rig, frames, gaps)
 
 
@@ -132,13 +121,13 @@ def test_dna_rendering_round_trip(seed, count, apart, opened_as_file):
 @given(SEEDS, COUNTS)
 def test_riftcast_round_trip(seed, count):
     with random_folder(seed, count, "{}", "{:05d}", 0) as (folder, rig, frames, gaps):
-        write_riftcast(folder, rig, frames, gaps)
+        studios.write_riftcast(folder, rig, frames, gaps)
         check_rig(folder, rig, frames, gaps)
 
 
 def test_only_cameras_with_footage_are_used(tmp_path):
     rig = named(random_rig(3, 4), "00_{:02d}")
-    write_panoptic(tmp_path, rig[:3], ["00000000"])
+    studios.write_panoptic(tmp_path, rig[:3], ["00000000"])
     file = tmp_path / "calibration_160422_ultimatum1.json"
     content = json.loads(file.read_text())
     content["cameras"].insert(1, content["cameras"][0] | {"name": "00_99"})
@@ -148,7 +137,7 @@ def test_only_cameras_with_footage_are_used(tmp_path):
 
 def test_label_masks_are_background_only_at_0(tmp_path):
     rig = named([camera | {"dist": np.zeros(5)} for camera in random_rig(3, 2)], "Camera_B{}")
-    write_zju(tmp_path, rig, ["000000"])
+    studios.write_zju(tmp_path, rig, ["000000"])
     assert sorted(open_capture(tmp_path).read(0).mask.unique().tolist()) == [0, 255]
 
 
@@ -172,9 +161,9 @@ def test_a_real_rig_of_genebody(shared, tmp_path):
     """Its 40 cameras look inwards from about 3 m."""
     content = json.loads((shared / "rigs/genebody_style_rig.json").read_text())
     rig = [{"name": name, "width": 64, "height": 48} for name in content]
-    write_take(tmp_path, rig, ["0001"], (), "image/{c}/{f}.jpg", "mask/{c}/mask{f}.png")
+    studios.write_take(tmp_path, rig, ["0001"], (), "image/{c}/{f}.jpg", "mask/{c}/mask{f}.png")
     cams = {name: {key: np.array(value) for key, value in cam.items()} for name, cam in content.items()}
-    save_object(tmp_path / "annots.npy", {"cams": cams}, 2)
+    studios.save_object(tmp_path / "annots.npy", {"cams": cams}, 2)
     cameras = open_capture(tmp_path).cameras
     forward, inwards = cameras.world_from_camera[:, :3, 2], cameras.centers.mean(0) - cameras.centers
     distance = inwards.norm(dim=-1)
@@ -183,12 +172,12 @@ def test_a_real_rig_of_genebody(shared, tmp_path):
 
 
 WRITERS = {
-    "zju": (write_zju, "00_{:02d}"),
-    "genebody": (write_genebody, "00_{:02d}"),
-    "mvhumannet": (write_mvhumannet, "CC32871A0{:02d}"),
-    "actorshq": (write_actorshq, "Cam{:03d}"),
-    "panoptic": (write_panoptic, "00_{:02d}"),
-    "easyvolcap": (write_easyvolcap, "00_{:02d}"),
+    "zju": (studios.write_zju, "00_{:02d}"),
+    "genebody": (studios.write_genebody, "00_{:02d}"),
+    "mvhumannet": (studios.write_mvhumannet, "CC32871A0{:02d}"),
+    "actorshq": (studios.write_actorshq, "Cam{:03d}"),
+    "panoptic": (studios.write_panoptic, "00_{:02d}"),
+    "easyvolcap": (studios.write_easyvolcap, "00_{:02d}"),
 }
 PANOPTIC = "calibration_160422_ultimatum1.json"
 
@@ -223,10 +212,10 @@ def test_invalid_files_are_rejected(tmp_path, name, file, old, new, message):
 def test_moving_cameras_and_several_scales_are_rejected(tmp_path):
     rig = named(random_rig(3, 2, 0), "Cam{:03d}")
     for scale in ("1x", "2x"):
-        write_actorshq(tmp_path, rig, ["000000"], scale=scale)
+        studios.write_actorshq(tmp_path, rig, ["000000"], scale=scale)
     with pytest.raises(CaptureError, match="expected a folder with one scale, got 1x, 2x"):
         open_capture(tmp_path)
-    write_easyvolcap(tmp_path / "b" / "cameras" / "00", rig, ["000000"])
+    studios.write_easyvolcap(tmp_path / "b" / "cameras" / "00", rig, ["000000"])
     with pytest.raises(CaptureError, match="expected static cameras"):
         read_any_calibration(tmp_path / "b")
 
@@ -238,7 +227,7 @@ def test_dna_rendering_has_colour_corrections(tmp_path):
     """A value x becomes a x^2 + b x + c, clipped to 0..255; coefficients are in the order blue, green, red."""
     rig = named([camera | {"dist": np.zeros(5)} for camera in random_rig(3, 2)], "{:02d}")
     blue, green, red = [0.001, 0.5, 3.0], [0.0, 1.0, 0.0], [0.0, 9.0, 0.0]
-    write_dna(tmp_path, rig, ["0"], colours=[np.array([blue, green, red])] * 2)
+    studios.write_dna(tmp_path, rig, ["0"], colours=[np.array([blue, green, red])] * 2)
     rgb = open_capture(tmp_path).read(0).rgb[0, :, 0, 0].tolist()
     assert rgb == [255, 60, round(0.001 * 3600 + 30 + 3)]
 
@@ -246,7 +235,7 @@ def test_dna_rendering_has_colour_corrections(tmp_path):
 def test_one_of_several_sequences_is_opened_by_its_file(tmp_path):
     rig = named(random_rig(3, 3), "{:02d}")
     for name in ("0012_11", "0013_01"):
-        main = write_dna(tmp_path, rig, ["0", "1"], apart=True, name=name)
+        main = studios.write_dna(tmp_path, rig, ["0", "1"], apart=True, name=name)
     with pytest.raises(CaptureError, match=r"expected one sequence, got 2 in .*; open one of them, e.g. 0012_11.smc"):
         open_capture(tmp_path)
     capture = open_capture(main)
@@ -261,7 +250,7 @@ def test_one_of_several_sequences_is_opened_by_its_file(tmp_path):
 @pytest.mark.parametrize("how", ["link", "external"])
 def test_hdf5_files_do_not_lead_to_other_files(tmp_path, how):
     rig = named(random_rig(3, 2), "{:02d}")
-    main = write_dna(tmp_path, rig, ["0", "1"])
+    main = studios.write_dna(tmp_path, rig, ["0", "1"])
     (tmp_path / "secret").write_bytes(b"secret" * 100)
     with h5py.File(tmp_path / "other.h5", "w") as other:
         other["image"] = np.zeros(10, np.uint8)
@@ -288,7 +277,7 @@ def test_hdf5_members_that_are_not_images_are_ignored_or_rejected(tmp_path):
 
 def test_plain_captures_may_have_images_in_hdf5_files(tmp_path):
     rig = named([camera | {"dist": np.zeros(5)} for camera in random_rig(3, 2)], "{:02d}")
-    main = write_dna(tmp_path, rig, ["0"])
+    main = studios.write_dna(tmp_path, rig, ["0"])
     cameras = []
     for camera in rig:
         number = int(camera["name"])
@@ -308,7 +297,7 @@ def test_the_meta_file_of_riftcast_has_bounds_up_and_frames(tmp_path):
     to_world = np.eye(4)
     to_world[:3, 3] = 1, 2, 3
     text = META % ", ".join(map(str, to_world.ravel().tolist()))
-    write_riftcast(tmp_path / "data", rig, [f"{n:05d}" for n in range(4)], (), text)
+    studios.write_riftcast(tmp_path / "data", rig, [f"{n:05d}" for n in range(4)], (), text)
     (tmp_path / "start.json").write_text(text)
     for path in (tmp_path / "data", tmp_path / "data/meta.json", tmp_path / "start.json"):
         capture = open_capture(path)
@@ -326,6 +315,6 @@ def test_the_meta_file_of_riftcast_has_bounds_up_and_frames(tmp_path):
 )
 def test_unsupported_meta_files_of_riftcast_are_rejected(tmp_path, old, new, message):
     text = META % ", ".join("1" if n % 5 == 0 else "0" for n in range(16))
-    write_riftcast(tmp_path, named(random_rig(3, 2, 0), "{}"), ["00001"], (), text.replace(old, new))
+    studios.write_riftcast(tmp_path, named(random_rig(3, 2, 0), "{}"), ["00001"], (), text.replace(old, new))
     with pytest.raises(CaptureError, match=message):
         open_capture(tmp_path)

@@ -169,6 +169,7 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
     disturbed(folder)
     true = lambda frames, *_: Refinement(cameras.select(frames[0].cameras.names), 0.9, 0.1)  # noqa: E731
     monkeypatch.setattr(held_out, "refine_by_silhouettes", true)
+    monkeypatch.setattr(held_out, "best_hold", lambda *_: HOLDS[0])
     assert main(["calibrate", str(folder), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["outlines"] == {"missed_px": 0.9, "refined_px": 0.1} and len(figures) == 4
@@ -179,6 +180,7 @@ def test_what_is_refined_is_written(studio, tmp_path, capsys, monkeypatch):
 
 def test_a_calibration_that_no_refinement_betters_is_kept(studio, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(held_out, "refine_by_silhouettes", lambda frames, *_: Refinement(frames[0].cameras, 0.1, 0.1))
+    monkeypatch.setattr(held_out, "best_hold", lambda *_: HOLDS[0])
     arguments = ["calibrate", str(studio[0]), str(tmp_path / "out"), "--silhouettes", "--num-frames", "1"]
     assert main(arguments) == 2
     assert "keep the calibration" in capsys.readouterr().err and not (tmp_path / "out").exists()
