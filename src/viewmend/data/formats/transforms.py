@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, structs
 
-from viewmend.data.formats.files import existing, frame_pattern, image_size_px, invert_pose, names_from_paths, warn
+from viewmend.data.formats.files import existing, frame_pattern, image_size_px, names_from_paths, warn
 from viewmend.data.images import uses_alpha
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, bounded_bytes, read_json, typed
@@ -32,8 +32,6 @@ WITHOUT_EFFECT = (
     *("transform_matrix_start", "transform_matrix_end"),
 )
 """Keys that change neither images nor cameras."""
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenCV's camera axes."""
 Row = tuple[Number, Number, Number, Number]
 Angle = Annotated[float, Meta(gt=0, lt=3.14)]
 Side = Annotated[int, Meta(ge=1, le=2**16)]
@@ -103,8 +101,10 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     names = names_from_paths(paths) if len(ids) == 1 else _names_of_patterns(paths)
     entries = []
     for (pattern, frame), name in zip(cameras, names, strict=True):
-        world_from_camera = np.array(frame.transform_matrix, float)[:3] @ OPENGL
-        entry = {"name": name, **_intrinsics(folder, frame.file_path, read, frame), **invert_pose(world_from_camera)}
+        world_from_camera = np.array(frame.transform_matrix, float)[:3]
+        R = np.diag([1.0, -1.0, -1.0]) @ world_from_camera[:, :3].T  # from OpenGL to OpenCV axes
+        entry = {"name": name, **_intrinsics(folder, frame.file_path, read, frame)}
+        entry |= {"R": R.tolist(), "t": (-R @ world_from_camera[:, 3]).tolist()}
         files = {"image": pattern.file_path, "mask": pattern.mask_path, "depth": pattern.depth_file_path}
         entries.append(entry | files | ({"mask": pattern.file_path} if alpha else {}))
     return {"first_pixel_center": [0.5, 0.5], "up": [0.0, 0.0, 1.0], "frames": ids, "cameras": entries}
