@@ -8,9 +8,8 @@ import torch
 from viewmend.data.synthetic.performer import Performer, TexturedMesh
 from viewmend.data.synthetic.procedural import PerformerStyle, procedural_scene
 from viewmend.data.synthetic.procedural.fabric import KINDS, Canvas, sample_fabric
-from viewmend.data.synthetic.procedural.grounds import Tempo
 from viewmend.data.synthetic.procedural.head import build_head
-from viewmend.data.synthetic.procedural.motion import MOTIONS, sample_motion
+from viewmend.data.synthetic.procedural.motion import MOTIONS, Tempo, sample_motion
 from viewmend.data.synthetic.procedural.skeleton import sample_physique
 
 SEED = 10_000

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from viewmend.data.synthetic.gltf import Character
 from viewmend.data.synthetic.performer import skin
-from viewmend.data.synthetic.procedural.fabric import QUIET, WORDS, Canvas, Fabric, sample_fabric, write
+from viewmend.data.synthetic.procedural.fabric import QUIET, WORDS, Canvas, Image, Plane, sample_fabric, write
 from viewmend.data.synthetic.retarget import find_parts, node_matrices
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.mesh import Mesh
@@ -64,9 +64,9 @@ class Garments:
     """Texels that a face shows."""
     bare: Bool[np.ndarray, "height width"]
     """Texels of hands and head."""
-    around_m: Float[np.ndarray, "height width"]
+    around_m: Plane
     """Way around the limb, 0 in front, growing towards the body's left (for arms: some fixed side)."""
-    along_m: Float[np.ndarray, "height width"]
+    along_m: Plane
     """Height above the soles; on arms `SHOULDER_M` at the shoulder, falling towards the hand."""
     dress: tuple[int, ...]
     """For each garment the number of the colour that it was found by: the halves of an overall share it."""
@@ -91,43 +91,37 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
     Raises:
         ValueError: the skeleton is not human.
     """
-    names, parents = [n.name for n in character.nodes], [n.parent for n in character.nodes]
-    part_of = {name: part for part, name in find_parts(names, parents).items()}
-    world = node_matrices(character, upright_from_file, (-1,) * len(names), torch.zeros(0, 3, 3), None)
+    part_of = {name: part for part, name in find_parts([n.name for n in character.nodes]).items()}
+    world = node_matrices(character, upright_from_file)
     owner = {part: n for n, limb in enumerate(NAMES) for part in LIMBS[limb][2]}
     limb_of_node: list[int] = []
-    for name, parent in zip(names, parents, strict=True):
-        above = limb_of_node[parent] if parent >= 0 else 0
-        limb_of_node.append(owner[part_of[name]] if name in part_of else above)
+    for node in character.nodes:
+        above = limb_of_node[node.parent] if node.parent >= 0 else 0
+        limb_of_node.append(owner[part_of[node.name]] if node.name in part_of else above)
     limb = torch.tensor(limb_of_node)[character.node_of_joint][character.joints]
     share = torch.zeros(len(limb), len(NAMES)).scatter_add_(1, limb, character.weights)
     matrices = world[character.node_of_joint] @ character.joint_from_bind
     vertices, _ = skin(character.vertices, character.normals, character.joints, character.weights, matrices)
-    joints = {part_of[name]: world[n, :3, 3].numpy() for n, name in enumerate(names) if name in part_of}
+    joints = {part_of[n.name]: world[i, :3, 3].numpy() for i, n in enumerate(character.nodes) if n.name in part_of}
     return RestBody(vertices, joints, share[character.faces].sum(1).argmax(1))
 
 
 def find_garments(character: Character, body: RestBody) -> list[Garments | None]:
     """The cloth of each texture, None where there is none (hair, eyes, bare skin)."""
-    lab = [_half_lab(texture) for texture in character.textures]
-    maps = [_texels(character, body, n, image.shape[:2]) for n, image in enumerate(lab)]
+    lab, maps = [], []
+    for n, texture in enumerate(character.textures):
+        width, height = max(1, texture.shape[2] // 2), max(1, texture.shape[1] // 2)
+        half = cv2.resize(cv2.merge(list(texture.numpy())), (width, height), interpolation=cv2.INTER_AREA)
+        lab.append(cv2.cvtColor(half, cv2.COLOR_RGB2LAB))
+        maps.append(_texels(character, body, n, width, height))
     bare = _skin_hues(lab, maps, body)
-    return [_garments(image, bare, *at, body) for image, at in zip(lab, maps, strict=True)]
-
-
-def _half_lab(texture: Float[Tensor, "3 _ _"]) -> Float[np.ndarray, "height width 3"]:
-    """The texture at half its size in CIELAB."""
-    height, width = texture.shape[1:]
-    image = cv2.merge(list(texture.numpy()))
-    half = cv2.resize(image, (max(1, width // 2), max(1, height // 2)), interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(half, cv2.COLOR_RGB2LAB)
+    return [_garments(image, bare, limb, place, body) for image, (limb, place) in zip(lab, maps, strict=True)]
 
 
 def _texels(
-    character: Character, body: RestBody, texture: int, size: tuple[int, ...]
-) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width 3"]]:
+    character: Character, body: RestBody, texture: int, width: int, height: int
+) -> tuple[Int[np.ndarray, "height width"], Image]:
     """Limb of each texel, -1 where no face shows it, and its place at rest."""
-    height, width = size
     of_texture = (character.texture_of_face == texture).nonzero()[:, 0]
     flat = Mesh(torch.cat([character.uv, torch.ones(len(character.uv), 1)], 1), character.faces[of_texture])
     # A camera facing the plane z = 1 of texture coordinates has one texel per pixel.
@@ -142,23 +136,17 @@ def _skin_hues(
     lab: list[np.ndarray], maps: list[tuple[np.ndarray, np.ndarray]], body: RestBody
 ) -> Float[np.ndarray, "2 2"] | None:
     """Hues (a and b) of the hands and of the face, None where neither shows; hair and gloves do not count."""
-    medians = []
-    for which in (HANDS, HEAD):
-        found = []
-        for image, (limb, place) in zip(lab, maps, strict=True):
-            at = limb == which
-            if which == HEAD and "Head" in body.joints:
-                at &= place[..., 2] > body.joints["Head"][2] + FACE_M
-            # Wigs hang in front of the head, too: a face is on the texture that has the hands.
-            found.append(image[at & (limb == HANDS).any()][::7, 1:])
-        values = np.concatenate(found)
-        medians += [np.median(values, 0)] if len(values) else []
+    face = body.joints["Head"][2] + FACE_M if "Head" in body.joints else -np.inf
+    hands, faces = [], []
+    for image, (limb, place) in zip(lab, maps, strict=True):
+        hands.append(image[limb == HANDS][::7, 1:])
+        # Wigs hang in front of the head, too: a face is on the texture that has the hands.
+        faces.append(image[(limb == HEAD) & (place[..., 2] > face) & (limb == HANDS).any()][::7, 1:])
+    medians = [np.median(values, 0) for values in map(np.concatenate, (hands, faces)) if len(values)]
     return np.stack((medians[0], medians[-1])) if medians else None
 
 
-def _is_skin(
-    lab: Float[np.ndarray, "height width 3"], hues: Float[np.ndarray, "2 2"]
-) -> Bool[np.ndarray, "height width"]:
+def _is_skin(lab: Image, hues: Float[np.ndarray, "2 2"]) -> Bool[np.ndarray, "height width"]:
     """Texels that look like hands and face (see `SKIN_RAD`)."""
     angle, chroma = np.arctan2(hues[:, 1], hues[:, 0]), np.linalg.norm(hues, axis=1)
     red, yellow = angle.min() - SKIN_RAD[0], angle.max() + SKIN_RAD[1]
@@ -169,14 +157,14 @@ def _is_skin(
     return between & (square > low**2) & (square < high**2)
 
 
-def _centers(values: Float[np.ndarray, "sample 3"], most: int, apart: float) -> Float[np.ndarray, "color 3"]:
-    """Colours that stand for many: farthest first until none is `apart` from all, then two rounds of means."""
+def _centers(values: Float[np.ndarray, "sample 3"]) -> Float[np.ndarray, "color 3"]:
+    """Colours that stand for many: farthest first until none is far from all, then two rounds of means."""
     centers = np.median(values, 0)[None]
-    while len(centers) < most:
+    while len(centers) < MOST_GARMENTS:
         distance = np.sqrt(((values[:, None] - centers) ** 2).sum(-1).min(1))
         # Not the very farthest, which may be a speck.
         far = int(np.argsort(distance)[int(0.97 * (len(values) - 1))])
-        if distance[far] < apart:
+        if distance[far] < APART_LAB:
             break
         centers = np.concatenate([centers, values[far][None]])
     for _ in range(2):
@@ -191,24 +179,24 @@ def _nearest(values: Float[np.ndarray, "*any 3"], centers: Float[np.ndarray, "co
 
 
 def _garments(
-    lab: Float[np.ndarray, "height width 3"],
-    skin: Float[np.ndarray, "2 2"] | None,
+    lab: Image,
+    hues: Float[np.ndarray, "2 2"] | None,
     limb: Int[np.ndarray, "height width"],
-    place: Float[np.ndarray, "height width 3"],
+    place: Image,
     body: RestBody,
 ) -> Garments | None:
     shown, bare = limb >= 0, limb >= HANDS
     clothable = (shown & ~bare).astype(np.float32)
     if clothable.sum() < BODY_SHARE * shown.sum():
         return None
-    naked = np.zeros_like(clothable) if skin is None else clothable * _is_skin(lab, skin)
+    naked = np.zeros_like(clothable) if hues is None else clothable * _is_skin(lab, hues)
     cloth = clothable * (_smooth(naked, 9) < 0.5 * _smooth(clothable, 9))
     inside = cloth > 0
     if inside.sum() < LEAST_SHARE * cloth.size:
         return None
     weight = np.maximum(_smooth(cloth, 3), 1e-3)
     color = _smooth(lab * cloth[..., None] * np.array([LIGHTNESS, 1, 1], np.float32), 3) / weight[..., None]
-    label = _nearest(color, _centers(color[inside][::23], MOST_GARMENTS, APART_LAB))
+    label = _nearest(color, _centers(color[inside][::23]))
     around, along = _unrolled(limb, place, body)
     below = (limb >= LEGS) | (limb == TRUNK) & (along < float(body.joints["Hips"][1] - body.vertices[:, 1].min()))
     covers, dress, shoes = [], [], []
@@ -226,9 +214,7 @@ def _smooth(values: np.ndarray, size: int) -> np.ndarray:
     return cv2.blur(values.astype(np.float32), (size, size))
 
 
-def _unrolled(
-    limb: Int[np.ndarray, "height width"], place: Float[np.ndarray, "height width 3"], body: RestBody
-) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+def _unrolled(limb: Int[np.ndarray, "height width"], place: Image, body: RestBody) -> tuple[Plane, Plane]:
     """Coordinates around and along each limb, as if it were a cylinder."""
     around, along = np.zeros(limb.shape, np.float32), np.zeros(limb.shape, np.float32)
     floor = float(body.vertices[:, 1].min())
@@ -266,7 +252,7 @@ _GRAY = np.array([0.299, 0.587, 0.114], np.float32)
 def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], variety: float, seed: int) -> Character:
     """The character in other clothes; skin, hair and eyes are unchanged.
 
-    Each garment is found by its colour (see `garments`), and with a chance of `variety` either dyed (its own pattern in
+    Each garment is found by its colour, and with a chance of `variety` either dyed (its own pattern in
     other hues) or replaced by a seeded cloth: plain, striped, checked, printed or lettered, under the garment's folds.
 
     Raises:
@@ -278,31 +264,28 @@ def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], va
         return character
     rng = np.random.default_rng([seed, 31])
     found = find_garments(character, rest_body(character, upright_from_file))
-    textures = [
-        texture if garments is None else _dressed(texture, garments, variety, rng)
-        for texture, garments in zip(character.textures, found, strict=True)
-    ]
+    textures = []
+    for texture, garments in zip(character.textures, found, strict=True):
+        if garments is None:
+            textures.append(texture)
+            continue
+        image = cv2.merge(list(texture.numpy()))
+        seeds: dict[int, int] = {}
+        for n, (dress, shoe) in enumerate(zip(garments.dress, garments.shoes, strict=True)):
+            changes, seed = rng.random() < variety, int(rng.integers(2**31))
+            # The halves of an overall: the second takes the seed of the first.
+            seed = seeds[dress] if not shoe and dress in seeds and rng.random() < _ONE_PIECE else seed
+            seeds[dress] = seed
+            if changes:
+                _dress(image, garments, n, np.random.default_rng(seed))
+        textures.append(torch.from_numpy(np.stack(cv2.split(image))))
     return replace(character, textures=tuple(textures))
 
 
-def _dressed(
-    texture: Float[Tensor, "3 height width"], garments: Garments, variety: float, rng: np.random.Generator
-) -> Float[Tensor, "3 height width"]:
-    image = cv2.merge(list(texture.numpy()))
-    seeds: dict[int, int] = {}
-    for n, (dress, shoe) in enumerate(zip(garments.dress, garments.shoes, strict=True)):
-        changes, seed = rng.random() < variety, int(rng.integers(2**31))
-        # The halves of an overall: the second takes the seed of the first.
-        seed = seeds[dress] if not shoe and dress in seeds and rng.random() < _ONE_PIECE else seed
-        seeds[dress] = seed
-        if changes:
-            _dress(image, garments, n, np.random.default_rng(seed))
-    return torch.from_numpy(np.stack(cv2.split(image)))
-
-
-def _dress(image: Float[np.ndarray, "height width 3"], garments: Garments, n: int, rng: np.random.Generator) -> None:
+def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -> None:
     """Change one garment of a texture, in place."""
-    half = _window(garments.cover[n])
+    rows, columns = (np.flatnonzero(garments.cover[n].any(axis)) for axis in (1, 0))
+    half = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
     # Half a texture's odd last row or column stays as it is.
     full = tuple(slice(2 * s.start, 2 * s.stop) for s in half)
     own, size = image[full], tuple(2 * (s.stop - s.start) for s in reversed(half))
@@ -321,13 +304,7 @@ def _dress(image: Float[np.ndarray, "height width 3"], garments: Garments, n: in
     own += cover * (new - own)
 
 
-def _window(cover: Float[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """Rows and columns that hold all of a garment."""
-    rows, columns = (np.flatnonzero(cover.any(axis)) for axis in (1, 0))
-    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-def _dyed(own: Float[np.ndarray, "height width 3"], rng: np.random.Generator) -> Float[np.ndarray, "height width 3"]:
+def _dyed(own: Image, rng: np.random.Generator) -> Image:
     """Hues turned, colours stronger or paler, lighter or darker, and tinted: what is grey takes a colour, too."""
     turn, strength, gain = rng.uniform(0, 2 * np.pi), rng.uniform(0.4, 1.2), np.exp(rng.uniform(-0.35, 0.45))
     axis = np.full(3, 3**-0.5)
@@ -339,34 +316,31 @@ def _dyed(own: Float[np.ndarray, "height width 3"], rng: np.random.Generator) ->
     return np.clip(cv2.transform(own, matrix.astype(np.float32)), 0, 1)
 
 
-def _colors(
-    garments: Garments, n: int, window: tuple[slice, slice], rng: np.random.Generator
-) -> Float[np.ndarray, "height width 3"]:
-    """Another cloth on the garment's window, without folds; its mean colour around visible texels."""
-    chart = _chart(sample_fabric(rng), rng)
+def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.random.Generator) -> Image:
+    """Another cloth on the garment's window, perhaps with a word across the chest, without folds.
+
+    Around visible texels it has its mean colour.
+    """
+    fabric = sample_fabric(rng)
+    cloth = fabric.paint(CHART)
+    if fabric.kind in QUIET and rng.random() < _LETTERED:
+        word = WORDS[int(rng.integers(len(WORDS)))]
+        cloth = write(cloth, CHART, word, fabric.colors[2], (0.0, CHEST_M), rng.uniform(0.2, 0.3))
+    chart = (255 * cloth).astype(np.uint8)
     column = (garments.around_m[window] + CHART.width_m / 2) * CHART.px_per_m - 0.5
     row = (CHART.height_m - garments.along_m[window]) * CHART.px_per_m - 0.5
     color = cv2.remap(chart, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT).astype(np.float32) / 255
     shown, part = garments.shown[window], garments.cover[n][window] > 0
     known = (shown & part).astype(np.float32)
-    # Wide enough for the margin of any cover (`garments.MARGIN_PX`).
+    # Wide enough for the margin of any cover (`MARGIN_PX`).
     mean = cv2.blur(color * known[..., None], (13, 13)) / np.maximum(cv2.blur(known, (13, 13)), 1e-4)[..., None]
     return np.where((known > 0)[..., None], color, mean)
 
 
-def _chart(fabric: Fabric, rng: np.random.Generator) -> UInt8[np.ndarray, "height width 3"]:
-    """The cloth on its chart, perhaps with a word across the chest."""
-    image = fabric.paint(CHART)
-    if fabric.kind in QUIET and rng.random() < _LETTERED:
-        word = WORDS[int(rng.integers(len(WORDS)))]
-        image = write(image, CHART, word, fabric.colors[2], (0.0, CHEST_M), rng.uniform(0.2, 0.3))
-    return (255 * image).astype(np.uint8)
-
-
 def _folds(
-    own: Float[np.ndarray, "height width 3"],
-    cover: Float[np.ndarray, "height width"],
-    shown: Float[np.ndarray, "height width"],
+    own: Image,
+    cover: Plane,
+    shown: Plane,
 ) -> Float[np.ndarray, "height width 1"]:
     """Shading of a garment, around 1; 1 outside visible texels."""
     gray = cv2.transform(own, _GRAY[None])

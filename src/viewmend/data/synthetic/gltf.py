@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -50,13 +51,11 @@ class Document:
     def view(self, index: int) -> bytes:
         """The bytes of a buffer view."""
         entry = self.entry("bufferViews", index)
-        start, length = _count(entry.get("byteOffset", 0)), _count(entry["byteLength"])
-        data = self.buffers[_count(entry["buffer"])]
-        if start + length > len(data):
-            raise self.fault(
-                f"expected {start + length} bytes of binary data or more, got {len(data)}: it is cut short"
-            )
-        return data[start : start + length]
+        start, data = _count(entry.get("byteOffset", 0)), self.buffers[_count(entry["buffer"])]
+        end = start + _count(entry["byteLength"])
+        if end > len(data):
+            raise self.fault(f"expected {end} bytes of binary data or more, got {len(data)}: it is cut short")
+        return data[start:end]
 
     def accessor(self, index: int) -> np.ndarray:
         """The values of an accessor, (count, width); normalised integers come as floats."""
@@ -64,14 +63,12 @@ class Document:
         if "sparse" in entry or "bufferView" not in entry:
             raise CaptureError(f"{self.path}: sparse accessors are not supported; export without shape keys")
         dtype, width = np.dtype(_COMPONENTS[entry["componentType"]]), _WIDTHS[entry["type"]]
-        data = self.view(entry["bufferView"])
-        stride = _count(self.entry("bufferViews", entry["bufferView"]).get("byteStride", dtype.itemsize * width))
+        data, size = self.view(entry["bufferView"]), dtype.itemsize * width
+        stride = _count(self.entry("bufferViews", entry["bufferView"]).get("byteStride", size))
         offset, count = _count(entry.get("byteOffset", 0)), _count(entry["count"])
-        if stride < dtype.itemsize * width:
-            raise self.fault(
-                f"accessor {index}: expected a byteStride of {dtype.itemsize * width} or more, got {stride}"
-            )
-        if count and offset + stride * (count - 1) + dtype.itemsize * width > len(data):
+        if stride < size:
+            raise self.fault(f"accessor {index}: expected a byteStride of {size} or more, got {stride}")
+        if count and offset + stride * (count - 1) + size > len(data):
             raise self.fault(f"accessor {index} wants {count} elements, its view has only {len(data)} bytes")
         values = np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize)).copy()
         if dtype.kind == "f" and not np.isfinite(values).all():
@@ -88,13 +85,8 @@ class Document:
         # glTF factors are linear light; the power 1/2.2 is within 1 % of the sRGB curve and multiplies through.
         tint = factor[:, None, None] ** (1 / 2.2)
         if "baseColorTexture" not in pbr:
-            return np.ascontiguousarray(tint)
-        texture = self.entry("textures", pbr["baseColorTexture"]["index"])
-        return self._image(texture.get("source", -1)) * tint
-
-    def _image(self, index: int) -> np.ndarray:
-        import cv2
-
+            return tint
+        index = self.entry("textures", pbr["baseColorTexture"]["index"]).get("source", -1)
         entry = self.entry("images", index)
         data = self.view(entry["bufferView"]) if "bufferView" in entry else _resource(self.path, entry["uri"])
         size = size_from_header(data) or (0, 0)
@@ -105,7 +97,7 @@ class Document:
         image = decode_image(data, cv2.IMREAD_COLOR)
         if image is None:
             raise self.fault(f"image {entry.get('name', index)} is no readable JPEG or PNG")
-        return np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)).astype(np.float32) / 255
+        return np.ascontiguousarray(image[..., ::-1].transpose(2, 0, 1)).astype(np.float32) / 255 * tint
 
 
 def read_document(path: Path) -> Document:
@@ -163,11 +155,6 @@ def _resource(path: Path, uri: str) -> bytes:
 
 
 def _count(value: object) -> int:
-    """A number of bytes or things.
-
-    Raises:
-        ValueError: it is none.
-    """
     if type(value) is not int or value < 0:
         raise ValueError(f"expected a whole number from 0 on, got {str(value)[:40]}")
     return value
@@ -245,7 +232,7 @@ def _load(path: Path) -> Character:
     document = read_document(path)
     order, parent_of = _tree(document)
     position = {node: place for place, node in enumerate(order)}
-    nodes = tuple(_node(document.json["nodes"][n], n, position.get(parent_of[n], -1), path) for n in order)
+    nodes = tuple(_node(document, n, position.get(parent_of[n], -1)) for n in order)
     parts = _Parts(document, position)
     for node in order:
         entry = document.json["nodes"][node]
@@ -280,28 +267,29 @@ def _tree(document: Document) -> tuple[list[int], dict[int, int]]:
     return order, parent_of
 
 
-def _node(entry: Mapping[str, Any], index: int, parent: int, path: Path) -> Node:
+def _node(document: Document, index: int, parent: int) -> Node:
+    entry = document.json["nodes"][index]
     name = str(entry.get("name", f"node{index}"))
     if "matrix" in entry:
         matrix = torch.tensor(entry["matrix"], dtype=torch.float32).reshape(4, 4).T
-        scale = matrix[:3, :3].norm(dim=0)
+        translation, scale = matrix[:3, 3].clone(), matrix[:3, :3].norm(dim=0)
         if not bool((scale > 0).all()):
-            raise CaptureError(f"{path}: node {name} has a singular matrix; apply transforms and export again")
-        return Node(name, parent, matrix[:3, 3].clone(), matrix[:3, :3] / scale, scale)
-    rotation = _rotation_from_quaternion(torch.tensor(entry.get("rotation", [0, 0, 0, 1]), dtype=torch.float32))
-    translation = torch.tensor(entry.get("translation", [0, 0, 0]), dtype=torch.float32)
-    return Node(name, parent, translation, rotation, torch.tensor(entry.get("scale", [1, 1, 1]), dtype=torch.float32))
-
-
-def _rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """The rotation of a quaternion (x, y, z, w) of any length but zero."""
-    x, y, z, w = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+            raise CaptureError(f"{document.path}: node {name} has a singular matrix; apply transforms and export again")
+        rotation = matrix[:3, :3] / scale
+    else:
+        rest = {"translation": [0, 0, 0], "scale": [1, 1, 1], "rotation": [0, 0, 0, 1]}
+        given = (torch.tensor(entry.get(key, value), dtype=torch.float32) for key, value in rest.items())
+        translation, scale, quaternion = given
+        x, y, z, w = torch.nn.functional.normalize(quaternion, dim=-1).unbind(-1)
+        rows = [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+            *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+            *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+        ]
+        rotation = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    if not all(bool(part.isfinite().all()) for part in (translation, rotation, scale)):
+        raise document.fault(f"node {name} is no finite transform")
+    return Node(name, parent, translation, rotation, scale)
 
 
 class _Parts:
@@ -310,13 +298,10 @@ class _Parts:
     def __init__(self, document: Document, position: Mapping[int, int]) -> None:
         self.document = document
         self.position = position
-        self.columns: dict[str, list[np.ndarray]] = {
-            name: [] for name in ("vertices", "normals", "uv", "joints", "weights")
-        }
+        self.columns: list[list[np.ndarray]] = [[], [], [], [], [], []]
+        """Vertices, normals, texture coordinates, weights; joints, and of faces their textures."""
         self.faces: list[np.ndarray] = []
-        self.texture_of_face: list[np.ndarray] = []
-        self.textures: list[np.ndarray] = []
-        self.texture_index: dict[int, int] = {}
+        self.textures: dict[int, np.ndarray] = {}
         self.joint_nodes: list[int] = []
         self.inverse_binds: list[np.ndarray] = []
         self.first_joint: dict[tuple[str, int], int] = {}
@@ -341,12 +326,13 @@ class _Parts:
         joints, weights = self._binding(node, skin, attributes, n)
         # Tiled textures: whole turns are dropped once for the primitive, the rest is clamped by the sampler.
         uv = uv - np.floor(uv.min(0)) if n and (uv.min() < 0 or uv.max() > 1) else uv
-        columns = (vertices, normals, uv, joints, weights)
-        for column, values in zip(self.columns.values(), columns, strict=True):
+        material = primitive.get("material", -1)
+        if material not in self.textures:
+            self.textures[material] = self.document.base_color(material)
+        texture = np.full(len(faces), list(self.textures).index(material))
+        for column, values in zip(self.columns, (vertices, normals, uv, weights, joints, texture), strict=True):
             column.append(values)
-        texture = self._texture(primitive.get("material", -1))
         self.faces.append(faces + self.count)
-        self.texture_of_face.append(np.full(len(faces), texture))
         self.count += n
 
     def _binding(
@@ -354,19 +340,11 @@ class _Parts:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Joint positions and weights of n vertices; the weights sum to one."""
         if skin is None or "JOINTS_0" not in attributes:
-            key = ("node", node)
-            if key not in self.first_joint:
-                self._add_joints(key, [node], np.eye(4, dtype=np.float32)[None])
-            joints = np.full((n, 4), self.first_joint[key], dtype=np.int64)
+            joints = np.full((n, 4), self._first_joint(("node", node), [node], None))
             return joints, np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (n, 1))
         self.skinned = True
         entry = self.document.entry("skins", skin)
-        key = ("skin", skin)
-        if key not in self.first_joint:
-            identity = np.tile(np.eye(4, dtype=np.float32), (len(entry["joints"]), 1, 1))
-            given = entry.get("inverseBindMatrices")
-            binds = identity if given is None else self.document.accessor(given).reshape(-1, 4, 4).transpose(0, 2, 1)
-            self._add_joints(key, entry["joints"], binds)
+        first = self._first_joint(("skin", skin), entry["joints"], entry.get("inverseBindMatrices"))
         joints = self.document.accessor(attributes["JOINTS_0"]).astype(np.int64)
         weights = self.document.accessor(attributes["WEIGHTS_0"]).astype(np.float32)
         if len(joints) != n or len(weights) != n or joints.max(initial=0) >= len(entry["joints"]):
@@ -375,43 +353,39 @@ class _Parts:
             raise self.document.fault(f"expected {expected}, got {got}")
         if not bool(((weights >= 0) & (weights <= HEAVIEST)).all()):
             raise self.document.fault("expected weights of joints in [0, 1], got others")
-        return joints + self.first_joint[key], weights / np.maximum(weights.sum(1, keepdims=True), 1e-8)
+        return joints + first, weights / np.maximum(weights.sum(1, keepdims=True), 1e-8)
 
-    def _add_joints(self, key: tuple[str, int], nodes: list[int], binds: np.ndarray) -> None:
-        missing = [n for n in nodes if n not in self.position]
-        if missing:
-            raise self.document.fault(f"joints {missing} are not in the scene")
-        self.first_joint[key] = len(self.joint_nodes)
-        self.joint_nodes += [self.position[n] for n in nodes]
-        self.inverse_binds.append(binds.astype(np.float32))
-
-    def _texture(self, material: int) -> int:
-        """Position of this material's base colour among the textures."""
-        if material not in self.texture_index:
-            self.texture_index[material] = len(self.textures)
-            self.textures.append(self.document.base_color(material))
-        return self.texture_index[material]
+    def _first_joint(self, key: tuple[str, int], nodes: list[int], binds: int | None) -> int:
+        """Position of a skin's or a node's first joint; `binds` is the accessor of their inverse bind matrices."""
+        if key not in self.first_joint:
+            identity = np.tile(np.eye(4, dtype=np.float32), (len(nodes), 1, 1))
+            given = identity if binds is None else self.document.accessor(binds).reshape(-1, 4, 4).transpose(0, 2, 1)
+            missing = [n for n in nodes if n not in self.position]
+            if missing:
+                raise self.document.fault(f"joints {missing} are not in the scene")
+            self.first_joint[key] = len(self.joint_nodes)
+            self.joint_nodes += [self.position[n] for n in nodes]
+            self.inverse_binds.append(given.astype(np.float32))
+        return self.first_joint[key]
 
     def character(self, nodes: tuple[Node, ...]) -> Character:
         """All that was added, as tensors."""
-        joined = {name: np.concatenate(parts) for name, parts in self.columns.items()}
 
         def floats(values: np.ndarray) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
-        for node in nodes:
-            if not all(bool(part.isfinite().all()) for part in (node.translation, node.rotation, node.scale)):
-                raise self.document.fault(f"node {node.name} is no finite transform")
+        vertices, normals, uv, weights = (floats(np.concatenate(column)) for column in self.columns[:4])
+        joints, texture = (torch.from_numpy(np.concatenate(column).astype(np.int64)) for column in self.columns[4:])
         return Character(
             nodes=nodes,
-            vertices=floats(joined["vertices"]),
-            normals=torch.nn.functional.normalize(floats(joined["normals"]), dim=-1),
-            uv=floats(joined["uv"]),
+            vertices=vertices,
+            normals=torch.nn.functional.normalize(normals, dim=-1),
+            uv=uv,
             faces=torch.from_numpy(np.concatenate(self.faces)),
-            texture_of_face=torch.from_numpy(np.concatenate(self.texture_of_face).astype(np.int64)),
-            textures=tuple(floats(t) for t in self.textures),
-            joints=torch.from_numpy(joined["joints"].astype(np.int64)),
-            weights=floats(joined["weights"]),
+            texture_of_face=texture,
+            textures=tuple(floats(t) for t in self.textures.values()),
+            joints=joints,
+            weights=weights,
             node_of_joint=torch.tensor(self.joint_nodes),
             joint_from_bind=floats(np.concatenate(self.inverse_binds)),
         )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -131,7 +132,13 @@ def _image(
         out = (value.clamp_(0, 1) * 255).round().to(torch.uint8)
     else:
         out = (level * 255).round().to(torch.uint8).take(entry)
-    return out if it.jpeg_quality is None else _compressed(out, it.jpeg_quality)
+    if it.jpeg_quality is None:
+        return out
+    pixels = np.ascontiguousarray(out.permute(1, 2, 0).cpu().numpy()[..., ::-1])
+    encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, it.jpeg_quality])[1]
+    decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+    assert decoded is not None, "what was just encoded decodes"
+    return torch.from_numpy(np.ascontiguousarray(decoded[..., ::-1])).permute(2, 0, 1).contiguous().to(rgb.device)
 
 
 def _stained(
@@ -141,7 +148,7 @@ def _stained(
     strength: float,
 ) -> UInt8[Tensor, "3 height width"]:
     """The subject with the background's colour on it, the more the nearer to its outline."""
-    window = _window(mask, _reach(SPILL_PX))
+    window = _window(mask, SPILL_PX)
     inside = _blurred(mask[window].float() / 255, SPILL_PX)
     share = strength * 2 * (1 - inside).clamp(0, 0.5) * (mask[window] > 0)
     # Further than the blur reaches nothing is stained; its tails are below a level.
@@ -154,13 +161,12 @@ def _stained(
     return out
 
 
-def _window(mask: Tensor, margin: int) -> tuple[slice, slice]:
-    """Rows and columns that hold all of a mask, and a margin."""
-    bounds = []
+def _window(mask: Tensor, sigma_px: float) -> tuple[slice, slice]:
+    """Rows and columns that hold all of a mask, and as much around it as a blur reaches."""
+    bounds, margin = [], _reach(sigma_px)
     for along in (1, 0):
-        places = (mask > 0).any(along).nonzero()
-        first, last = (int(places[0]), int(places[-1])) if len(places) else (0, 0)
-        bounds.append(slice(max(0, first - margin), last + 1 + margin))
+        places = (mask > 0).any(along).nonzero().flatten().tolist() or [0]
+        bounds.append(slice(max(0, places[0] - margin), places[-1] + 1 + margin))
     return bounds[0], bounds[1]
 
 
@@ -169,8 +175,7 @@ def _mask(
 ) -> UInt8[Tensor, "height width"]:
     """Holes and blobs, then an outline that wanders and softens."""
     seed, view, time = seeds
-    generator = _generator(seed, 4, view, time)
-    value = mask.float() / 255
+    generator, value = _generator(seed, 4, view, time), mask.float() / 255
     if it.mask_holes or it.mask_blobs:
         means = torch.tensor([it.mask_holes, it.mask_blobs])
         holes, blobs = torch.poisson(means, generator=generator).int().tolist()
@@ -180,7 +185,7 @@ def _mask(
                 value = torch.where(_spot(where, generator), torch.full_like(value, to), value)
     if it.mask_edge_px:
         sigma = 1.5 * it.mask_edge_px
-        window = _window(value, _reach(sigma))
+        window = _window(value, sigma)
         part = value[window]
         coarse = torch.randn(1, 1, 8, 8, generator=generator).to(value)
         wander = torch.nn.functional.interpolate(coarse, size=tuple(part.shape), mode="bicubic")[0, 0]
@@ -199,10 +204,9 @@ def _mask(
 def _spot(where: Tensor, generator: torch.Generator) -> Tensor:
     """An ellipse about a random pixel of `where`, 1 to 4 per cent of the image across."""
     height, width = where.shape
-    places = where.nonzero()
-    draw = torch.rand(4, generator=generator).tolist()
+    places, draw = where.nonzero(), torch.rand(4, generator=generator).tolist()
     if not len(places):
-        return torch.zeros_like(where, dtype=torch.bool)
+        return torch.zeros_like(where)
     row, column = places[int(draw[0] * len(places))].tolist()
     radii = [max(height, width) * (0.005 + 0.015 * d) for d in draw[1:3]]
     y = (torch.arange(height, device=where.device) - row)[:, None]
@@ -224,16 +228,6 @@ def _blurred(value: Float[Tensor, "height width"], sigma_px: float) -> Float[Ten
     padded = torch.nn.functional.pad(value[None, None], (reach,) * 4, mode="replicate")
     rows = torch.nn.functional.conv2d(padded, kernel[None, None, :, None])
     return torch.nn.functional.conv2d(rows, kernel[None, None, None, :])[0, 0]
-
-
-def _compressed(rgb: UInt8[Tensor, "3 height width"], quality: int) -> UInt8[Tensor, "3 height width"]:
-    import cv2
-
-    pixels = np.ascontiguousarray(rgb.permute(1, 2, 0).cpu().numpy()[..., ::-1])
-    encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
-    assert decoded is not None, "what was just encoded decodes"
-    return torch.from_numpy(np.ascontiguousarray(decoded[..., ::-1])).permute(2, 0, 1).contiguous().to(rgb.device)
 
 
 def _generator(*key: int) -> torch.Generator:

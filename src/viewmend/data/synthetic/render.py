@@ -18,6 +18,7 @@ from viewmend.types import MultiViewFrame
 
 _WALLS = ((0.05, 0.35, 0.08), (0.22, 0.22, 0.23), (0.04, 0.04, 0.05), (0.6, 0.6, 0.58), (0.06, 0.12, 0.4))
 """Linear light: green screen, grey, dark, white, blue screen."""
+DIRECTIONS, EVENNESS = 16, 0.65
 SHADOW_PX = 128
 SHADOW_DISTANCE_M = 12.0
 """Lights are this far away: near enough to be a pinhole camera, far enough to look parallel."""
@@ -40,14 +41,18 @@ class Lights:
     """The colour of each lamp's highlight at its middle."""
 
 
-def stage_lights(seed: int, directions: int = 16, evenness: float = 0.65) -> Lights:
+def stage_lights(seed: int) -> Lights:
     """Seeded lights as on a capture stage: much the same from all sides, and a little not.
 
-    A surrounding that is brighter above than below gives the share `evenness`; three large soft lamps of slightly
+    A surrounding that is brighter above than below gives the share `EVENNESS`; three large soft lamps of slightly
     different strength and tint, around and above, give the rest.
     """
     generator = torch.Generator().manual_seed(seed)
-    toward = _sphere(directions)
+    # Directions spread evenly over a sphere (a Fibonacci spiral).
+    place = torch.arange(DIRECTIONS) + 0.5
+    y, around = 1 - 2 * place / DIRECTIONS, place * math.pi * (3 - math.sqrt(5))
+    radius = (1 - y * y).sqrt()
+    toward = torch.stack([radius * around.cos(), y, radius * around.sin()], -1)
     surrounding = (0.75 + 0.45 * toward[:, 1:2]).expand(-1, 3)
     angle = torch.rand((), generator=generator) * 2 * math.pi + torch.arange(3) * 2 * math.pi / 3
     angle = angle + 0.5 * torch.rand(3, generator=generator)
@@ -60,30 +65,15 @@ def stage_lights(seed: int, directions: int = 16, evenness: float = 0.65) -> Lig
     heading = torch.arange(16) * math.pi / 8
     walls = torch.stack([heading.cos(), torch.zeros(16), heading.sin()], -1)
     facing = (walls @ toward.T).clamp(min=0)
-    parts = [share * part / (facing @ part).mean() for share, part in ((evenness, surrounding), (1 - evenness, lobes))]
+    parts = [share * part / (facing @ part).mean() for share, part in ((EVENNESS, surrounding), (1 - EVENNESS, lobes))]
     return Lights(toward, 0.95 * (parts[0] + parts[1]), lamps, 0.05 * power)
 
 
-def _sphere(count: int) -> Float[Tensor, "direction 3"]:
-    """Directions spread evenly (a Fibonacci spiral)."""
-    place = torch.arange(count) + 0.5
-    y = 1 - 2 * place / count
-    angle = place * math.pi * (3 - math.sqrt(5))
-    radius = (1 - y * y).sqrt()
-    return torch.stack([radius * angle.cos(), y, radius * angle.sin()], -1)
-
-
-def irradiance(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -> Float[Tensor, "vertex 3"]:
-    """Irradiance of a white surface at each vertex from all unoccluded lights, linear.
+def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -> Float[Tensor, "vertex light"]:
+    """How much of each direction the mesh leaves free at its vertices, 0 to 1.
 
     One small shadow map per direction; together they are soft shadows and ambient occlusion at once.
     """
-    facing = (normals @ lights.toward.T).clamp(min=0)
-    return (facing * visibility(mesh, normals, lights)) @ lights.strength
-
-
-def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -> Float[Tensor, "vertex light"]:
-    """How much of each direction the mesh leaves free at its vertices, 0 to 1."""
     cameras = _light_cameras(mesh, lights)
     depth = rasterize(mesh, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
@@ -103,12 +93,10 @@ def _light_cameras(mesh: Mesh, lights: Lights) -> Cameras:
     middle = (low + high) / 2
     radius = float((high - low).norm()) / 2 + 0.02
     distance = SHADOW_DISTANCE_M + radius
-    up = torch.tensor([0.0, 0.6, 0.8], device=middle.device)
-    side = torch.tensor([1.0, 0.0, 0.0], device=middle.device)
+    up, side = torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]], device=middle.device)
     cameras = []
     for toward in lights.toward:
-        turn = side if float((toward @ up).abs()) > 0.99 else up
-        pose = look_at(middle + toward * distance, middle, turn)
+        pose = look_at(middle + toward * distance, middle, side if float((toward @ up).abs()) > 0.99 else up)
         cameras.append(pinhole(2 * math.asin(radius / distance), SHADOW_PX, SHADOW_PX, pose))
     return concatenate_cameras(cameras)
 
@@ -147,7 +135,9 @@ class Surface:
 
 def light(scene: TexturedMesh, lights: Lights, pyramid: TexturePyramid) -> Surface:
     """Light a scene once, for any number of cameras."""
-    return Surface(scene, irradiance(scene.mesh, scene.normals, lights), lights, pyramid)
+    facing = (scene.normals @ lights.toward.T).clamp(min=0)
+    irradiance = (facing * visibility(scene.mesh, scene.normals, lights)) @ lights.strength
+    return Surface(scene, irradiance, lights, pyramid)
 
 
 def render(
@@ -169,11 +159,8 @@ def render(
     """
     if samples_per_side < 1:
         raise ValueError(f"expected samples_per_side of at least 1, got {samples_per_side}; 2 is usual")
-    fine = replace(
-        cameras,
-        K=cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None],
-        size_px=cameras.size_px * samples_per_side,
-    )
+    K = cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None]
+    fine = replace(cameras, K=K, size_px=cameras.size_px * samples_per_side)
     mesh = surface.scene.mesh
     triangle = rasterize(mesh, fine).triangle
     depth = rasterize(mesh, cameras).depth

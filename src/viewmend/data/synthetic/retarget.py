@@ -10,6 +10,7 @@ from torch import Tensor
 
 from viewmend.data.synthetic.bvh import Motion
 from viewmend.data.synthetic.gltf import Character
+from viewmend.geometry.rigid import rigid
 
 SIDED = ("Shoulder", "Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot", "ToeBase")
 TRUNK = ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head")
@@ -68,8 +69,8 @@ def family_table(family: str) -> dict[str, str]:
     return dict(zip(PARTS, [*trunk, *sided, *right], strict=True))
 
 
-def find_parts(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
-    """Part -> joint name of any skeleton, given with parents first (-1: none); parts that it lacks are absent.
+def find_parts(names: Sequence[str]) -> dict[str, str]:
+    """Part -> joint name of any skeleton, given with parents first; parts that it lacks are absent.
 
     A family's table is taken where its required parts are all there, under any common prefix such as `mixamorig:`
     (the family with the most parts wins); otherwise the parts are guessed from the words in the names.
@@ -78,14 +79,16 @@ def find_parts(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
         ValueError: a required part (hips, arms, legs) is found in neither way.
     """
     best: dict[str, str] = {}
-    for prefix in _prefixes(names):
+    # What stands before the hips' name where joints have a namespace.
+    found = {m.group(1) for name in names if (m := re.match(r"^(.+?[:_|.\- ])(?:hips|pelvis|root)$", name, re.I))}
+    for prefix in ("", *sorted(found)):
         plain = {name[len(prefix) :].lower(): name for name in reversed(names) if name.startswith(prefix)}
         for family in _FAMILIES:
-            table = family_table(family)
-            found = {part: plain[joint.lower()] for part, joint in table.items() if joint.lower() in plain}
-            if all(part in found for part in REQUIRED) and len(found) > len(best):
-                best = found
-    best = best or _guess(names, parents)
+            joints = {part: plain.get(joint.lower()) for part, joint in family_table(family).items()}
+            fitting = {part: joint for part, joint in joints.items() if joint is not None}
+            if fitting.keys() >= set(REQUIRED) and len(fitting) > len(best):
+                best = fitting
+    best = best or _guess(names)
     missing = [part for part in REQUIRED if part not in best]
     if missing:
         raise ValueError(
@@ -95,19 +98,13 @@ def find_parts(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
     return best
 
 
-def _prefixes(names: Sequence[str]) -> list[str]:
-    """The empty prefix, and what stands before the hips' name where joints have a namespace."""
-    found = {m.group(1) for name in names if (m := re.match(r"^(.+?[:_|.\- ])(?:hips|pelvis|root)$", name, re.I))}
-    return ["", *sorted(found)]
-
-
 def _words(name: str) -> str:
     """Lower case, camel case split by blanks, other separators as blanks."""
     split = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
     return re.sub(r"[^a-z0-9]+", " ", split.lower()).strip()
 
 
-def _guess(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
+def _guess(names: Sequence[str]) -> dict[str, str]:
     """Parts by the words in the names: the joint nearest to the root wins a part."""
     found: dict[str, str] = {}
     trunk: list[str] = []
@@ -124,10 +121,10 @@ def _guess(names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
         part = next((part for part, keys in _WORDS if any(key in tight for key in keys)), None)
         if part is not None:
             found.setdefault(label + part, name)
-    return found | _guess_trunk(trunk, names, parents)
+    return found | _guess_trunk(trunk)
 
 
-def _guess_trunk(trunk: Sequence[str], names: Sequence[str], parents: Sequence[int]) -> dict[str, str]:
+def _guess_trunk(trunk: Sequence[str]) -> dict[str, str]:
     """Hips, spine, neck and head among the joints without a side."""
 
     def first(*keys: str) -> str | None:
@@ -137,17 +134,20 @@ def _guess_trunk(trunk: Sequence[str], names: Sequence[str], parents: Sequence[i
     chosen = {"Hips": first("hips", "pelvis", "hip", "root"), "Neck": first("neck"), "Head": first("head")}
     if spine:
         # The last joint of the back carries the collars; what lies between acts through its rotation.
-        picks = {"Spine": spine[0], "Spine2": spine[-1], "Spine1": spine[len(spine) // 2]}
-        chosen |= {part: name for part, name in picks.items() if name not in chosen.values()}
-        if len(spine) < 3:
-            chosen.pop("Spine1", None)
-        if len(spine) < 2:
-            chosen.pop("Spine2", None)
+        picks = [("Spine", spine[0]), ("Spine2", spine[-1]), ("Spine1", spine[len(spine) // 2])][: len(spine)]
+        chosen |= {part: name for part, name in picks if name not in chosen.values()}
     return {part: name for part, name in chosen.items() if name is not None}
 
 
-_LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
-"""Limbs whose rest directions are aligned, and the part that each points to."""
+_FOREARM = ("ForeArm", "Hand")
+_LIMBS = {
+    "Arm": ("Arm", "ForeArm"),
+    "ForeArm": _FOREARM,
+    "Hand": _FOREARM,
+    "UpLeg": ("UpLeg", "Leg"),
+    "Leg": ("Leg", "Foot"),
+}
+"""Parts that are aligned, and the two ends of the bone whose rest directions are."""
 
 
 Rest = Mapping[str, Float[Tensor, "3"]]
@@ -173,7 +173,6 @@ class Retarget:
     """Node of the hips."""
     hips_path: Float[Tensor, "frame 3"]
     """World positions of the hips, metres."""
-    seconds_per_frame: float
 
     def joint_matrices(self, frame: float) -> Float[Tensor, "joint 4 4"]:
         """world_from_bind of every joint, at a frame or between two."""
@@ -192,12 +191,10 @@ def retarget(character: Character, motion: Motion) -> Retarget:
     Raises:
         ValueError: one of the skeletons has no hips, arms or legs by any known name.
     """
-    target = find_parts([n.name for n in character.nodes], [n.parent for n in character.nodes])
-    source = find_parts(motion.names, motion.parents)
-    node_of = {part: [n.name for n in character.nodes].index(name) for part, name in target.items()}
-    joint_of = {part: motion.names.index(name) for part, name in source.items()}
-    no_driver = (-1,) * len(character.nodes)
-    file_rest = node_matrices(character, torch.eye(4), no_driver, torch.zeros(0, 3, 3), None)[:, :3, 3]
+    names = [n.name for n in character.nodes]
+    node_of = {part: names.index(name) for part, name in find_parts(names).items()}
+    joint_of = {part: motion.names.index(name) for part, name in find_parts(motion.names).items()}
+    file_rest = node_matrices(character, torch.eye(4))[:, :3, 3]
     upright = torch.eye(4)
     upright[:3, :3] = _upright({p: file_rest[n] for p, n in node_of.items()})
     height = float(file_rest[node_of["Hips"]].sub(file_rest[node_of["LeftFoot"]]).norm())
@@ -210,27 +207,27 @@ def retarget(character: Character, motion: Motion) -> Retarget:
     rotations = turn @ motion.rotations @ turn.T
 
     parts = [p for p in PARTS if p in node_of and p in joint_of]
-    alignment = {p: _alignment(p, own, actor) for p in parts}
-    rest_turns = _rest_rotations(character, upright)
-    driven = [rotations[:, joint_of[p]] @ alignment[p] @ rest_turns[node_of[p]] for p in parts]
-    driver = [-1] * len(character.nodes)
+    rest_turns: list[Tensor] = []  # R0: global rest rotations, scale removed
+    for node in character.nodes:
+        above = upright[:3, :3] / upright[0, :3].norm() if node.parent < 0 else rest_turns[node.parent]
+        rest_turns.append(above @ node.rotation)
+    driven = [rotations[:, joint_of[p]] @ _alignment(p, own, actor) @ rest_turns[node_of[p]] for p in parts]
+    driver = [-1] * len(names)
     for place, part in enumerate(parts):
         driver[node_of[part]] = place
     # s (p + G_root o_b) - G_root o_a, scaled by leg length: the middle of the hip joints moves as the actor's.
     hips, hips_turn = _joint_path(motion, joint_of["Hips"]) @ turn.T, rotations[:, joint_of["Hips"]]
     scale = _leg_length(own) / _leg_length(actor)
     path = scale * (hips + hips_turn @ _hip_middle(actor)) - hips_turn @ _hip_middle(own)
-    return Retarget(
-        *(character, upright, tuple(driver), torch.stack(driven, 1), node_of["Hips"], path, motion.seconds_per_frame)
-    )
+    return Retarget(character, upright, tuple(driver), torch.stack(driven, 1), node_of["Hips"], path)
 
 
 def node_matrices(
     character: Character,
     upright_from_file: Float[Tensor, "4 4"],
-    driver: tuple[int, ...],
-    turns: Float[Tensor, "driver 3 3"],
-    hips: tuple[int, Float[Tensor, "3"]] | None,
+    driver: tuple[int, ...] = (),
+    turns: Float[Tensor, "driver 3 3"] | None = None,
+    hips: tuple[int, Float[Tensor, "3"]] | None = None,
 ) -> Float[Tensor, "node 4 4"]:
     """World matrices of the nodes: driven ones turned to `turns` (global rotations), the others as at rest.
 
@@ -245,46 +242,32 @@ def node_matrices(
         parent = node.parent
         above, above_turn = (start, unit) if parent < 0 else (linear[parent], turned[parent])
         origin = upright_from_file[:3, 3] if parent < 0 else moved[parent]
-        local = node.rotation if driver[n] < 0 else above_turn.T @ turns[driver[n]]
+        local = node.rotation if turns is None or driver[n] < 0 else above_turn.T @ turns[driver[n]]
         turned.append(above_turn @ local)
         linear.append((above @ local) * node.scale)
-        at_hips = hips is not None and hips[0] == n
-        moved.append(hips[1] if hips is not None and at_hips else above @ node.translation + origin)
-    matrices = torch.zeros(len(character.nodes), 4, 4)
-    matrices[:, :3, :3] = torch.stack(linear)
-    matrices[:, :3, 3] = torch.stack(moved)
-    matrices[:, 3, 3] = 1
-    return matrices
-
-
-def _rest_rotations(character: Character, upright: Float[Tensor, "4 4"]) -> list[Tensor]:
-    """R0: the nodes' global rest rotations, scale removed."""
-    turned: list[Tensor] = []
-    for node in character.nodes:
-        above = upright[:3, :3] / upright[0, :3].norm() if node.parent < 0 else turned[node.parent]
-        turned.append(above @ node.rotation)
-    return turned
+        moved.append(hips[1] if hips is not None and hips[0] == n else above @ node.translation + origin)
+    return rigid(torch.stack(linear), torch.stack(moved))
 
 
 def _upright(rest: Rest) -> Float[Tensor, "3 3"]:
     """The turn by right angles that brings a rest pose to y up and its left side to +x."""
-    legs = (rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - (rest["LeftFoot"] + rest["RightFoot"]) / 2
-    up = torch.zeros(3)
-    up[int(legs.abs().argmax())] = float(legs[legs.abs().argmax()].sign())
+
+    def nearest_axis(v: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+        axis, n = torch.zeros(3), int(v.abs().argmax())
+        axis[n] = v[n].sign()
+        return axis
+
+    up = nearest_axis((rest["LeftUpLeg"] + rest["RightUpLeg"]) / 2 - (rest["LeftFoot"] + rest["RightFoot"]) / 2)
     left = rest["LeftUpLeg"] - rest["RightUpLeg"]
-    left = left - (left @ up) * up
-    side = torch.zeros(3)
-    side[int(left.abs().argmax())] = float(left[left.abs().argmax()].sign())
+    side = nearest_axis(left - (left @ up) * up)
     return torch.stack([side, up, torch.linalg.cross(side, up)])
 
 
 def _alignment(part: str, own: Rest, actor: Rest) -> Float[Tensor, "3 3"]:
     """A_j: the smallest rotation from the character's bone direction at rest to the motion's."""
     side = "Left" if part.startswith("Left") else "Right"
-    limb = part.removeprefix(side)
-    limb = "ForeArm" if limb == "Hand" else limb
-    start, end = side + limb, side + _LIMBS.get(limb, "")
-    if limb not in _LIMBS or not all(p in own and p in actor for p in (start, end)):
+    start, end = (side + name for name in _LIMBS.get(part.removeprefix(side), ("", "")))
+    if not all(p in own and p in actor for p in (start, end)):
         return torch.eye(3)
     return smallest_rotation(own[end] - own[start], actor[end] - actor[start])
 
@@ -306,8 +289,7 @@ def smallest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Ten
 def _joint_path(motion: Motion, joint: int) -> Float[Tensor, "frame 3"]:
     """World positions of a joint of the motion."""
     path = motion.root
-    while motion.parents[joint] >= 0:
-        parent = motion.parents[joint]
+    while (parent := motion.parents[joint]) >= 0:
         path = path + motion.rotations[:, parent] @ (motion.rest[joint] - motion.rest[parent])
         joint = parent
     return path
@@ -318,11 +300,8 @@ def _hip_middle(rest: Rest) -> Float[Tensor, "3"]:
 
 
 def _leg_length(rest: Rest) -> float:
-    total = 0.0
-    for side in ("Left", "Right"):
-        hip, knee, foot = (rest[side + part] for part in ("UpLeg", "Leg", "Foot"))
-        total += float((knee - hip).norm() + (foot - knee).norm()) / 2
-    return total
+    sides = [[rest[side + part] for part in ("UpLeg", "Leg", "Foot")] for side in ("Left", "Right")]
+    return sum(float((knee - hip).norm() + (foot - knee).norm()) / 2 for hip, knee, foot in sides)
 
 
 def _orthonormal(matrices: Float[Tensor, "batch 3 3"]) -> Float[Tensor, "batch 3 3"]:

@@ -16,6 +16,7 @@ from viewmend.data.synthetic.procedural.fabric import (
     Fabric,
     Image,
     Patch,
+    Plane,
     blend,
     edge,
     hsv,
@@ -55,7 +56,7 @@ class Folds:
     px_per_m: float = PX_PER_M
     """Texels of the sheet's chart."""
 
-    def height(self, canvas: Canvas) -> Float[np.ndarray, "height width"]:
+    def height(self, canvas: Canvas) -> Plane:
         """Displacement on the canvas, metres, periodic from the right edge to the left one."""
         rng = np.random.default_rng(self.seed)
         field = canvas.noise(rng, self.around_m, self.along_m)
@@ -63,42 +64,37 @@ class Folds:
         share = np.clip((np.linspace(0, 1, field.shape[1]) - 0.85) / 0.15, 0, 1)
         return self.depth_m * (field + share * (field[:, :1] - field))
 
-    def shade(self, canvas: Canvas) -> Float[np.ndarray, "height width"]:
-        """Factor on the colour: slopes that face down are darker."""
+    def crease(self, canvas: Canvas, uv: Float[np.ndarray, "row column 2"]) -> Float[np.ndarray, "row column"]:
+        """Displacement at places of the canvas, metres."""
+        height = self.height(canvas).astype(np.float32)
+        rows, columns = height.shape
+        x, y = uv[..., 0] * (columns - 1), (1 - uv[..., 1]) * (rows - 1)
+        return cv2.remap(height, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(np.float64)
+
+    def paint(self, canvas: Canvas, painter: Painter) -> Image:
+        """The cloth in its creases: slopes that face down are darker."""
         slope = np.gradient(self.height(canvas), axis=0) * canvas.px_per_m
-        return np.clip(1 + 0.8 * slope, 0.65, 1.2)
+        return np.clip(painter(canvas) * np.clip(1 + 0.8 * slope, 0.65, 1.2)[..., None], 0, 1)
 
 
 BARE = Folds(0.0, 0.1, 0.1, 0, 220.0)
 """Skin: smooth, and with little to show."""
 
 
-def azimuths(columns: int, gap: float = 0.0, aspect: float = 0.62) -> Azimuths:
+def azimuths(columns: int, gap: float = 0.0) -> Azimuths:
     """Azimuths from the back round the front to the back, about evenly spaced on an ellipse; `gap` opens the front.
 
     With a gap they run from the front's left edge round the back to its right edge instead.
     """
     dense = np.linspace(-np.pi, np.pi, 1025) if gap == 0 else np.linspace(gap, 2 * np.pi - gap, 1025)
-    r = 1 / np.hypot(np.sin(dense), np.cos(dense) / aspect)
+    r = 1 / np.hypot(np.sin(dense), np.cos(dense) / 0.62)
     steps = np.hypot(np.diff(r * np.sin(dense)), np.diff(r * np.cos(dense)))
     arc = np.concatenate([[0], np.cumsum(steps)])
     return np.interp(np.linspace(0, arc[-1], columns), arc, dense)
 
 
-def _paint(canvas: Canvas, painter: Painter, folds: Folds) -> Image:
-    return np.clip(painter(canvas) * folds.shade(canvas)[..., None], 0, 1)
-
-
-def _crease(canvas: Canvas, folds: Folds, uv: Float[np.ndarray, "row column 2"]) -> Float[np.ndarray, "row column"]:
-    height = folds.height(canvas).astype(np.float32)
-    rows, columns = height.shape
-    x, y = uv[..., 0] * (columns - 1), (1 - uv[..., 1]) * (rows - 1)
-    return cv2.remap(height, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR).astype(np.float64)
-
-
-def _with_lips(grid: np.ndarray, low: np.ndarray | None, high: np.ndarray | None) -> np.ndarray:
-    rows = (None if low is None else low[None], grid, None if high is None else high[None])
-    return np.concatenate([row for row in rows if row is not None])
+def _closed(around: Azimuths) -> bool:
+    return bool(np.isclose(around[-1] - around[0], 2 * np.pi))
 
 
 def torso_sheet(
@@ -112,9 +108,8 @@ def torso_sheet(
     rows: int = 44,
 ) -> Patch:
     """The torso of `shape` between the heights `low` and `high` (metres, per azimuth), with lips turned inwards."""
-    torso = shape.torso
-    arc = torso.arc
-    s_low, s_high = np.interp(low, torso.y, arc), np.interp(high, torso.y, arc)
+    torso, arc = shape.torso, shape.torso.arc
+    s_low, s_high = (np.interp(edge, torso.y, arc) for edge in (low, high))
     s = s_low + np.linspace(0, 1, rows)[:, None] * (s_high - s_low)
     y = np.interp(s, arc, torso.y)
     theta = np.broadcast_to(around, s.shape)
@@ -126,16 +121,15 @@ def torso_sheet(
     uv = np.stack([np.broadcast_to(np.linspace(0, 1, len(around)), s.shape), (s - bottom) / (top - bottom)], -1)
     outward = outward_of(theta)
     points = shape.settle(torso.point(theta, y), outward, 0)
-    points = points + _crease(canvas, folds, uv)[..., None] * outward
+    points = points + folds.crease(canvas, uv)[..., None] * outward
     lips = []
-    for row in (0, -1):
+    for row, rise in ((0, 0.004), (-1, -0.012)):
         inner = wearer.body.torso.point(around, y[row])
         axis = inner * np.array([0, 1, 0]) + np.array([0, 0, 1]) * np.interp(y[row], torso.y, torso.z)[:, None]
-        lips.append(axis + 0.93 * (inner - axis) + np.array([0, 0.004 if row == 0 else -0.012, 0]))
-    points = _with_lips(points, lips[0], lips[1])
-    uv = _with_lips(uv, uv[0], uv[-1])
-    closed = bool(np.isclose(around[-1] - around[0], 2 * np.pi))
-    return Patch(points, uv, wearer.weights(points), _paint(canvas, painter, folds), closed=closed)
+        lips.append(axis + 0.93 * (inner - axis) + np.array([0, rise, 0]))
+    points = np.concatenate([lips[0][None], points, lips[1][None]])
+    uv = np.concatenate([uv[:1], uv, uv[-1:]])
+    return Patch(points, uv, wearer.weights(points), folds.paint(canvas, painter), closed=_closed(around))
 
 
 def limb_sheet(
@@ -163,11 +157,11 @@ def limb_sheet(
     on_limb = limb.point(around, t)
     outward = (on_limb - limb.center(t)) / np.interp(t, limb.t, limb.r)[..., None]
     # A joint's first seam: the torso's sheet lies over the limb's.
-    points = shape.settle(on_limb, outward, part) + _crease(canvas, folds, uv)[..., None] * outward
+    points = shape.settle(on_limb, outward, part) + folds.crease(canvas, uv)[..., None] * outward
     center = naked.center(t[0])
     lip = center + 0.8 * (naked.point(theta, t[0]) - center) + 0.004 * limb.frame[1]
-    points = _with_lips(points, lip, None)
-    return Patch(points, _with_lips(uv, uv[0], None), wearer.weights(points, part), _paint(canvas, painter, folds))
+    points, uv = np.concatenate([lip[None], points]), np.concatenate([uv[:1], uv])
+    return Patch(points, uv, wearer.weights(points, part), folds.paint(canvas, painter))
 
 
 def skirt_weights(wearer: Wearer, points: Points, around: Values) -> Weights:
@@ -176,18 +170,17 @@ def skirt_weights(wearer: Wearer, points: Points, around: Values) -> Weights:
     column = (around / (2 * np.pi) * SKIRT_COLUMNS) % SKIRT_COLUMNS
     first = np.floor(column).astype(int) % SKIRT_COLUMNS
     share = column - np.floor(column)
-    weights = {}
-    for segment in ("high", "low"):
+    y, soft = points[..., 1], 0.03 * wearer.height_m
+    sheets, steps = [], []
+    for segment in ("low", "high"):
         dense = np.zeros((*shape, len(INDEX)))
         index = np.array([INDEX[f"skirt{c}_{segment}"] for c in range(SKIRT_COLUMNS)])
         np.put_along_axis(dense, index[first][..., None], (1 - share)[..., None], -1)
         np.put_along_axis(dense, index[(first + 1) % SKIRT_COLUMNS][..., None], share[..., None], -1)
-        weights[segment] = dense
-    y = points[..., 1]
-    hip, knee = (float(wearer.skeleton.at(name)[1]) for name in ("skirt0_high", "skirt0_low"))
-    soft = 0.03 * wearer.height_m
-    hanging = mix(weights["low"], weights["high"], smoothstep(y, knee - soft, knee + soft))
-    return mix(hanging, one_joint(shape, "pelvis"), smoothstep(y, hip - soft, hip + soft))
+        sheets.append(dense)
+        top = float(wearer.skeleton.at(f"skirt0_{segment}")[1])
+        steps.append(smoothstep(y, top - soft, top + soft))
+    return mix(mix(sheets[0], sheets[1], steps[0]), one_joint(shape, "pelvis"), steps[1])
 
 
 def skirt_sheets(
@@ -220,8 +213,8 @@ def skirt_sheets(
     shade = 1 + 8 * pleats[1] * np.cos(pleats[0] * turn) * (1 - canvas.y / canvas.height_m)
     chart = np.clip(painter(canvas) * np.clip(shade, 0.65, 1.15)[..., None], 0, 1)
     weights = skirt_weights(wearer, points, theta)
-    closed = bool(np.isclose(around[-1] - around[0], 2 * np.pi))
-    return two_sided(Patch(points, uv, weights, chart, closed=closed), points - 0.005 * outward, 0.45)
+    sheet = Patch(points, uv, weights, chart, closed=_closed(around))
+    return two_sided(sheet, points - 0.005 * outward, 0.45)
 
 
 TOPS = ("t-shirt", "long sleeves", "shirt", "sweater", "tank top")
@@ -267,9 +260,8 @@ def sample_outfit(rng: np.random.Generator, femininity: float) -> Outfit:
     fabrics = (sample_fabric(rng), lower, sample_fabric(rng, LOOSE))
     written = bottom != "dress" and outer == "none" and fabrics[0].kind in QUIET and rng.random() < 0.6
     lettering = WORDS[int(rng.integers(len(WORDS)))] if written else ""
-    light = rng.random() < 0.5
+    sole = np.full(3, 0.9 if rng.random() < 0.5 else 0.12)
     upper = hsv(rng.random(), rng.uniform(0, 0.7) * (rng.random() < 0.5), rng.uniform(0.1, 0.95))
-    sole = np.full(3, 0.9) if light else np.full(3, 0.12)
     return Outfit(top, bottom, outer, fabrics, lettering, np.stack([upper, sole]), int(rng.integers(2**31)))
 
 
@@ -357,15 +349,14 @@ class Tailor:
         legs = tuple(leg.eased(0.004) for leg in lower.legs)
         shape = replace(body, torso=self._trunk(lower.torso), arms=arms, legs=legs)
         around = azimuths(65)
-        wide = 0.008 if outfit.top == "tank top" else 0.0
-        high = neckline(around, H, cut.neck, cut.vee, wide)
+        high = neckline(around, H, cut.neck, cut.vee, 0.008 if outfit.top == "tank top" else 0.0)
         low = np.full_like(around, cut.top_hem * H)
-        folds = self.folds(0.0022, 0.10, 0.16, 0)
-        trunk = torso_sheet(self.wearer, shape, low, high, around, self._paint_top, folds, 40)
-        start = -0.03
+        trunk = torso_sheet(
+            self.wearer, shape, low, high, around, self._paint_top, self.folds(0.0022, 0.10, 0.16, 0), 40
+        )
+        start = -0.03 if outfit.outer == "none" else 0.8
         if outfit.outer != "none":
             # Only what an open front and the hems show: the rest could but poke through.
-            start = 0.8
             shown = np.broadcast_to(np.abs(around) < 0.9, trunk.points.shape[:2]).copy()
             shown[:6] = shown[-5:] = True
             trunk = replace(trunk, keep=shown)
@@ -373,10 +364,8 @@ class Tailor:
             return [trunk]
         folds = self.folds(0.0022, 0.06, 0.12, 1)
         rows = 20 if cut.sleeve < 0.7 or start > 0 else 40
-        return [trunk] + [
-            limb_sheet(self.wearer, shape, 1 + i, start, cut.sleeve, self._paint_sleeve, folds, (rows, 25))
-            for i in (0, 1)
-        ]
+        sleeve = (start, cut.sleeve, self._paint_sleeve, folds, (rows, 25))
+        return [trunk, *(limb_sheet(self.wearer, shape, arm, *sleeve) for arm in (1, 2))]
 
     def _paint_top(self, canvas: Canvas) -> Image:
         outfit = self.outfit
@@ -394,8 +383,7 @@ class Tailor:
 
     def _paint_sleeve(self, canvas: Canvas) -> Image:
         image = self.outfit.fabrics[0].paint(canvas)
-        cuff = edge(0.0015 - np.abs(canvas.y - 0.02), canvas)
-        return blend(image, 0.7 * image, cuff)
+        return blend(image, 0.7 * image, edge(0.0015 - np.abs(canvas.y - 0.02), canvas))
 
     def bottom(self) -> list[Patch]:
         """Trousers, shorts or skirt."""
@@ -408,11 +396,9 @@ class Tailor:
         waist = 0.602 if cut.top_hem > 0.58 else cut.top_hem + 0.035
         folds = self.folds(0.0 if kind == "leggings" else 0.0020, 0.08, 0.12, 2)
         low, high = (np.full_like(around, share * H) for share in (0.470, waist))
-        patches = [torso_sheet(self.wearer, shape, low, high, around, self._paint_waist, folds, 26)]
-        rows = 24 if kind == "shorts" else 44
-        return patches + [
-            limb_sheet(self.wearer, shape, 3 + i, -0.02, cut.leg, self._paint_leg, folds, (rows, 29)) for i in (0, 1)
-        ]
+        waistband = torso_sheet(self.wearer, shape, low, high, around, self._paint_waist, folds, 26)
+        leg = (-0.02, cut.leg, self._paint_leg, folds, (24 if kind == "shorts" else 44, 29))
+        return [waistband, *(limb_sheet(self.wearer, shape, part, *leg) for part in (3, 4))]
 
     def _paint_waist(self, canvas: Canvas) -> Image:
         image = self.outfit.fabrics[1].paint(canvas)
@@ -421,13 +407,13 @@ class Tailor:
         if self.outfit.seed % 3 == 0:
             leather = 0.4 * self.outfit.shoes[0] + np.array([0.06, 0.04, 0.03])
             image = blend(image, leather, edge(0.034 - top, canvas))
-            buckle = np.maximum(np.abs(canvas.x), np.abs(top - 0.018))
-            image = blend(image, np.array([0.75, 0.7, 0.5]), edge(0.018 - buckle, canvas))
+            buckle = 0.018 - np.maximum(np.abs(canvas.x), np.abs(top - 0.018))
+            image = blend(image, np.array([0.75, 0.7, 0.5]), edge(buckle, canvas))
         pocket = np.abs(np.abs(canvas.x) - 0.10 - 0.35 * (top - 0.04))
         inside = edge(top - 0.036, canvas) * edge(0.15 - top, canvas)
         image = blend(image, 0.6 * image, inside * edge(0.0018 - pocket, canvas))
-        fly = edge(0.0014 - np.abs(canvas.x), canvas) * edge(top - 0.036, canvas) * edge(0.17 - top, canvas)
-        return blend(image, 0.6 * image, fly)
+        fly = edge(0.0014 - np.abs(canvas.x), canvas) * edge(top - 0.036, canvas)
+        return blend(image, 0.6 * image, fly * edge(0.17 - top, canvas))
 
     def _paint_leg(self, canvas: Canvas) -> Image:
         image = self.outfit.fabrics[1].paint(canvas)
@@ -439,9 +425,8 @@ class Tailor:
     def _skirt(self) -> list[Patch]:
         H, outfit, body = self.wearer.height_m, self.outfit, self.wearer.body
         rng = np.random.default_rng(outfit.seed + 1)
-        fabric = outfit.fabrics[0] if outfit.bottom == "dress" else outfit.fabrics[1]
-        hem = float(rng.uniform(0.17, 0.36))
-        flare = float(rng.uniform(0.14, 0.42))
+        fabric = outfit.fabrics[0 if outfit.bottom == "dress" else 1]
+        hem, flare = float(rng.uniform(0.17, 0.36)), float(rng.uniform(0.14, 0.42))
         pleats = (int(rng.integers(7, 15)), float(rng.uniform(0.002, 0.014)))
         shape = replace(body, torso=body.torso.eased(0.014))
         waist = 0.606 if self.cut.top_hem > 0.58 else self.cut.top_hem + 0.02
@@ -457,22 +442,17 @@ class Tailor:
         torso = body.torso.eased(ease, float(rng.uniform(0.5, 0.9)))
         torso = torso.outside(self._trunk(self.lower_shape().torso), 0.012)
         shape = replace(body, torso=torso, arms=tuple(arm.eased(ease - 0.004, 0.55, -0.004) for arm in body.arms))
-        gap = float(rng.uniform(0.12, 0.4))
-        around = azimuths(65, gap)
-        coat = outfit.outer == "coat"
+        around = azimuths(65, float(rng.uniform(0.12, 0.4)))
+        coat, cloth = outfit.outer == "coat", outfit.fabrics[2].paint
         hem = 0.535 if coat else float(rng.uniform(0.50, 0.55))
-        high = neckline(around, H, 0.05, vee=True)
+        low, high = np.full_like(around, hem * H), neckline(around, H, 0.05, vee=True)
         folds = self.folds(0.0025, 0.09, 0.14, 5)
-        patches = [
-            torso_sheet(self.wearer, shape, np.full_like(around, hem * H), high, around, self._paint_outer, folds)
-        ]
-        patches.append(lining(patches[0]))
-        patches += [limb_sheet(self.wearer, shape, 1 + i, -0.03, 0.97, outfit.fabrics[2].paint, folds) for i in (0, 1)]
+        trunk = torso_sheet(self.wearer, shape, low, high, around, self._paint_outer, folds)
+        sleeves = [limb_sheet(self.wearer, shape, part, -0.03, 0.97, cloth, folds) for part in (1, 2)]
+        patches = [trunk, lining(trunk), *sleeves]
         if coat:
-            low = float(rng.uniform(0.2, 0.38))
-            patches += skirt_sheets(
-                self.wearer, shape, 0.575 * H, low * H, around, outfit.fabrics[2].paint, 0.16, (6, 0.003)
-            )
+            skirt_hem = float(rng.uniform(0.2, 0.38)) * H
+            patches += skirt_sheets(self.wearer, shape, 0.575 * H, skirt_hem, around, cloth, 0.16, (6, 0.003))
         return patches
 
     def _paint_outer(self, canvas: Canvas) -> Image:
@@ -487,8 +467,7 @@ def lining(sheet: Patch) -> Patch:
     inside = sheet.points[:, ::-1].copy()
     center = inside.mean(1, keepdims=True)
     inside = center + 0.975 * (inside - center)
-    edge_columns = np.arange(inside.shape[1])
-    near = np.minimum(edge_columns, edge_columns[::-1]) < 7
-    keep = np.broadcast_to(near, inside.shape[:2])
+    column = np.arange(inside.shape[1])
+    keep = np.broadcast_to(np.minimum(column, column[::-1]) < 7, inside.shape[:2])
     dark = np.broadcast_to(0.45 * sheet.chart.mean((0, 1)), (8, 8, 3))
     return Patch(inside, sheet.uv[:, ::-1], sheet.weights[:, ::-1], dark, keep, closed=False)

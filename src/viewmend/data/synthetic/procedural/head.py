@@ -6,13 +6,18 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.data.synthetic.procedural.body import Torso, mix, one_joint, smooth_table, smoothstep
-from viewmend.data.synthetic.procedural.fabric import Canvas, Image, Patch, blend, hsv, outward_of, two_sided
+from viewmend.data.synthetic.procedural.fabric import Canvas, Image, Patch, Plane, blend, hsv, outward_of, two_sided
 from viewmend.data.synthetic.procedural.skeleton import TABLES, Physique, Points, Skeleton, Values, Vector
 
 RINGS = np.array(TABLES["head"])
 HEAD_SHARE = 0.132
 """The head's height as a share of the person's (7.6 heads)."""
 EYE_AZIMUTH, EYE_Y = 0.37, 0.495
+
+
+def _spot(turn: Values, y: Values, at: float, height: float, wide: float, tall: float) -> Values:
+    """1 at a place of the face, and less around it."""
+    return np.exp(-(((turn - at) / wide) ** 2) - ((y - height) / tall) ** 2)
 
 
 @dataclass(frozen=True)
@@ -39,24 +44,11 @@ class Head:
         r = ((sine / np.maximum(a, 1e-3)) ** 2.25 + (np.abs(cosine) / depth) ** 2.25) ** (-1 / 2.25)
         turn = np.abs(np.angle(np.exp(1j * azimuth)))
 
-        def bump(at: float, height: float, wide: float, tall: float) -> Values:
-            return np.exp(-(((turn - at) / wide) ** 2) - ((y - height) / tall) ** 2)
-
         ridge = np.interp(y, [0.315, 0.345, 0.37, 0.45, 0.53, 0.57], [0, 0.085, 0.112, 0.068, 0.028, 0.0])
         nose = (1 + 0.2 * face[1] - 0.1 * f) * ridge * np.exp(-((turn / (0.115 + 0.015 * face[2])) ** 2))
-        features = (
-            nose
-            + 0.035 * bump(0.13, 0.345, 0.09, 0.028)
-            - 0.034 * bump(EYE_AZIMUTH, EYE_Y, 0.17, 0.045)
-            + 0.014 * bump(EYE_AZIMUTH, EYE_Y, 0.11, 0.022)
-            + (0.016 - 0.008 * f) * bump(0.3, 0.575, 0.35, 0.028)
-            + 0.014 * bump(0.72, 0.40, 0.25, 0.07)
-            + 0.024 * bump(0.0, 0.222, 0.18, 0.016)
-            + 0.026 * bump(0.0, 0.180, 0.16, 0.016)
-            - 0.016 * bump(0.0, 0.135, 0.20, 0.018)
-            + (0.030 + 0.012 * face[3] - 0.008 * f) * bump(0.0, 0.065, 0.20, 0.05)
-            - 0.012 * bump(1.05, 0.62, 0.30, 0.10)
-        )
+        features = nose
+        for swelling, by_chin, by_sex, *place in TABLES["face"]:
+            features = features + (swelling + by_chin * face[3] + by_sex * f) * _spot(turn, y, *place)
         return r + features * (np.cos(azimuth) > -0.2)
 
     def point(self, azimuth: Values, y: Values, thickness: Values | float = 0.0) -> Points:
@@ -86,11 +78,6 @@ def face_grid(rows: int, columns: int) -> tuple[Float[np.ndarray, "row column"],
     return np.broadcast_to(azimuth, (rows, columns)), np.broadcast_to(y[:, None], (rows, columns))
 
 
-def chart_coordinates(canvas: Canvas) -> tuple[Float[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Azimuth and height (0 chin, 1 crown) of each texel of a chart over the head."""
-    return canvas.x / canvas.width_m * 2 * np.pi, canvas.y / canvas.height_m
-
-
 def head_patches(person: Physique, head: Head, rng: np.random.Generator, hair_rgb: Vector) -> list[Patch]:
     """The head with its painted face, and two ears."""
     azimuth, y = face_grid(68, 73)
@@ -117,16 +104,16 @@ def head_patches(person: Physique, head: Head, rng: np.random.Generator, hair_rg
 
 def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_rgb: Vector) -> Image:
     """Skin with eyes, brows, mouth, cheeks, nostrils, and stubble on some."""
-    theta, y = chart_coordinates(canvas)
+    theta, y = canvas.x / canvas.width_m * 2 * np.pi, canvas.y / canvas.height_m
     turn = np.abs(theta)
     skin, face, f = np.array(person.skin_rgb), person.face, person.femininity
     mottled = 1 + 0.02 * canvas.noise(rng, 0.012, 0.012) + 0.012 * canvas.noise(rng, 0.003, 0.003)
     image = skin * mottled[..., None]
 
-    def soft(at: float, height: float, wide: float, tall: float) -> Float[np.ndarray, "height width"]:
-        return np.exp(-(((turn - at) / wide) ** 2) - ((y - height) / tall) ** 2)
+    def soft(*place: float) -> Plane:
+        return _spot(turn, y, *place)
 
-    def crisp(value: Float[np.ndarray, "height width"], softness: float = 0.12) -> Float[np.ndarray, "height width"]:
+    def crisp(value: Plane, softness: float = 0.12) -> Plane:
         return np.clip(value / softness + 0.5, 0, 1)
 
     image = blend(image, skin * [1.0, 0.72, 0.68], 0.35 * soft(0.62, 0.36, 0.28, 0.09))
@@ -143,11 +130,11 @@ def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_
     image = blend(image, lip * 0.4, crisp(1 - (turn / (wide * 0.97)) ** 2 - ((y - 0.201) / 0.0055) ** 2, 0.8))
     x = turn - EYE_AZIMUTH - 0.01 * face[5]
     lid = ((y - EYE_Y) / 0.025) ** 2 + (x / 0.150) ** 2
-    image = blend(image, np.array([0.84, 0.82, 0.80]), crisp(1 - lid, 0.3))
+    inside = crisp(1 - lid, 0.3)
+    image = blend(image, np.array([0.84, 0.82, 0.80]), inside)
     iris = np.array([hsv(0.07, 0.7, 0.25), hsv(0.08, 0.6, 0.4), hsv(0.57, 0.45, 0.55), hsv(0.3, 0.3, 0.4)])
     color = iris[int(rng.choice(4, p=[0.5, 0.25, 0.15, 0.1]))]
     disc = np.hypot(x / 0.072, (y - EYE_Y) / 0.029)
-    inside = crisp(1 - lid, 0.3)
     image = blend(image, color, inside * crisp(1 - disc, 0.2))
     image = blend(image, np.array([0.03, 0.03, 0.03]), inside * crisp(0.5 - disc, 0.15))
     lash = np.exp(-(((y - EYE_Y - 0.025 * np.sqrt(np.clip(1 - (x / 0.165) ** 2, 0, 1))) / 0.006) ** 2))
@@ -155,9 +142,6 @@ def paint_face(person: Physique, canvas: Canvas, rng: np.random.Generator, hair_
     arch = 0.585 + 0.012 * face[6] + 0.018 * np.cos((x - 0.05) / 0.2 * 1.5)
     brow = 1 - ((y - arch) / (0.017 - 0.006 * f)) ** 2 - ((x - 0.02) / 0.21) ** 4
     return np.clip(blend(image, 0.75 * hair_rgb, 0.85 * crisp(brow, 0.7)), 0, 1)
-
-
-STYLES = ("bald", "cropped", "short", "parted", "afro", "bob", "long", "ponytail", "bun", "cap")
 
 
 @dataclass(frozen=True)
@@ -178,37 +162,20 @@ class Hair:
 
 def sample_hair(rng: np.random.Generator, femininity: float, dark_skin: bool) -> Hair:
     """Draw a hairstyle; colours over the human range, dark ones on dark skin."""
-    if femininity > 0.5:
-        odds = [0.01, 0.04, 0.08, 0.05, 0.08, 0.16, 0.24, 0.16, 0.12, 0.06]
-    else:
-        odds = [0.10, 0.22, 0.26, 0.16, 0.07, 0.02, 0.04, 0.02, 0.03, 0.08]
-    style = STYLES[int(rng.choice(len(STYLES), p=odds))]
-    shades = [(0.07, 0.5, 0.09), (0.07, 0.55, 0.2), (0.08, 0.55, 0.36), (0.11, 0.5, 0.7), (0.05, 0.75, 0.45)]
-    shades += [(0.1, 0.04, 0.62), (rng.random(), 0.6, 0.6)]
-    odds = [0.6, 0.25, 0.03, 0.02, 0.02, 0.06, 0.02] if dark_skin else [0.26, 0.24, 0.19, 0.13, 0.08, 0.07, 0.03]
-    h, s, v = shades[int(rng.choice(len(shades), p=odds))]
+    styles, odds = list(TABLES["hair"]), [row[femininity > 0.5] for row in TABLES["hair"].values()]
+    style = styles[int(rng.choice(len(styles), p=odds))]
+    colors = np.array([*TABLES["hair_colors"], (rng.random(), 0.6, 0.6, 0.03, 0.02)])
+    h, s, v = colors[int(rng.choice(len(colors), p=colors[:, 4 if dark_skin else 3])), :3]
     color = hsv(h, s * rng.uniform(0.85, 1.15), v * rng.uniform(0.8, 1.2))
     return Hair(style, color, float(rng.random()), int(rng.integers(2**31)))
-
-
-def hairline(azimuth: Values, recede: float) -> Values:
-    """Height of the hairline on the head (0 chin, 1 crown) at an azimuth."""
-    turn = np.abs(np.angle(np.exp(1j * azimuth)))
-    line = np.interp(
-        turn,
-        [0, 0.5, 0.95, 1.2, 1.5, 1.62, 1.75, 2.1, 2.6, np.pi],
-        [0.83, 0.82, 0.75, 0.6, 0.44, 0.46, 0.6, 0.36, 0.2, 0.16],
-    )
-    return line + recede * 0.08 * np.exp(-(((turn - 0.55) / 0.35) ** 2))
 
 
 def strands(hair: Hair, canvas: Canvas) -> Image:
     """Hair as paint: streaks that run down, lighter and darker."""
     rng = np.random.default_rng(hair.seed)
     tight = hair.style in ("afro", "cropped", "bald")
-    streaks = canvas.noise(rng, 0.004, 0.006 if tight else 0.10) + 0.7 * canvas.noise(
-        rng, 0.015, 0.012 if tight else 0.2
-    )
+    streaks = canvas.noise(rng, 0.004, 0.006 if tight else 0.10)
+    streaks = streaks + 0.7 * canvas.noise(rng, 0.015, 0.012 if tight else 0.2)
     return np.clip(hair.color * (1 + 0.20 * streaks[..., None]) + 0.012 * streaks[..., None], 0, 1)
 
 
@@ -220,10 +187,10 @@ def hair_patches(head: Head, hair: Hair, torso: Torso, accent: Vector) -> list[P
     canvas = Canvas(0.6, 0.26, 600.0)
     chart = strands(hair, canvas)
     azimuth, y = face_grid(48, 65)
-    base = {"bald": 0.012, "cropped": 0.018, "short": 0.045, "parted": 0.06, "afro": 0.17, "bob": 0.075, "cap": 0.065}
-    thick = base.get(hair.style, 0.05) * (0.75 + 0.5 * hair.volume)
-    recede = float(rng.uniform(-0.4, 1.0))
-    line = hairline(azimuth, recede)
+    thick = TABLES["hair"][hair.style][2] * (0.75 + 0.5 * hair.volume)
+    turn = np.abs(np.angle(np.exp(1j * azimuth)))
+    recede = float(rng.uniform(-0.4, 1.0)) * 0.08 * np.exp(-(((turn - 0.55) / 0.35) ** 2))
+    line = np.interp(turn, *TABLES["hairline"]) + recede
     if hair.style == "cap":
         chart = np.clip(accent * (1 + 0.05 * canvas.noise(rng, 0.02, 0.02))[..., None], 0, 1)
         line = np.interp(np.abs(azimuth), [0, 1.2, np.pi], [0.70, 0.66, 0.52])
@@ -274,21 +241,20 @@ def _tied(head: Head, hair: Hair, chart: Image) -> Patch:
     """A ponytail or a bun behind the crown."""
     v, phi = np.meshgrid(np.linspace(0, 1, 24), np.linspace(-np.pi, np.pi, 17), indexing="ij")
     start = head.origin + head.size_m * np.array([0, 0.80, -0.44])
+    uv = np.stack([(phi / np.pi + 1) / 2, v], -1)
     if hair.style == "bun":
-        s, radius = v, 0.16 * head.size_m * (0.9 + 0.5 * hair.volume)
+        radius = 0.16 * head.size_m * (0.9 + 0.5 * hair.volume)
         center = start + np.array([0, 0.1, -0.12]) * head.size_m
-        across = radius * np.sqrt(np.clip(1 - (2 * s - 1) ** 2, 0, 1))
-        points = center + np.stack([across * np.sin(phi), radius * (2 * s - 1), across * np.cos(phi)], -1)
-        return Patch(points, np.stack([(phi / np.pi + 1) / 2, v], -1), one_joint(v.shape, "head"), chart)
+        across = radius * np.sqrt(np.clip(1 - (2 * v - 1) ** 2, 0, 1))
+        points = center + np.stack([across * np.sin(phi), radius * (2 * v - 1), across * np.cos(phi)], -1)
+        return Patch(points, uv, one_joint(v.shape, "head"), chart)
     s = 1 - v
     length = head.size_m * (0.9 + 1.0 * hair.volume)
     radius = 0.10 * head.size_m * np.sqrt(np.clip(s * 6, 0, 1)) * np.interp(s, [0, 0.1, 0.5, 1], [0.55, 0.9, 1, 0.05])
-    drop = np.stack(
-        [np.zeros_like(s), -length * s + 0.03 * np.sin(np.pi * s), -0.09 * np.sin(np.minimum(s * 3, 1.57))], -1
-    )
+    drop, back = -length * s + 0.03 * np.sin(np.pi * s), -0.09 * np.sin(np.minimum(s * 3, 1.57))
     ring = np.stack([radius * np.sin(phi), np.zeros_like(s), radius * np.cos(phi)], -1)
-    uv = np.stack([(phi / np.pi + 1) / 2, v], -1)
-    return Patch(start + drop + ring, uv, one_joint(v.shape, "tail"), chart)
+    points = start + np.stack([np.zeros_like(s), drop, back], -1) + ring
+    return Patch(points, uv, one_joint(v.shape, "tail"), chart)
 
 
 def _brim(head: Head, chart: Image) -> Patch:

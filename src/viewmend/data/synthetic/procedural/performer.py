@@ -19,11 +19,17 @@ from viewmend.data.synthetic.procedural.clothing import (
     torso_sheet,
 )
 from viewmend.data.synthetic.procedural.fabric import BoundMesh, Canvas, Image, Patch, assemble
-from viewmend.data.synthetic.procedural.grounds import Tempo, seat_height, solve
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
-from viewmend.data.synthetic.procedural.motion import MOTIONS, Motion, sample_motion
+from viewmend.data.synthetic.procedural.motion import MOTIONS, Motion, Tempo, sample_motion, seat_height
 from viewmend.data.synthetic.procedural.props import HELD, STANDING, held_prop, standing_prop, stool
-from viewmend.data.synthetic.procedural.skeleton import SIDES, Physique, Skeleton, build_skeleton, sample_physique
+from viewmend.data.synthetic.procedural.skeleton import (
+    SIDES,
+    Physique,
+    Skeleton,
+    build_skeleton,
+    sample_physique,
+    solve,
+)
 from viewmend.geometry.mesh import Mesh
 
 LAG_S = 0.12
