@@ -57,7 +57,7 @@ def read_bvh(path: Path) -> Motion:
     head, found, body = text.partition("MOTION")
     if not found or "HIERARCHY" not in head:
         raise CaptureError(f"{path}: expected a BVH file with HIERARCHY and MOTION; export the motion as BVH")
-    joints = _hierarchy(path, head.split())
+    joints = _hierarchy(path, head)
     step, values = _frames(path, body, sum(len(j.channels) for j in joints))
     if len(values) * len(joints) > MAX_TRANSFORMS:
         raise CaptureError(
@@ -66,10 +66,10 @@ def read_bvh(path: Path) -> Motion:
     return _motion(joints, step, values)
 
 
-def _hierarchy(path: Path, words: list[str]) -> list[_Joint]:
+def _hierarchy(path: Path, text: str) -> list[_Joint]:
     joints: list[_Joint] = []
     inside = [-1]  # the joints whose braces are open
-    tokens = iter(words)
+    tokens = iter(text.split())
     try:
         for token in tokens:
             match token.upper():
@@ -86,22 +86,20 @@ def _hierarchy(path: Path, words: list[str]) -> list[_Joint]:
                     joints[-1].offset = tuple([float(next(tokens)) for _ in range(3)])
                 case "CHANNELS":
                     count = int(next(tokens))
-                    joints[-1].channels = _channels([next(tokens) for _ in range(count)], count)
+                    words = [next(tokens) for _ in range(count)]
+                    joints[-1].channels = tuple(word.lower() for word in words)
+                    if len(words) != count or not CHANNELS.issuperset(joints[-1].channels):
+                        known, got = ", ".join(sorted(CHANNELS)), " ".join(words)[:80]
+                        raise ValueError(f"expected {count} channels among {known}, got {got}")
     except (IndexError, ValueError, StopIteration) as error:
         reason = f"{error}" or "it is cut short"
         raise CaptureError(f"{path}: its HIERARCHY breaks off ({reason}); export it again") from error
-    if not joints or sum(j.parent < 0 for j in joints) != 1:
-        raise CaptureError(f"{path}: expected one ROOT, found {sum(j.parent < 0 for j in joints)}; export one skeleton")
-    if not all(len(j.offset) == 3 and all(abs(x) < 1e9 for x in j.offset) for j in joints):
+    roots = sum(j.parent < 0 for j in joints)
+    if roots != 1:
+        raise CaptureError(f"{path}: expected one ROOT, found {roots}; export one skeleton")
+    if not all(abs(x) < 1e9 for j in joints for x in j.offset):
         raise CaptureError(f"{path}: expected three finite numbers after each OFFSET, got others; export it again")
     return joints
-
-
-def _channels(words: list[str], count: int) -> tuple[str, ...]:
-    channels = tuple(word.lower() for word in words)
-    if len(channels) != count or not CHANNELS.issuperset(channels):
-        raise ValueError(f"expected {count} channels among {', '.join(sorted(CHANNELS))}, got {' '.join(words)[:80]}")
-    return channels
 
 
 def _frames(path: Path, body: str, channels: int) -> tuple[float, np.ndarray]:
@@ -111,9 +109,8 @@ def _frames(path: Path, body: str, channels: int) -> tuple[float, np.ndarray]:
         count, step = int(lines[0].split(":")[1]), float(lines[1].split(":")[1])
         values = np.array(" ".join(lines[2:]).split(), dtype=np.float64)
     except (IndexError, ValueError) as error:
-        raise CaptureError(
-            f"{path}: expected 'Frames:', 'Frame Time:' and numbers ({error}); export it again"
-        ) from error
+        expected = f"expected 'Frames:', 'Frame Time:' and numbers ({error})"
+        raise CaptureError(f"{path}: {expected}; export it again") from error
     fits = channels >= 1 and values.size == count * channels and bool((np.abs(values) < 1e9).all())
     if count < 1 or not 0 < step < 1e6 or not fits:
         raise CaptureError(
@@ -134,7 +131,12 @@ def _motion(joints: list[_Joint], step: float, values: np.ndarray) -> Motion:
         for channel in joint.channels:
             axis = "xyz".index(channel[0])
             if channel.endswith("rotation"):
-                local = local @ _turn(axis, np.deg2rad(values[:, column]))
+                angle, (a, b) = np.deg2rad(values[:, column]), ((axis + 1) % 3, (axis + 2) % 3)
+                turn = np.tile(np.eye(3), (frames, 1, 1))
+                turn[:, a, a] = turn[:, b, b] = np.cos(angle)
+                turn[:, b, a] = np.sin(angle)
+                turn[:, a, b] = -turn[:, b, a]
+                local = local @ turn
             elif n == 0:
                 root[:, axis] = values[:, column]
             column += 1
@@ -148,14 +150,3 @@ def _motion(joints: list[_Joint], step: float, values: np.ndarray) -> Motion:
         torch.from_numpy(root.astype(np.float32)),
         step,
     )
-
-
-def _turn(axis: int, angle_rad: np.ndarray) -> np.ndarray:
-    """Rotations about x, y or z, (frame, 3, 3)."""
-    a, b = (axis + 1) % 3, (axis + 2) % 3
-    turn = np.zeros((len(angle_rad), 3, 3))
-    turn[:, axis, axis] = 1
-    turn[:, a, a] = turn[:, b, b] = np.cos(angle_rad)
-    turn[:, a, b] = -np.sin(angle_rad)
-    turn[:, b, a] = np.sin(angle_rad)
-    return turn

@@ -53,30 +53,23 @@ class GltfPerformer:
 
             self.character = vary_cloth(self.character, self._body.upright_from_file, cloth_variety, seed)
         self.description = f"{character.stem} doing {motion.stem}"
-        generator = torch.Generator().manual_seed(seed)
-        chance, turn = torch.rand(2, generator=generator).tolist()
+        chance, turn = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
         self._start_s = chance * max(0.0, self.motion.duration_s - duration_s)
-        yaw = rotation_from_axis_angle(torch.tensor([0.0, turn * 2 * math.pi, 0.0]))
-        self._stage_from_motion = yaw
+        self._stage_from_motion = rotation_from_axis_angle(torch.tensor([0.0, turn * 2 * math.pi, 0.0]))
         middle = min(self._start_s + duration_s / 2, self.motion.duration_s)
         self._shift = _stage_shift(self._body.hips_path, self.motion, middle)
         self._shift[:, 1] = -self._floor()
 
     def pose(self, time_s: float) -> TexturedMesh:
         """The performer `time_s` after the start of its window."""
-        c = self.character
-        vertices, normals = skin(c.vertices, c.normals, c.joints, c.weights, self._matrices(time_s))
-        return TexturedMesh(Mesh(vertices, c.faces), normals, c.uv, c.texture_of_face, c.textures)
-
-    def _matrices(self, time_s: float) -> Float[Tensor, "joint 4 4"]:
-        """stage_from_bind of every joint."""
-        frame = self._frame(self._start_s + time_s)
+        c, frame = self.character, self._frame(self._start_s + time_s)
         before = min(int(frame), len(self._shift) - 1)
         after = min(before + 1, len(self._shift) - 1)
         matrices = self._body.joint_matrices(frame)
         matrices[:, :3, 3] += torch.lerp(self._shift[before], self._shift[after], frame - before)
         matrices[:, :3] = self._stage_from_motion @ matrices[:, :3]
-        return matrices
+        vertices, normals = skin(c.vertices, c.normals, c.joints, c.weights, matrices)
+        return TexturedMesh(Mesh(vertices, c.faces), normals, c.uv, c.texture_of_face, c.textures)
 
     def _frame(self, clip_s: float) -> float:
         """Frame number at a time of the clip, back and forth past its ends."""
@@ -90,9 +83,7 @@ class GltfPerformer:
 
     def _floor(self) -> float:
         """Height of the floor under the clip: the median of the soles, or their 5th percentile and a little."""
-        c = self.character
-        count = len(self.motion.root)
-        lows = []
+        c, count, lows = self.character, len(self.motion.root), []
         for n in range(min(FLOOR_SAMPLES, count)):
             matrices = self._body.joint_matrices(float(n * count // min(FLOOR_SAMPLES, count)))
             lows.append(skin(c.vertices, c.normals, c.joints, c.weights, matrices)[0][:, 1].min())

@@ -18,34 +18,19 @@ VISIBLE_M = 2.4
 """Height and width that an image holds at the stage's centre: a person of 1.75 m fills three quarters."""
 RADIUS_M = 3.0
 """Distance of the cameras from the stage's axis, or from the subject in a dome."""
+HEIGHTS_M = (1.1, 1.8)
+"""Heights of a ring's cameras above the floor, in turn."""
 DOME_RAD = (0.0, 1.2)
 """Elevations above the horizon between which a dome's cameras stand."""
 UP = (0.0, 1.0, 0.0)
 
 
-def ring_rig(
-    count: int,
-    size_px: tuple[int, int] = (512, 512),
-    *,
-    radius_m: float = RADIUS_M,
-    heights_m: Sequence[float] = (1.1, 1.8),
-    jitter: float = 1.0,
-    seed: int = 0,
-) -> Cameras:
-    """Cameras all around the stage, at alternating heights.
-
-    Args:
-        count: cameras, at least 1.
-        size_px: width and height of the images.
-        radius_m: distance of the cameras from the stage's axis.
-        heights_m: heights above the floor; camera n stands at the n-th, again from the first after the last.
-        jitter: 0 for an exact ring; 1 for errors as of careful hands (degrees, centimetres).
-        seed: of the jitter.
-    """
+def ring_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
+    """Cameras all around the stage, at alternating heights, with errors as of careful hands (degrees, centimetres)."""
     azimuth = torch.arange(_positive(count)) * 2 * math.pi / count
-    height = torch.tensor([heights_m[n % len(heights_m)] for n in range(count)])
-    eyes = torch.stack([radius_m * azimuth.sin(), height, radius_m * azimuth.cos()], -1)
-    return _stand(eyes, size_px, jitter, seed)
+    height = torch.tensor([HEIGHTS_M[n % 2] for n in range(count)])
+    eyes = torch.stack([RADIUS_M * azimuth.sin(), height, RADIUS_M * azimuth.cos()], -1)
+    return _stand(eyes, size_px, seed)
 
 
 def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0) -> Cameras:
@@ -55,35 +40,24 @@ def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0
     angle = torch.arange(count) * math.pi * (3 - math.sqrt(5))
     around = (1 - y * y).sqrt()
     eyes = RADIUS_M * torch.stack([around * angle.sin(), y, around * angle.cos()], -1) + torch.tensor(SUBJECT_CENTER_M)
-    return _stand(eyes, size_px, 1.0, seed)
+    return _stand(eyes, size_px, seed)
 
 
 def orbit(
-    azimuths_rad: Sequence[float],
-    size_px: tuple[int, int] = (512, 512),
-    *,
-    radius_m: float = RADIUS_M,
-    elevation_rad: float = 0.15,
+    azimuths_rad: Sequence[float], size_px: tuple[int, int] = (512, 512), *, elevation_rad: float = 0.15
 ) -> Cameras:
     """Novel cameras on a circle around the middle of who stands on the stage.
 
     Azimuth 0 is in front (+z), and azimuths grow towards +x.
     """
-    return orbit_of(
-        azimuths_rad,
-        size_px,
-        radius_m=radius_m,
-        elevation_rad=elevation_rad,
-        center=torch.tensor(SUBJECT_CENTER_M),
-        up=torch.tensor(UP),
-        visible_m=VISIBLE_M,
-    )
+    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor(UP)
+    shown = {"radius_m": RADIUS_M, "elevation_rad": elevation_rad, "visible_m": VISIBLE_M}
+    return orbit_of(azimuths_rad, size_px, center=center, up=up, **shown)
 
 
-def _stand(eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], jitter: float, seed: int) -> Cameras:
-    """Cameras at `eyes` that look at the subject, a little off by the jitter."""
-    generator = torch.Generator().manual_seed(seed)
-    off = jitter * torch.randn(len(eyes), 3, 3, generator=generator)
+def _stand(eyes: Float[Tensor, "view 3"], size_px: tuple[int, int], seed: int) -> Cameras:
+    """Cameras at about `eyes` that look at about the subject's centre."""
+    off = torch.randn(len(eyes), 3, 3, generator=torch.Generator().manual_seed(seed))
     center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor(UP)
     views = []
     for n, eye in enumerate(eyes):

@@ -1,6 +1,7 @@
 """The studio: performers, lights and cameras as a capture with exact truth."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -82,37 +83,32 @@ class Studio:
         performer_seed, rig_seed, light_seed, self._backdrop_seed, self._error_seed = seeds
         self.performer = performer or _cast(config, performer_seed)
         rig = {"ring": ring_rig, "dome": dome_rig}[config.rig]
-        cameras = config.cameras if isinstance(config.cameras, Cameras) else rig(config.cameras, size, seed=rig_seed)
+        given = config.cameras
         self.name = f"studio {config.seed}: {self.performer.description}"
         self.frame_ids = tuple(f"{time:06d}" for time in range(config.frames))
         """Six digits each, from 000000."""
         self.fps = float(config.fps) if config.frames > 1 else None
         """Frames per second, None for a single frame."""
         self.up = torch.tensor([0.0, 1.0, 0.0])
-        self.true_cameras = cameras
+        self.true_cameras = given if isinstance(given, Cameras) else rig(given, size, seed=rig_seed)
         """True poses of the cameras; `cameras` has the calibration errors of the capture."""
         self.cameras = imperfect_cameras(self.true_cameras, config.imperfections, self._error_seed)
         """The calibration of the capture, including its errors."""
         self._lights = stage_lights(light_seed)
-        self._backdrop = None
-        if config.background == "stage":
-            self._backdrop = stage_backdrop(self.true_cameras, self._backdrop_seed)
+        on_stage = config.background == "stage"
+        self._backdrop = stage_backdrop(self.true_cameras, self._backdrop_seed) if on_stage else None
         # Cache of the last frame, since a frame and its ground truth are read in pairs.
         self._last_surface: tuple[int, Surface] | None = None
         self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
-        self._bounds: Bounds | None = None
 
-    @property
+    @cached_property
     def bounds(self) -> Bounds | None:
         """Bounds of the performers over the capture, with a margin (sampled at most 48 times)."""
-        if self._bounds is None:
-            count = min(self.config.frames, BOUNDS_SAMPLES)
-            times = np.linspace(0, self.config.frames - 1, count).round().astype(int)
-            corners = [self.performer.pose(int(t) / self.config.fps).mesh.vertices.aminmax(dim=0) for t in times]
-            low = torch.stack([c.min for c in corners]).amin(0) - BOUNDS_MARGIN_M
-            high = torch.stack([c.max for c in corners]).amax(0) + BOUNDS_MARGIN_M
-            self._bounds = Bounds(low, high)
-        return self._bounds
+        count = min(self.config.frames, BOUNDS_SAMPLES)
+        times = np.linspace(0, self.config.frames - 1, count).round().astype(int)
+        corners = [self.scene(int(t)).mesh.vertices.aminmax(dim=0) for t in times]
+        low = torch.stack([c.min for c in corners]).amin(0) - BOUNDS_MARGIN_M
+        return Bounds(low, torch.stack([c.max for c in corners]).amax(0) + BOUNDS_MARGIN_M)
 
     def scene(self, time: int) -> TexturedMesh:
         """The performers' surface at index `time`, which may lie beyond the capture's frames."""
@@ -150,21 +146,12 @@ class Studio:
         return replace(render(self._surface(time), cameras, backdrop, self.config.samples_per_side), time=time)
 
     def _surface(self, time: int) -> Surface:
-        last = self._last_surface
-        if last is not None and last[0] == time:
-            return last[1]
-        scene = self.scene(time)
-        surface = light(scene, self._lights, self._pyramid(scene.textures))
-        self._last_surface = (time, surface)
-        return surface
-
-    def _pyramid(self, textures: tuple[Tensor, ...]) -> TexturePyramid:
-        last = self._last_pyramid
-        if last is not None and [*map(id, last[0])] == [*map(id, textures)]:
-            return last[1]
-        pyramid = texture_pyramid(textures)
-        self._last_pyramid = (textures, pyramid)
-        return pyramid
+        if self._last_surface is None or self._last_surface[0] != time:
+            scene, pyramid = self.scene(time), self._last_pyramid
+            if pyramid is None or [*map(id, pyramid[0])] != [*map(id, scene.textures)]:
+                pyramid = self._last_pyramid = scene.textures, texture_pyramid(scene.textures)
+            self._last_surface = time, light(scene, self._lights, pyramid[1])
+        return self._last_surface[1]
 
 
 def _cast(config: StudioConfig, seed: int) -> Performer:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from viewmend.data.synthetic.procedural.body import Body, Torso, body_weights, mix, one_joint, smoothstep
+from viewmend.data.synthetic.procedural.body import Body, Torso, body_weights, hand_patches, mix, one_joint, smoothstep
 from viewmend.data.synthetic.procedural.fabric import (
     PX_PER_M,
     QUIET,
@@ -25,7 +25,16 @@ from viewmend.data.synthetic.procedural.fabric import (
     two_sided,
     write,
 )
-from viewmend.data.synthetic.procedural.skeleton import INDEX, SKIRT_COLUMNS, Points, Skeleton, Values, Weights
+from viewmend.data.synthetic.procedural.skeleton import (
+    INDEX,
+    SIDES,
+    SKIRT_COLUMNS,
+    Physique,
+    Points,
+    Skeleton,
+    Values,
+    Weights,
+)
 
 Painter = Callable[[Canvas], Image]
 Azimuths = Float[np.ndarray, "column"]
@@ -460,6 +469,28 @@ class Tailor:
         # The chart of an open garment begins and ends at the front's edges.
         front = canvas.width_m / 2 - np.abs(canvas.x)
         return blend(image, 0.6 * image, edge(0.002 - np.abs(front - 0.03), canvas))
+
+    def skin(self, person: Physique, rng: np.random.Generator) -> list[Patch]:
+        """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
+        H, wearer, cut = person.height_m, self.wearer, self.cut
+
+        def paint(canvas: Canvas) -> Image:
+            tone = 1 + 0.015 * canvas.noise(rng, 0.03, 0.03) + 0.012 * canvas.noise(rng, 0.004, 0.004)
+            return np.clip(np.array(person.skin_rgb) * tone[..., None], 0, 1)
+
+        around = azimuths(49)
+        low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
+        patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=24)]
+        # Cloth covers what lies further in than a hand's breadth from its hem.
+        arm, leg = max(cut.cuff - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
+        grids = (8 + int(24 * (1 - arm)), 21), (8 + int(28 * (1 - leg)), 25)
+        for i in (0, 1):
+            patches.append(limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, grid=grids[0]))
+            patches.append(limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, grid=grids[1]))
+        skin, girth = paint(Canvas(0.1, 0.1)), 1.05 - 0.13 * person.femininity + 0.05 * person.weight
+        for side in SIDES:
+            patches += hand_patches(wearer.body, wearer.skeleton, H, side, skin, girth)
+        return patches
 
 
 def lining(sheet: Patch) -> Patch:

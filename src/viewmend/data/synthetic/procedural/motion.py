@@ -52,12 +52,10 @@ class Score:
         """Standing with the feet `width` apart and the pelvis `drop` lower than at rest (shares of the height)."""
         H = self.height_m
         place = ahead_m * (self.turn @ np.array([0, 0, 1.0]))
-        feet = [
-            FootPose(place + self.turn @ np.array([s * width * H / 2, 0, 0]), self.heading + s * 0.16)
-            for s in SIGN.values()
-        ]
+        sides = [(s, place + self.turn @ np.array([s * width * H / 2, 0, 0])) for s in SIGN.values()]
+        feet = [FootPose(at, self.heading + s * 0.16) for s, at in sides]
         pelvis = place + np.array([0, float(self.legs.at("pelvis")[1]) - drop * H, 0])
-        return Stance(pelvis, self.heading, feet, (ArmPose(), ArmPose()))
+        return Stance(pelvis, self.heading, feet)
 
 
 def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
@@ -80,8 +78,7 @@ def _path(score: Score, time_s: float) -> tuple[Float[np.ndarray, "2"], float]:
 
 def _stepping(score: Score, time_s: float, beats: float) -> Stance:
     """Feet that step along the path: planted, lifted, swung to where the body will be."""
-    H = score.height_m
-    run = score.kind == "run"
+    H, run = score.height_m, score.kind == "run"
     duty = 0.42 if run else 0.62
     lift = {"run": 0.13, "march": 0.17, "walk": 0.045}.get(score.kind, 0.05) * H
     width = 0.10 if score.kind != "sidestep" else 0.16
@@ -103,8 +100,8 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
         turn = planted[0][1] + share * (planted[1][1] - planted[0][1])
         roll_off = 0.45 * (ease((tau - duty + 0.16) / 0.16) - ease((go - 0.15) / 0.45)) * (go < 1)
         strike = (0.20 * (not run)) * (ease((go - 0.6) / 0.4) + (1 - ease(tau / 0.10)) * (tau < 0.10))
-        flat = score.kind in ("sidestep", "turn", "spin")
-        feet.append(FootPose(place, turn, float(strike - roll_off) * (0.4 if flat else 1.0)))
+        flat = 0.4 if score.kind in ("sidestep", "turn", "spin") else 1.0
+        feet.append(FootPose(place, turn, float(strike - roll_off) * flat))
     turn = 2 * np.pi * beats
     bob = (0.045 if run else 0.014) * H * np.cos(2 * turn + (0.4 if run else 2.6))
     over = rotation(1, yaw) @ np.array([0.016 * H * np.sin(turn - 0.2), 0, 0])
@@ -114,7 +111,6 @@ def _stepping(score: Score, time_s: float, beats: float) -> Stance:
         pelvis,
         yaw,
         feet,
-        (ArmPose(), ArmPose()),
         lean=0.14 if run else 0.03,
         roll=0.05 * float(np.sin(turn)),
         sway=swing,
@@ -235,14 +231,12 @@ def _reaching(score: Score, time_s: float, beats: float) -> Stance:
 def _goal(score: Score, step: int) -> Float[np.ndarray, "side 3"]:
     """Places of both wrists in the heading's frame, shares of the height; the hands often go together."""
     rng = np.random.default_rng([int(1e6 * score.amounts[5]), step % 1000])
-    places = np.array(
-        [(0.12, 0.98, 0.16), (0.36, 0.74, 0.12), (0.14, 0.62, 0.30), (0.20, 0.86, 0.26), (0.16, 0.40, 0.24)]
-    )
+    places, down = np.array(TABLES["reaches"]), np.array([0.17, 0.47, 0.05])
+    mirror = np.array([-1, 1, 1])
     chosen = rng.integers(0, len(places), 2)
-    left, right = places[chosen[0]], places[chosen[1 if rng.random() < 0.4 else 0]] * np.array([-1, 1, 1])
-    down = np.array([0.17, 0.47, 0.05])
+    left, right = places[chosen[0]], places[chosen[1 if rng.random() < 0.4 else 0]] * mirror
     if rng.random() < 0.4:
-        right = down * np.array([-1, 1, 1])
+        right = down * mirror
     elif rng.random() < 0.4:
         left = down
     return np.stack([left, right]) + rng.uniform(-0.03, 0.03, (2, 3))
@@ -262,13 +256,9 @@ MOTIONS: dict[Tempo, tuple[str, ...]] = {
     "dance": ("groove", "sidestep", "spin", "march", "lunge"),
     "fast": ("run", "jacks", "box", "groove", "spin"),
 }
-GESTURES: dict[str, tuple[str, ...]] = {kind: tuple(names) for kind, names in TABLES["gestures_of_motion"].items()}
 BEAT_HZ: dict[Tempo, tuple[float, float]] = {"calm": (0.35, 0.6), "dance": (0.8, 1.15), "fast": (1.3, 1.8)}
 OWN_BEAT_HZ = {"walk": (0.75, 0.98), "jacks": (0.85, 1.15), "run": (1.25, 1.5)}
 ENERGY: dict[Tempo, float] = {"calm": 0.8, "dance": 1.0, "fast": 1.1}
-
-
-FAMILIES = TABLES["gestures"]
 FASTEST_RAD_S = 7.0
 """Fastest turn of an arm's joint; hands then stay below about ten metres a second."""
 
@@ -277,7 +267,6 @@ FASTEST_RAD_S = 7.0
 class Gesture:
     """A family with a person's own bases, amplitudes and phases, for left and right."""
 
-    families: tuple[str, str]
     bases: Float[np.ndarray, "side angle"]
     amplitudes: Float[np.ndarray, "side angle"]
     phases: Float[np.ndarray, "side angle"]
@@ -286,13 +275,12 @@ class Gesture:
     def angles(self, beats: float) -> Float[np.ndarray, "side angle"]:
         """Flexion, abduction, twist, elbow, curl of both arms at this point of the music."""
         moving = self.bases + self.amplitudes * np.sin(2 * np.pi * (self.harmonics[:, None] * beats + self.phases))
-        moving[:, 1] = np.maximum(moving[:, 1], 0.02)
-        moving[:, 3] = np.maximum(moving[:, 3], 0.02)
+        moving[:, [1, 3]] = np.maximum(moving[:, [1, 3]], 0.02)
         return moving
 
 
 def sample_gesture(
-    rng: np.random.Generator, families: tuple[str, ...], bulk: float, energy: float, beat_hz: float
+    rng: np.random.Generator, families: list[str], bulk: float, energy: float, beat_hz: float
 ) -> Gesture:
     """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes.
 
@@ -302,11 +290,10 @@ def sample_gesture(
     names = (first, "hang" if first == "wave" else first)
     if first == "wave" and rng.random() < 0.5:
         names = (names[1], names[0])
-    phase = rng.random()
-    own = rng.uniform(0, 1, 4)
+    phase, own = rng.random(), rng.uniform(0, 1, 4)
     bases, amplitudes, phases, harmonics = [], [], [], []
     for i, name in enumerate(names):
-        angles, harmonic, apart, curl = FAMILIES[name]
+        angles, harmonic, apart, curl = TABLES["gestures"][name]
         table = np.array(angles)
         base = table[:, 0] + 0.08 * rng.standard_normal(4)
         base[1] = max(base[1], table[1, 0]) + bulk * np.clip(1.2 - base[1], 0, 1)
@@ -318,13 +305,7 @@ def sample_gesture(
         amplitudes.append([*amplitude, 0.05])
         phases.append([*offsets, phase])
         harmonics.append(harmonic)
-    return Gesture(names, np.array(bases), np.array(amplitudes), np.array(phases), np.array(harmonics))
-
-
-def arm_poses(angles: Float[np.ndarray, "side angle"]) -> tuple[ArmPose, ArmPose]:
-    """Both arms at these angles."""
-    left, right = (ArmPose(flexion=a[0], abduction=a[1], twist=a[2], elbow=a[3], curl=a[4]) for a in angles.tolist())
-    return left, right
+    return Gesture(np.array(bases), np.array(amplitudes), np.array(phases), np.array(harmonics))
 
 
 @dataclass(frozen=True)
@@ -332,52 +313,42 @@ class Motion:
     """A motion of one person; `stance` is a smooth, deterministic function of time."""
 
     score: Score
-    gestures: tuple[Gesture, Gesture]
+    gestures: list[Gesture]
     bar_s: float
     """Rate at which the two gestures alternate."""
-    center: tuple[float, float] = (0.0, 0.0)
+    center: tuple[float, float]
+    grip: str | None = None
+    """The side whose hand is closed round something."""
 
     def stance(self, time_s: float) -> Stance:
         """The body at this time."""
         beats = self.score.beat_hz * time_s + float(self.score.amounts[7])
-        base = GROUNDS[self.score.kind](self.score, time_s, beats)
-        stance = self._arms(base, time_s, beats)
-        glance = self.score.amounts
-        look = 0.45 * np.sin(0.9 * time_s + 6 * glance[0]) * np.sin(0.37 * time_s + 6 * glance[1])
-        nod = 0.10 * np.sin(0.7 * time_s + 6 * glance[2]) + (0.10 if self.score.tempo != "calm" else 0.03) * np.sin(
-            2 * np.pi * beats
-        )
+        stance = GROUNDS[self.score.kind](self.score, time_s, beats)
+        a, b, c = 6 * self.score.amounts[:3]
+        look = 0.45 * np.sin(0.9 * time_s + a) * np.sin(0.37 * time_s + b)
+        strong = 0.10 if self.score.tempo != "calm" else 0.03
+        nod = 0.10 * np.sin(0.7 * time_s + c) + strong * np.sin(2 * np.pi * beats)
         offset = np.array([self.center[0], 0.0, self.center[1]])
-        left, right = (replace(foot, place=foot.place + offset) for foot in stance.feet)
-        left_arm, right_arm = (a if a.target is None else replace(a, target=a.target + offset) for a in stance.arms)
+        arms = stance.arms or self._arms(time_s, beats)
         return replace(
             stance,
             look=float(look) - 0.5 * stance.twist,
-            nod=stance.nod + float(nod) - 0.45 * (stance.bend + stance.lean),
+            nod=float(nod) - 0.45 * (stance.bend + stance.lean),
             tilt=0.10 * float(np.sin(np.pi * beats)),
             pelvis=stance.pelvis + offset,
-            feet=(left, right),
-            arms=(left_arm, right_arm),
+            feet=[replace(foot, place=foot.place + offset) for foot in stance.feet],
+            arms=[arm if arm.target is None else replace(arm, target=arm.target + offset) for arm in arms],
         )
 
-    def gripping(self, side: str) -> "Motion":
-        """The same motion with this hand closed round something."""
-        i = SIDES.index(side)
-        gestures = []
-        for gesture in self.gestures:
-            bases, amplitudes = gesture.bases.copy(), gesture.amplitudes.copy()
-            bases[i, 4], amplitudes[i, 4] = 1.3, 0.0
-            gestures.append(replace(gesture, bases=bases, amplitudes=amplitudes))
-        return replace(self, gestures=(gestures[0], gestures[1]))
-
-    def _arms(self, base: Stance, time_s: float, beats: float) -> Stance:
-        if self.score.kind == "reach":
-            return base
+    def _arms(self, time_s: float, beats: float) -> list[ArmPose]:
         bar = time_s / self.bar_s + float(self.score.amounts[6])
         # The distance from the middle of the second gesture's bar, in bars, goes up and down between 0 and 1.
         share = ease((0.7 - abs(bar % 2.0 - 1.0)) / 0.4)
         first, second = (gesture.angles(beats) for gesture in self.gestures)
-        return replace(base, arms=arm_poses(first + share * (second - first)))
+        angles = first + share * (second - first)
+        if self.grip:
+            angles[SIDES.index(self.grip), 4] = 1.3
+        return [ArmPose(*arm) for arm in angles.tolist()]
 
 
 def sample_motion(
@@ -391,17 +362,15 @@ def sample_motion(
 ) -> Motion:
     """Draw a motion of this tempo; `kind` fixes which."""
     chosen = kind or MOTIONS[tempo][int(rng.integers(len(MOTIONS[tempo])))]
-    low, high = BEAT_HZ[tempo]
-    beat = float(rng.uniform(low, high))
+    beat = float(rng.uniform(*BEAT_HZ[tempo]))
     if chosen in OWN_BEAT_HZ:
         beat = float(rng.uniform(*OWN_BEAT_HZ[chosen]))
-    gestures = [sample_gesture(rng, GESTURES[chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
+    gestures = [sample_gesture(rng, TABLES["gestures_of_motion"][chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
     path = 0.0
     if chosen in ("walk", "run"):
         path = float(rng.uniform(0.42, 0.65)) if rng.random() < 0.7 else 0.0
     if chosen == "sidestep":
         path = float(rng.uniform(0.12, 0.3))
-    score = Score(
-        chosen, tempo, beat, skeleton, person.height_m, float(rng.uniform(-np.pi, np.pi)), path, rng.uniform(0, 1, 8)
-    )
-    return Motion(score, (gestures[0], gestures[1]), float(rng.uniform(2.5, 5.0)), center)
+    heading = float(rng.uniform(-np.pi, np.pi))
+    score = Score(chosen, tempo, beat, skeleton, person.height_m, heading, path, rng.uniform(0, 1, 8))
+    return Motion(score, gestures, float(rng.uniform(2.5, 5.0)), center)

@@ -7,18 +7,9 @@ import numpy as np
 import torch
 
 from viewmend.data.synthetic.performer import TexturedMesh, skin
-from viewmend.data.synthetic.procedural.body import build_body, hand_patches, shoe_patch
-from viewmend.data.synthetic.procedural.clothing import (
-    Cut,
-    Tailor,
-    Wearer,
-    azimuths,
-    limb_sheet,
-    sample_cut,
-    sample_outfit,
-    torso_sheet,
-)
-from viewmend.data.synthetic.procedural.fabric import BoundMesh, Canvas, Image, Patch, assemble
+from viewmend.data.synthetic.procedural.body import build_body, shoe_patch
+from viewmend.data.synthetic.procedural.clothing import Tailor, Wearer, sample_cut, sample_outfit
+from viewmend.data.synthetic.procedural.fabric import BoundMesh, Patch, assemble
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
 from viewmend.data.synthetic.procedural.motion import MOTIONS, Motion, Tempo, sample_motion, seat_height
 from viewmend.data.synthetic.procedural.props import HELD, STANDING, held_prop, standing_prop, stool
@@ -66,49 +57,24 @@ def draw_person(
     hair = sample_hair(hair_rng, person.femininity, person.skin_rgb[0] < 0.6)
     skeleton = build_skeleton(person)
     body = build_body(person, skeleton)
-    wearer = Wearer(body, skeleton, person.height_m)
-    tailor = Tailor(wearer, outfit, sample_cut(outfit))
+    tailor = Tailor(Wearer(body, skeleton, person.height_m), outfit, sample_cut(outfit))
     bulk = 0.06 + 0.08 * max(person.weight, 0) + (0.10 if outfit.outer != "none" else 0.0)
     motion = sample_motion(motion_rng, person, skeleton, tempo, kind, bulk, center)
     patches = tailor.top() + tailor.bottom() + tailor.outer()
     head = build_head(person, skeleton)
     patches += head_patches(person, head, hair_rng, hair.color)
     patches += hair_patches(head, hair, body.torso, outfit.fabrics[1].colors[0])
-    patches += _skin_patches(person, wearer, tailor.cut, hair_rng)
+    patches += tailor.skin(person, hair_rng)
     patches += [shoe_patch(skeleton, person.height_m, side, outfit.shoes[0], outfit.shoes[1]) for side in SIDES]
     held = ""
     if (prop_rng.random() < 0.3 if holding is None else holding) and motion.score.kind not in BUSY_HANDS:
         thing, side = HELD[int(prop_rng.integers(len(HELD)))], SIDES[int(prop_rng.integers(2))]
         patches += held_prop(thing, prop_rng, body, skeleton, person.height_m, side)
-        motion = motion.gripping(side)
+        motion = replace(motion, grip=side)
         held = f" with a {thing}"
     sex = "woman" if person.femininity > 0.5 else "man"
     words = f"{sex}, {person.height_m:.2f} m, {hair.words}, {outfit.words}, {motion.score.kind} ({tempo}){held}"
     return ProceduralPerson(assemble(patches), skeleton, motion, person, words)
-
-
-def _skin_patches(person: Physique, wearer: Wearer, cut: Cut, rng: np.random.Generator) -> list[Patch]:
-    """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
-    H = person.height_m
-
-    def paint(canvas: Canvas) -> Image:
-        tone = 1 + 0.015 * canvas.noise(rng, 0.03, 0.03) + 0.012 * canvas.noise(rng, 0.004, 0.004)
-        return np.clip(np.array(person.skin_rgb) * tone[..., None], 0, 1)
-
-    around = azimuths(49)
-    low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
-    patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=24)]
-    # Cloth covers what lies further in than a hand's breadth from its hem.
-    arm, leg = max(cut.cuff - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
-    for i in (0, 1):
-        grids = (8 + int(24 * (1 - arm)), 21), (8 + int(28 * (1 - leg)), 25)
-        patches.append(limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, grid=grids[0]))
-        patches.append(limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, grid=grids[1]))
-    skin = paint(Canvas(0.1, 0.1))
-    girth = 1.05 - 0.13 * person.femininity + 0.05 * person.weight
-    for side in SIDES:
-        patches += hand_patches(wearer.body, wearer.skeleton, H, side, skin, girth)
-    return patches
 
 
 TEMPOS: tuple[Tempo, ...] = ("calm", "dance", "fast")
@@ -165,16 +131,22 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
     aside = np.array([np.sin(angle), np.cos(angle)]) * (0.46 if count == 2 else 0.0)
     people = []
     for i, seeds in enumerate(np.random.SeedSequence(seed).spawn(count)):
-        kind = style.motion or _kind(rng, tempo, crowded=count == 2)
+        kinds = [kind for kind in MOTIONS[tempo] if count == 1 or kind not in ROAMING]
+        kind = style.motion or kinds[int(rng.integers(len(kinds)))]
         x, z = (aside * (1 - 2 * i)).tolist()
         people.append(draw_person(seeds, tempo, kind, style.holding, (x, z)))
-    patches, names = _seats(people, rng), []
+    patches: list[Patch] = []
+    for person in people:
+        score = person.motion.score
+        if score.kind == "sit":
+            under = np.array([person.motion.center[0], 0.0, person.motion.center[1]])
+            back = 0.03 * score.height_m * np.array([np.sin(score.heading), 0, np.cos(score.heading)])
+            patches += stool(rng, under - back, score.heading, seat_height(score.height_m))
+    words = " and ".join(person.description for person in people)
     roams = any(person.motion.score.kind in ROAMING for person in people)
     if (chance[1] < 0.5 if style.furniture is None else style.furniture) and not roams:
         more, names = _furniture(rng, angle)
         patches += more
-    words = " and ".join(person.description for person in people)
-    if names:
         words += ", next to " + " and ".join(names)
     return ProceduralPerformer(tuple(people), assemble(patches).rest if patches else None, words)
 
@@ -187,27 +159,9 @@ def _check(style: PerformerStyle) -> None:
         raise ValueError(f"expected 1 or 2 people, got {style.people}; the stage holds no more")
 
 
-def _kind(rng: np.random.Generator, tempo: Tempo, crowded: bool) -> str:
-    kinds = [kind for kind in MOTIONS[tempo] if not (crowded and kind in ROAMING)]
-    return kinds[int(rng.integers(len(kinds)))]
-
-
-def _seats(people: list[ProceduralPerson], rng: np.random.Generator) -> list[Patch]:
-    """A stool under everyone who sits."""
-    patches: list[Patch] = []
-    for person in people:
-        score, center = person.motion.score, person.motion.center
-        if score.kind == "sit":
-            under = np.array([center[0], 0.0, center[1]])
-            back = 0.03 * score.height_m * np.array([np.sin(score.heading), 0, np.cos(score.heading)])
-            patches += stool(rng, under - back, score.heading, seat_height(score.height_m))
-    return patches
-
-
 def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], list[str]]:
     """One or two things on the floor, off the line through two people."""
-    patches: list[Patch] = []
-    names: list[str] = []
+    patches, names = [], []
     for i in range(int(rng.integers(1, 3))):
         kind = STANDING[int(rng.integers(len(STANDING)))]
         turn = angle + np.pi / 2 + i * np.pi + rng.uniform(-0.6, 0.6)
@@ -219,16 +173,12 @@ def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], lis
 
 def merge(parts: Sequence[TexturedMesh]) -> TexturedMesh:
     """All parts in one mesh; their textures stay separate."""
-    vertices, faces, textures, first, layer = [], [], [], 0, 0
+    first, layer, faces, textures = 0, 0, [], []
     for part in parts:
-        vertices.append(part.mesh.vertices)
         faces.append(part.mesh.faces + first)
         textures.append(part.texture_of_face + layer)
         first, layer = first + len(part.mesh.vertices), layer + len(part.textures)
-    return TexturedMesh(
-        Mesh(torch.cat(vertices), torch.cat(faces)),
-        torch.cat([part.normals for part in parts]),
-        torch.cat([part.uv for part in parts]),
-        torch.cat(textures),
-        tuple(texture for part in parts for texture in part.textures),
-    )
+    vertices, normals, uv = zip(*((part.mesh.vertices, part.normals, part.uv) for part in parts), strict=True)
+    mesh = Mesh(torch.cat(vertices), torch.cat(faces))
+    every = tuple(texture for part in parts for texture in part.textures)
+    return TexturedMesh(mesh, torch.cat(normals), torch.cat(uv), torch.cat(textures), every)

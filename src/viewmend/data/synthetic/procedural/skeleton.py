@@ -187,12 +187,12 @@ class ArmPose:
 
     flexion: float = 0.0
     """Forward and up."""
-    abduction: float = 0.15
+    abduction: float = 0.0
     """Away from the side, before flexion."""
-    twist: float = 0.2
+    twist: float = 0.0
     """Inward about the upper arm."""
-    elbow: float = 0.25
-    curl: float = 0.3
+    elbow: float = 0.0
+    curl: float = 0.0
     """How far the fingers are curled."""
     target: Vector | None = None
     """World place of the wrist, metres; the angles above then do not count."""
@@ -214,8 +214,8 @@ class Stance:
 
     pelvis: Vector
     yaw: float
-    feet: Sequence[FootPose]
-    arms: Sequence[ArmPose]
+    feet: list[FootPose]
+    arms: Sequence[ArmPose] = ()
     lean: float = 0.0
     roll: float = 0.0
     sway: float = 0.0
@@ -232,8 +232,7 @@ class Stance:
 def solve(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float) -> Transforms:
     """world_from_bind of every joint; `before` is the stance `elapsed_s` earlier, for what swings behind."""
     world = np.tile(np.eye(4), (len(INDEX), 1, 1))
-    heading = rotation(1, stance.yaw)
-    R = heading @ rotation(1, stance.sway) @ rotation(0, stance.lean) @ rotation(2, -stance.roll)
+    R = rotation(1, stance.yaw) @ rotation(1, stance.sway) @ rotation(0, stance.lean) @ rotation(2, -stance.roll)
     world[0, :3, :3] = R
     world[0, :3, 3] = _reachable(skeleton, stance, R) - R @ skeleton.positions[0]
     third = rotation(1, stance.twist / 3) @ rotation(0, stance.bend / 3) @ rotation(2, -stance.side / 3)
@@ -281,16 +280,14 @@ def _place_leg(skeleton: Skeleton, side: str, foot: FootPose, stance: Stance, wo
     ankle, foot_R = _ankle(skeleton, side, foot)
     names = [f"{side}_{part}" for part in ("thigh", "shin", "foot", "toe")]
     lengths = (skeleton.length(names[0], names[1]), skeleton.length(names[1], names[2]))
-    out = SIGN[side] * stance.knees_out
     yaw = stance.yaw + 0.5 * float(np.arctan2(np.sin(foot.yaw - stance.yaw), np.cos(foot.yaw - stance.yaw)))
-    pole = rotation(1, yaw + out) @ np.array([0.0, 0.45, 1.0])
+    pole = rotation(1, yaw + SIGN[side] * stance.knees_out) @ np.array([0.0, 0.45, 1.0])
     thigh, shin, hinge = two_bone(hip, ankle, lengths, pole)
     for i, along in ((0, thigh), (1, shin)):
         bind = hinge_frame(skeleton.at(names[i + 1]) - skeleton.at(names[i]), np.array([1.0, 0, 0]))
         skeleton.place(names[i], hinge_frame(along, hinge) @ bind.T, world)
     skeleton.place(names[2], foot_R, world)
-    flat = rotation(1, foot.yaw) @ rotation(0, -max(foot.pitch, 0.0))
-    skeleton.place(names[3], flat, world)
+    skeleton.place(names[3], rotation(1, foot.yaw) @ rotation(0, -max(foot.pitch, 0.0)), world)
 
 
 def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -> None:
@@ -298,8 +295,7 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -
     names = [f"{side}_{part}" for part in ("clavicle", "upperarm", "forearm", "hand", "fingers")]
     chest = world[INDEX["upper"], :3, :3]
     hanging = rotation(2, -s * ARM_ANGLE_RAD)
-    raised = max(0.0, arm.abduction - 0.6) + 0.5 * max(0.0, arm.flexion - 0.9)
-    lift = 0.0 if arm.target is not None else 0.28 * float(np.tanh(raised))
+    lift = 0.28 * float(np.tanh(max(0.0, arm.abduction - 0.6) + 0.5 * max(0.0, arm.flexion - 0.9)))
     skeleton.place(names[0], chest @ rotation(2, s * lift), world)
     if arm.target is None:
         R = chest @ rotation(0, -arm.flexion) @ rotation(2, s * arm.abduction) @ rotation(1, -s * arm.twist)
@@ -310,11 +306,9 @@ def _place_arm(skeleton: Skeleton, side: str, arm: ArmPose, world: Transforms) -
         pole = chest @ np.array([0.6 * s, -1.0, -0.7])
         along, second, hinge = two_bone(shoulder, arm.target, lengths, pole)
         upper, fore = (hinge_frame(bone, -hinge) @ hanging for bone in (along, second))
-    skeleton.place(names[1], upper, world)
-    skeleton.place(names[2], fore, world)
-    skeleton.place(names[3], fore, world)
-    curl = hanging.T @ rotation(2, -s * arm.curl) @ hanging
-    skeleton.place(names[4], fore @ curl, world)
+    fingers = fore @ (hanging.T @ rotation(2, -s * arm.curl) @ hanging)
+    for name, R in zip(names[1:], (upper, fore, fore, fingers), strict=True):
+        skeleton.place(name, R, world)
 
 
 def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, world: Transforms) -> None:
@@ -348,10 +342,8 @@ def _hang(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float, 
     skeleton.place("tail", lag @ hinge_frame(drop, head @ np.array([1.0, 0, 0])), world)
 
 
-def _tilted(
-    outward: Float[np.ndarray, "column 3"], angle_rad: Float[np.ndarray, "column"]
-) -> Float[np.ndarray, "column 3 3"]:
-    """Rotations that lift what hangs down (-y) towards `outward` by these angles: (column, 3, 3)."""
+def _tilted(outward: Points, angle_rad: Values) -> Float[np.ndarray, "column 3 3"]:
+    """Rotations that lift what hangs down (-y) towards `outward` by these angles."""
     x, z = outward[:, 0], outward[:, 2]
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     # In the plane of `outward` and y; what is across both stays.
