@@ -11,15 +11,19 @@ from viewmend.data.synthetic.gltf import load_character
 from viewmend.data.synthetic.retarget import node_matrices
 
 
+def read(path):
+    """The JSON part of a .glb, and what comes after it."""
+    data = path.read_bytes()
+    end = 20 + struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20:end]), data[end:]
+
+
 def edited(path, change):
     """Rewrite the JSON part of a .glb."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
+    document, rest = read(path)
     change(document)
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
     header = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
     path.write_bytes(header + text + rest)
     return path
@@ -43,10 +47,8 @@ def test_textures_are_rgb_with_their_first_row_on_top(character_file):
 
 
 def test_a_gltf_with_a_data_uri_reads_the_same(character_file):
-    data = character_file.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    document = json.loads(data[20 : 20 + size])
-    document["buffers"][0]["uri"] = "data:x;base64," + base64.b64encode(data[28 + size :]).decode()
+    document, rest = read(character_file)
+    document["buffers"][0]["uri"] = "data:x;base64," + base64.b64encode(rest[8:]).decode()
     path = character_file.with_suffix(".gltf")
     path.write_text(json.dumps(document))
     a, b = load_character(character_file), load_character(path)

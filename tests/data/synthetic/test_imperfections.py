@@ -61,7 +61,7 @@ def test_each_switch_is_seeded_and_does_its_own(frame, switch):
 
 
 def test_every_hole_begins_in_the_subject(frame):
-    """A hole beside it would change nothing: a small subject loses as many as a large one."""
+    """A hole next to it would change nothing: a small subject loses as many as a large one."""
     small = replace(frame, mask=torch.zeros_like(frame.mask))
     small.mask[:, 18:22, 23:27] = 255
     hit = [imperfect_frame(small, Imperfections(mask_holes=8.0), seed).mask[0].sum() < 16 * 255 for seed in range(20)]

@@ -11,20 +11,26 @@ from viewmend.data.synthetic.gltf_performer import GltfPerformer
 from viewmend.data.synthetic.retarget import (
     PARTS,
     REQUIRED,
+    Retarget,
     family_table,
     find_parts,
     node_matrices,
     retarget,
 )
 
+
+def posed(body: Retarget, frame: int) -> torch.Tensor:
+    """World matrices of the nodes in a frame."""
+    hips = body.hips, body.hips_path[frame]
+    return node_matrices(body.character, body.upright_from_file, body.driver, body.rotations[frame], hips)
+
+
 FAMILIES = ("acclaim", "cgspeed", "humanik", "mixamo", "rigify", "mannequin")
 
 
 def test_limbs_point_as_the_actors_do(character_file, motion_file):
     character, motion = load_character(character_file), read_bvh(motion_file)
-    body = retarget(character, motion)
-    turns = body.rotations[3]
-    world = node_matrices(character, body.upright_from_file, body.driver, turns, (body.hips, body.hips_path[3]))
+    world = posed(retarget(character, motion), 3)
     at = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
     offsets = {name: torch.tensor(o, dtype=torch.float32) for name, (_, o) in BVH_JOINTS.items()}
     for (start, end), (joint, child) in {
@@ -53,8 +59,7 @@ def test_hips_are_where_the_actors_are_in_the_size_of_the_character(character_fi
     actor_cm, middle_cm = legs(dict(zip(motion.names, motion.rest, strict=True)), "Hip", "Knee", "Ankle")
     own_m, _ = legs({name: place for name, (_, place) in JOINTS.items()}, "UpLeg", "Leg", "Foot")
     for frame in (0, 1, 3):
-        pose = body.hips, body.hips_path[frame]
-        world = node_matrices(character, body.upright_from_file, body.driver, body.rotations[frame], pose)
+        world = posed(body, frame)
         at = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
         expected_cm = motion.root[frame] + motion.rotations[frame, 0] @ middle_cm
         found = (at["LeftUpLeg"] + at["RightUpLeg"]) / 2
@@ -65,14 +70,8 @@ def test_other_axes_and_units_change_nothing(character_file, motion_file):
     """The same motion with z up and in another unit puts the character into the same pose."""
     character, motion = load_character(character_file), read_bvh(motion_file)
     turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    other = type(motion)(
-        motion.names,
-        motion.parents,
-        3 * motion.rest @ turn.T,
-        turn @ motion.rotations @ turn.T,
-        3 * motion.root @ turn.T,
-        motion.seconds_per_frame,
-    )
+    rest, root = 3 * motion.rest @ turn.T, 3 * motion.root @ turn.T
+    other = replace(motion, rest=rest, rotations=turn @ motion.rotations @ turn.T, root=root)
     a, b = retarget(character, motion), retarget(character, other)
     torch.testing.assert_close(a.joint_matrices(2.0), b.joint_matrices(2.0), atol=1e-4, rtol=0)
 
@@ -108,8 +107,6 @@ def test_families_are_recognised(family, prefix):
     table = family_table(family)
     assert tuple(table) == PARTS
     names = [prefix + n for n in table.values()]
-    if prefix and not names[0].lower().endswith(("hips", "pelvis", "root")):
-        pytest.skip("a namespace is found by the hips' name")
     assert find_parts(names) == {part: prefix + name for part, name in table.items()}
 
 
@@ -140,31 +137,31 @@ def test_a_table_is_no_person(tmp_path, motion_file):
     with pytest.raises(ValueError, match="human skeleton"):
         find_parts(["Table", "leg_front_left"])
     broken = write_character(tmp_path / "x.glb", prefix="bone_q")
-    text = broken.read_bytes().replace(b"LeftUpLeg", b"LeftXXXXX")
-    broken.write_bytes(text)
+    broken.write_bytes(broken.read_bytes().replace(b"LeftUpLeg", b"LeftXXXXX"))
     with pytest.raises(CaptureError, match=r"x\.glb with .*wave\.bvh"):
         GltfPerformer(broken, motion_file)
 
 
-class TestPerformer:
-    def test_is_a_function_of_time_and_seed(self, character_file, motion_file):
-        a = GltfPerformer(character_file, motion_file, seed=5)
-        b = GltfPerformer(character_file, motion_file, seed=5)
-        b.pose(0.09)
-        assert torch.equal(a.pose(0.04).mesh.vertices, b.pose(0.04).mesh.vertices)
-        c = GltfPerformer(character_file, motion_file, seed=6)
-        assert not torch.equal(a.pose(0.04).mesh.vertices, c.pose(0.04).mesh.vertices)
+def test_a_pose_is_a_function_of_time_and_seed(character_file, motion_file):
+    a = GltfPerformer(character_file, motion_file, seed=5)
+    b = GltfPerformer(character_file, motion_file, seed=5)
+    b.pose(0.09)
+    assert torch.equal(a.pose(0.04).mesh.vertices, b.pose(0.04).mesh.vertices)
+    c = GltfPerformer(character_file, motion_file, seed=6)
+    assert not torch.equal(a.pose(0.04).mesh.vertices, c.pose(0.04).mesh.vertices)
 
-    def test_runs_back_and_forth_past_its_end(self, character_file, motion_file):
-        performer = GltfPerformer(character_file, motion_file)
-        step = performer.motion.seconds_per_frame
-        turned = performer.pose(4 * step).mesh.vertices
-        torch.testing.assert_close(turned, performer.pose(2 * step).mesh.vertices, atol=1e-5, rtol=0)
 
-    def test_stands_on_the_floor_near_the_centre(self, character_file, tmp_path):
-        far = write_motion(tmp_path / "far.bvh", frames=150, travel_cm=900)
-        performer = GltfPerformer(character_file, far, seed=2)
-        for t in (0.0, 0.05, 2.1, 4.0, 5.5, 7.0):
-            vertices = performer.pose(t).mesh.vertices
-            assert float(vertices[:, [0, 2]].mean(0).norm()) < 1.2
-            assert abs(float(vertices[:, 1].min())) < 0.05
+def test_a_clip_runs_back_and_forth_past_its_end(character_file, motion_file):
+    performer = GltfPerformer(character_file, motion_file)
+    step = performer.motion.seconds_per_frame
+    turned = performer.pose(4 * step).mesh.vertices
+    torch.testing.assert_close(turned, performer.pose(2 * step).mesh.vertices, atol=1e-5, rtol=0)
+
+
+def test_a_performer_stands_on_the_floor_near_the_centre(character_file, tmp_path):
+    far = write_motion(tmp_path / "far.bvh", frames=150, travel_cm=900)
+    performer = GltfPerformer(character_file, far, seed=2)
+    for t in (0.0, 0.05, 2.1, 4.0, 5.5, 7.0):
+        vertices = performer.pose(t).mesh.vertices
+        assert float(vertices[:, [0, 2]].mean(0).norm()) < 1.2
+        assert abs(float(vertices[:, 1].min())) < 0.05

@@ -185,9 +185,8 @@ def test_depth_and_cameras_agree_with_the_surface(folders):
 )
 def test_real_people_move_as_people_do(shared, motion):
     train = shared / "performers"
-    performer = GltfPerformer(
-        train / "train" / "Black_F_3_Casual.glb", train / "motions" / "train" / f"{motion}.bvh", 1, 1.0
-    )
+    person, clip = train / "train/Black_F_3_Casual.glb", train / f"motions/train/{motion}.bvh"
+    performer = GltfPerformer(person, clip, 1, 1.0)
     heights, lows = [], []
     for t in (0.0, 0.35, 0.7):
         mesh = performer.pose(t).mesh
@@ -195,8 +194,9 @@ def test_real_people_move_as_people_do(shared, motion):
         corners = mesh.vertices[mesh.faces]
         # At rest this character's longest edge is 0.263 m.
         assert float((corners - corners.roll(1, 1)).norm(dim=-1).max()) < 0.3, "exploded vertices"
-        heights.append(float(mesh.vertices[:, 1].max()))
-        lows.append(float(mesh.vertices[:, 1].min()))
+        low, high = mesh.vertices[:, 1].aminmax()
+        heights.append(float(high))
+        lows.append(float(low))
     assert all(1.2 < h < 2.4 for h in heights)
     assert min(map(abs, lows)) < 0.06 and max(lows) < 0.35
     assert np.ptp(heights) < 1
@@ -228,17 +228,17 @@ def test_rigs_hold_an_upright_person(make, count):
     assert float(cameras.centers[:, 1].min()) > 0.5
 
 
-def random_case(rng: torch.Generator, vertices: int = 50, joints: int = 5):
-    weights = torch.rand(vertices, 4, generator=rng)
-    weights = weights / weights.sum(1, keepdim=True)
-    index = torch.randint(0, joints, (vertices, 4), generator=rng)
-    turns = rotation_from_axis_angle(torch.randn(joints, 3, generator=rng))
-    motions = rigid(turns, torch.randn(joints, 3, generator=rng))
-    return torch.randn(vertices, 3, generator=rng), index, weights, motions
+@pytest.fixture
+def bound(rng):
+    """Points, joints, weights and motions of a skinned surface."""
+    joints, weights = torch.randint(0, 5, (50, 4), generator=rng), torch.rand(50, 4, generator=rng)
+    turns = rotation_from_axis_angle(torch.randn(5, 3, generator=rng))
+    motions = rigid(turns, torch.randn(5, 3, generator=rng))
+    return torch.randn(50, 3, generator=rng), joints, weights / weights.sum(1, keepdim=True), motions
 
 
-def test_skin_is_the_weighted_mean_of_rigid_motions(rng):
-    points, joints, weights, motions = random_case(rng)
+def test_skin_is_the_weighted_mean_of_rigid_motions(bound):
+    points, joints, weights, motions = bound
     expected = torch.zeros_like(points)
     for v in range(len(points)):
         for slot in range(4):
@@ -247,8 +247,8 @@ def test_skin_is_the_weighted_mean_of_rigid_motions(rng):
     torch.testing.assert_close(skin(points, points, joints, weights, motions)[0], expected)
 
 
-def test_one_joint_turns_the_normals(rng):
-    points, joints, weights, motions = random_case(rng)
+def test_one_joint_turns_the_normals(bound, rng):
+    points, joints, weights, motions = bound
     normals = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=rng), dim=-1)
     _, turned = skin(points, normals, torch.full_like(joints, 2), weights, motions)
     torch.testing.assert_close(turned, normals @ motions[2, :3, :3].T)

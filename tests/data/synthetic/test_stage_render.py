@@ -1,57 +1,31 @@
-import numpy as np
 import torch
 from data.synthetic.tiny_performer import write_motion
+from reference import ball
 from reference.shading_reference import shade, unshadowed
 
+from viewmend.data.synthetic import _shade_numba
 from viewmend.data.synthetic.gltf_performer import GltfPerformer
 from viewmend.data.synthetic.performer import TexturedMesh, texture_pyramid
-from viewmend.data.synthetic.render import (
-    SHADOW_BIAS_M,
-    Lights,
-    Surface,
-    light,
-    render,
-    stage_lights,
-    visibility,
-)
-from viewmend.data.synthetic.rigs import SUBJECT_CENTER_M, ring_rig
+from viewmend.data.synthetic.render import SHADOW_BIAS_M, Lights, Surface, light, render, stage_lights, visibility
+from viewmend.data.synthetic.rigs import orbit, ring_rig
 from viewmend.geometry.cameras import Cameras, concatenate_cameras, pinhole
 from viewmend.geometry.mesh import Mesh, vertex_normals
-from viewmend.geometry.orbit import orbit
 from viewmend.geometry.rasterize import rasterize
 from viewmend.geometry.rigid import look_at
 
 
-def sphere(radius: float, center=(0.0, 0.95, 0.0), rings: int = 40) -> TexturedMesh:
-    polar, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
-    points = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
-    index = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
-    a, b, c, d = (t.reshape(-1) for t in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    faces = torch.from_numpy(np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]))
-    normals = torch.from_numpy(points.reshape(-1, 3)).float()
-    uv = torch.from_numpy(np.stack([around / (2 * np.pi), polar / np.pi], -1).reshape(-1, 2)).float()
-    mesh = Mesh(radius * normals + torch.tensor(center), faces)
+def sphere(radius: float, center=(0.0, 0.95, 0.0)) -> TexturedMesh:
+    mesh = ball.proxy(40).mesh
+    normals = mesh.vertices / ball.RADIUS_M
+    around, polar = torch.atan2(normals[:, 0], normals[:, 2]), normals[:, 1].clamp(-1, 1).acos()
+    uv = torch.stack([around / (2 * torch.pi) + 0.5, polar / torch.pi], -1)
     texture = torch.rand(3, 32, 64, generator=torch.Generator().manual_seed(3))
-    return TexturedMesh(mesh, normals, uv, torch.zeros(len(faces), dtype=torch.long), (texture,))
+    whole = Mesh(radius * normals + torch.tensor(center), mesh.faces)
+    return TexturedMesh(whole, normals, uv, torch.zeros(len(mesh.faces), dtype=torch.long), (texture,))
 
 
-def lit(scene: TexturedMesh, seed: int = 0) -> Surface:
-    return light(scene, stage_lights(seed), texture_pyramid(scene.textures))
-
-
-def square(size_m: float, texture: torch.Tensor) -> TexturedMesh:
-    """Faces +z at z = 0 about (0, 0.95, 0), its texture upright as seen from +z."""
-    h = size_m / 2
-    vertices = torch.tensor([[-h, 0.95 + h, 0], [h, 0.95 + h, 0], [h, 0.95 - h, 0], [-h, 0.95 - h, 0]])
-    mesh = Mesh(vertices, torch.tensor([[0, 2, 1], [0, 3, 2]]))
-    uv = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    return TexturedMesh(mesh, vertex_normals(mesh), uv, torch.zeros(2, dtype=torch.long), (texture,))
-
-
-def front(size: int = 64, visible_m: float = 2.0) -> Cameras:
-    center, up = torch.tensor(SUBJECT_CENTER_M), torch.tensor([0.0, 1.0, 0.0])
-    shown = {"radius_m": 3.0, "elevation_rad": 0.0, "visible_m": visible_m}
-    return orbit([0.0], (size, size), center=center, up=up, **shown)
+def lit(scene: TexturedMesh) -> Surface:
+    return light(scene, stage_lights(0), texture_pyramid(scene.textures))
 
 
 def test_textures_are_upright_and_not_mirrored():
@@ -59,7 +33,12 @@ def test_textures_are_upright_and_not_mirrored():
     texture[0, :8, :8] = 1  # red at the top left
     texture[1, :8, 8:] = 1  # green at the top right
     texture[2, 8:] = 1  # blue below
-    rgb = render(lit(square(1.0, texture)), front()).rgb[0]
+    # A square of one metre that faces +z.
+    uv = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    corners = torch.cat([uv[:, :1] - 0.5, 1.45 - uv[:, 1:], torch.zeros(4, 1)], 1)
+    mesh = Mesh(corners, torch.tensor([[0, 2, 1], [0, 3, 2]]))
+    square = TexturedMesh(mesh, vertex_normals(mesh), uv, torch.zeros(2, dtype=torch.long), (texture,))
+    rgb = render(lit(square), orbit([0.0], (64, 64), elevation_rad=0.0)).rgb[0]
     for row, column, channel in ((24, 24, 0), (24, 40, 1), (40, 24, 2), (40, 40, 2)):
         assert int(rgb[:, row, column].argmax()) == channel and int(rgb[channel, row, column]) > 100
 
@@ -68,7 +47,7 @@ def test_the_left_hand_is_at_the_images_right(character_file, tmp_path):
     """Seen from the front, the character's left (red) is at the right side of the image, and its head on top."""
     performer = GltfPerformer(character_file, write_motion(tmp_path / "still.bvh"), seed=1)
     performer._stage_from_motion = torch.eye(3)
-    rgb = render(lit(performer.pose(0.0)), front(96)).rgb[0].int()
+    rgb = render(lit(performer.pose(0.0)), orbit([0.0], (96, 96), elevation_rad=0.0)).rgb[0].int()
     columns = torch.arange(96).float()
     red, green = ((rgb[a] - rgb[b]).clamp(min=0).float() for a, b in ((0, 1), (1, 0)))
     assert float((red.sum(0) * columns).sum() / red.sum()) > float((green.sum(0) * columns).sum() / green.sum()) + 10
@@ -78,7 +57,8 @@ def test_the_left_hand_is_at_the_images_right(character_file, tmp_path):
 
 def test_shading_is_that_of_the_reference():
     scene = sphere(0.6)
-    cameras = concatenate_cameras([ring_rig(2, (60, 44), seed=2), pinhole(1.0, 50, 48, look_at_subject(0.8), "near")])
+    near = look_at(torch.tensor([0.8, 1.2, 0.4]), torch.tensor([0.0, 0.95, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+    cameras = concatenate_cameras([ring_rig(2, (60, 44), seed=2), pinhole(1.0, 50, 48, near, "near")])
     surface = lit(scene)
     background = torch.rand(3, 3, 48, 60, generator=torch.Generator().manual_seed(1))
     fast = render(surface, cameras, background)
@@ -91,11 +71,6 @@ def test_shading_is_that_of_the_reference():
     assert float((rgb != fast.rgb).float().mean()) < 1e-3
 
 
-def look_at_subject(distance: float) -> torch.Tensor:
-    eye = torch.tensor([distance, 1.2, 0.4])
-    return look_at(eye, torch.tensor([0.0, 0.95, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
-
-
 def test_shadow_lookups_agree():
     generator = torch.Generator().manual_seed(0)
     scene, lights = sphere(0.4), stage_lights(0)
@@ -105,8 +80,6 @@ def test_shadow_lookups_agree():
     assert float(fast[facing < -0.4].max()) < 0.5, "what faces away is in its own shadow"
     pixels = 140 * torch.rand(2, 500, 2, generator=generator) - 6
     z, depth = torch.rand(2, 500, generator=generator), torch.rand(2, 128, 128, generator=generator)
-    from viewmend.data.synthetic import _shade_numba
-
     slow, seen = unshadowed(pixels, z, depth), torch.zeros(2, 500)
     for n in range(2):
         arrays = (pixels[n].numpy(), z[n].numpy(), depth[n].numpy(), SHADOW_BIAS_M, seen[n].numpy())

@@ -7,39 +7,41 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+
+def both_sides(*parts: tuple[str, str, float, float, float]) -> dict:
+    """Joints of the left and the right side, from name, parent and place of the left ones."""
+    return {
+        f"{side}{part}": (parent if parent in ("Hips", "Spine", "lowerback") else side + parent, (sign * x, y, z))
+        for side, sign in (("Left", 1), ("Right", -1))
+        for part, parent, x, y, z in parts
+    }
+
+
 JOINTS = {
     # name: (parent, rest position in metres): a T-pose of sticks, the left hand at +x.
     "Hips": (None, (0, 1.0, 0)),
     "Spine": ("Hips", (0, 1.1, 0)),
     "Head": ("Spine", (0, 1.6, 0)),
-    **{
-        f"{side}{part}": (parent if parent in ("Hips", "Spine") else side + parent, (sign * x, y, z))
-        for side, sign in (("Left", 1), ("Right", -1))
-        for part, parent, x, y, z in (
-            ("Arm", "Spine", 0.2, 1.45, 0.0),
-            ("ForeArm", "Arm", 0.45, 1.45, -0.02),
-            ("Hand", "ForeArm", 0.7, 1.44, 0.0),
-            ("UpLeg", "Hips", 0.1, 0.95, 0.0),
-            ("Leg", "UpLeg", 0.12, 0.5, 0.02),
-            ("Foot", "Leg", 0.12, 0.06, 0.0),
-        )
-    },
+    **both_sides(
+        ("Arm", "Spine", 0.2, 1.45, 0.0),
+        ("ForeArm", "Arm", 0.45, 1.45, -0.02),
+        ("Hand", "ForeArm", 0.7, 1.44, 0.0),
+        ("UpLeg", "Hips", 0.1, 0.95, 0.0),
+        ("Leg", "UpLeg", 0.12, 0.5, 0.02),
+        ("Foot", "Leg", 0.12, 0.06, 0.0),
+    ),
 }
 
 
-def skeleton_nodes(scale: float = 0.01) -> list[dict]:
-    """Nodes of a glTF file; the hips carry a scale, so that everything below them is in its unit."""
-    names = list(JOINTS)
+def skeleton_nodes(prefix: str) -> list[dict]:
+    """Nodes of a glTF file; the hips carry a scale, so that everything below them is in centimetres."""
     nodes = []
     for name, (parent, position) in JOINTS.items():
-        if parent is None:
-            nodes.append({"name": name, "translation": list(position), "scale": [scale] * 3})
-        else:
-            offset = (np.array(position) - np.array(JOINTS[parent][1])) / scale
-            nodes.append({"name": name, "translation": offset.tolist()})
-        children = [names.index(n) for n, (p, _) in JOINTS.items() if p == name]
-        if children:
-            nodes[-1]["children"] = children
+        above = np.array(JOINTS[parent][1]) if parent else 0.0
+        offset = (np.array(position) - above) * (100 if parent else 1)
+        nodes.append({"name": prefix + name, "translation": offset.tolist()})
+        children = [n for n, (p, _) in enumerate(JOINTS.values()) if p == name]
+        nodes[-1] |= ({"children": children} if children else {}) | ({} if parent else {"scale": [0.01] * 3})
     return nodes
 
 
@@ -77,15 +79,12 @@ def write_character(path: Path, prefix: str = "") -> Path:
         {"bufferView": k, "componentType": c, "type": t, "count": len(a)}
         for k, ((t, c), a) in enumerate(zip([*kinds, ("MAT4", 5126)], arrays, strict=True))
     ]
-    nodes = skeleton_nodes()
-    for node in nodes:
-        node["name"] = prefix + node["name"]
     attributes = {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2, "JOINTS_0": 3, "WEIGHTS_0": 4}
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": [0, n]}],
-        "nodes": [*nodes, {"name": "mesh", "mesh": 0, "skin": 0, "scale": [0.01] * 3}],
+        "nodes": [*skeleton_nodes(prefix), {"name": "mesh", "mesh": 0, "skin": 0, "scale": [0.01] * 3}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": 5, "material": 0}]}],
         "skins": [{"joints": list(range(n)), "inverseBindMatrices": 6}],
         "materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}],
@@ -108,18 +107,14 @@ BVH_JOINTS = {
     "Hips": (None, (0, 0, 0)),
     "lowerback": ("Hips", (0, 12, 0)),
     "Head": ("lowerback", (0, 60, 0)),
-    **{
-        f"{side}{part}": (parent if parent in ("Hips", "lowerback") else side + parent, (sign * x, y, z))
-        for side, sign in (("Left", 1), ("Right", -1))
-        for part, parent, x, y, z in (
-            ("Shoulder", "lowerback", 22, 40, 0),
-            ("Elbow", "Shoulder", 1, -30, 0),
-            ("Wrist", "Elbow", 0, -28, 2),
-            ("Hip", "Hips", 11, -5, 0),
-            ("Knee", "Hip", 15, -45, 0),
-            ("Ankle", "Knee", 15, -45, 0),
-        )
-    },
+    **both_sides(
+        ("Shoulder", "lowerback", 22, 40, 0),
+        ("Elbow", "Shoulder", 1, -30, 0),
+        ("Wrist", "Elbow", 0, -28, 2),
+        ("Hip", "Hips", 11, -5, 0),
+        ("Knee", "Hip", 15, -45, 0),
+        ("Ankle", "Knee", 15, -45, 0),
+    ),
 }
 
 
@@ -146,11 +141,9 @@ def write_motion(
 
     text = "HIERARCHY\n" + block("Hips", 0)
     lines = []
-    for frame in range(frames):
-        share = frame / max(frames - 1, 1)
-        row = [50.0 + 10.0 * share, 95.0, -travel_cm * share]
-        for name in order:
-            row += [a * share for a in angles.get(name, (0, 0, 0))]
+    for share in np.linspace(0, 1, frames):
+        turns = [a * share for name in order for a in angles.get(name, (0, 0, 0))]
+        row = [50.0 + 10.0 * share, 95.0, -travel_cm * share, *turns]
         lines.append(" ".join(f"{v:.6f}" for v in row))
     path.write_text(f"{text}MOTION\nFrames: {frames}\nFrame Time: 0.0333333\n" + "\n".join(lines) + "\n")
     return path
