@@ -163,13 +163,13 @@ class Limb:
 
 @dataclass(frozen=True)
 class Body:
-    """Torso and limbs; limbs are left arm, right arm, left leg, right leg."""
+    """Torso and limbs around a skeleton; limbs are left arm, right arm, left leg, right leg."""
 
     torso: Torso
     arms: tuple[Limb, ...]
     legs: tuple[Limb, ...]
-    blend_m: float
-    """Softness of the union."""
+    skeleton: Skeleton
+    height_m: float
 
     @property
     def limbs(self) -> tuple[Limb, ...]:
@@ -192,7 +192,7 @@ class Body:
         moved = np.zeros(points.shape[:-1])
         for _ in range(4):
             fields = self.fields(points + moved[..., None] * outward) + bias.reshape(-1, *[1] * moved.ndim)
-            k = self.blend_m
+            k = 0.010 * self.height_m
             union = -k * np.log(np.exp(np.clip(-fields / k, -30, 30)).sum(0))
             moved = np.clip(moved - 0.8 * union, 0.0, 2.0 * k)
         return points + moved[..., None] * outward
@@ -226,7 +226,7 @@ def build_body(person: Physique, skeleton: Skeleton) -> Body:
         return tuple(Limb(skeleton.at(f"{s}_{first}"), skeleton.at(f"{s}_{last}"), t, *table.T) for s in SIDES)
 
     arms, legs = pair("upperarm", "hand", ARM_PROFILE, girth), pair("thigh", "foot", LEG_PROFILE, leg_girth)
-    return Body(torso, arms, legs, 0.010 * H)
+    return Body(torso, arms, legs, skeleton, H)
 
 
 def smoothstep(x: Values, low: float, high: float) -> Values:
@@ -247,22 +247,22 @@ def mix(first: Weights, second: Weights, share: Values) -> Weights:
     return first + share[..., None] * (second - first)
 
 
-def body_weights(body: Body, skeleton: Skeleton, height_m: float, points: Points, part: int = 0) -> Weights:
+def body_weights(body: Body, points: Points, part: int = 0) -> Weights:
     """Weights of points on or near the body: soft membership in a part, then soft steps along the part's chain.
 
     Points of a limb's sheet (`part`, as in `Body.fields`) never follow the limb of the other side.
     """
     fields = body.fields(points)
     fields[opposite(part)] = 1.0
-    soft = 0.010 * height_m
+    soft = 0.010 * body.height_m
     member = np.exp(np.clip(-(fields - fields.min(0)) / soft, -40, 0))
     member /= member.sum(0)
-    weights = member[0][..., None] * _trunk(skeleton, height_m, points)
+    weights = member[0][..., None] * _trunk(body.skeleton, body.height_m, points)
     for i, side in enumerate(SIDES):
         # The width is half the bend's extent as a share of the limb.
         for n, names, width in ((i, ARM[1:4], 0.10), (2 + i, LEG[:3], 0.085)):
             t = body.limbs[n].along(points)
-            middle = float(body.limbs[n].along(skeleton.at(f"{side}_{names[1]}")[None])[0])
+            middle = float(body.limbs[n].along(body.skeleton.at(f"{side}_{names[1]}")[None])[0])
             first, second, third = (one_joint(points.shape[:-1], f"{side}_{name}") for name in names)
             bent = mix(first, second, smoothstep(t, middle - width, middle + width))
             weights = weights + member[1 + n][..., None] * mix(bent, third, smoothstep(t, 0.94, 1.05))
@@ -305,11 +305,11 @@ def unit_grid(shape: tuple[int, ...]) -> Float[np.ndarray, "row column 2"]:
     return np.stack([u, v], -1)
 
 
-def hand_patches(body: Body, skeleton: Skeleton, height_m: float, side: str, skin: Image, girth: float) -> list[Patch]:
+def hand_patches(body: Body, side: str, skin: Image, girth: float) -> list[Patch]:
     """One hand, its fingers a little curled; `girth` 1 is average."""
-    H = height_m
+    H = body.height_m
     arm = body.arms[0 if side == "left" else 1]
-    wrist = skeleton.at(f"{side}_hand")
+    wrist = body.skeleton.at(f"{side}_hand")
     along, forward = -arm.frame[1], arm.frame[2]
     palm = np.cross(along, forward) * SIGN[side]
     s = np.linspace(1, -0.12, 12)
@@ -344,10 +344,10 @@ def _finger(
 SHOE = np.array(TABLES["shoe"])
 
 
-def shoe_patch(skeleton: Skeleton, height_m: float, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Patch:
+def shoe_patch(body: Body, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Patch:
     """One shoe, its sole on the floor y = 0 in the bind pose. The chart's u runs around, v from heel to tip."""
-    H = height_m
-    ankle = skeleton.at(f"{side}_foot")
+    H = body.height_m
+    ankle = body.skeleton.at(f"{side}_foot")
     s = np.concatenate([np.linspace(0, 0.1, 6)[:-1], np.linspace(0.1, 0.9, 18), np.linspace(0.9, 1, 7)[1:]])
     half, tall = (np.interp(s, SHOE[:, 0], SHOE[:, k]) * H for k in (1, 2))
     phi = np.linspace(0, 2 * np.pi, 29)
@@ -366,7 +366,7 @@ def shoe_patch(skeleton: Skeleton, height_m: float, side: str, upper_rgb: Vector
     v = np.linspace(1, 0, 96)[:, None, None]
     laces = (np.abs(np.sin(u) - 1) < 0.14) & (v > 0.42) & (v < 0.66) & ((v * 24) % 1 < 0.4)
     chart = np.where(laces, 0.5 * sole_rgb + 0.45, np.where(np.sin(u) < 0.16, sole_rgb, upper_rgb))
-    toe = float(skeleton.at(f"{side}_toe")[2])
+    toe = float(body.skeleton.at(f"{side}_toe")[2])
     foot, tip = (one_joint(points.shape[:2], f"{side}_{name}") for name in ("foot", "toe"))
     weights = mix(foot, tip, smoothstep(points[..., 2], toe - 0.02 * H, toe + 0.02 * H))
     return Patch(points, unit_grid(points.shape), weights, chart)

@@ -31,26 +31,12 @@ from viewmend.data.synthetic.procedural.skeleton import (
     SKIRT_COLUMNS,
     Physique,
     Points,
-    Skeleton,
     Values,
     Weights,
 )
 
 Painter = Callable[[Canvas], Image]
 Azimuths = Float[np.ndarray, "column"]
-
-
-@dataclass(frozen=True)
-class Wearer:
-    """The naked body that gives all sheets their weights."""
-
-    body: Body
-    skeleton: Skeleton
-    height_m: float
-
-    def weights(self, points: Points, part: int = 0) -> Weights:
-        """Skinning weights at these points of a part's sheet."""
-        return body_weights(self.body, self.skeleton, self.height_m, points, part)
 
 
 @dataclass(frozen=True)
@@ -107,7 +93,7 @@ def _closed(around: Azimuths) -> bool:
 
 
 def torso_sheet(
-    wearer: Wearer,
+    body: Body,
     shape: Body,
     low: Azimuths,
     high: Azimuths,
@@ -133,16 +119,16 @@ def torso_sheet(
     points = points + folds.crease(canvas, uv)[..., None] * outward
     lips = []
     for row, rise in ((0, 0.004), (-1, -0.012)):
-        inner = wearer.body.torso.point(around, y[row])
+        inner = body.torso.point(around, y[row])
         axis = inner * np.array([0, 1, 0]) + np.array([0, 0, 1]) * np.interp(y[row], torso.y, torso.z)[:, None]
         lips.append(axis + 0.93 * (inner - axis) + np.array([0, rise, 0]))
     points = np.concatenate([lips[0][None], points, lips[1][None]])
     uv = np.concatenate([uv[:1], uv, uv[-1:]])
-    return Patch(points, uv, wearer.weights(points), folds.paint(canvas, painter), closed=_closed(around))
+    return Patch(points, uv, body_weights(body, points), folds.paint(canvas, painter), closed=_closed(around))
 
 
 def limb_sheet(
-    wearer: Wearer,
+    body: Body,
     shape: Body,
     part: int,
     low: float,
@@ -156,7 +142,7 @@ def limb_sheet(
     `grid` counts its rows and columns.
     """
     rows, columns = grid
-    limb, naked = (s.limbs[part - 1] for s in (shape, wearer.body))
+    limb, naked = (s.limbs[part - 1] for s in (shape, body))
     theta = np.linspace(-np.pi, np.pi, columns)
     t = np.broadcast_to(np.linspace(high, low, rows)[:, None], (rows, columns))
     around = np.broadcast_to(theta, t.shape)
@@ -170,16 +156,16 @@ def limb_sheet(
     center = naked.center(t[0])
     lip = center + 0.8 * (naked.point(theta, t[0]) - center) + 0.004 * limb.frame[1]
     points, uv = np.concatenate([lip[None], points]), np.concatenate([uv[:1], uv])
-    return Patch(points, uv, wearer.weights(points, part), folds.paint(canvas, painter))
+    return Patch(points, uv, body_weights(body, points, part), folds.paint(canvas, painter))
 
 
-def skirt_weights(wearer: Wearer, points: Points, around: Values) -> Weights:
+def skirt_weights(body: Body, points: Points, around: Values) -> Weights:
     """Weights of a skirt's points: the waist, then its hanging columns, high and low, each between two neighbours."""
     shape = points.shape[:-1]
     column = (around / (2 * np.pi) * SKIRT_COLUMNS) % SKIRT_COLUMNS
     first = np.floor(column).astype(int) % SKIRT_COLUMNS
     share = column - np.floor(column)
-    y, soft = points[..., 1], 0.03 * wearer.height_m
+    y, soft = points[..., 1], 0.03 * body.height_m
     sheets, steps = [], []
     for segment in ("low", "high"):
         dense = np.zeros((*shape, len(INDEX)))
@@ -187,13 +173,13 @@ def skirt_weights(wearer: Wearer, points: Points, around: Values) -> Weights:
         np.put_along_axis(dense, index[first][..., None], (1 - share)[..., None], -1)
         np.put_along_axis(dense, index[(first + 1) % SKIRT_COLUMNS][..., None], share[..., None], -1)
         sheets.append(dense)
-        top = float(wearer.skeleton.at(f"skirt0_{segment}")[1])
+        top = float(body.skeleton.at(f"skirt0_{segment}")[1])
         steps.append(smoothstep(y, top - soft, top + soft))
     return mix(mix(sheets[0], sheets[1], steps[0]), one_joint(shape, "pelvis"), steps[1])
 
 
 def skirt_sheets(
-    wearer: Wearer,
+    body: Body,
     shape: Body,
     waist_y: float,
     hem_y: float,
@@ -206,7 +192,7 @@ def skirt_sheets(
     rows = 34
     y = np.broadcast_to(np.linspace(hem_y, waist_y, rows)[:, None], (rows, len(around)))
     theta = np.broadcast_to(around, y.shape)
-    hip_y = float(wearer.skeleton.at("left_thigh")[1])
+    hip_y = float(body.skeleton.at("left_thigh")[1])
     held = np.maximum(y, hip_y)
     points = shape.torso.point(theta, held)
     fall = hip_y - np.minimum(y, hip_y)
@@ -221,7 +207,7 @@ def skirt_sheets(
     turn = np.interp(np.linspace(0, 1, canvas.shape[1]), u[0], around)
     shade = 1 + 8 * pleats[1] * np.cos(pleats[0] * turn) * (1 - canvas.y / canvas.height_m)
     chart = np.clip(painter(canvas) * np.clip(shade, 0.65, 1.15)[..., None], 0, 1)
-    weights = skirt_weights(wearer, points, theta)
+    weights = skirt_weights(body, points, theta)
     sheet = Patch(points, uv, weights, chart, closed=_closed(around))
     return two_sided(sheet, points - 0.005 * outward, 0.45)
 
@@ -329,9 +315,9 @@ def neckline(around: Azimuths, height_m: float, depth: float, vee: bool = False,
 
 @dataclass(frozen=True)
 class Tailor:
-    """Cuts garments for one wearer."""
+    """Cuts garments for one body."""
 
-    wearer: Wearer
+    body: Body
     outfit: Outfit
     cut: Cut
 
@@ -341,17 +327,17 @@ class Tailor:
 
     def lower_shape(self) -> Body:
         """The body in what covers the legs."""
-        body, cut = self.wearer.body, self.cut
+        body, cut = self.body, self.cut
         legs = tuple(leg.eased(cut.ease_m, cut.leg_hang, cut.leg_flare_m) for leg in body.legs)
         return replace(body, torso=body.torso.eased(min(cut.ease_m, 0.006) - 0.001), legs=legs)
 
     def _trunk(self, under: Torso) -> Torso:
         """The trunk in the top, over what is tucked into it."""
-        return self.wearer.body.torso.eased(self.cut.loose_m, self.cut.hang, 0.004).outside(under, 0.005)
+        return self.body.torso.eased(self.cut.loose_m, self.cut.hang, 0.004).outside(under, 0.005)
 
     def top(self) -> list[Patch]:
         """Shirt, sweater or the like: trunk and sleeves."""
-        H, outfit, body, cut = self.wearer.height_m, self.outfit, self.wearer.body, self.cut
+        H, outfit, body, cut = self.body.height_m, self.outfit, self.body, self.cut
         lower = self.lower_shape()
         hang, flare = (0.10, 0.012) if cut.sleeve < 0.7 else (0.62, -0.006)
         arms = tuple(arm.eased(cut.loose_m + 0.003, hang, flare) for arm in body.arms)
@@ -360,9 +346,7 @@ class Tailor:
         around = azimuths(65)
         high = neckline(around, H, cut.neck, cut.vee, 0.008 if outfit.top == "tank top" else 0.0)
         low = np.full_like(around, cut.top_hem * H)
-        trunk = torso_sheet(
-            self.wearer, shape, low, high, around, self._paint_top, self.folds(0.0022, 0.10, 0.16, 0), 40
-        )
+        trunk = torso_sheet(self.body, shape, low, high, around, self._paint_top, self.folds(0.0022, 0.10, 0.16, 0), 40)
         start = -0.03 if outfit.outer == "none" else 0.8
         if outfit.outer != "none":
             # Only what an open front and the hems show: the rest could but poke through.
@@ -374,7 +358,7 @@ class Tailor:
         folds = self.folds(0.0022, 0.06, 0.12, 1)
         rows = 20 if cut.sleeve < 0.7 or start > 0 else 40
         sleeve = (start, cut.sleeve, self._paint_sleeve, folds, (rows, 25))
-        return [trunk, *(limb_sheet(self.wearer, shape, arm, *sleeve) for arm in (1, 2))]
+        return [trunk, *(limb_sheet(self.body, shape, arm, *sleeve) for arm in (1, 2))]
 
     def _paint_top(self, canvas: Canvas) -> Image:
         outfit = self.outfit
@@ -396,7 +380,7 @@ class Tailor:
 
     def bottom(self) -> list[Patch]:
         """Trousers, shorts or skirt."""
-        H, cut, kind = self.wearer.height_m, self.cut, self.outfit.bottom
+        H, cut, kind = self.body.height_m, self.cut, self.outfit.bottom
         if kind in ("skirt", "dress"):
             return self._skirt()
         shape = self.lower_shape()
@@ -405,9 +389,9 @@ class Tailor:
         waist = 0.602 if cut.top_hem > 0.58 else cut.top_hem + 0.035
         folds = self.folds(0.0 if kind == "leggings" else 0.0020, 0.08, 0.12, 2)
         low, high = (np.full_like(around, share * H) for share in (0.470, waist))
-        waistband = torso_sheet(self.wearer, shape, low, high, around, self._paint_waist, folds, 26)
+        waistband = torso_sheet(self.body, shape, low, high, around, self._paint_waist, folds, 26)
         leg = (-0.02, cut.leg, self._paint_leg, folds, (24 if kind == "shorts" else 44, 29))
-        return [waistband, *(limb_sheet(self.wearer, shape, part, *leg) for part in (3, 4))]
+        return [waistband, *(limb_sheet(self.body, shape, part, *leg) for part in (3, 4))]
 
     def _paint_waist(self, canvas: Canvas) -> Image:
         image = self.outfit.fabrics[1].paint(canvas)
@@ -432,18 +416,18 @@ class Tailor:
         return blend(image, 0.75 * image, edge(0.0014 - np.abs(canvas.y - 0.025), canvas))
 
     def _skirt(self) -> list[Patch]:
-        H, outfit, body = self.wearer.height_m, self.outfit, self.wearer.body
+        H, outfit, body = self.body.height_m, self.outfit, self.body
         rng = np.random.default_rng(outfit.seed + 1)
         fabric = outfit.fabrics[0 if outfit.bottom == "dress" else 1]
         hem, flare = float(rng.uniform(0.17, 0.36)), float(rng.uniform(0.14, 0.42))
         pleats = (int(rng.integers(7, 15)), float(rng.uniform(0.002, 0.014)))
         shape = replace(body, torso=body.torso.eased(0.014))
         waist = 0.606 if self.cut.top_hem > 0.58 else self.cut.top_hem + 0.02
-        return skirt_sheets(self.wearer, shape, waist * H, hem * H, azimuths(97), fabric.paint, flare, pleats)
+        return skirt_sheets(self.body, shape, waist * H, hem * H, azimuths(97), fabric.paint, flare, pleats)
 
     def outer(self) -> list[Patch]:
         """Jacket or coat, open in front."""
-        H, outfit, body = self.wearer.height_m, self.outfit, self.wearer.body
+        H, outfit, body = self.body.height_m, self.outfit, self.body
         if outfit.outer == "none":
             return []
         rng = np.random.default_rng(outfit.seed + 2)
@@ -456,12 +440,12 @@ class Tailor:
         hem = 0.535 if coat else float(rng.uniform(0.50, 0.55))
         low, high = np.full_like(around, hem * H), neckline(around, H, 0.05, vee=True)
         folds = self.folds(0.0025, 0.09, 0.14, 5)
-        trunk = torso_sheet(self.wearer, shape, low, high, around, self._paint_outer, folds)
-        sleeves = [limb_sheet(self.wearer, shape, part, -0.03, 0.97, cloth, folds) for part in (1, 2)]
+        trunk = torso_sheet(self.body, shape, low, high, around, self._paint_outer, folds)
+        sleeves = [limb_sheet(self.body, shape, part, -0.03, 0.97, cloth, folds) for part in (1, 2)]
         patches = [trunk, lining(trunk), *sleeves]
         if coat:
             skirt_hem = float(rng.uniform(0.2, 0.38)) * H
-            patches += skirt_sheets(self.wearer, shape, 0.575 * H, skirt_hem, around, cloth, 0.16, (6, 0.003))
+            patches += skirt_sheets(self.body, shape, 0.575 * H, skirt_hem, around, cloth, 0.16, (6, 0.003))
         return patches
 
     def _paint_outer(self, canvas: Canvas) -> Image:
@@ -472,7 +456,7 @@ class Tailor:
 
     def skin(self, person: Physique, rng: np.random.Generator) -> list[Patch]:
         """Bare skin: neck and shoulders, arms, legs and hands; what cloth covers stays inside it."""
-        H, wearer, cut = person.height_m, self.wearer, self.cut
+        H, body, cut = person.height_m, self.body, self.cut
 
         def paint(canvas: Canvas) -> Image:
             tone = 1 + 0.015 * canvas.noise(rng, 0.03, 0.03) + 0.012 * canvas.noise(rng, 0.004, 0.004)
@@ -480,16 +464,16 @@ class Tailor:
 
         around = azimuths(49)
         low, high = np.full_like(around, 0.73 * H), np.full_like(around, 0.893 * H)
-        patches = [torso_sheet(wearer, wearer.body, low, high, around, paint, rows=24)]
+        patches = [torso_sheet(body, body, low, high, around, paint, rows=24)]
         # Cloth covers what lies further in than a hand's breadth from its hem.
         arm, leg = max(cut.cuff - 0.15, -0.03), max(cut.leg - 0.12, 0.0)
         grids = (8 + int(24 * (1 - arm)), 21), (8 + int(28 * (1 - leg)), 25)
         for i in (0, 1):
-            patches.append(limb_sheet(wearer, wearer.body, 1 + i, arm, 1.0, paint, grid=grids[0]))
-            patches.append(limb_sheet(wearer, wearer.body, 3 + i, leg, 1.04, paint, grid=grids[1]))
+            patches.append(limb_sheet(body, body, 1 + i, arm, 1.0, paint, grid=grids[0]))
+            patches.append(limb_sheet(body, body, 3 + i, leg, 1.04, paint, grid=grids[1]))
         skin, girth = paint(Canvas(0.1, 0.1)), 1.05 - 0.13 * person.femininity + 0.05 * person.weight
         for side in SIDES:
-            patches += hand_patches(wearer.body, wearer.skeleton, H, side, skin, girth)
+            patches += hand_patches(body, side, skin, girth)
         return patches
 
 

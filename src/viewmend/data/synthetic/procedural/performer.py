@@ -8,7 +8,7 @@ import torch
 
 from viewmend.data.synthetic.performer import TexturedMesh, skin
 from viewmend.data.synthetic.procedural.body import build_body, shoe_patch
-from viewmend.data.synthetic.procedural.clothing import Tailor, Wearer, sample_cut, sample_outfit
+from viewmend.data.synthetic.procedural.clothing import Tailor, sample_cut, sample_outfit
 from viewmend.data.synthetic.procedural.fabric import BoundMesh, Patch, assemble
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
 from viewmend.data.synthetic.procedural.motion import MOTIONS, Motion, Tempo, sample_motion, seat_height
@@ -57,7 +57,7 @@ def draw_person(
     hair = sample_hair(hair_rng, person.femininity, person.skin_rgb[0] < 0.6)
     skeleton = build_skeleton(person)
     body = build_body(person, skeleton)
-    tailor = Tailor(Wearer(body, skeleton, person.height_m), outfit, sample_cut(outfit))
+    tailor = Tailor(body, outfit, sample_cut(outfit))
     bulk = 0.06 + 0.08 * max(person.weight, 0) + (0.10 if outfit.outer != "none" else 0.0)
     motion = sample_motion(motion_rng, person, skeleton, tempo, kind, bulk, center)
     patches = tailor.top() + tailor.bottom() + tailor.outer()
@@ -65,11 +65,11 @@ def draw_person(
     patches += head_patches(person, head, hair_rng, hair.color)
     patches += hair_patches(head, hair, body.torso, outfit.fabrics[1].colors[0])
     patches += tailor.skin(person, hair_rng)
-    patches += [shoe_patch(skeleton, person.height_m, side, outfit.shoes[0], outfit.shoes[1]) for side in SIDES]
+    patches += [shoe_patch(body, side, outfit.shoes[0], outfit.shoes[1]) for side in SIDES]
     held = ""
     if (prop_rng.random() < 0.3 if holding is None else holding) and motion.score.kind not in BUSY_HANDS:
         thing, side = HELD[int(prop_rng.integers(len(HELD)))], SIDES[int(prop_rng.integers(2))]
-        patches += held_prop(thing, prop_rng, body, skeleton, person.height_m, side)
+        patches += held_prop(thing, prop_rng, body, side)
         motion = replace(motion, grip=side)
         held = f" with a {thing}"
     sex = "woman" if person.femininity > 0.5 else "man"

@@ -16,7 +16,7 @@ from viewmend.data.synthetic.procedural.fabric import (
     sample_fabric,
     wave,
 )
-from viewmend.data.synthetic.procedural.skeleton import SIGN, TABLES, Rotation, Skeleton, Values, Vector, rotation
+from viewmend.data.synthetic.procedural.skeleton import SIGN, TABLES, Rotation, Values, Vector, rotation
 
 HELD = ("ball", "cup", "book", "bag", "staff", "bottle", "tablet")
 STANDING = ("crate", "plant", "lamp", "ball", "suitcase", "table", "stool")
@@ -156,15 +156,13 @@ def _plant(rng: np.random.Generator, frame: Frame) -> list[Patch]:
     return patches
 
 
-def held_prop(
-    kind: str, rng: np.random.Generator, body: Body, skeleton: Skeleton, height_m: float, side: str
-) -> list[Patch]:
+def held_prop(kind: str, rng: np.random.Generator, body: Body, side: str) -> list[Patch]:
     """One of `HELD`, in the bind pose of this hand."""
-    H = height_m
+    H = body.height_m
     arm = body.arms[0 if side == "left" else 1]
     along, forward = -arm.frame[1], arm.frame[2]
     palm = np.cross(along, forward) * SIGN[side]
-    grip = skeleton.at(f"{side}_hand") + 0.058 * H * along + 0.024 * H * palm
+    grip = body.skeleton.at(f"{side}_hand") + 0.058 * H * along + 0.024 * H * palm
     # The hand's own up is towards the thumb: a fist holds a stick that way.
     across = np.cross(forward, along)
     frame = Frame(grip, np.stack([across, forward, np.cross(across, forward)], 1), f"{side}_hand")
