@@ -29,6 +29,8 @@ LIMBS = {
     "head": ("", "", ("Head",)),
 }
 """Hands and head are never clothed."""
+Limbs = Int[np.ndarray, "height width"]
+"""Positions in `NAMES`, -1 for none."""
 NAMES = tuple(LIMBS)
 TRUNK, LEGS, FEET, HANDS, HEAD = (NAMES.index(name) for name in ("trunk", "left leg", "feet", "hands", "head"))
 
@@ -118,9 +120,7 @@ def find_garments(character: Character, body: RestBody) -> list[Garments | None]
     return [_garments(image, bare, limb, place, body) for image, (limb, place) in zip(lab, maps, strict=True)]
 
 
-def _texels(
-    character: Character, body: RestBody, texture: int, width: int, height: int
-) -> tuple[Int[np.ndarray, "height width"], Image]:
+def _texels(character: Character, body: RestBody, texture: int, width: int, height: int) -> tuple[Limbs, Image]:
     """Limb of each texel, -1 where no face shows it, and its place at rest."""
     of_texture = (character.texture_of_face == texture).nonzero()[:, 0]
     flat = Mesh(torch.cat([character.uv, torch.ones(len(character.uv), 1)], 1), character.faces[of_texture])
@@ -179,11 +179,7 @@ def _nearest(values: Float[np.ndarray, "*any 3"], centers: Float[np.ndarray, "co
 
 
 def _garments(
-    lab: Image,
-    hues: Float[np.ndarray, "2 2"] | None,
-    limb: Int[np.ndarray, "height width"],
-    place: Image,
-    body: RestBody,
+    lab: Image, hues: Float[np.ndarray, "2 2"] | None, limb: Limbs, place: Image, body: RestBody
 ) -> Garments | None:
     shown, bare = limb >= 0, limb >= HANDS
     clothable = (shown & ~bare).astype(np.float32)
@@ -214,7 +210,7 @@ def _smooth(values: np.ndarray, size: int) -> np.ndarray:
     return cv2.blur(values.astype(np.float32), (size, size))
 
 
-def _unrolled(limb: Int[np.ndarray, "height width"], place: Image, body: RestBody) -> tuple[Plane, Plane]:
+def _unrolled(limb: Limbs, place: Image, body: RestBody) -> tuple[Plane, Plane]:
     """Coordinates around and along each limb, as if it were a cylinder."""
     around, along = np.zeros(limb.shape, np.float32), np.zeros(limb.shape, np.float32)
     floor = float(body.vertices[:, 1].min())
@@ -337,11 +333,7 @@ def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.ran
     return np.where((known > 0)[..., None], color, mean)
 
 
-def _folds(
-    own: Image,
-    cover: Plane,
-    shown: Plane,
-) -> Float[np.ndarray, "height width 1"]:
+def _folds(own: Image, cover: Plane, shown: Plane) -> Float[np.ndarray, "height width 1"]:
     """Shading of a garment, around 1; 1 outside visible texels."""
     gray = cv2.transform(own, _GRAY[None])
     weight = cover * shown

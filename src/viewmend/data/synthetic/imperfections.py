@@ -13,6 +13,11 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.rigid import rotation_from_axis_angle
 from viewmend.types import MultiViewFrame
 
+Picture = UInt8[Tensor, "3 height width"]
+Mask = UInt8[Tensor, "height width"]
+Backdrop = Float[Tensor, "3 height width"]
+Seeds = tuple[int, int, int]
+"""Of the capture, the camera's position, and the time."""
 SPILL_PX = 3.0
 """Standard deviation of the blur that measures the distance to the outline."""
 
@@ -105,13 +110,7 @@ def imperfect_frame(
     return replace(frame, rgb=torch.stack(rgb), mask=torch.stack(mask))
 
 
-def _image(
-    rgb: UInt8[Tensor, "3 height width"],
-    mask: UInt8[Tensor, "height width"],
-    background: Float[Tensor, "3 height width"] | None,
-    it: Imperfections,
-    seeds: tuple[int, int, int],
-) -> UInt8[Tensor, "3 height width"]:
+def _image(rgb: Picture, mask: Mask, background: Backdrop | None, it: Imperfections, seeds: Seeds) -> Picture:
     """Spill, then exposure and white balance in linear light, noise, compression.
 
     Gains and strengths of noise are looked up by 8-bit level: powers for every pixel would cost as much as drawing.
@@ -141,12 +140,7 @@ def _image(
     return torch.from_numpy(np.ascontiguousarray(decoded[..., ::-1])).permute(2, 0, 1).contiguous().to(rgb.device)
 
 
-def _stained(
-    rgb: UInt8[Tensor, "3 height width"],
-    mask: UInt8[Tensor, "height width"],
-    background: Float[Tensor, "3 height width"],
-    strength: float,
-) -> UInt8[Tensor, "3 height width"]:
+def _stained(rgb: Picture, mask: Mask, background: Backdrop, strength: float) -> Picture:
     """The subject with the background's colour on it, the more the nearer to its outline."""
     window = _window(mask, SPILL_PX)
     inside = _blurred(mask[window].float() / 255, SPILL_PX)
@@ -170,9 +164,7 @@ def _window(mask: Tensor, sigma_px: float) -> tuple[slice, slice]:
     return bounds[0], bounds[1]
 
 
-def _mask(
-    mask: UInt8[Tensor, "height width"], it: Imperfections, seeds: tuple[int, int, int]
-) -> UInt8[Tensor, "height width"]:
+def _mask(mask: Mask, it: Imperfections, seeds: Seeds) -> Mask:
     """Holes and blobs, then an outline that wanders and softens."""
     seed, view, time = seeds
     generator, value = _generator(seed, 4, view, time), mask.float() / 255

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.data.synthetic import _shade_numba as kernels
@@ -121,6 +121,7 @@ def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height 
 
 
 BANDS = 4
+"""Bands of rows that threads share."""
 
 
 @dataclass(frozen=True)
@@ -161,22 +162,10 @@ def render(
         raise ValueError(f"expected samples_per_side of at least 1, got {samples_per_side}; 2 is usual")
     K = cameras.K * torch.tensor([samples_per_side, samples_per_side, 1.0])[:, None]
     fine = replace(cameras, K=K, size_px=cameras.size_px * samples_per_side)
-    mesh = surface.scene.mesh
-    triangle = rasterize(mesh, fine).triangle
-    depth = rasterize(mesh, cameras).depth
+    scene, lights, pyramid = surface.scene, surface.lights, surface.pyramid
+    triangle, depth = rasterize(scene.mesh, fine).triangle, rasterize(scene.mesh, cameras).depth
     if background is None:
         background = torch.zeros(len(cameras), 3, *depth.shape[1:])
-    return MultiViewFrame(cameras, *_shade(surface, fine, triangle, background), 0, depth)
-
-
-def _shade(
-    surface: Surface,
-    fine: Cameras,
-    triangle: Int[Tensor, "view fine_height fine_width"],
-    background: Float[Tensor, "view 3 height width"],
-) -> tuple[UInt8[Tensor, "view 3 height width"], UInt8[Tensor, "view height width"]]:
-    """Colour and coverage of each pixel from the triangles that its samples see: bands of rows, shared by threads."""
-    scene, lights, pyramid = surface.scene, surface.lights, surface.pyramid
     views, _, height, width = background.shape
     P = fine.K.double() @ fine.camera_from_world[:, :3].double()
     projected = scene.mesh.vertices.double() @ P[:, :, :3].mT + P[:, None, :, 3]
@@ -195,4 +184,4 @@ def _shade(
         kernels.shade_band(shared, kernels.View(*(a[v] for a in seen)), *rows, colors[v], covers[v])
 
     parallel_for(draw, views * BANDS)
-    return rgb, mask
+    return MultiViewFrame(cameras, rgb, mask, 0, depth)

@@ -139,16 +139,8 @@ def _guess_trunk(trunk: Sequence[str]) -> dict[str, str]:
     return {part: name for part, name in chosen.items() if name is not None}
 
 
-_FOREARM = ("ForeArm", "Hand")
-_LIMBS = {
-    "Arm": ("Arm", "ForeArm"),
-    "ForeArm": _FOREARM,
-    "Hand": _FOREARM,
-    "UpLeg": ("UpLeg", "Leg"),
-    "Leg": ("Leg", "Foot"),
-}
-"""Parts that are aligned, and the two ends of the bone whose rest directions are."""
-
+_LIMBS = {"Arm": "ForeArm", "ForeArm": "Hand", "UpLeg": "Leg", "Leg": "Foot"}
+"""Limbs whose rest directions are aligned, and the part that each points to; hands turn with their forearms."""
 
 Rest = Mapping[str, Float[Tensor, "3"]]
 """Part -> position of its joint in a rest pose."""
@@ -266,7 +258,8 @@ def _upright(rest: Rest) -> Float[Tensor, "3 3"]:
 def _alignment(part: str, own: Rest, actor: Rest) -> Float[Tensor, "3 3"]:
     """A_j: the smallest rotation from the character's bone direction at rest to the motion's."""
     side = "Left" if part.startswith("Left") else "Right"
-    start, end = (side + name for name in _LIMBS.get(part.removeprefix(side), ("", "")))
+    limb = "ForeArm" if part == side + "Hand" else part.removeprefix(side)
+    start, end = side + limb, side + _LIMBS.get(limb, "")
     if not all(p in own and p in actor for p in (start, end)):
         return torch.eye(3)
     return smallest_rotation(own[end] - own[start], actor[end] - actor[start])

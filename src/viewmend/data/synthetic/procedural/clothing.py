@@ -25,15 +25,7 @@ from viewmend.data.synthetic.procedural.fabric import (
     two_sided,
     write,
 )
-from viewmend.data.synthetic.procedural.skeleton import (
-    INDEX,
-    SIDES,
-    SKIRT_COLUMNS,
-    Physique,
-    Points,
-    Values,
-    Weights,
-)
+from viewmend.data.synthetic.procedural.skeleton import INDEX, SIDES, SKIRT_COLUMNS, Physique, Points, Values, Weights
 
 Painter = Callable[[Canvas], Image]
 Azimuths = Float[np.ndarray, "column"]

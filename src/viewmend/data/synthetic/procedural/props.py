@@ -6,16 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from viewmend.data.synthetic.procedural.body import Body, one_joint, unit_grid
-from viewmend.data.synthetic.procedural.fabric import (
-    Canvas,
-    Image,
-    Patch,
-    blend,
-    edge,
-    hsv,
-    sample_fabric,
-    wave,
-)
+from viewmend.data.synthetic.procedural.fabric import Canvas, Image, Patch, blend, edge, hsv, sample_fabric, wave
 from viewmend.data.synthetic.procedural.skeleton import SIGN, TABLES, Rotation, Values, Vector, rotation
 
 HELD = ("ball", "cup", "book", "bag", "staff", "bottle", "tablet")
