@@ -5,6 +5,7 @@ import torch
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.bvh import read_bvh
+from viewmend.geometry.rigid import rotation_from_axis_angle
 
 TEXT = """HIERARCHY
 ROOT a
@@ -47,17 +48,8 @@ def test_reads_hierarchy_and_rotations_by_hand(tmp_path):
 def test_channels_multiply_in_their_order(tmp_path):
     path = tmp_path / "two.bvh"
     path.write_text(TEXT.replace("90 0 0 0 0 90", "30 40 50 0 0 0"))
-
-    def turn(axis: int, degrees: float) -> torch.Tensor:
-        a = math.radians(degrees)
-        R = torch.eye(3)
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        R[i, i] = R[j, j] = math.cos(a)
-        R[i, j], R[j, i] = -math.sin(a), math.sin(a)
-        return R
-
-    expected = turn(2, 30) @ turn(0, 40) @ turn(1, 50)
-    torch.testing.assert_close(read_bvh(path).rotations[1, 0], expected, atol=1e-6, rtol=0)
+    z, x, y = (rotation_from_axis_angle(torch.eye(3)[a] * math.radians(d)) for a, d in ((2, 30), (0, 40), (1, 50)))
+    torch.testing.assert_close(read_bvh(path).rotations[1, 0], z @ x @ y, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -77,5 +69,8 @@ def test_bad_files_say_what_is_wrong(tmp_path, change, message):
     with pytest.raises(CaptureError, match=message) as caught:
         read_bvh(path)
     assert "bad.bvh" in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(CaptureError, match=r"none\.bvh"):
         read_bvh(tmp_path / "none.bvh")

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 import torch
-from data.synthetic.tiny_performer import JOINTS
+from data.synthetic.tiny_performer import JOINTS, write_glb
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.gltf import load_character
@@ -22,11 +22,7 @@ def edited(path, change):
     """Rewrite the JSON part of a .glb."""
     document, rest = read(path)
     change(document)
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    header = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
-    path.write_bytes(header + text + rest)
-    return path
+    return write_glb(path, document, rest)
 
 
 def test_reads_the_rest_pose(character_file):

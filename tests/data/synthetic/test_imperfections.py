@@ -8,17 +8,8 @@ from viewmend.data.synthetic.rigs import ring_rig
 from viewmend.geometry.cameras import Cameras, project
 from viewmend.types import MultiViewFrame
 
-SWITCHES = {
-    "exposure_stops": 0.3,
-    "white_balance": 0.1,
-    "shot_noise": 0.05,
-    "read_noise": 0.02,
-    "spill": 0.5,
-    "jpeg_quality": 40,
-    "mask_edge_px": 2.0,
-    "mask_holes": 3.0,
-    "mask_blobs": 3.0,
-}
+SWITCHES = "exposure_stops white_balance shot_noise read_noise spill jpeg_quality mask_edge_px mask_holes mask_blobs"
+STRENGTHS = (0.3, 0.1, 0.05, 0.02, 0.5, 40, 2.0, 3.0, 3.0)
 
 
 RADIUS = torch.hypot(torch.arange(64) - 25.0, torch.arange(48)[:, None] - 20.0)
@@ -45,9 +36,9 @@ def test_all_off_changes_nothing(frame):
     assert imperfect_cameras(frame.cameras, Imperfections(), 1) is frame.cameras
 
 
-@pytest.mark.parametrize("switch", SWITCHES)
-def test_each_switch_is_seeded_and_does_its_own(frame, switch):
-    wrong = replace(Imperfections(), **{switch: SWITCHES[switch]})
+@pytest.mark.parametrize(("switch", "strength"), zip(SWITCHES.split(), STRENGTHS, strict=True))
+def test_each_switch_is_seeded_and_does_its_own(frame, switch, strength):
+    wrong = replace(Imperfections(), **{switch: strength})
     a, b = (imperfect_frame(frame, wrong, 3, background(frame)) for _ in range(2))
     assert torch.equal(a.rgb, b.rgb) and torch.equal(a.mask, b.mask)
     of_mask = switch.startswith("mask")

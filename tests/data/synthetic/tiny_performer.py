@@ -1,5 +1,6 @@
 """A tiny character and motion, written by the tests themselves."""
 
+import itertools
 import json
 import struct
 from pathlib import Path
@@ -70,11 +71,10 @@ def write_character(path: Path, prefix: str = "") -> Path:
     arrays = [vertices, normals, uv, joints, weights, indices, binds.transpose(0, 2, 1).copy()]
     kinds = [("VEC3", 5126), ("VEC3", 5126), ("VEC2", 5126), ("VEC4", 5121), ("VEC4", 5126), ("SCALAR", 5123)]
     blobs = [a.tobytes() for a in arrays] + [png]
-    views, offset = [], 0
-    for blob in blobs:
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(blob)})
-        offset += (len(blob) + 3) // 4 * 4
-    data = b"".join(blob + b"\0" * (-len(blob) % 4) for blob in blobs)
+    starts = itertools.accumulate(map(len, blobs), initial=0)
+    views = [{"buffer": 0, "byteOffset": n, "byteLength": len(b)} for n, b in zip(starts, blobs, strict=False)]
+    data = b"".join(blobs)
+    data += b"\0" * (-len(data) % 4)
     accessors = [
         {"bufferView": k, "componentType": c, "type": t, "count": len(a)}
         for k, ((t, c), a) in enumerate(zip([*kinds, ("MAT4", 5126)], arrays, strict=True))
@@ -94,11 +94,15 @@ def write_character(path: Path, prefix: str = "") -> Path:
         "bufferViews": views,
         "buffers": [{"byteLength": len(data)}],
     }
+    return write_glb(path, document, struct.pack("<I4s", len(data), b"BIN\0") + data)
+
+
+def write_glb(path: Path, document: dict, binary: bytes) -> Path:
+    """A .glb of a document and its binary chunk."""
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
-    total = 12 + 8 + len(text) + 8 + len(data)
-    header = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON")
-    path.write_bytes(header + text + struct.pack("<I4s", len(data), b"BIN\0") + data)
+    header = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(binary), len(text), b"JSON")
+    path.write_bytes(header + text + binary)
     return path
 
 
