@@ -71,10 +71,7 @@ def shade_band(scene, view, first_row, end_row, rgb, mask):
 
 @kernel
 def interpolate(scene, projected, face, u, v, at):
-    """Fill `at` with the vertex columns of a face at pixel (u, v), perspective-correct (see the rasteriser).
-
-    Returns the texture level at which a texel is as large as a pixel.
-    """
+    """Fill `at` with a face's vertex columns at a pixel, perspective-correct, and return its level of the texture."""
     i, j, k = scene.faces[face, 0], scene.faces[face, 1], scene.faces[face, 2]
     ax, ay, az = projected[i, 0], projected[i, 1], projected[i, 2]
     bx, by, bz = projected[j, 0], projected[j, 1], projected[j, 2]
@@ -95,6 +92,7 @@ def interpolate(scene, projected, face, u, v, at):
     texels = np.abs(u1 * v2 - v1 * u2) * scene.size[texture, 0, 0] * scene.size[texture, 0, 1]
     x0, y0 = ax / az, ay / az
     pixels = np.abs((bx / bz - x0) * (cy / cz - y0) - (by / bz - y0) * (cx / cz - x0))
+    # At this level a texel is as large as a pixel.
     level = 0.5 * np.log2(max(texels / max(pixels, 2e-6), 1e-6))
     return min(max(level, 0.0), scene.first.shape[1] - 1.0)
 

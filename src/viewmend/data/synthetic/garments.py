@@ -313,12 +313,10 @@ def _dyed(own: Image, rng: np.random.Generator) -> Image:
 
 
 def _colors(garments: Garments, n: int, window: tuple[slice, slice], rng: np.random.Generator) -> Image:
-    """Another cloth on the garment's window, perhaps with a word across the chest, without folds.
-
-    Around visible texels it has its mean colour.
-    """
+    """Another cloth on the garment's window, without folds; around visible texels its mean colour."""
     fabric = sample_fabric(rng)
     cloth = fabric.paint(CHART)
+    # Perhaps with a word across the chest.
     if fabric.kind in QUIET and rng.random() < _LETTERED:
         word = WORDS[int(rng.integers(len(WORDS)))]
         cloth = write(cloth, CHART, word, fabric.colors[2], (0.0, CHEST_M), rng.uniform(0.2, 0.3))

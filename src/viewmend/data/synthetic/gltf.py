@@ -101,11 +101,7 @@ class Document:
 
 
 def read_document(path: Path) -> Document:
-    """Parse a .glb (binary) or .gltf (JSON with separate files or data URIs).
-
-    Raises:
-        CaptureError: missing, cut short, not glTF 2.0, or an extension is required.
-    """
+    """Parse a .glb (binary) or .gltf (JSON with separate files or data URIs); errors as of `load_character`."""
     data = _read(path)
     if data[:4] == b"glTF":
         text, binary = _chunks(path, data)

@@ -74,7 +74,17 @@ def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -
 
     One small shadow map per direction; together they are soft shadows and ambient occlusion at once.
     """
-    cameras = _light_cameras(mesh, lights)
+    # A far camera at each light that holds the whole mesh.
+    low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
+    middle, radius = (low + high) / 2, float((high - low).norm()) / 2 + 0.02
+    distance = SHADOW_DISTANCE_M + radius
+    up, side = torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]], device=middle.device)
+    poses = [
+        look_at(middle + toward * distance, middle, side if float((toward @ up).abs()) > 0.99 else up)
+        for toward in lights.toward
+    ]
+    fov = 2 * math.asin(radius / distance)
+    cameras = concatenate_cameras([pinhole(fov, SHADOW_PX, SHADOW_PX, pose) for pose in poses])
     depth = rasterize(mesh, cameras).depth
     depth = torch.where(depth > 0, depth, torch.full_like(depth, torch.inf))
     pixels, z = project(mesh.vertices + SHADOW_BIAS_M * normals, cameras)
@@ -85,20 +95,6 @@ def visibility(mesh: Mesh, normals: Float[Tensor, "vertex 3"], lights: Lights) -
 
     parallel_for(look, len(cameras))
     return seen.T
-
-
-def _light_cameras(mesh: Mesh, lights: Lights) -> Cameras:
-    """A far camera at each light that holds the whole mesh."""
-    low, high = mesh.vertices.amin(0), mesh.vertices.amax(0)
-    middle = (low + high) / 2
-    radius = float((high - low).norm()) / 2 + 0.02
-    distance = SHADOW_DISTANCE_M + radius
-    up, side = torch.tensor([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]], device=middle.device)
-    cameras = []
-    for toward in lights.toward:
-        pose = look_at(middle + toward * distance, middle, side if float((toward @ up).abs()) > 0.99 else up)
-        cameras.append(pinhole(2 * math.asin(radius / distance), SHADOW_PX, SHADOW_PX, pose))
-    return concatenate_cameras(cameras)
 
 
 def stage_backdrop(cameras: Cameras, seed: int) -> Float[Tensor, "view 3 height width"]:

@@ -286,10 +286,7 @@ def _trunk(skeleton: Skeleton, height_m: float, points: Points) -> Weights:
 def _tube(
     tip: Vector, centers: Float[np.ndarray, "row 3"], across: Vector, radii: Float[np.ndarray, "2 row"], columns: int
 ) -> Float[np.ndarray, "row+1 column 3"]:
-    """Ellipses around a line that runs from its far end to its near end (up), after their tip.
-
-    `across` is the axis of the first radius.
-    """
+    """Ellipses around a line from its far end to its near one (up), after their tip; `across`: the first radius."""
     up = unit(np.gradient(centers, axis=0))
     side = unit(across - up * (across * up).sum(-1, keepdims=True))
     front = np.cross(side, up)
@@ -341,15 +338,13 @@ def _finger(
     return Patch(grid, unit_grid(grid.shape), one_joint(grid.shape[:2], joint), skin)
 
 
-SHOE = np.array(TABLES["shoe"])
-
-
 def shoe_patch(body: Body, side: str, upper_rgb: Vector, sole_rgb: Vector) -> Patch:
     """One shoe, its sole on the floor y = 0 in the bind pose. The chart's u runs around, v from heel to tip."""
     H = body.height_m
     ankle = body.skeleton.at(f"{side}_foot")
     s = np.concatenate([np.linspace(0, 0.1, 6)[:-1], np.linspace(0.1, 0.9, 18), np.linspace(0.9, 1, 7)[1:]])
-    half, tall = (np.interp(s, SHOE[:, 0], SHOE[:, k]) * H for k in (1, 2))
+    place, *measures = np.array(TABLES["shoe"]).T
+    half, tall = (np.interp(s, place, measure) * H for measure in measures)
     phi = np.linspace(0, 2 * np.pi, 29)
     sole = 0.009 * H
     # The upper is round, the sole a box with soft corners; phi runs from the outer side over the top.

@@ -69,10 +69,7 @@ BARE = Folds(0.0, 0.1, 0.1, 0, 220.0)
 
 
 def azimuths(columns: int, gap: float = 0.0) -> Azimuths:
-    """Azimuths from the back round the front to the back, about evenly spaced on an ellipse; `gap` opens the front.
-
-    With a gap they run from the front's left edge round the back to its right edge instead.
-    """
+    """Azimuths from back to back, about evenly spaced on an ellipse; with a gap from the front's left edge on."""
     dense = np.linspace(-np.pi, np.pi, 1025) if gap == 0 else np.linspace(gap, 2 * np.pi - gap, 1025)
     r = 1 / np.hypot(np.sin(dense), np.cos(dense) / 0.62)
     steps = np.hypot(np.diff(r * np.sin(dense)), np.diff(r * np.cos(dense)))
@@ -129,10 +126,7 @@ def limb_sheet(
     folds: Folds = BARE,
     grid: tuple[int, int] = (36, 29),
 ) -> Patch:
-    """A limb of `shape` (part 1..4 of `Body.fields`) from t = `low` (towards the body) to `high`, with a lip there.
-
-    `grid` counts its rows and columns.
-    """
+    """A limb of `shape` (part 1..4 of `Body.fields`) from t = `low` (towards the body) to `high`, with a lip there."""
     rows, columns = grid
     limb, naked = (s.limbs[part - 1] for s in (shape, body))
     theta = np.linspace(-np.pi, np.pi, columns)

@@ -177,9 +177,8 @@ def _crouching(score: Score, time_s: float, beats: float) -> Stance:
     )
 
 
-def seat_height(height_m: float) -> float:
-    """Height of the stool that fits this person, metres."""
-    return 0.262 * height_m
+SEAT = 0.262
+"""Height of the stool that fits a person, as a share of theirs."""
 
 
 def _sitting(score: Score, time_s: float, beats: float) -> Stance:
@@ -187,7 +186,7 @@ def _sitting(score: Score, time_s: float, beats: float) -> Stance:
     H, a = score.height_m, score.amounts
     forward = score.turn @ np.array([0, 0, 1.0])
     base = score.rest(0.13 + 0.06 * a[0], 0.01, 0.21 * H)
-    seated = np.array([0, seat_height(H) + 0.062 * H, 0]) - 0.02 * H * forward
+    seated = np.array([0, SEAT * H + 0.062 * H, 0]) - 0.02 * H * forward
     cycle = (time_s / 7.0 + a[1]) % 1.0
     down = 1.0 if a[2] < 0.5 else 1 - ease((cycle - 0.55) / 0.18) + ease((cycle - 0.82) / 0.18)
     pelvis = base.pelvis + down * (seated - base.pelvis) - 0.03 * H * np.sin(np.pi * down) * forward
@@ -282,10 +281,7 @@ class Gesture:
 def sample_gesture(
     rng: np.random.Generator, families: list[str], bulk: float, energy: float, beat_hz: float
 ) -> Gesture:
-    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes.
-
-    At `beat_hz` no joint turns faster than an arm can.
-    """
+    """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes."""
     first = families[int(rng.integers(len(families)))]
     names = (first, "hang" if first == "wave" else first)
     if first == "wave" and rng.random() < 0.5:
@@ -297,6 +293,7 @@ def sample_gesture(
         table = np.array(angles)
         base = table[:, 0] + 0.08 * rng.standard_normal(4)
         base[1] = max(base[1], table[1, 0]) + bulk * np.clip(1.2 - base[1], 0, 1)
+        # At this beat no joint turns faster than an arm can.
         most = FASTEST_RAD_S / (2 * np.pi * harmonic * beat_hz)
         amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
         # The main angle beats with the music; the others follow it loosely.
@@ -326,7 +323,7 @@ class Motion:
         stance = GROUNDS[self.score.kind](self.score, time_s, beats)
         a, b, c = 6 * self.score.amounts[:3]
         look = 0.45 * np.sin(0.9 * time_s + a) * np.sin(0.37 * time_s + b)
-        strong = 0.10 if self.score.tempo != "calm" else 0.03
+        strong = 0.03 if self.score.tempo == "calm" else 0.10
         nod = 0.10 * np.sin(0.7 * time_s + c) + strong * np.sin(2 * np.pi * beats)
         offset = np.array([self.center[0], 0.0, self.center[1]])
         arms = stance.arms or self._arms(time_s, beats)
@@ -367,8 +364,8 @@ def sample_motion(
         beat = float(rng.uniform(*OWN_BEAT_HZ[chosen]))
     gestures = [sample_gesture(rng, TABLES["gestures_of_motion"][chosen], bulk, ENERGY[tempo], beat) for _ in range(2)]
     path = 0.0
-    if chosen in ("walk", "run"):
-        path = float(rng.uniform(0.42, 0.65)) if rng.random() < 0.7 else 0.0
+    if chosen in ("walk", "run") and rng.random() < 0.7:
+        path = float(rng.uniform(0.42, 0.65))
     if chosen == "sidestep":
         path = float(rng.uniform(0.12, 0.3))
     heading = float(rng.uniform(-np.pi, np.pi))

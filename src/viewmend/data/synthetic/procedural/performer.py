@@ -11,7 +11,7 @@ from viewmend.data.synthetic.procedural.body import build_body, shoe_patch
 from viewmend.data.synthetic.procedural.clothing import Tailor, sample_cut, sample_outfit
 from viewmend.data.synthetic.procedural.fabric import BoundMesh, Patch, assemble
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
-from viewmend.data.synthetic.procedural.motion import MOTIONS, Motion, Tempo, sample_motion, seat_height
+from viewmend.data.synthetic.procedural.motion import MOTIONS, SEAT, Motion, Tempo, sample_motion
 from viewmend.data.synthetic.procedural.props import HELD, STANDING, held_prop, standing_prop, stool
 from viewmend.data.synthetic.procedural.skeleton import (
     SIDES,
@@ -122,7 +122,11 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
         ValueError: the style names a motion that does not exist, or another number of people than 1 or 2.
     """
     style = style or PerformerStyle()
-    _check(style)
+    known = sorted({kind for kinds in MOTIONS.values() for kind in kinds})
+    if style.motion is not None and style.motion not in known:
+        raise ValueError(f"expected a motion among {known}, got {style.motion!r}; choose one of them")
+    if style.people not in (None, 1, 2):
+        raise ValueError(f"expected 1 or 2 people, got {style.people}; the stage holds no more")
     rng = np.random.default_rng([seed, 77])
     chance = rng.random(3)
     count = style.people or (2 if chance[0] < 0.2 else 1)
@@ -141,7 +145,7 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
         if score.kind == "sit":
             under = np.array([person.motion.center[0], 0.0, person.motion.center[1]])
             back = 0.03 * score.height_m * np.array([np.sin(score.heading), 0, np.cos(score.heading)])
-            patches += stool(rng, under - back, score.heading, seat_height(score.height_m))
+            patches += stool(rng, under - back, score.heading, SEAT * score.height_m)
     words = " and ".join(person.description for person in people)
     roams = any(person.motion.score.kind in ROAMING for person in people)
     if (chance[1] < 0.5 if style.furniture is None else style.furniture) and not roams:
@@ -149,14 +153,6 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
         patches += more
         words += ", next to " + " and ".join(names)
     return ProceduralPerformer(tuple(people), assemble(patches).rest if patches else None, words)
-
-
-def _check(style: PerformerStyle) -> None:
-    known = sorted({kind for kinds in MOTIONS.values() for kind in kinds})
-    if style.motion is not None and style.motion not in known:
-        raise ValueError(f"expected a motion among {known}, got {style.motion!r}; choose one of them")
-    if style.people not in (None, 1, 2):
-        raise ValueError(f"expected 1 or 2 people, got {style.people}; the stage holds no more")
 
 
 def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], list[str]]:
