@@ -27,7 +27,8 @@ def edited(path, change):
 
 def test_reads_the_rest_pose(character_file):
     character = load_character(character_file)
-    assert len(character.vertices) == 8 * len(JOINTS) and len(character.faces) == 12 * len(JOINTS)
+    mesh = character.rest.mesh
+    assert len(mesh.vertices) == 8 * len(JOINTS) and len(mesh.faces) == 12 * len(JOINTS)
     world = node_matrices(character, torch.eye(4))
     place = {n.name: world[i, :3, 3] for i, n in enumerate(character.nodes)}
     for name, (_, position) in JOINTS.items():
@@ -37,7 +38,7 @@ def test_reads_the_rest_pose(character_file):
 
 
 def test_textures_are_rgb_with_their_first_row_on_top(character_file):
-    (texture,) = load_character(character_file).textures
+    (texture,) = load_character(character_file).rest.textures
     assert texture.shape == (3, 8, 16)
     assert texture[:, 0, 0].tolist() == [1, 0, 0] and texture[:, 0, 15].tolist() == [0, 1, 0]
 
@@ -48,7 +49,7 @@ def test_a_gltf_with_a_data_uri_reads_the_same(character_file):
     path = character_file.with_suffix(".gltf")
     path.write_text(json.dumps(document))
     a, b = load_character(character_file), load_character(path)
-    torch.testing.assert_close(a.vertices, b.vertices)
+    torch.testing.assert_close(a.rest.mesh.vertices, b.rest.mesh.vertices)
     torch.testing.assert_close(a.joint_from_bind, b.joint_from_bind)
 
 
@@ -56,7 +57,7 @@ def test_color_factors_tint_and_replace_textures(character_file):
     def change(document):
         document["materials"][0]["pbrMetallicRoughness"] = {"baseColorFactor": [1, 0.2140, 0, 1]}
 
-    (texture,) = load_character(edited(character_file, change)).textures
+    (texture,) = load_character(edited(character_file, change)).rest.textures
     # 0.214 of linear light is 0.5 in sRGB.
     torch.testing.assert_close(texture[:, 0, 0], torch.tensor([1, 0.5, 0]), atol=0.01, rtol=0)
 

@@ -1,4 +1,5 @@
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ from data.synthetic.tiny_performer import write_character, write_motion
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.gltf_performer import GltfPerformer
 from viewmend.data.synthetic.imperfections import Imperfections
-from viewmend.data.synthetic.performer import skin
+from viewmend.data.synthetic.performer import BoundMesh, TexturedMesh
 from viewmend.data.synthetic.rigs import dome_rig, orbit, ring_rig
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import project
+from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rigid import is_rotation, rigid, rotation_from_axis_angle
 
 
@@ -217,27 +219,20 @@ def test_rigs_hold_an_upright_person(make, count):
     assert float(cameras.centers[:, 1].min()) > 0.5
 
 
-@pytest.fixture
-def bound(rng):
-    """Points, joints, weights and motions of a skinned surface."""
-    joints, weights = torch.randint(0, 5, (50, 4), generator=rng), torch.rand(50, 4, generator=rng)
+def test_posing_is_the_weighted_mean_of_rigid_motions(rng):
+    points, weights = torch.randn(50, 3, generator=rng), torch.rand(50, 4, generator=rng)
+    normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=rng), dim=-1)
     turns = rotation_from_axis_angle(torch.randn(5, 3, generator=rng))
     motions = rigid(turns, torch.randn(5, 3, generator=rng))
-    return torch.randn(50, 3, generator=rng), joints, weights / weights.sum(1, keepdim=True), motions
-
-
-def test_skin_is_the_weighted_mean_of_rigid_motions(bound):
-    points, joints, weights, motions = bound
+    faces = torch.arange(48).reshape(16, 3)
+    rest = TexturedMesh(Mesh(points, faces), normals, points[:, :2], faces[:, 0], (torch.rand(3, 2, 2),))
+    joints = torch.randint(0, 5, (50, 4), generator=rng)
+    bound = BoundMesh(rest, joints, weights / weights.sum(1, keepdim=True))
     expected = torch.zeros_like(points)
     for v in range(len(points)):
         for slot in range(4):
             motion = motions[joints[v, slot]]
-            expected[v] += weights[v, slot] * (motion[:3, :3] @ points[v] + motion[:3, 3])
-    torch.testing.assert_close(skin(points, points, joints, weights, motions)[0], expected)
-
-
-def test_one_joint_turns_the_normals(bound, rng):
-    points, joints, weights, motions = bound
-    normals = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=rng), dim=-1)
-    _, turned = skin(points, normals, torch.full_like(joints, 2), weights, motions)
-    torch.testing.assert_close(turned, normals @ motions[2, :3, :3].T)
+            expected[v] += bound.weights[v, slot] * (motion[:3, :3] @ points[v] + motion[:3, 3])
+    torch.testing.assert_close(bound.posed(motions).mesh.vertices, expected)
+    moved_by_one = replace(bound, joints=torch.full_like(joints, 2)).posed(motions)
+    torch.testing.assert_close(moved_by_one.normals, normals @ motions[2, :3, :3].T)

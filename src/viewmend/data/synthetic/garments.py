@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from viewmend.data.synthetic.gltf import Character
-from viewmend.data.synthetic.performer import skin
 from viewmend.data.synthetic.procedural.fabric import QUIET, WORDS, Canvas, Image, Plane, sample_fabric, write
 from viewmend.data.synthetic.retarget import find_parts, node_matrices
 from viewmend.geometry.cameras import Cameras
@@ -103,15 +102,15 @@ def rest_body(character: Character, upright_from_file: Float[Tensor, "4 4"]) -> 
     limb = torch.tensor(limb_of_node)[character.node_of_joint][character.joints]
     share = torch.zeros(len(limb), len(NAMES)).scatter_add_(1, limb, character.weights)
     matrices = world[character.node_of_joint] @ character.joint_from_bind
-    vertices, _ = skin(character.vertices, character.normals, character.joints, character.weights, matrices)
+    vertices = character.posed(matrices).mesh.vertices
     joints = {part_of[n.name]: world[i, :3, 3].numpy() for i, n in enumerate(character.nodes) if n.name in part_of}
-    return RestBody(vertices, joints, share[character.faces].sum(1).argmax(1))
+    return RestBody(vertices, joints, share[character.rest.mesh.faces].sum(1).argmax(1))
 
 
 def find_garments(character: Character, body: RestBody) -> list[Garments | None]:
     """The cloth of each texture, None where there is none (hair, eyes, bare skin)."""
     lab, maps = [], []
-    for n, texture in enumerate(character.textures):
+    for n, texture in enumerate(character.rest.textures):
         width, height = max(1, texture.shape[2] // 2), max(1, texture.shape[1] // 2)
         half = cv2.resize(cv2.merge(list(texture.numpy())), (width, height), interpolation=cv2.INTER_AREA)
         lab.append(cv2.cvtColor(half, cv2.COLOR_RGB2LAB))
@@ -122,8 +121,9 @@ def find_garments(character: Character, body: RestBody) -> list[Garments | None]
 
 def _texels(character: Character, body: RestBody, texture: int, width: int, height: int) -> tuple[Limbs, Image]:
     """Limb of each texel, -1 where no face shows it, and its place at rest."""
-    of_texture = (character.texture_of_face == texture).nonzero()[:, 0]
-    flat = Mesh(torch.cat([character.uv, torch.ones(len(character.uv), 1)], 1), character.faces[of_texture])
+    rest = character.rest
+    of_texture = (rest.texture_of_face == texture).nonzero()[:, 0]
+    flat = Mesh(torch.cat([rest.uv, torch.ones(len(rest.uv), 1)], 1), rest.mesh.faces[of_texture])
     # A camera facing the plane z = 1 of texture coordinates has one texel per pixel.
     K = torch.diag(torch.tensor([float(width), float(height), 1.0]))
     camera = Cameras(("texture",), K[None], torch.eye(4)[None], torch.tensor([[width, height]]))
@@ -261,7 +261,7 @@ def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], va
     rng = np.random.default_rng([seed, 31])
     found = find_garments(character, rest_body(character, upright_from_file))
     textures = []
-    for texture, garments in zip(character.textures, found, strict=True):
+    for texture, garments in zip(character.rest.textures, found, strict=True):
         if garments is None:
             textures.append(texture)
             continue
@@ -275,7 +275,7 @@ def vary_cloth(character: Character, upright_from_file: Float[Tensor, "4 4"], va
             if changes:
                 _dress(image, garments, n, np.random.default_rng(seed))
         textures.append(torch.from_numpy(np.stack(cv2.split(image))))
-    return replace(character, textures=tuple(textures))
+    return replace(character, rest=replace(character.rest, textures=tuple(textures)))
 
 
 def _dress(image: Image, garments: Garments, n: int, rng: np.random.Generator) -> None:

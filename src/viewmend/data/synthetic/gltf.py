@@ -17,6 +17,7 @@ from torch import Tensor
 from viewmend.data.errors import CaptureError
 from viewmend.data.images import decode_image, size_from_header
 from viewmend.data.native_format import stays_inside
+from viewmend.data.synthetic.performer import BoundMesh, TexturedMesh
 from viewmend.geometry.mesh import Mesh, vertex_normals
 from viewmend.utils.untrusted_input import read_json, shown
 
@@ -186,19 +187,10 @@ class Node:
 
 
 @dataclass(frozen=True)
-class Character:
+class Character(BoundMesh):
     """A character in its rest pose: all parts as one mesh. Lengths are the file's (glTF: metres, y up)."""
 
     nodes: tuple[Node, ...]
-    vertices: Float[Tensor, "vertex 3"]
-    normals: Float[Tensor, "vertex 3"]
-    uv: Float[Tensor, "vertex 2"]
-    faces: Int[Tensor, "face 3"]
-    texture_of_face: Int[Tensor, "face"]
-    textures: tuple[Float[Tensor, "3 _ _"], ...]
-    joints: Int[Tensor, "vertex 4"]
-    """Per vertex, positions in `node_of_joint`."""
-    weights: Float[Tensor, "vertex 4"]
     node_of_joint: Int[Tensor, "joint"]
     joint_from_bind: Float[Tensor, "joint 4 4"]
     """Inverse bind matrices."""
@@ -372,16 +364,8 @@ class _Parts:
 
         vertices, normals, uv, weights = (floats(np.concatenate(column)) for column in self.columns[:4])
         joints, texture = (torch.from_numpy(np.concatenate(column).astype(np.int64)) for column in self.columns[4:])
-        return Character(
-            nodes=nodes,
-            vertices=vertices,
-            normals=torch.nn.functional.normalize(normals, dim=-1),
-            uv=uv,
-            faces=torch.from_numpy(np.concatenate(self.faces)),
-            texture_of_face=texture,
-            textures=tuple(floats(t) for t in self.textures.values()),
-            joints=joints,
-            weights=weights,
-            node_of_joint=torch.tensor(self.joint_nodes),
-            joint_from_bind=floats(np.concatenate(self.inverse_binds)),
-        )
+        mesh = Mesh(vertices, torch.from_numpy(np.concatenate(self.faces)))
+        textures = tuple(floats(t) for t in self.textures.values())
+        rest = TexturedMesh(mesh, torch.nn.functional.normalize(normals, dim=-1), uv, texture, textures)
+        binds = floats(np.concatenate(self.inverse_binds))
+        return Character(rest, joints, weights, nodes, torch.tensor(self.joint_nodes), binds)

@@ -10,9 +10,8 @@ from torch import Tensor
 from viewmend.data.errors import CaptureError
 from viewmend.data.synthetic.bvh import Motion, read_bvh
 from viewmend.data.synthetic.gltf import load_character
-from viewmend.data.synthetic.performer import TexturedMesh, skin
+from viewmend.data.synthetic.performer import TexturedMesh
 from viewmend.data.synthetic.retarget import Retarget, retarget
-from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.rigid import rotation_from_axis_angle
 
 ROAM_M = 0.7
@@ -62,14 +61,13 @@ class GltfPerformer:
 
     def pose(self, time_s: float) -> TexturedMesh:
         """The performer `time_s` after the start of its window."""
-        c, frame = self.character, self._frame(self._start_s + time_s)
+        frame = self._frame(self._start_s + time_s)
         before = min(int(frame), len(self._shift) - 1)
         after = min(before + 1, len(self._shift) - 1)
         matrices = self._body.joint_matrices(frame)
         matrices[:, :3, 3] += torch.lerp(self._shift[before], self._shift[after], frame - before)
         matrices[:, :3] = self._stage_from_motion @ matrices[:, :3]
-        vertices, normals = skin(c.vertices, c.normals, c.joints, c.weights, matrices)
-        return TexturedMesh(Mesh(vertices, c.faces), normals, c.uv, c.texture_of_face, c.textures)
+        return self.character.posed(matrices)
 
     def _frame(self, clip_s: float) -> float:
         """Frame number at a time of the clip, back and forth past its ends."""
@@ -83,10 +81,10 @@ class GltfPerformer:
 
     def _floor(self) -> float:
         """Height of the floor under the clip: the median of the soles, or their 5th percentile and a little."""
-        c, count, lows = self.character, len(self.motion.root), []
+        count, lows = len(self.motion.root), []
         for n in range(min(FLOOR_SAMPLES, count)):
             matrices = self._body.joint_matrices(float(n * count // min(FLOOR_SAMPLES, count)))
-            lows.append(skin(c.vertices, c.normals, c.joints, c.weights, matrices)[0][:, 1].min())
+            lows.append(self.character.posed(matrices).mesh.vertices[:, 1].min())
         heights = torch.stack(lows)
         return float(torch.minimum(heights.quantile(0.5), heights.quantile(0.05) + FLIGHT_M))
 

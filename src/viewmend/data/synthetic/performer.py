@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -40,29 +40,33 @@ class Performer(Protocol):
         ...
 
 
-def skin(
-    vertices: Float[Tensor, "vertex 3"],
-    normals: Float[Tensor, "vertex 3"],
-    joints: Int[Tensor, "vertex 4"],
-    weights: Float[Tensor, "vertex 4"],
-    world_from_bind: Float[Tensor, "joint 4 4"],
-) -> tuple[Float[Tensor, "vertex 3"], Float[Tensor, "vertex 3"]]:
-    """Bind-pose vertices and normals in the world: sum over slots of weight * (world_from_bind[joint] vertex), metres.
+@dataclass(frozen=True)
+class BoundMesh:
+    """A mesh in its bind pose, and the joints that move it."""
 
-    `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind matrix. Weights are
-    expected to sum to one per vertex; an unused slot has weight zero and any valid joint index. The normals are turned
-    by the same blend and of unit length; vertices that coincide and share a normal keep sharing it.
-    """
-    rows = world_from_bind[:, :3].reshape(-1, 12)
-    # A bag of four rows per vertex: ten times as fast on a CPU as gathers and a weighted sum.
-    bags = torch.nn.functional.embedding_bag(joints.long(), rows, per_sample_weights=weights, mode="sum")
-    a, b, c, moved = bags.unflatten(1, (3, 4)).unbind(-1)
+    rest: TexturedMesh
+    joints: Int[Tensor, "vertex 4"]
+    """An unused slot has weight zero and any valid joint."""
+    weights: Float[Tensor, "vertex 4"]
+    """They sum to one per vertex."""
 
-    def turned(vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
-        x, y, z = vectors[:, :, None].unbind(1)
-        return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
+    def posed(self, world_from_bind: Float[Tensor, "joint 4 4"]) -> TexturedMesh:
+        """The mesh in the world: sum over slots of weight * (world_from_bind[joint] vertex), metres.
 
-    return turned(vertices) + moved, torch.nn.functional.normalize(turned(normals), dim=-1)
+        `world_from_bind` is what glTF calls jointMatrix: the joint's pose times its inverse bind matrix. The normals
+        are turned by the same blend and of unit length; vertices that coincide and share a normal keep sharing it.
+        """
+        rows = world_from_bind[:, :3].reshape(-1, 12)
+        # A bag of four rows per vertex: ten times as fast on a CPU as gathers and a weighted sum.
+        bags = torch.nn.functional.embedding_bag(self.joints.long(), rows, per_sample_weights=self.weights, mode="sum")
+        a, b, c, moved = bags.unflatten(1, (3, 4)).unbind(-1)
+
+        def turned(vectors: Float[Tensor, "vertex 3"]) -> Float[Tensor, "vertex 3"]:
+            x, y, z = vectors[:, :, None].unbind(1)
+            return torch.addcmul(torch.addcmul(a * x, b, y), c, z)
+
+        mesh = Mesh(turned(self.rest.mesh.vertices) + moved, self.rest.mesh.faces)
+        return replace(self.rest, mesh=mesh, normals=torch.nn.functional.normalize(turned(self.rest.normals), dim=-1))
 
 
 @dataclass(frozen=True)

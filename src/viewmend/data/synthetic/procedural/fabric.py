@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from viewmend.data.synthetic.performer import TexturedMesh
+from viewmend.data.synthetic.performer import BoundMesh, TexturedMesh
 from viewmend.data.synthetic.procedural.skeleton import Vector
 from viewmend.geometry.mesh import Mesh, vertex_normals
 
@@ -234,15 +234,6 @@ class Patch:
     """A face goes where none of its corners is kept."""
     closed: bool = True
     """The last column repeats the first (the normals must agree)."""
-
-
-@dataclass(frozen=True)
-class BoundMesh:
-    """A mesh in its bind pose, ready for `performer.skin`."""
-
-    rest: TexturedMesh
-    joints: Int[Tensor, "vertex 4"]
-    weights: Float[Tensor, "vertex 4"]
 
 
 def outward_of(azimuth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:

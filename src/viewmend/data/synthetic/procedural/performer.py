@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from viewmend.data.synthetic.performer import TexturedMesh, skin
+from viewmend.data.synthetic.performer import BoundMesh, TexturedMesh
 from viewmend.data.synthetic.procedural.body import build_body, shoe_patch
 from viewmend.data.synthetic.procedural.clothing import Tailor, sample_cut, sample_outfit
-from viewmend.data.synthetic.procedural.fabric import BoundMesh, Patch, assemble
+from viewmend.data.synthetic.procedural.fabric import Patch, assemble
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
 from viewmend.data.synthetic.procedural.motion import MOTIONS, SEAT, Motion, Tempo, sample_motion
 from viewmend.data.synthetic.procedural.props import HELD, STANDING, held_prop, standing_prop, stool
@@ -42,9 +42,7 @@ class ProceduralPerson:
         """The person at this time, in seconds."""
         now, before = self.motion.stance(time_s), self.motion.stance(time_s - LAG_S)
         transforms = torch.from_numpy(solve(self.skeleton, now, before, LAG_S)).float()
-        rest, joints, weights = self.bound.rest, self.bound.joints, self.bound.weights
-        vertices, normals = skin(rest.mesh.vertices, rest.normals, joints, weights, transforms)
-        return replace(rest, mesh=Mesh(vertices, rest.mesh.faces), normals=normals)
+        return self.bound.posed(transforms)
 
 
 def draw_person(
