@@ -41,7 +41,7 @@ def shade(surface, fine, triangle, background):
 def _sample_colors(surface, camera, triangle):
     """Linear light of the covered samples of one view."""
     scene, lights = surface.scene, surface.lights
-    levels = face_levels(scene, camera, surface.pyramid)[0]
+    levels = face_levels(scene, camera, surface.pyramid)
     raster = Raster(torch.zeros(triangle.shape), triangle)
     values = torch.cat([scene.uv, scene.normals, surface.irradiance, scene.mesh.vertices], 1)
     shown = interpolate(values, scene.mesh, camera, raster)[triangle >= 0]
@@ -65,17 +65,14 @@ def _highlight(normal, toward_camera, lights):
     return total
 
 
-def face_levels(scene, cameras, pyramid):
-    """The pyramid level, with fraction, at which a texel of each face is about as large as a pixel of each view."""
+def face_levels(scene, camera, pyramid):
+    """The pyramid level, with fraction, at which a texel of each face is about as large as a pixel."""
     faces = scene.mesh.faces.long()
+    pixels, z = (found[0][faces] for found in project(scene.mesh.vertices, camera))
     corners = scene.uv[faces] * pyramid.size[scene.texture_of_face.long(), 0][:, None]
-    pixels, z = project(scene.mesh.vertices, cameras)
-    shown = pixels[:, faces]
+    level = 0.5 * torch.log2((_area(corners) / _area(pixels).clamp(min=1e-6)).clamp(min=1e-6))
     # A face across the camera plane has no meaningful area: it is too near to need a smaller texture.
-    behind = (z[:, faces] <= 0).any(-1)
-    ratio = _area(corners)[None] / _area(shown).clamp(min=1e-6)
-    level = 0.5 * torch.log2(ratio.clamp(min=1e-6))
-    return torch.where(behind, torch.zeros_like(level), level).clamp(0, pyramid.first.shape[1] - 1)
+    return level.masked_fill((z <= 0).any(-1), 0).clamp(0, pyramid.first.shape[1] - 1)
 
 
 def _area(triangles):
