@@ -37,13 +37,13 @@ RADII = ("width", "front", "back")
 """The fields of `Torso` that are distances from its axis."""
 
 
-def smooth_table(xs: Float[np.ndarray, "knot"], table: Float[np.ndarray, "knot column"], samples: int = 256):
+def smooth_table(xs: Float[np.ndarray, "knot"], table: Float[np.ndarray, "knot column"]):
     """Resample knots evenly and round their corners: (positions [sample], values [sample column])."""
-    grid = np.linspace(xs[0], xs[-1], samples)
+    grid = np.linspace(xs[0], xs[-1], 256)
     values = np.stack([np.interp(grid, xs, column) for column in table.T], axis=1)
     for _ in range(2):
         padded = np.pad(values, ((4, 4), (0, 0)), mode="edge")
-        values = np.stack([padded[i : i + samples] for i in range(9)]).mean(0)
+        values = np.stack([padded[i : i + len(grid)] for i in range(9)]).mean(0)
     return grid, values
 
 

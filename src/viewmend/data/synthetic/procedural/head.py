@@ -28,8 +28,6 @@ class Head:
     origin: Vector
     """Below the ears at chin height, world metres."""
     size_m: float
-    thickness: float = 0.0
-    """Layer on top (hair), a share of the head's height."""
 
     def radius(self, azimuth: Values, y: Values) -> Values:
         """Horizontal distance from the axis in head heights, with the face's features."""

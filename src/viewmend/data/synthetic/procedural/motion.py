@@ -287,7 +287,7 @@ def sample_gesture(
     if first == "wave" and rng.random() < 0.5:
         names = (names[1], names[0])
     phase, own = rng.random(), rng.uniform(0, 1, 4)
-    bases, amplitudes, phases, harmonics = [], [], [], []
+    sides = []
     for i, name in enumerate(names):
         angles, harmonic, apart, curl = TABLES["gestures"][name]
         table = np.array(angles)
@@ -298,11 +298,8 @@ def sample_gesture(
         amplitude = np.clip(table[:, 1] * energy * rng.uniform(0.8, 1.2), -most, most)
         # The main angle beats with the music; the others follow it loosely.
         offsets = phase + i * apart + (0.12 * own if name not in ("jacks", "box", "drive", "swing") else 0 * own)
-        bases.append([*base, curl])
-        amplitudes.append([*amplitude, 0.05])
-        phases.append([*offsets, phase])
-        harmonics.append(harmonic)
-    return Gesture(np.array(bases), np.array(amplitudes), np.array(phases), np.array(harmonics))
+        sides.append(([*base, curl], [*amplitude, 0.05], [*offsets, phase], harmonic))
+    return Gesture(*map(np.array, zip(*sides, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,7 @@ from viewmend.data.synthetic.procedural.fabric import Patch, assemble
 from viewmend.data.synthetic.procedural.head import build_head, hair_patches, head_patches, sample_hair
 from viewmend.data.synthetic.procedural.motion import MOTIONS, SEAT, Motion, Tempo, sample_motion
 from viewmend.data.synthetic.procedural.props import HELD, STANDING, held_prop, standing_prop, stool
-from viewmend.data.synthetic.procedural.skeleton import (
-    SIDES,
-    Physique,
-    Skeleton,
-    build_skeleton,
-    sample_physique,
-    solve,
-)
+from viewmend.data.synthetic.procedural.skeleton import SIDES, Physique, Skeleton, build_skeleton, sample_physique
 from viewmend.geometry.mesh import Mesh
 
 LAG_S = 0.12
@@ -41,7 +34,7 @@ class ProceduralPerson:
     def pose(self, time_s: float) -> TexturedMesh:
         """The person at this time, in seconds."""
         now, before = self.motion.stance(time_s), self.motion.stance(time_s - LAG_S)
-        transforms = torch.from_numpy(solve(self.skeleton, now, before, LAG_S)).float()
+        transforms = torch.from_numpy(now.solve(self.skeleton, before, LAG_S)).float()
         return self.bound.posed(transforms)
 
 

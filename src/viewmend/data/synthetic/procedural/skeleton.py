@@ -228,26 +228,25 @@ class Stance:
     tilt: float = 0.0
     knees_out: float = 0.1
 
-
-def solve(skeleton: Skeleton, stance: Stance, before: Stance, elapsed_s: float) -> Transforms:
-    """world_from_bind of every joint; `before` is the stance `elapsed_s` earlier, for what swings behind."""
-    world = np.tile(np.eye(4), (len(INDEX), 1, 1))
-    R = rotation(1, stance.yaw) @ rotation(1, stance.sway) @ rotation(0, stance.lean) @ rotation(2, -stance.roll)
-    world[0, :3, :3] = R
-    world[0, :3, 3] = _reachable(skeleton, stance, R) - R @ skeleton.positions[0]
-    third = rotation(1, stance.twist / 3) @ rotation(0, stance.bend / 3) @ rotation(2, -stance.side / 3)
-    for name in ("spine", "chest", "upper"):
-        R = R @ third
-        skeleton.place(name, R, world)
-    half = rotation(1, stance.look / 2) @ rotation(0, stance.nod / 2) @ rotation(2, -stance.tilt / 2)
-    for name in ("neck", "head"):
-        R = R @ half
-        skeleton.place(name, R, world)
-    for i, side in enumerate(SIDES):
-        _place_arm(skeleton, side, stance.arms[i], world)
-        _place_leg(skeleton, side, stance.feet[i], stance, world)
-    _hang(skeleton, stance, before, elapsed_s, world)
-    return world
+    def solve(self, skeleton: Skeleton, before: "Stance", elapsed_s: float) -> Transforms:
+        """world_from_bind of every joint; `before` is the stance `elapsed_s` earlier, for what swings behind."""
+        world = np.tile(np.eye(4), (len(INDEX), 1, 1))
+        R = rotation(1, self.yaw) @ rotation(1, self.sway) @ rotation(0, self.lean) @ rotation(2, -self.roll)
+        world[0, :3, :3] = R
+        world[0, :3, 3] = _reachable(skeleton, self, R) - R @ skeleton.positions[0]
+        third = rotation(1, self.twist / 3) @ rotation(0, self.bend / 3) @ rotation(2, -self.side / 3)
+        for name in ("spine", "chest", "upper"):
+            R = R @ third
+            skeleton.place(name, R, world)
+        half = rotation(1, self.look / 2) @ rotation(0, self.nod / 2) @ rotation(2, -self.tilt / 2)
+        for name in ("neck", "head"):
+            R = R @ half
+            skeleton.place(name, R, world)
+        for i, side in enumerate(SIDES):
+            _place_arm(skeleton, side, self.arms[i], world)
+            _place_leg(skeleton, side, self.feet[i], self, world)
+        _hang(skeleton, self, before, elapsed_s, world)
+        return world
 
 
 def _ankle(skeleton: Skeleton, side: str, foot: FootPose) -> tuple[Vector, Rotation]:
