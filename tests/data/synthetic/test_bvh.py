@@ -48,8 +48,9 @@ def test_reads_hierarchy_and_rotations_by_hand(tmp_path):
 def test_channels_multiply_in_their_order(tmp_path):
     path = tmp_path / "two.bvh"
     path.write_text(TEXT.replace("90 0 0 0 0 90", "30 40 50 0 0 0"))
-    z, x, y = (rotation_from_axis_angle(torch.eye(3)[a] * math.radians(d)) for a, d in ((2, 30), (0, 40), (1, 50)))
-    torch.testing.assert_close(read_bvh(path).rotations[1, 0], z @ x @ y, atol=1e-6, rtol=0)
+    axes = torch.eye(3, dtype=torch.float64)
+    z, x, y = (rotation_from_axis_angle(axes[a] * math.radians(d)) for a, d in ((2, 30), (0, 40), (1, 50)))
+    torch.testing.assert_close(read_bvh(path).rotations[1, 0], (z @ x @ y).float(), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(

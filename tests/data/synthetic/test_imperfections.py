@@ -36,7 +36,7 @@ def test_all_off_changes_nothing(frame):
     assert imperfect_cameras(frame.cameras, Imperfections(), 1) is frame.cameras
 
 
-@pytest.mark.parametrize(("switch", "strength"), zip(SWITCHES.split(), STRENGTHS, strict=True))
+@pytest.mark.parametrize(("switch", "strength"), list(zip(SWITCHES.split(), STRENGTHS, strict=True)))
 def test_each_switch_is_seeded_and_does_its_own(frame, switch, strength):
     wrong = replace(Imperfections(), **{switch: strength})
     a, b = (imperfect_frame(frame, wrong, 3, background(frame)) for _ in range(2))

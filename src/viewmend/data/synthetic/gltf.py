@@ -188,9 +188,10 @@ class Node:
 
 @dataclass(frozen=True)
 class Character(BoundMesh):
-    """A character in its rest pose: all parts as one mesh. Lengths are the file's (glTF: metres, y up)."""
+    """A character in its rest pose: all parts as one mesh, in the file's units (glTF: metres, y up)."""
 
     nodes: tuple[Node, ...]
+    """`joints` are positions in `node_of_joint`, which are positions here."""
     node_of_joint: Int[Tensor, "joint"]
     joint_from_bind: Float[Tensor, "joint 4 4"]
     """Inverse bind matrices."""

@@ -262,14 +262,10 @@ def _alignment(part: str, own: Rest, actor: Rest) -> Float[Tensor, "3 3"]:
     start, end = side + limb, side + _LIMBS.get(limb, "")
     if not all(p in own and p in actor for p in (start, end)):
         return torch.eye(3)
-    return smallest_rotation(own[end] - own[start], actor[end] - actor[start])
-
-
-def smallest_rotation(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The rotation by the smallest angle that takes direction a to direction b (any half turn if opposite)."""
-    a, b = a / a.norm(), b / b.norm()
+    a, b = ((rest[end] - rest[start]) / (rest[end] - rest[start]).norm() for rest in (own, actor))
     cosine = float(a @ b)
     if cosine < -1 + 1e-6:
+        # Opposite: any half turn.
         axis = torch.linalg.cross(a, torch.eye(3)[int(a.abs().argmin())])
         axis = axis / axis.norm()
         return 2 * torch.outer(axis, axis) - torch.eye(3)

@@ -43,9 +43,7 @@ def dome_rig(count: int, size_px: tuple[int, int] = (512, 512), *, seed: int = 0
     return _stand(eyes, size_px, seed)
 
 
-def orbit(
-    azimuths_rad: Sequence[float], size_px: tuple[int, int] = (512, 512), *, elevation_rad: float = 0.15
-) -> Cameras:
+def orbit(azimuths_rad: Sequence[float], size_px: tuple[int, int], *, elevation_rad: float = 0.15) -> Cameras:
     """Novel cameras on a circle around the middle of who stands on the stage.
 
     Azimuth 0 is in front (+z), and azimuths grow towards +x.

@@ -140,10 +140,8 @@ class Studio:
         straight = srgb_from_linear((linear_from_srgb(frame.rgb.float() / 255) / share).clamp(0, 1))
         return replace(frame, rgb=(255 * straight).round().to(torch.uint8))
 
-    def _draw(
-        self, cameras: Cameras, time: int, backdrop: Float[Tensor, "view 3 height width"] | None
-    ) -> MultiViewFrame:
-        return replace(render(self._surface(time), cameras, backdrop, self.config.samples_per_side), time=time)
+    def _draw(self, cameras: Cameras, time: int, behind: Float[Tensor, "view 3 height width"] | None) -> MultiViewFrame:
+        return replace(render(self._surface(time), cameras, behind, self.config.samples_per_side), time=time)
 
     def _surface(self, time: int) -> Surface:
         if self._last_surface is None or self._last_surface[0] != time:

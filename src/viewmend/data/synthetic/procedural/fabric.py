@@ -203,15 +203,13 @@ def _flowers(image: Image, fabric: Fabric, canvas: Canvas, rng: np.random.Genera
     return flat / 255.0
 
 
-def write(
-    image: Image, canvas: Canvas, word: str, color: Vector, center_m: tuple[float, float], width_m: float
-) -> Image:
+def write(image: Image, canvas: Canvas, word: str, color: Vector, at_m: tuple[float, float], width_m: float) -> Image:
     """A word of this width, at most 9 cm tall, centred at this place of the canvas."""
     font, thick = cv2.FONT_HERSHEY_DUPLEX, max(2, round(0.05 * width_m * canvas.px_per_m))
     (wide, tall), _ = cv2.getTextSize(word, font, 1.0, 1)
     scale = min(width_m * canvas.px_per_m / wide, 0.09 * canvas.px_per_m / tall)
-    left = int((center_m[0] + canvas.width_m / 2) * canvas.px_per_m - scale * wide / 2)
-    base = int((canvas.height_m - center_m[1]) * canvas.px_per_m + scale * tall / 2)
+    left = int((at_m[0] + canvas.width_m / 2) * canvas.px_per_m - scale * wide / 2)
+    base = int((canvas.height_m - at_m[1]) * canvas.px_per_m + scale * tall / 2)
     ink = np.zeros(canvas.shape, dtype=np.uint8)
     cv2.putText(ink, word, (left, base), font, scale, 255, thick, cv2.LINE_AA)
     return blend(image, color, ink / 255.0)
@@ -305,9 +303,7 @@ def _grid_normals(patch: Patch, triangles: Int[np.ndarray, "face 3"]) -> Float[n
     return normals
 
 
-def pack_charts(
-    charts: list[Float[np.ndarray, "_ _ 3"]],
-) -> tuple[list[tuple[int, int]], Float[np.ndarray, "height width 3"]]:
+def pack_charts(charts: list[Float[np.ndarray, "_ _ 3"]]) -> tuple[list[tuple[int, int]], Image]:
     """Shelve the charts in one near-square image: (left, top) of each in pixels, and the image.
 
     Each chart is framed by a gutter that repeats its edge, so that sampling near an edge never reaches a neighbour.

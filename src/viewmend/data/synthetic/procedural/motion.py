@@ -278,11 +278,9 @@ class Gesture:
         return moving
 
 
-def sample_gesture(
-    rng: np.random.Generator, families: list[str], bulk: float, energy: float, beat_hz: float
-) -> Gesture:
+def sample_gesture(rng: np.random.Generator, kinds: list[str], bulk: float, energy: float, beat_hz: float) -> Gesture:
     """Draw a gesture; `bulk` (radians) keeps hanging arms off a wide body, `energy` scales the amplitudes."""
-    first = families[int(rng.integers(len(families)))]
+    first = kinds[int(rng.integers(len(kinds)))]
     names = (first, "hang" if first == "wave" else first)
     if first == "wave" and rng.random() < 0.5:
         names = (names[1], names[0])

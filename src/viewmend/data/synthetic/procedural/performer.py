@@ -1,6 +1,5 @@
 """Performers and scenes drawn from a seed."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,7 +67,6 @@ def draw_person(
     return ProceduralPerson(assemble(patches), skeleton, motion, person, words)
 
 
-TEMPOS: tuple[Tempo, ...] = ("calm", "dance", "fast")
 ROAMING = ("walk", "run", "sidestep")
 """Motions that need the floor for themselves."""
 
@@ -82,11 +80,21 @@ class ProceduralPerformer:
     description: str
 
     def pose(self, time_s: float) -> TexturedMesh:
-        """All of them at this time, in seconds."""
+        """All of them at this time, in seconds, as one mesh; their textures stay separate."""
         parts = [person.pose(time_s) for person in self.people]
         if self.things is not None:
             parts.append(self.things)
-        return parts[0] if len(parts) == 1 else merge(parts)
+        if len(parts) == 1:
+            return parts[0]
+        first, layer, faces, textures = 0, 0, [], []
+        for part in parts:
+            faces.append(part.mesh.faces + first)
+            textures.append(part.texture_of_face + layer)
+            first, layer = first + len(part.mesh.vertices), layer + len(part.textures)
+        vertices, normals, uv = zip(*((part.mesh.vertices, part.normals, part.uv) for part in parts), strict=True)
+        mesh = Mesh(torch.cat(vertices), torch.cat(faces))
+        every = tuple(texture for part in parts for texture in part.textures)
+        return TexturedMesh(mesh, torch.cat(normals), torch.cat(uv), torch.cat(textures), every)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +129,7 @@ def procedural_scene(seed: int, *, style: PerformerStyle | None = None) -> Proce
     rng = np.random.default_rng([seed, 77])
     chance = rng.random(3)
     count = style.people or (2 if chance[0] < 0.2 else 1)
-    tempo: Tempo = style.tempo or TEMPOS[int(rng.integers(3))]
+    tempo: Tempo = style.tempo or list(MOTIONS)[int(rng.integers(3))]
     angle = rng.uniform(0, 2 * np.pi)
     aside = np.array([np.sin(angle), np.cos(angle)]) * (0.46 if count == 2 else 0.0)
     people = []
@@ -156,16 +164,3 @@ def _furniture(rng: np.random.Generator, angle: float) -> tuple[list[Patch], lis
         patches += standing_prop(kind, rng, at, float(rng.uniform(0, 6.3)))
         names.append(f"a {kind}")
     return patches, names
-
-
-def merge(parts: Sequence[TexturedMesh]) -> TexturedMesh:
-    """All parts in one mesh; their textures stay separate."""
-    first, layer, faces, textures = 0, 0, [], []
-    for part in parts:
-        faces.append(part.mesh.faces + first)
-        textures.append(part.texture_of_face + layer)
-        first, layer = first + len(part.mesh.vertices), layer + len(part.textures)
-    vertices, normals, uv = zip(*((part.mesh.vertices, part.normals, part.uv) for part in parts), strict=True)
-    mesh = Mesh(torch.cat(vertices), torch.cat(faces))
-    every = tuple(texture for part in parts for texture in part.textures)
-    return TexturedMesh(mesh, torch.cat(normals), torch.cat(uv), torch.cat(textures), every)

@@ -34,11 +34,7 @@ LEG = ("thigh", "shin", "foot", "toe")
 SIDES = ("left", "right")
 _CHAINS = (
     SPINE,
-    *(
-        (root, *(f"{side}_{name}" for name in limb))
-        for side in SIDES
-        for root, limb in (("upper", ARM), ("pelvis", LEG))
-    ),
+    *((root, *(f"{s}_{name}" for name in limb)) for s in SIDES for root, limb in (("upper", ARM), ("pelvis", LEG))),
     *(("pelvis", f"skirt{column}_high", f"skirt{column}_low") for column in range(SKIRT_COLUMNS)),
     ("head", "tail"),
 )
@@ -71,9 +67,7 @@ def hinge_frame(along: Vector, hinge: Vector) -> Rotation:
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
-def two_bone(
-    start: Vector, target: Vector, lengths: tuple[float, float], pole: Vector
-) -> tuple[Vector, Vector, Vector]:
+def two_bone(start: Vector, target: Vector, lengths: tuple[float, float], pole: Vector) -> tuple[Vector, ...]:
     """Directions of a limb's two bones from `start` to `target`, its middle joint bent towards `pole`, and the hinge.
 
     A target out of reach is replaced by the nearest point the limb does reach.
@@ -235,12 +229,9 @@ class Stance:
         world[0, :3, :3] = R
         world[0, :3, 3] = _reachable(skeleton, self, R) - R @ skeleton.positions[0]
         third = rotation(1, self.twist / 3) @ rotation(0, self.bend / 3) @ rotation(2, -self.side / 3)
-        for name in ("spine", "chest", "upper"):
-            R = R @ third
-            skeleton.place(name, R, world)
         half = rotation(1, self.look / 2) @ rotation(0, self.nod / 2) @ rotation(2, -self.tilt / 2)
-        for name in ("neck", "head"):
-            R = R @ half
+        for name, turn in zip(SPINE[1:], (third, third, third, half, half), strict=True):
+            R = R @ turn
             skeleton.place(name, R, world)
         for i, side in enumerate(SIDES):
             _place_arm(skeleton, side, self.arms[i], world)
