@@ -156,7 +156,7 @@ def test_a_network_that_outputs_black_still_gets_gradients_in_bfloat16(clip_of_t
 def test_positional_maps_are_trained_in_parts(network, kind, size, clip_of_two):
     """Frames smaller than the maps use another random part of them each time."""
     own = objective(network=network, size_px=size)
-    for _ in range(8):
+    for _ in range(3):
         own([clip_of_two]).total.backward()
     maps = [own.model.sc.bias.grad.abs().sum(0)]
     if kind is FuseFormer:
