@@ -14,8 +14,7 @@ from viewmend.geometry.cameras import concatenate_cameras
 
 def rig():
     """Six cameras about the ball at different heights, and `held` between two of them."""
-    heights = (0.0, 1.2, -0.8, 0.6, 1.4, -1.0)
-    around = [camera_at(60 * n, f"c{n}", height_m=height) for n, height in enumerate(heights)]
+    around = [camera_at(60 * n, f"c{n}", height_m=height) for n, height in enumerate((0.0, 1.2, -0.8, 0.6, 1.4, -1.0))]
     return concatenate_cameras([*around, camera_at(75, "held", height_m=0.3)])
 
 
@@ -29,8 +28,7 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def shifted(folder, tmp_path):
     """The same capture, whose calibration says that all images are a pixel further right."""
-    path = tmp_path / "shifted"
-    shutil.copytree(folder, path)
+    path = shutil.copytree(folder, tmp_path / "shifted")
 
     def change(content):
         for camera in content["cameras"]:

@@ -26,8 +26,7 @@ def test_the_demo_renders_mends_and_scores(tmp_path, capsys):
     assert read and int(video.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
     # Three panels of 72 pixels with gaps, their captions above.
     assert panel.shape == (LABEL_PX + 72 + 2 * GAP_PX, 3 * (72 + GAP_PX) + GAP_PX, 3)
-    captions = panel[GAP_PX : GAP_PX + LABEL_PX]
-    assert captions.max() > 150
+    assert panel[GAP_PX : GAP_PX + LABEL_PX].max() > 150
 
 
 def test_every_frame_is_judged_by_the_truth_of_its_time_and_place(tmp_path, monkeypatch):

@@ -28,37 +28,29 @@ def test_help_and_mistakes_import_nothing_heavy(arguments):
         "heavy = {'torch', 'cv2', 'numba', 'skimage', 'av'} & set(sys.modules); print(code, heavy, file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", check, *arguments], capture_output=True, text=True, check=True)
-    expected = 0 if "--help" in arguments else 2
-    assert done.stderr.splitlines()[-1] == f"{expected} set()"
+    assert done.stderr.splitlines()[-1] == f"{0 if '--help' in arguments else 2} set()"
 
 
-@pytest.mark.parametrize(
-    ("error", "code"), [(ValueError("too\nbad"), 2), (FileNotFoundError(2, "no such", "f"), 2), (OSError("full"), 2)]
-)
-def test_what_a_user_can_get_wrong_is_one_line(monkeypatch, capsys, error, code):
+def raising(error):
     def run(options):
         raise error
 
-    assert run_command(monkeypatch, run) == code
+    return run
+
+
+@pytest.mark.parametrize("error", [ValueError("too\nbad"), FileNotFoundError(2, "no such", "f"), OSError("full")])
+def test_what_a_user_can_get_wrong_is_one_line(monkeypatch, capsys, error):
+    assert run_command(monkeypatch, raising(error)) == 2
     out, message = capsys.readouterr()
     assert out == "" and message.startswith(f"viewmend: error: {' '.join(str(error).split())}")
     assert message.count("\n") == 1 and ("check the path" in message) == (getattr(error, "filename", None) == "f")
 
 
-def test_our_own_mistakes_show_where(monkeypatch, capsys):
-    def run(options):
-        raise KeyError("ours")
-
-    assert run_command(monkeypatch, run) == 1
+def test_our_own_mistakes_interruption_and_success(monkeypatch, capsys):
+    assert run_command(monkeypatch, raising(KeyError("ours"))) == 1
     message = capsys.readouterr().err
     assert "Traceback" in message and "KeyError: 'ours'" in message
-
-
-def test_interruption_and_success(monkeypatch, capsys):
-    def interrupted(options):
-        raise KeyboardInterrupt
-
-    assert run_command(monkeypatch, interrupted) == 130
+    assert run_command(monkeypatch, raising(KeyboardInterrupt())) == 130
     assert "Traceback" not in capsys.readouterr().err
     assert run_command(monkeypatch, lambda options: 0) == 0
     assert run_command(monkeypatch, lambda options: SimpleNamespace(), ["--no-such-option"]) == 2

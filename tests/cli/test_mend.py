@@ -113,8 +113,7 @@ def test_the_subject_is_cut_out_without_dark_fringes(folder, tmp_path, mend):
     cut = pictures(tmp_path / "cutout", cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]].astype(int)
     alpha = cut[..., 3:]
     assert cut.shape == (2, 48, 48, 4) and (alpha == 0).any() and ((alpha > 20) & (alpha < 200)).any()
-    near = (alpha > 0)[..., 0]
-    assert np.abs(cut[near][:, :3] - np.array(tells_all.COLOUR) * 255).max() < 10
+    assert np.abs(cut[(alpha > 0)[..., 0]][:, :3] - np.array(tells_all.COLOUR) * 255).max() < 10
     with av.open(str(tmp_path / "cutout.webm")) as film:
         decoder = av.CodecContext.create("libvpx-vp9", "r")
         frames = [f.to_ndarray(format="rgba") for p in film.demux(film.streams.video[0]) for f in decoder.decode(p)]

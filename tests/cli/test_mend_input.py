@@ -12,6 +12,9 @@ from viewmend.cli.checks import chosen_times
 from viewmend.data.native_capture import open_capture
 from viewmend.data.prepare import adjustments
 
+AS_IT_IS = ("--no-align", "--no-match-colours")
+POSES = [torch.eye(4).tolist()]
+
 
 @pytest.mark.parametrize(
     ("content", "message"),
@@ -20,20 +23,17 @@ from viewmend.data.prepare import adjustments
         ("[]", "world_from_camera: expected a list that is not empty"),
         ("[[[1, 0], [0, 1]]]", "world_from_camera[0]: expected a list of length 4"),
         (json.dumps([(2 * torch.eye(4)).tolist()]), "pose 0: expected a rotation"),
-        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 30}), "'height'"),
-        (json.dumps([torch.eye(4).tolist()] * 3), "one per frame (2 frames), got 3"),
-        (json.dumps({"world_from_camera": [torch.eye(4).tolist()], "K": [[0] * 3] * 3}), "expected 'K' as"),
-        (
-            json.dumps({"world_from_camera": [torch.eye(4).tolist()], "width": 10**8, "height": 9}),
-            "width: expected a whole number <= 16384",
-        ),
+        (json.dumps({"world_from_camera": POSES, "width": 30}), "'height'"),
+        (json.dumps(POSES * 3), "one per frame (2 frames), got 3"),
+        (json.dumps({"world_from_camera": POSES, "K": [[0] * 3] * 3}), "expected 'K' as"),
+        (json.dumps({"world_from_camera": POSES, "width": 10**8, "height": 9}), "expected a whole number <= 16384"),
         ("[" * 100_000, "expected JSON"),
     ],
 )
 def test_a_bad_path_is_named(folder, tmp_path, mend, content, message):
     file = tmp_path / "path.json"
     file.write_text(content)
-    code, _, err = mend(folder, tmp_path / "out", "--path", file)
+    code, _, err = mend(folder, tmp_path / "out", "--path", file, *AS_IT_IS)
     assert code == 2 and message in err
     assert [f.name for f in tmp_path.iterdir()] == ["path.json"]
 
@@ -66,16 +66,14 @@ def test_fewer_frames_than_asked_for_are_said(capsys, text, times, said):
 
 
 def test_a_capture_without_masks_is_refused(folder, tmp_path, mend):
-    bare = tmp_path / "bare"
-    shutil.copytree(folder, bare)
+    bare = shutil.copytree(folder, tmp_path / "bare")
     remove_masks(bare)
     code, _, err = mend(bare, tmp_path / "out", "--leave-out", "held")
     assert code == 2 and "expected a 'mask'" in err and not (tmp_path / "out").exists()
 
 
 def test_an_unreadable_frame_leaves_nothing_half_written(folder, tmp_path, mend):
-    broken = tmp_path / "broken"
-    shutil.copytree(folder, broken)
+    broken = shutil.copytree(folder, tmp_path / "broken")
     last = broken / "image" / "c5" / "001.png"
     last.write_bytes(b"no picture")
     code, _, err = mend(broken, tmp_path / "out", "--leave-out", "held")
@@ -87,24 +85,16 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, mend):
     notes = tmp_path / "holes/notes.txt"
     notes.parent.mkdir()
     notes.write_text("precious")
-    code, _, err = mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
-    assert (
-        code == 2
-        and "notes.txt: expected no such file, or an unchanged one from an earlier run" in err
-        and notes.read_text() == "precious"
-    )
+    given = ("--leave-out", "held", "--frames", "0:1", *AS_IT_IS)
+    code, _, err = mend(folder, tmp_path, *given)
+    assert code == 2 and "notes.txt: expected no such file, or an unchanged one from an earlier run" in err
+    assert notes.read_text() == "precious"
     notes.unlink()
     for said in (False, True):  # its own results are
-        code, _, err = mend(folder, tmp_path, "--leave-out", "held", "--frames", "0:1")
+        code, _, err = mend(folder, tmp_path, *given)
         assert code == 0 and (f"{tmp_path}: the results of an earlier run will be replaced" in err) == said
-    assert {f.name for f in tmp_path.iterdir()} == {
-        ".viewmend",
-        "holes",
-        "mended",
-        "rendered",
-        "truth",
-        "contact_sheet.png",
-    }
+    written = {".viewmend", "holes", "mended", "rendered", "truth", "contact_sheet.png"}
+    assert {f.name for f in tmp_path.iterdir()} == written
 
 
 def test_check_says_what_mend_would_change(folder, shifted, capsys):

@@ -82,17 +82,8 @@ def test_a_damaged_capture_is_one_line_also_from_a_worker(capture, tmp_path, cap
     shutil.copytree(capture, broken)
     for image in broken.glob("image/*/*1.*"):
         image.write_bytes(b"none")
-    command = [
-        "make-dataset",
-        "finetune",
-        "--captures",
-        str(broken),
-        "--hold-out",
-        "None",
-        "--out",
-        str(tmp_path / "out"),
-    ]
-    assert main([*command, "--count", "40", "--workers", "1"]) == 2
+    command = ["make-dataset", "finetune", "--captures", str(broken), "--out", str(tmp_path / "out")]
+    assert main([*command, "--hold-out", "None", "--count", "40", "--workers", "1"]) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if "error" in line]
     assert len(lines) == 1 and "expected an image" in lines[0] and "Traceback" not in lines[0]
     assert not multiprocessing.active_children()

@@ -64,8 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"viewmend {__version__}")
         return 0
     by_name = {command.name: command for command in COMMANDS}
-    name = ALIASES.get(arguments[0], arguments[0])
-    command = by_name.get(" ".join(arguments[:2])) or by_name.get(name)
+    command = by_name.get(" ".join(arguments[:2])) or by_name.get(ALIASES.get(arguments[0], arguments[0]))
     if command is None:
         names = ", ".join(by_name)
         return _fail(f"expected a command among {names}, got '{arguments[0]}'; see viewmend --help")

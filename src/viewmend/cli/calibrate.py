@@ -57,11 +57,7 @@ def run(options: Options) -> int:
     if options.json:
         print_json(figures)
     else:
-        show(
-            "\n".join(
-                f"{name}  " + ", ".join(f"{key} {n:.4g}" for key, n in row.items()) for name, row in figures.items()
-            )
-        )
+        show(*(f"{name}  " + ", ".join(f"{key} {n:.4g}" for key, n in row.items()) for name, row in figures.items()))
     say(f"wrote {options.out}")
     return 0
 

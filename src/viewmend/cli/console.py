@@ -117,9 +117,6 @@ def in_db(value: float | None) -> str:
     return "    -" if value is None else f"{value:5.2f}"
 
 
-Handler = Callable[[int, FrameType | None], None]
-
-
 @contextlib.contextmanager
 def exit_on_sigterm() -> Iterator[None]:
     """Make SIGTERM unwind the stack as Ctrl-C does, so that partial output is removed."""
@@ -153,7 +150,7 @@ def stop_requests() -> Iterator[Callable[[], int]]:
 
 
 @contextlib.contextmanager
-def _handle(handler: Handler, *signals: signal.Signals) -> Iterator[None]:
+def _handle(handler: Callable[[int, FrameType | None], None], *signals: signal.Signals) -> Iterator[None]:
     """Install a handler; does nothing outside the main thread, where Python does not allow it."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,7 +1,7 @@
 """`viewmend convert`: converts a capture of any supported format."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -40,10 +40,6 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --scale above 0 and at most 1, got {options.scale}; choose again")
     capture = open_capture(options.source, options.cameras or None, options.format)
     subset = CaptureSubset(capture, chosen_times(options.frames, len(capture.frame_ids)), options.scale)
-
-    def progress(times: Iterable[int]) -> Iterable[int]:
-        return track(times, options.out.name)
-
-    write_capture(subset, options.out, images=options.images, progress=progress)
+    write_capture(subset, options.out, images=options.images, progress=partial(track, description=options.out.name))
     say(f"{options.out}: {len(subset.cameras)} cameras, {len(subset.frame_ids)} frames")
     return 0

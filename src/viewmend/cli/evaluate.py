@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from viewmend.data.holdout.scenes import LeaveOneOutScene
     from viewmend.evaluation.report import Report
     from viewmend.evaluation.result_cache import CellStore
-    from viewmend.evaluation.scene_run import RunSettings
 
 WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
 """Files in OUT besides cells, models and samples."""
@@ -140,13 +139,20 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     Raises:
         ValueError: an option is not valid.
     """
-    _check(options, sets)
+    check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1)
+    if not sets:
+        raise ValueError("expected at least one set, got no set; P needs nothing")
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
+    check_device(options.device)
     from viewmend.cli.console import say, track
     from viewmend.evaluation.report import make_report
     from viewmend.evaluation.result_cache import CellStore
     from viewmend.evaluation.runner import run_evaluation
+    from viewmend.evaluation.scene_run import RunSettings
     from viewmend.evaluation.scores import available_networks
     from viewmend.models.registry import method_names, split_missing
+    from viewmend.stream import StreamConfig
 
     if options.weights is not None:
         _search_first(options.weights)
@@ -154,13 +160,14 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     names = method_names(methods)
     available, missing = split_missing(names, options.device)
     networks, missing_networks = available_networks()
-    settings = _settings(options, networks)
+    same = {name: getattr(options, name) for name in ("device", "precision", "ssim", "protocol")}
+    stream = StreamConfig(render=options.view.config(), memory_mb=None)
+    settings = RunSettings(stream=stream, background=options.score_background, networks=networks, **same)
     if missing or missing_networks:
         say(f"n/a (the report has the reasons): {', '.join(missing | missing_networks)}")
     store, cells = CellStore(options.out / "cells"), []
     steps = run_evaluation(scenes, available, store, settings, options.jobs, options.ray)
-    total = len(scenes) * len(available)
-    for cell in track((cell for found in steps for cell in found), "evaluating", total):
+    for cell in track((cell for found in steps for cell in found), "evaluating", len(scenes) * len(available)):
         cells.append(cell)
         if cell.error is not None:
             say(f"{cell.key.scene}, {cell.key.method}: failed: {cell.error}")
@@ -221,30 +228,6 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         raise ValueError("expected --inputs all or a number of cameras, got none; leave it out for all")
     captured = [s for number in inputs for s in capture_set(Path(name), number, options.frames, options.format)[part]]
     return [replace(scene, **prepared) for scene in captured]
-
-
-def _settings(options: RunOptions, networks: tuple[str, ...]) -> "RunSettings":
-    from viewmend.evaluation.scene_run import RunSettings
-    from viewmend.stream import StreamConfig
-
-    return RunSettings(
-        device=options.device,
-        precision=options.precision,
-        stream=StreamConfig(render=options.view.config(), memory_mb=None),
-        ssim=options.ssim,
-        background=options.score_background,
-        networks=networks,
-        protocol=options.protocol,
-    )
-
-
-def _check(options: RunOptions, sets: tuple[str, ...]) -> None:
-    check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1)
-    if not sets:
-        raise ValueError("expected at least one set, got no set; P needs nothing")
-    if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
-    check_device(options.device)
 
 
 def _search_first(folder: Path) -> None:

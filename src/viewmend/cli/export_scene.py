@@ -12,8 +12,6 @@ from viewmend.training.config import FLAT
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from viewmend.data.prepare import PreparedCapture
-    from viewmend.data.source import CaptureSource
     from viewmend.frame_cache import CachedFrame
     from viewmend.geometry.cameras import Cameras
 
@@ -56,9 +54,9 @@ def run(options: Options) -> int:
     check_least(options, views=1)
     if not 0 <= options.min_confidence <= 1:
         raise ValueError(f"expected --min-confidence from 0 to 1, got {options.min_confidence}; choose again")
-    from viewmend.cli.checks import chosen_times, load_named
+    from viewmend.cli.checks import chosen_times, load_named, log_preparation
     from viewmend.cli.console import say, track
-    from viewmend.data.prepare import open_masked
+    from viewmend.data.prepare import open_masked, prepare
     from viewmend.data.source import prefetch
     from viewmend.export.scene import RESULTS, check_openexr, export_scene
     from viewmend.stream import Stream
@@ -70,36 +68,21 @@ def run(options: Options) -> int:
     stream = Stream(load_named(options.model, options.device), bounds=opened.bounds)
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
-        capture = _prepared(options, opened, times[0])
-        frame = capture.read(times[0]).to(options.device)
-        first = stream.add_frame(frame)
+        prepared, size = asdict(options.preparation), options.max_image_size
+        capture = prepare(opened, max_image_size=size, **prepared, first=times[0])
+        log_preparation(capture)
+        first = stream.add_frame(capture.read(times[0]).to(options.device))
         views = _views(options, first, capture.cameras, capture.up)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))
-        written = export_scene(
-            track(frames, "exporting", len(times)),
-            stream,
-            views,
-            capture.cameras,
-            folder.draft,
-            up=capture.up,
-            fps=capture.fps,
-            min_confidence=options.min_confidence,
-        )
+        more = {"up": capture.up, "fps": capture.fps, "min_confidence": options.min_confidence}
+        frames = track(frames, "exporting", len(times))
+        written = export_scene(frames, stream, views, capture.cameras, folder.draft, **more)
         folder.publish(*RESULTS)
     say(
         f"{options.out}: {written.frames} frames of {written.views} views; {written.vertices} hull vertices, "
         f"{written.points} points"
     )
     return 0
-
-
-def _prepared(options: Options, opened: "CaptureSource", first: int) -> "PreparedCapture":
-    from viewmend.cli.checks import log_preparation
-    from viewmend.data.prepare import prepare
-
-    capture = prepare(opened, max_image_size=options.max_image_size, **asdict(options.preparation), first=first)
-    log_preparation(capture)
-    return capture
 
 
 def _views(options: Options, first: "CachedFrame", rig: "Cameras", up: "Tensor | None") -> "Cameras":

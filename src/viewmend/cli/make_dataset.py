@@ -86,8 +86,7 @@ def _make(options: Options) -> None:
     source = options.objective.make_scenes(options.scenes, f"{options.seed}/0")
     began, shards = time.monotonic(), []
     samples = islice(_missing(at, samples_in_order(source, at.scene, options.workers)), count)
-    shard_size = options.objective.shard_size
-    for shard in write_shards(track(samples, "samples", count), options.out, shard_size, at.shards):
+    for shard in write_shards(track(samples, "samples", count), options.out, options.objective.shard_size, at.shards):
         shards.append(shard)
         at.shards += 1
         write_text(options.out / POSITION, json.dumps(asdict(at)))

@@ -191,10 +191,9 @@ def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int])
     for frame in map(capture.read, thinned(sorted(set(shown)))):
         assert frame.mask is not None, "captures without masks are refused"
         points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
-    extent = torch.cat(points)
-    center, arc = (extent.amin(0) + extent.amax(0)) / 2, turntable.arc
-    arc_rad = None if arc is None else math.radians(arc)
-    views = len(shown)
+    extent, views = torch.cat(points), len(shown)
+    center = (extent.amin(0) + extent.amax(0)) / 2
+    arc_rad = None if turntable.arc is None else math.radians(turntable.arc)
     path = orbit_around(center, capture.cameras, capture.up, views, views, arc_rad, turntable.size_px)
     path = fit_to(path, extent)
     return [(time, path[view]) for view, time in enumerate(shown)]

@@ -41,15 +41,7 @@ def run(options: Options) -> int:
     """Run the command; 1 if a cell failed, else 0."""
     from viewmend.cli.console import show
     from viewmend.cli.evaluate import evaluate, exit_code, report_folder
-    from viewmend.evaluation.paper_tables import (
-        OURS,
-        PAPERS_MODEL,
-        PaperRow,
-        ablation_models,
-        paper_grid,
-        paper_rows,
-        row_label,
-    )
+    from viewmend.evaluation import paper_tables as paper
     from viewmend.evaluation.report import csv_text, markdown_table
     from viewmend.metrics.weights import find_weights, known_weights
     from viewmend.models.registry import method_names
@@ -57,27 +49,27 @@ def run(options: Options) -> int:
 
     options = replace(options, view=replace(options.view, error_rule=options.view.error_rule or "holes"))
     sets = options.sets or (("P", "Q") if options.performers else ("P",))
-    rows = paper_rows(options.table)
+    rows = paper.paper_rows(options.table)
     if options.table == 3:
         if options.models is None:
             raise ValueError("expected --models DIR for table 3, got none; research/ablation.py trains them")
-        methods = ablation_models(options.models)
+        methods = paper.ablation_models(options.models)
     else:
         if options.table == 2 and not options.sets:
             raise ValueError("expected captures for table 2, got none; name their folders after the 2")
         if not options.ours.strip():
             raise ValueError("expected --ours with a model's name or folder, got none; leave it out for the default")
         ours = method_names(options.ours)
-        trained = next((name for name in ours if row_label(name).startswith(PAPERS_MODEL)), None)
-        methods = {OURS: () if trained is None else (trained,)}
+        trained = next((name for name in ours if paper.row_label(name).startswith(paper.PAPERS_MODEL)), None)
+        methods = {paper.OURS: () if trained is None else (trained,)}
         if find_weights(known_weights("raft")) is None:
             methods["rgvi"] = ()  # without RAFT it is not RGVI
         rows = [_relabelled(row, trained) for row in rows]
-        rows += [PaperRow(row_label(name), name) for name in (*ours, *EXTRA_ROWS) if name != trained]
+        rows += [paper.PaperRow(paper.row_label(name), name) for name in (*ours, *EXTRA_ROWS) if name != trained]
     names = [name for row in rows for name in methods.get(row.method, (row.method,))]
     with report_folder(options.out):
         report = evaluate(options, sets, ",".join(dict.fromkeys(names)))
-        grid = paper_grid(rows, report, methods)
+        grid = paper.paper_grid(rows, report, methods)
         text = _text(options.table, sets, markdown_table(grid), report)
         by_head = [dict(zip(grid.heads, row, strict=True)) for row in grid.rows]
         forms = {"md": text, "json": json.dumps(by_head, indent=1), "csv": csv_text(grid.heads, grid.rows)}

@@ -216,8 +216,7 @@ def open_source(options: Options) -> "FrameSource":
     from viewmend.data.prepare import open_masked, prepare
 
     # Prepared before the address is printed, so that an unusable capture is an error of the command.
-    capture = open_masked(options.source, format=options.format)
-    source = prepare(capture, max_image_size=size_px, **prepared)
+    source = prepare(open_masked(options.source, format=options.format), max_image_size=size_px, **prepared)
     log_preparation(source)
     return RecordedSource(lambda: source, options.fps, memory_mb=memory_mb)
 

@@ -51,15 +51,8 @@ def run(options: Options) -> int:
         )
     check_least(options, scenes=2)
     remove_partial_file(options.out)
-    splits = make_splits(
-        options.captures,
-        options.out.parent,
-        seed=options.seed,
-        test_fraction=options.test_fraction,
-        scenes=options.scenes,
-        subject=options.subject,
-        format=options.format,
-    )
+    how = {name: getattr(options, name) for name in ("seed", "test_fraction", "scenes", "subject", "format")}
+    splits = make_splits(options.captures, options.out.parent, **how)
     text = splits_json(splits)
     if options.out.exists() and options.out.read_text("utf-8", "replace") != text:
         raise ValueError(

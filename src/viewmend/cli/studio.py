@@ -1,6 +1,6 @@
 """`viewmend studio`: generates synthetic multi-camera captures with ground truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -57,20 +57,15 @@ def run(options: Options) -> int:
     if any(existing := [folder.exists() for folder in folders]):
         first = folders[existing.index(True)]
         raise CaptureError(f"{first}: expected a new folder, got an existing one; {_advice(options, existing)}")
+    same = ("cameras", "rig", "frames", "performers", "motions", "background")
+    config = StudioConfig(
+        **{name: getattr(options, name) for name in same},
+        size_px=options.size,
+        imperfections=Imperfections.typical() if options.imperfect else Imperfections(),
+    )
     report = []
     for seed, folder in zip(seeds, folders, strict=True):
-        config = StudioConfig(
-            seed=seed,
-            cameras=options.cameras,
-            rig=options.rig,
-            frames=options.frames,
-            size_px=options.size,
-            performers=options.performers,
-            motions=options.motions,
-            background=options.background,
-            imperfections=Imperfections.typical() if options.imperfect else Imperfections(),
-        )
-        studio = Studio(config)
+        studio = Studio(replace(config, seed=seed))
         write_capture(studio, folder, images=options.images, progress=lambda times, f=folder: track(times, f.name))
         say(f"{folder}: {studio.performer.description}")
         report.append({"folder": str(folder), "seed": seed, "performer": studio.performer.description})

@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from viewmend.metrics.weights import KnownWeights
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +26,7 @@ def run(options: Options) -> int:
     from viewmend.cli.console import print_json, show
     from viewmend.metrics.weights import KNOWN, find_weights, weight_folders
 
-    found = [_describe(known.name, find_weights(known)) for known in KNOWN]
+    found = [_describe(known, find_weights(known)) for known in KNOWN]
     if options.json:
         print_json(found)
     else:
@@ -36,11 +40,11 @@ def run(options: Options) -> int:
     return 1 if any(line["status"] == "wrong" for line in found) else 0
 
 
-def _describe(name: str, path: Path | None) -> dict[str, str]:
-    from viewmend.metrics.weights import known_weights, stated_hash, verify_weights
+def _describe(known: "KnownWeights", path: Path | None) -> dict[str, str]:
+    from viewmend.metrics.weights import stated_hash, verify_weights
     from viewmend.utils.weight_files import WeightsError
 
-    known, status, problem = known_weights(name), "missing", ""
+    status, problem = "missing", ""
     if path is not None:
         status = "right" if known.sha256 else "there (no hash was published; loading checks shapes)"
         try:
@@ -48,13 +52,7 @@ def _describe(name: str, path: Path | None) -> dict[str, str]:
         except WeightsError as error:
             status, problem = "wrong", str(error)
     return {
-        "name": name,
-        "status": status,
-        "path": "" if path is None else str(path),
-        "files": " or ".join(known.files),
-        "what": known.what,
-        "source": known.source,
-        "licence": known.licence,
-        "hash": stated_hash(known),
-        "error": problem,
+        **{"name": known.name, "status": status, "path": "" if path is None else str(path)},
+        **{"files": " or ".join(known.files), "what": known.what, "source": known.source},
+        **{"licence": known.licence, "hash": stated_hash(known), "error": problem},
     }
