@@ -138,7 +138,8 @@ def test_views_of_a_rig_on_one_side_swing_only_there(tmp_path):
     side, out = str(tmp_path / "side"), str(tmp_path / "out")
     write_capture(BallCapture(ring(8, 48)[:3], 1), tmp_path / "side", images="png")
     assert main(["export-scene", side, out, "--views", "4", "--model", "telea"]) == 0
-    views = Usd.Stage.Open(f"{out}/cameras.usda").GetPrimAtPath("/scene/views").GetChildren()
+    stage = Usd.Stage.Open(f"{out}/cameras.usda")
+    views = stage.GetPrimAtPath("/scene/views").GetChildren()
     places = torch.tensor([list(view.GetAttribute("xformOp:transform").Get()[3]) for view in views])
     assert float(torch.pdist(places[:, :3]).min()) > 0.3
 
