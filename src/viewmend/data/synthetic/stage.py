@@ -101,9 +101,13 @@ class Studio:
         self._last_surface: tuple[int, Surface] | None = None
         self._last_pyramid: tuple[tuple[Tensor, ...], TexturePyramid] | None = None
 
-    @cached_property
+    @property
     def bounds(self) -> Bounds | None:
         """Bounds of the performers over the capture, with a margin (sampled at most 48 times)."""
+        return self._bounds
+
+    @cached_property
+    def _bounds(self) -> Bounds:
         count = min(self.config.frames, BOUNDS_SAMPLES)
         times = np.linspace(0, self.config.frames - 1, count).round().astype(int)
         corners = [self.scene(int(t)).mesh.vertices.aminmax(dim=0) for t in times]
