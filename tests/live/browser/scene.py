@@ -101,15 +101,3 @@ def original(name: str, time: int) -> np.ndarray:
 def hole_share(z: np.ndarray, points: np.ndarray) -> float:
     seen = z > 0
     return float((seen & (np.abs(points[..., 1] - CENTER[1]) < 0.12)).sum() / max(1, seen.sum()))
-
-
-def pack_depth(z: np.ndarray, stride: int) -> tuple[np.ndarray, float, float]:
-    """16-bit inverse depth at every `stride`-th pixel, and near and far."""
-    height, width = z.shape
-    rows = np.minimum(np.arange(0, height, stride) + stride // 2, height - 1)
-    columns = np.minimum(np.arange(0, width, stride) + stride // 2, width - 1)
-    sampled = z[rows][:, columns]
-    near, far = (sampled[sampled > 0].min() * 0.99, sampled.max() * 1.01) if (sampled > 0).any() else (1.0, 2.0)
-    with np.errstate(divide="ignore"):
-        q = 1 + 65534 * (1 / sampled - 1 / far) / (1 / near - 1 / far)
-    return np.where(sampled > 0, np.round(q), 0).astype(np.uint16), float(near), float(far)

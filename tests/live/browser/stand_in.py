@@ -3,15 +3,13 @@
 import asyncio
 import io
 import json
-import struct
 import threading
 import time
-import zlib
 from dataclasses import dataclass, field
-from fractions import Fraction
 
 import cv2
 import numpy as np
+import torch
 import uvicorn
 from live.browser import scene
 from starlette.applications import Starlette
@@ -20,7 +18,11 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from viewmend.data.videos import write_mp4
+from viewmend.live.encoding import pack_depth, to_jpeg
+from viewmend.live.protocol import pack
 from viewmend.live.responses import HEADERS, page_files
+from viewmend.live.video import STRINGS, VideoStream
 
 MODES = ["rendered", "holes", "mended", "depth", "coverage", "confidence", "hull", "points"]
 LIMITS = {"max_side_px": 1024, "max_pixels": 700_000, "max_message_bytes": 65536, "messages_per_s": 240, "viewers": 4}
@@ -41,7 +43,6 @@ class Seen:
     acknowledged: int = 0
     sent: int = 0
     answered: tuple = ()
-    encoders: dict = field(default_factory=dict)
 
 
 @dataclass
@@ -119,7 +120,7 @@ class StandIn:
             await asyncio.sleep(0.05)
             if await request.is_disconnected():
                 self.film = (None, None)
-                break
+                return Response()
         return Response(await asyncio.to_thread(film, body), media_type="video/mp4")
 
     async def _progress(self, request: Request) -> Response:
@@ -217,7 +218,7 @@ class StandIn:
             for mode in look.get("modes", ["mended"]):
                 image = scene.picture(rgb, z, points, mode)
                 image[z == 0] = tuple(bytes.fromhex(look.get("background", "000000")))
-                about, content = self._encode(viewer, image, look.get("codec", "jpeg"), (eye, mode))
+                about, content = self._encode(image, look.get("codec", "jpeg"))
                 parts.append({"kind": "image", "eye": eye, "mode": mode, **about})
                 data.append(content)
             if look.get("depth"):
@@ -226,77 +227,32 @@ class StandIn:
                 data.append(content)
         header = {"frame": viewer.sent, "look": look["id"], "sent_ms": look["sent_ms"], "time": now, "width": width}
         header |= {"height": height, "full": part == 1.0, "cameras": cameras, "holes": share}
-        header |= {
-            "source_views": scene.SOURCES,
-            "top_k": look.get("top_k"),
-            "context_times": 3,
-            "dropped": 0,
-            "colours": scene.COLOURS,
-            "confidence": self.confidence,
-        }
-        stages = {
-            "geometry": 8.0,
-            "context": 4.0,
-            "rendering": 6.0,
-            "inpainting": 30.0 + 10 * np.sin(now),
-            "encode": 2.0,
-        }
+        header |= {"source_views": scene.SOURCES, "top_k": look.get("top_k"), "context_times": 3, "dropped": 0}
+        header |= {"colours": scene.COLOURS, "confidence": self.confidence}
+        stages = {"geometry": 8.0, "context": 4.0, "rendering": 6.0, "encode": 2.0}
+        stages["inpainting"] = 30.0 + 10 * np.sin(now)
         header["stage_ms"] = {**stages, "wait": 1.0, "total": sum(stages.values()) + 1}
         header["parts"] = [about | {"bytes": len(content)} for about, content in zip(parts, data, strict=True)]
-        text = json.dumps(header).encode()
-        return b"VMF1" + struct.pack("<I", len(text)) + text + b"".join(data)
+        return pack(header, data)
 
-    def _encode(self, viewer: Seen, image: np.ndarray, codec: str, stream: tuple) -> tuple[dict, bytes]:
-        if codec == "jpeg":
-            data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
-        else:
-            data = video_key_frame(image, codec)
-        about = {"codec": codec, "key": True, "codec_string": CODEC_STRINGS.get(codec)}
+    def _encode(self, image: np.ndarray, codec: str) -> tuple[dict, bytes]:
+        data = to_jpeg(image, 92) if codec == "jpeg" else VideoStream().encode(image, codec, key=True)[0]
+        about = {"codec": codec, "key": True, "codec_string": STRINGS.get(codec)}
         return about, b"\xff\xd8broken" if self.broken else data
 
 
-CODEC_STRINGS = {"vp9": "vp09.00.20.08", "h264": "avc1.42E01F"}
-
-
-def video_key_frame(image: np.ndarray, codec: str) -> bytes:
-    """A key frame by itself."""
-    import av
-
-    encoder = av.CodecContext.create({"vp9": "libvpx-vp9", "h264": "libx264"}[codec], "w")
-    encoder.height, encoder.width = image.shape[:2]
-    encoder.pix_fmt, encoder.time_base, encoder.bit_rate = "yuv420p", Fraction(1, 30), 8_000_000
-    fast = {"deadline": "realtime", "cpu-used": "8", "lag-in-frames": "0"}
-    encoder.options = {"preset": "ultrafast", "tune": "zerolatency", "profile": "baseline"} if codec == "h264" else fast
-    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24").reformat(format="yuv420p")
-    return b"".join(bytes(packet) for packet in [*encoder.encode(frame), *encoder.encode(None)])
-
-
 def depth_part(z: np.ndarray, stride: int) -> tuple[dict, bytes]:
-    q, near, far = scene.pack_depth(z, stride)
-    deltas = np.diff(q, axis=1, prepend=np.uint16(0)).astype("<u2")
-    about = {"kind": "depth", "encoding": "u16-delta-zlib", "width": q.shape[1], "height": q.shape[0]}
-    return about | {"stride": stride, "near_m": near, "far_m": far}, zlib.compress(deltas.tobytes(), 1)
+    packed = vars(pack_depth(torch.from_numpy(z), stride)).copy()
+    data = packed.pop("data")
+    return {"kind": "depth", "encoding": "u16-delta-zlib", **packed}, data
 
 
 def film(body: dict) -> bytes:
     """The posted path as MP4."""
-    import av
-
-    file = io.BytesIO()
-    with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=body["fps"])
-        eyes = 1 if body["stereo_m"] is None else 2
-        stream.width, stream.height, stream.pix_fmt = eyes * body["width"], body["height"], "yuv420p"
-        for pose, now in zip(body["poses"], body["times"], strict=True):
-            image = scene.picture(*scene.render(pose, body["width"], body["height"], now), body["mode"])
-            image = np.hstack([image] * eyes)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")))
-        container.mux(stream.encode(None))
+    file, eyes = io.BytesIO(), 1 if body["stereo_m"] is None else 2
+    images = (
+        scene.picture(*scene.render(pose, body["width"], body["height"], now), body["mode"])
+        for pose, now in zip(body["poses"], body["times"], strict=True)
+    )
+    write_mp4(file, (np.hstack([image] * eyes) for image in images), float(body["fps"]))
     return file.getvalue()
-
-
-if __name__ == "__main__":
-    with StandIn(playing=True) as server:
-        print(server.url)
-        while True:
-            time.sleep(1)
