@@ -1,5 +1,6 @@
 """A real Chromium, and pages of it that look at a stand-in server; skipped where there is none."""
 
+import contextlib
 import os
 import shutil
 import time
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from live.browser.stand_in import StandIn
 
+SCREENSHOT_S = 60.0
 SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 
 
@@ -33,7 +35,7 @@ def browser():
 class View:
     """A page and what a test does with it."""
 
-    def __init__(self, page, server: StandIn, errors: list[str]) -> None:
+    def __init__(self, page, server, errors: list[str]) -> None:
         self.page, self.server, self.errors = page, server, errors
 
     def until(self, condition: str | Callable[[], object], seconds: float = 10.0) -> None:
@@ -95,17 +97,24 @@ class View:
 
 
 # Tests ask for small pictures at rest too, unless that is what they test: the stand-in traces each ray.
-def opened(browser, server: StandIn, size: str, query: str = "?sharp=0", **options) -> Iterator[View]:
+@contextlib.contextmanager
+def opened(browser, server, size="desktop", query="?sharp=0", route=None, **options) -> Iterator[View]:
+    """A page of a server or the stand-in, without errors; `route` answers its requests for assets, which may fail."""
     width, height = SIZES[size]
     touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
     context = browser.new_context(viewport={"width": width, "height": height}, **touch, **options)
     page = context.new_page()
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-    page.goto(server.url + query)
-    yield View(page, server, errors)
-    context.close()
+    page.on("console", lambda m: errors.append(m.text) if m.type == "error" and route is None else None)
+    if route is not None:
+        page.route("**/assets/**", route)
+    page.goto(f"{server.url.rstrip('/')}/{query}")
+    try:
+        yield View(page, server, errors)
+    finally:
+        if browser.is_connected():  # without a browser, closing waits for ever
+            context.close()
     assert not errors, errors
 
 
@@ -118,13 +127,13 @@ def server() -> Iterator[StandIn]:
 @pytest.fixture(params=list(SIZES))
 def view(browser, server, request) -> Iterator[View]:
     """A page that shows its first full picture, at both sizes."""
-    for one in opened(browser, server, request.param):
+    with opened(browser, server, request.param) as one:
         one.settle()
         yield one
 
 
 @pytest.fixture
 def desktop(browser, server) -> Iterator[View]:
-    for one in opened(browser, server, "desktop"):
+    with opened(browser, server) as one:
         one.settle()
         yield one

@@ -1,12 +1,9 @@
 """Models are compared, and cameras left out, while one looks: split view, original, error map and score."""
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
-import pytest
-from live.browser.test_page_drawing import SCREENSHOT_S, opened
-from live.live_servers import CAMERAS, PIPELINE, Running, get, running
+from live.browser.conftest import SCREENSHOT_S, opened
+from live.live_servers import CAMERAS, PIPELINE, get
 from reference.ball import BallCapture
 
 from viewmend import serve
@@ -15,18 +12,12 @@ from viewmend.models.smooth_fill import SmoothFill
 NAME = CAMERAS.names[0]
 
 
-@pytest.fixture(scope="module")
-def ball() -> Iterator[Running]:
-    with running() as server:
-        yield server
-
-
 def texts(view, *names: str) -> list[str]:
     return [view.page.locator(f"#{name}").inner_text() for name in names]
 
 
 def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
-    with opened(browser, ball, "time=0") as view:
+    with opened(browser, ball, query="?time=0") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
         (session,) = ball.live.registry.sessions
         assert view.page.locator("#input-row").is_hidden()
@@ -46,7 +37,7 @@ def test_a_camera_is_left_out_scored_and_used_again(browser, ball):
 
 
 def test_the_original_lies_behind_the_divider_in_its_place(browser, ball):
-    with opened(browser, ball, "time=0&mode=split&left=original&right=mended") as view:
+    with opened(browser, ball, query="?time=0&mode=split&left=original&right=mended") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
         view.page.keyboard.press("n")
         view.until(lambda: view.page.locator("#original-image").evaluate("i => i.complete && i.naturalWidth > 0"))
@@ -74,7 +65,7 @@ def test_the_original_lies_behind_the_divider_in_its_place(browser, ball):
 
 
 def test_two_models_are_compared(browser, ball):
-    with opened(browser, ball, "time=0&mode=split") as view:
+    with opened(browser, ball, query="?time=0&mode=split") as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
         view.page.locator("#split-left").select_option("mended")
         view.page.locator("#split-right").select_option("compared:paper-small")
@@ -89,7 +80,7 @@ def test_two_models_are_compared(browser, ball):
 
 
 def test_depth_and_errors_have_a_scale(browser, ball):
-    with opened(browser, ball, "time=0&mode=depth") as view:
+    with opened(browser, ball, query="?time=0&mode=depth") as view:
         view.until(lambda: view.page.locator("#scale").is_visible(), SCREENSHOT_S)
         far, near = (float(text.split()[0]) for text in texts(view, "scale-low", "scale-high"))
         assert far > near > 0

@@ -41,6 +41,15 @@ def test_modes_show_their_pictures(view):
         assert share(seen["Source cameras"], tuple(colour)) > 0.01
 
 
+def test_every_picture_can_be_chosen_and_all_are_seen_at_once_on_a_large_screen(view, desktop):
+    assert desktop.page.locator("#modes").evaluate("e => e.scrollWidth <= e.clientWidth")
+    strip = view.page.locator("#modes").get_by_role("radio")
+    assert strip.count() == 9
+    strip.last.scroll_into_view_if_needed()
+    box, width = strip.last.bounding_box(), view.page.viewport_size["width"]
+    assert box["x"] >= 0 and box["x"] + box["width"] <= width
+
+
 DIGITS = ["rendered", "holes", "mended", None, "depth", "coverage", "confidence", "hull", "points"]
 
 
@@ -192,13 +201,13 @@ def test_steps_and_clicks_start_from_what_is_shown(desktop):
 
 
 def test_what_the_address_asks_for_must_make_sense(browser, server):
-    for view in opened(browser, server, "desktop", "?sharp=0&mode=foo&left=split&size=big"):
+    with opened(browser, server, "desktop", "?sharp=0&mode=foo&left=split&size=big") as view:
         view.settle()
         assert server.looks[-1]["modes"] == ["mended"]
 
 
 def test_a_phone_that_is_turned_upright_has_its_tabs(browser, server):
-    for view in opened(browser, server, "phone"):
+    with opened(browser, server, "phone") as view:
         view.page.set_viewport_size({"width": 844, "height": 390})
         view.page.reload()
         view.settle()
@@ -285,7 +294,6 @@ def test_the_panel_makes_room(desktop):
 
 @pytest.mark.parametrize("codec", ["vp9", "h264"])
 def test_video_is_decoded_when_both_sides_can(desktop, codec):
-    pytest.importorskip("av")
     if codec not in desktop.server.hellos[0]["codecs"]:
         pytest.skip(f"this Chromium has no {codec}")
     before = desktop.picture()
@@ -299,8 +307,7 @@ def test_video_is_decoded_when_both_sides_can(desktop, codec):
 
 
 def test_a_browser_without_video_is_offered_jpeg_alone(browser):
-    with StandIn(video=False) as server:
-        for view in opened(browser, server, "desktop"):
-            view.settle()
-            assert view.page.locator("#codec").is_hidden()
-            assert view.server.looks[-1]["codec"] == "jpeg"
+    with StandIn(video=False) as server, opened(browser, server) as view:
+        view.settle()
+        assert view.page.locator("#codec").is_hidden()
+        assert view.server.looks[-1]["codec"] == "jpeg"

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from live.browser.conftest import SIZES, View
+from live.browser.conftest import SCREENSHOT_S, View, opened
 from live.live_servers import CAMERAS, Running, running, wait_until
 from reference.ball import photograph
 
@@ -20,31 +20,12 @@ from viewmend.models.base import RenderQuality
 
 MIN_DB, MIN_BALL_DB = 35.0, 32.0
 """Of a real scene; and of the ball, whose texture is as fine as its images of 48 pixels, which JPEG costs more."""
-SCREENSHOT_S = 60.0
 COUNT_PAINTS = """() => {
   window.paints = 0;
   const clear = WebGL2RenderingContext.prototype.clear;
   WebGL2RenderingContext.prototype.clear = function (mask) { window.paints += 1; clear.call(this, mask); };
 }"""
 STUDIO = {"source": "studio", "size": 256, "frames": 2, "cameras": 8}
-
-
-@contextlib.contextmanager
-def opened(browser, server: Running, query: str = "", size: str = "desktop", route=None) -> Iterator[View]:
-    width, height = SIZES[size]
-    touch = {"has_touch": True, "is_mobile": True} if size == "phone" else {}
-    page = browser.new_page(viewport={"width": width, "height": height}, **touch)
-    errors: list[str] = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda m: errors.append(m.text) if m.type == "error" and route is None else None)
-    if route is not None:
-        page.route("**/assets/**", route)
-    page.goto(f"{server.url}/?{query}")
-    try:
-        yield View(page, server, errors)
-    finally:
-        page.close()
-    assert not errors, errors
 
 
 @contextlib.contextmanager
@@ -110,31 +91,25 @@ def compare(browser, server: Running, azimuths, time: int = 0) -> list[float]:
     found = []
     for azimuth in azimuths:
         pose = pose_text(rig["home"], rig["center"], azimuth)
-        with silent(server), opened(browser, server, f"mode=rendered&time={time}&pose={pose}") as view:
+        with silent(server), opened(browser, server, query=f"?mode=rendered&time={time}&pose={pose}") as view:
             page = drawn(view, time)
             picture, _, mask = rendered(server, time)
             found.append(psnr_in_box(page, picture, mask, np.zeros_like(mask)))
     return found
 
 
-@pytest.fixture(scope="module")
-def balls() -> Iterator[Running]:
-    with running() as server:
-        yield server
+def test_the_page_draws_what_the_server_renders(browser, ball):
+    assert min(compare(browser, ball, (20, 75, 200))) > MIN_BALL_DB
 
 
-def test_the_page_draws_what_the_server_renders(browser, balls):
-    assert min(compare(browser, balls, (20, 75, 200))) > MIN_BALL_DB
-
-
-def test_holes_are_filled_marked_or_black(browser, balls):
-    rig = balls.service.renderer.rig_json
+def test_holes_are_filled_marked_or_black(browser, ball):
+    rig = ball.service.renderer.rig_json
     pose = pose_text(rig["home"], rig["center"], 300, 40)
     shown = {}
     for mode in ("mended", "holes", "rendered"):
-        with silent(balls), opened(browser, balls, f"mode={mode}&time=0&pose={pose}") as view:
+        with silent(ball), opened(browser, ball, query=f"?mode={mode}&time=0&pose={pose}") as view:
             shown[mode] = drawn(view)
-            _, holes, mask = rendered(balls, 0)
+            _, holes, mask = rendered(ball, 0)
     inner = holes & mask
     assert inner.sum() > 100
     assert shown["rendered"][inner].mean() < 8
@@ -147,15 +122,15 @@ def test_holes_are_filled_marked_or_black(browser, balls):
     assert np.abs(shown["mended"] - around)[among].mean() < 6, "holes continue what is around them"
 
 
-def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, balls):
-    with opened(browser, balls, "time=0") as view:
+def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, ball):
+    with opened(browser, ball, query="?time=0") as view:
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         view.page.wait_for_timeout(500)
         shown = view.picture()
-        with silent(balls):
-            picture, _, mask = rendered(balls, 0, "mended")
+        with silent(ball):
+            picture, _, mask = rendered(ball, 0, "mended")
             assert psnr_in_box(shown, picture, mask, np.zeros_like(mask)) > 30, "as JPEG"
-        (session,) = balls.live.registry.sessions
+        (session,) = ball.live.registry.sessions
         x, y = view.middle()
         view.page.mouse.move(x, y)
         view.page.mouse.down()
@@ -172,8 +147,8 @@ def test_the_server_completes_a_view_at_rest_and_a_movement_cancels_it(browser, 
         assert looks and not any(look.moving for look in looks), "the page draws moving views alone"
 
 
-def test_playing_costs_the_server_no_views(browser, balls):
-    with opened(browser, balls) as view:
+def test_playing_costs_the_server_no_views(browser, ball):
+    with opened(browser, ball, query="") as view:
         times = set()
 
         def seen() -> bool:
@@ -181,11 +156,11 @@ def test_playing_costs_the_server_no_views(browser, balls):
             return times >= {"0", "1", "2"}
 
         view.until(seen, SCREENSHOT_S)
-        wait_until(lambda: balls.live.registry.sessions[0].newest_look is None)
-        before = balls.service.counts["frames"]
+        wait_until(lambda: ball.live.registry.sessions[0].newest_look is None)
+        before = ball.service.counts["frames"]
         times.clear()
         view.until(seen, SCREENSHOT_S)
-        assert balls.service.counts["frames"] == before
+        assert ball.service.counts["frames"] == before
         view.page.keyboard.press("Space")
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         assert view.data("time") == view.data("drawn"), "it pauses at the frame that is shown"
@@ -194,7 +169,7 @@ def test_playing_costs_the_server_no_views(browser, balls):
 def test_a_rigs_frames_are_drawn_as_they_come_and_painted_once(browser):
     with running(PushSource(), ready=False) as server, Publisher(CAMERAS, server.ws, fps=10.0) as rig:
         rig.push(photograph(CAMERAS))
-        with opened(browser, server) as view:
+        with opened(browser, server, query="") as view:
             for number in range(4):
                 view.until(lambda: view.data("drawn") == str(number), SCREENSHOT_S)  # noqa: B023
                 rig.push(photograph(CAMERAS))
@@ -207,22 +182,22 @@ def test_a_rigs_frames_are_drawn_as_they_come_and_painted_once(browser):
             view.until("window.paints > 0", SCREENSHOT_S)
 
 
-def test_the_server_draws_where_asked_to_and_where_assets_are_missing(browser, balls):
+def test_the_server_draws_where_asked_to_and_where_assets_are_missing(browser, ball):
     requested = []
 
     def refuse(route):
         requested.append(route.request.url)
         route.fulfill(status=503, body="{}")
 
-    with opened(browser, balls, "render=server", route=refuse) as view:
+    with opened(browser, ball, query="?render=server", route=refuse) as view:
         view.until(lambda: view.data("frame") is not None, SCREENSHOT_S)
         assert not requested and view.data("drawn") is None
-    with opened(browser, balls, route=refuse) as view:
+    with opened(browser, ball, query="", route=refuse) as view:
         view.until(lambda: view.data("frame") is not None, SCREENSHOT_S)
         assert requested and view.data("drawn") is None
 
 
-def test_assets_are_fetched_again_where_the_server_was_too_busy(browser, balls):
+def test_assets_are_fetched_again_where_the_server_was_too_busy(browser, ball):
     tries = Counter()
 
     def busy(route):
@@ -234,7 +209,7 @@ def test_assets_are_fetched_again_where_the_server_was_too_busy(browser, balls):
         else:
             route.continue_()
 
-    with opened(browser, balls, route=busy) as view:
+    with opened(browser, ball, query="", route=busy) as view:
         view.until(lambda: view.data("drawn") is not None, SCREENSHOT_S)
     assert max(tries.values()) >= 3
 

@@ -13,12 +13,12 @@ def cover(view) -> str:
 
 def test_loading_is_said_until_the_first_picture(browser, server):
     server.hold, server.source = True, "loading"
-    for view in opened(browser, server, "phone"):
-        view.until(lambda view=view: "Loading" in cover(view))
+    with opened(browser, server, "phone") as view:
+        view.until(lambda: "Loading" in cover(view))
         server.source = "ready"
-        view.until(lambda view=view: "Rendering" in cover(view))
+        view.until(lambda: "Rendering" in cover(view))
         server.hold = False
-        view.until(lambda view=view: cover(view) == "")
+        view.until(lambda: cover(view) == "")
 
 
 def test_a_lost_connection_comes_back_with_view_and_time(desktop):
@@ -63,15 +63,15 @@ def test_while_it_is_lost_there_is_a_button(desktop):
 @pytest.mark.parametrize(("code", "words"), [(4401, "needs a token"), (4426, "Reload the page")])
 def test_a_final_refusal_says_what_to_do(browser, server, code, words):
     server.refuse = code
-    for view in opened(browser, server, "phone"):
-        view.until(lambda view=view: words in cover(view))
+    with opened(browser, server, "phone") as view:
+        view.until(lambda: words in cover(view))
         view.page.wait_for_timeout(700)
         assert not server.viewers
 
 
 def test_the_token_of_the_address_is_passed_on(browser, server):
     asked = []
-    for view in opened(browser, server, "desktop", "?token=a%20b"):
+    with opened(browser, server, "desktop", "?token=a%20b") as view:
         view.settle()
         view.page.on("request", lambda request: asked.append(request.url))
         for _ in range(2):
@@ -111,7 +111,6 @@ def test_broken_pictures_do_not_stop_the_page(desktop):
 
 
 def test_broken_video_falls_back_to_jpeg(desktop):
-    pytest.importorskip("av")
     if "vp9" not in desktop.server.hellos[0]["codecs"]:
         pytest.skip("this Chromium has no VP9")
     desktop.server.broken = True
@@ -123,7 +122,7 @@ def test_broken_video_falls_back_to_jpeg(desktop):
 
 
 def test_who_wants_no_motion_gets_none(browser, server):
-    for view in opened(browser, server, "desktop", reduced_motion="reduce"):
+    with opened(browser, server, reduced_motion="reduce") as view:
         view.settle()
         count = len(server.looks)
         view.page.locator("#cameras").get_by_role("button", name="cam03").click()

@@ -20,7 +20,6 @@ def eye(camera: dict) -> np.ndarray:
 
 def export(view, tmp_path) -> tuple[dict, list[np.ndarray]]:
     """Press the button; what was posted and the film's frames."""
-    pytest.importorskip("av")
     with view.page.expect_download(timeout=60_000) as waiting:
         view.page.get_by_role("button", name="Export MP4").click()
     path = tmp_path / waiting.value.suggested_filename
@@ -168,3 +167,18 @@ def test_a_file_that_is_no_path_is_said_and_changes_nothing(desktop, tmp_path, t
     desktop.page.locator("#path-file").set_input_files(file)
     desktop.until(lambda: "none.json is not a camera path" in desktop.page.locator("#toasts").inner_text())
     assert "2 views" in desktop.page.locator("#path-text").inner_text()
+
+
+def test_a_film_for_headsets_has_two_eyes_in_the_size_that_was_chosen(desktop, tmp_path):
+    for _ in range(2):
+        desktop.page.get_by_role("button", name="Add view").click()
+    desktop.page.locator("#path-stereo").check()
+    two, (both, *_) = export(desktop, tmp_path)
+    desktop.page.locator("#path-stereo").uncheck()
+    one, (alone, *_) = export(desktop, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"viewmend-path_SBS.mp4", "viewmend-path.mp4"}
+    assert two["stereo_m"] == pytest.approx(0.064) and one["stereo_m"] is None
+    assert (two["width"], two["height"]) == (240, 480) and (one["width"], one["height"]) == (480, 480)
+    assert two["poses"][0]["cx"] == 120
+    assert two["poses"][0]["fy"] < one["poses"][0]["fy"], "narrower, but nothing is cut"
+    assert both.shape == alone.shape == (480, 480, 3)

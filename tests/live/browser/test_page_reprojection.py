@@ -75,20 +75,6 @@ def test_what_was_hidden_is_dim_and_not_torn(desktop):
     assert (shown[~inside].max(-1) > 60).mean() < 0.03
 
 
-def test_the_page_repaints_faster_than_pictures_come(desktop):
-    desktop.server.hold = True
-    count = "document.querySelector('#figure-repaints').textContent"
-    desktop.page.mouse.move(*desktop.middle())
-    desktop.page.mouse.down()
-    for n in range(60):
-        desktop.page.mouse.move(400 + 3 * n, 300)
-        desktop.page.wait_for_timeout(16)
-    desktop.page.wait_for_timeout(400)
-    rate = float(desktop.page.evaluate(count))
-    desktop.page.mouse.up()
-    assert rate > 8, "of repaints a second on a machine that may be busy"
-
-
 HEADSET = """
 (() => {
   const eye = x => ({

@@ -17,7 +17,7 @@ def told(view) -> dict[str, str]:
 
 @pytest.mark.parametrize("size", ["phone", "desktop"])
 def test_at_rest_each_pixel_of_the_canvas_is_asked_for(browser, server, size):
-    for view in opened(browser, server, size, ""):
+    with opened(browser, server, size, "") as view:
         view.settle()
         look = view.server.looks[-1]
         page = view.page.viewport_size
@@ -41,7 +41,7 @@ def says(view, resolution: str) -> None:
 
 
 def test_the_slider_tells_the_resolution_that_is_shown(browser, server):
-    for view in opened(browser, server, "desktop", "?side=400"):
+    with opened(browser, server, "desktop", "?side=400") as view:
         view.settle()
         view.page.keyboard.press("Space")
         says(view, "504 × 316")  # 400 pixels squared in the page's shape
@@ -51,12 +51,11 @@ def test_the_slider_tells_the_resolution_that_is_shown(browser, server):
 
 def test_a_capture_of_one_time_has_no_timeline(browser, desktop):
     assert desktop.page.locator("#transport").is_visible()
-    with StandIn(frames=1, playing=True) as server:
-        for view in opened(browser, server, "phone", ""):
-            view.settle()
-            view.until(lambda view=view: view.page.locator("#transport").is_hidden())
-            assert view.page.locator("#modes").is_visible()
-            view.until(lambda view=view: view.server.looks[-1]["height"] == 844)  # at rest, though its clock runs
+    with StandIn(frames=1, playing=True) as server, opened(browser, server, "phone", "") as view:
+        view.settle()
+        view.until(lambda: view.page.locator("#transport").is_hidden())
+        assert view.page.locator("#modes").is_visible()
+        view.until(lambda: view.server.looks[-1]["height"] == 844)  # at rest, though its clock runs
 
 
 def test_a_reload_shows_the_same_pose_picture_and_time(view):
@@ -80,7 +79,7 @@ def test_a_reload_shows_the_same_pose_picture_and_time(view):
 
 @pytest.mark.parametrize("pose", ["1,2,3", "0,95,0,3,45,0,1,0", "0,x,0,3,45,0,1,0", "0,0,0,0,45,0,1,0"])
 def test_a_pose_that_makes_no_sense_is_the_home(browser, server, pose):
-    for view in opened(browser, server, "desktop", f"?sharp=0&pose={pose}&time=-3"):
+    with opened(browser, server, "desktop", f"?sharp=0&pose={pose}&time=-3") as view:
         view.settle()
         T = np.array(view.server.looks[-1]["camera"]["T"])
         R = np.reshape(view.server.looks[-1]["camera"]["R"], (3, 3))
@@ -88,7 +87,7 @@ def test_a_pose_that_makes_no_sense_is_the_home(browser, server, pose):
 
 
 def test_choices_are_kept_for_the_next_time(browser, server):
-    for view in opened(browser, server, "desktop"):
+    with opened(browser, server) as view:
         view.settle()
         view.page.locator("#side").fill("512")
         view.page.locator("#adaptive").set_checked(False)

@@ -4,25 +4,19 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
-from live.browser.conftest import SIZES, View
+from live.browser.conftest import SIZES, View, opened
 
 pytestmark = pytest.mark.slow
 SCENE = ("studio", "--size", "128", "--frames", "5", "--cameras", "6", "--port", "0", "--budget-ms", "0")
 
 
-@dataclass
-class Served:
-    url: str
-    looks: list[dict] = field(default_factory=list)
-
-
 @pytest.fixture(scope="module")
-def served() -> Iterator[Served]:
+def served() -> Iterator[SimpleNamespace]:
     command = [sys.executable, "-m", "viewmend", "serve", *SCENE]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
@@ -30,7 +24,7 @@ def served() -> Iterator[Served]:
             for line in process.stdout:
                 said.append(line)
                 if found := re.search(r"http://\S+", line):
-                    yield Served(found.group())
+                    yield SimpleNamespace(url=found.group())
                     break
             else:
                 pytest.fail("".join(said))
@@ -40,19 +34,12 @@ def served() -> Iterator[Served]:
 
 @pytest.fixture(params=list(SIZES))
 def view(browser, served, request) -> Iterator[View]:
-    width, height = SIZES[request.param]
-    page = browser.new_page(viewport={"width": width, "height": height})
-    errors: list[str] = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
-    page.goto(f"{served.url}?side=256&sharp=0&render=server")  # its pictures are what these tests are about
-    page.wait_for_selector("#picture[data-frame]", timeout=120_000)
-    page.locator("#play").click()
-    one = View(page, served, errors)
-    rest(one)
-    yield one
-    page.close()
-    assert not errors
+    # The server's pictures are what these tests are about.
+    with opened(browser, served, request.param, "?side=256&sharp=0&render=server") as view:
+        view.page.wait_for_selector("#picture[data-frame]", timeout=120_000)
+        view.page.locator("#play").click()
+        rest(view)
+        yield view
 
 
 def rest(view: View) -> None:
@@ -108,7 +95,6 @@ def test_the_re_projected_picture_is_nearly_what_the_server_then_answers(view):
 
 
 def test_a_film_of_a_path_plays(view, tmp_path):
-    pytest.importorskip("av")
     view.tab("path")
     for dx in (0, 60):
         view.drag(dx, 0)

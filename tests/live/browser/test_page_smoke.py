@@ -9,10 +9,9 @@ from live.browser.stand_in import StandIn, depth_part
 
 @pytest.fixture(scope="module")
 def page(browser):
-    with StandIn() as server:
-        for view in opened(browser, server, "desktop"):
-            view.settle()
-            yield view
+    with StandIn() as server, opened(browser, server) as view:
+        view.settle()
+        yield view
 
 
 def call(page, module: str, body: str, argument: object = None):

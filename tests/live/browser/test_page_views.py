@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from live.browser.conftest import SIZES
-from live.browser.test_page_drawing import SCREENSHOT_S, opened
+from live.browser.conftest import SCREENSHOT_S, SIZES, opened
 from live.live_servers import running
 
 
@@ -23,6 +22,7 @@ def test_a_turntable_and_the_order_of_views(desktop):
     (asked,) = desktop.server.turntables
     assert (asked["arc"], asked["width"], asked["height"]) == ("360", "480", "480") and int(asked["frames"]) > 1
     assert moments(page) == [n / 2 for n in range(9)]
+    desktop.server.film_hold = True
     page.get_by_role("button", name="Export MP4").click()
     desktop.until(lambda: bool(desktop.server.paths), 30)
     page.get_by_role("button", name="Cancel").click()
@@ -58,7 +58,7 @@ def test_a_link_is_copied(desktop):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_double_click_or_tap_turns_about_the_surface(browser, size):
-    with running() as server, opened(browser, server, "time=0", size) as view:
+    with running() as server, opened(browser, server, size, "?time=0") as view:
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         x, y = view.middle()
         if size == "phone":
@@ -79,7 +79,7 @@ def test_a_double_click_or_tap_turns_about_the_surface(browser, size):
 
 
 def test_the_cameras_show_their_images(browser):
-    with running() as server, opened(browser, server, "time=0&pose=20,20,0,9,45,0,0,0") as view:
+    with running() as server, opened(browser, server, query="?time=0&pose=20,20,0,9,45,0,0,0") as view:
         view.until(lambda: view.data("full") == "true", SCREENSHOT_S)
         before = view.picture()
         view.page.keyboard.press("g")
