@@ -3,7 +3,7 @@
 import json
 import struct
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from safetensors.torch import save_file
 
 from viewmend.evaluation.averages import records
 from viewmend.evaluation.result_cache import Cell, CellKey, CellStore
-from viewmend.evaluation.scene_run import MethodRun
 from viewmend.evaluation.scores import KINDS, ViewScores
 from viewmend.models.paper.config import paper_small
 from viewmend.training.config import TrainConfig
@@ -71,7 +70,7 @@ def cell() -> Cell:
 
 def test_features_with_a_truncated_header_are_ignored(tmp_path):
     store = CellStore(tmp_path)
-    store.save(cell(), MethodRun("m", cell().frames))
+    store.save(cell(), None)
     head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1, 1024, \n"
     with zipfile.ZipFile(tmp_path / f"{cell().key.stem}.npz", "w") as packed:
         for kind in KINDS:
@@ -82,7 +81,7 @@ def test_features_with_a_truncated_header_are_ignored(tmp_path):
 def test_cells(tmp_path):
     store = CellStore(tmp_path)
     features = {kind: np.zeros((1, 1024), np.float32) for kind in KINDS}
-    store.save(cell(), MethodRun("m", cell().frames, features=features))
+    store.save(replace(cell(), features=features), None)
     key = cell().key
     assert store.load(key) == cell() and store.load(key).features is not None
 
