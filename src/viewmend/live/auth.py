@@ -28,7 +28,7 @@ class AccessControl:
     def __init__(self, host: str, token: str | None, public_url: str | None = None) -> None:
         """Set up the checks of one server, which a proxy may serve at a public address.
 
-        ValueError if other machines can reach the server and there is no token, or if token or address are none.
+        ValueError if other machines can reach the server and there is no token, or the token or the address is invalid.
         """
         if token is not None and len(token) < MIN_TOKEN_LENGTH:
             raise ValueError(

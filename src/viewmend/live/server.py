@@ -69,7 +69,7 @@ ExtensionFactory = Callable[[RenderService, ServerConfig], Extension]
 
 
 def load_extension(name: str, value: Any) -> ExtensionFactory:
-    """Prepare an optional part of the server with the value of its option; ValueError or OSError if that cannot be."""
+    """Prepare an optional part of the server with the value of its option; ValueError or OSError if it cannot."""
     return import_object(EXTENSIONS[name])(value)
 
 

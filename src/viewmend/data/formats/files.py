@@ -98,7 +98,7 @@ def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -
 
 
 def frame_pattern(paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """A path with `{frame}`, and the part in which each path differs, with all digits; ValueError for several parts."""
+    """A path with `{frame}`, and the number in which each path differs; ValueError if paths differ in several parts."""
     if len(set(paths)) == 1:
         return paths[0], ("0",) * len(paths)
     same = [takewhile(lambda at: len(set(at)) == 1, zip(*(p[::step] for p in paths), strict=False)) for step in (1, -1)]

@@ -36,7 +36,7 @@ Points = Float64[np.ndarray, "point 2"]
 
 
 def refined(grey: Grey, pixels: Points, on_board_m: Points, square_m: float, marker_m: float) -> Points:
-    """The pixels of a board's corners where its edges cross; those about which too little is seen stay.
+    """Move a board's corners to where its edges cross, in pixels; corners with too few edge pixels stay where they are.
 
     They were found at `pixels`, to a pixel or two; the top-left pixel has its centre at (0.5, 0.5). On the board, along
     its edges, they are at `on_board_m`. `square_m` is a square's side, `marker_m` that of a marker in its middle.

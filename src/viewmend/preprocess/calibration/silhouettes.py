@@ -84,7 +84,7 @@ class Refinement:
 
 
 def refine_by_silhouettes(frames: Sequence[MultiViewFrame], bounds: Sequence[Bounds], hold: float) -> Refinement:
-    """Refine poses and focal lengths of `LEAST_CAMERAS` or more by some frames; several times tell more than one.
+    """Refine poses and focal lengths of `LEAST_CAMERAS` or more; several frames constrain them better than one.
 
     The rig as a whole stays where it was, and as large. `bounds` are boxes around the subject, one for each frame;
     `hold` is one of `HOLDS`. Here and below, a CaptureError is raised for frames without masks, and a ValueError for
