@@ -1,8 +1,12 @@
 """The server from Python: an address, what pages show, and an end; and the command that opens a browser."""
 
+import asyncio
 import json
+import math
+import time
 import urllib.error
 import urllib.request
+from unittest.mock import Mock
 
 import pytest
 from live.live_servers import CAMERAS, PIPELINE, get, say_hello
@@ -13,6 +17,10 @@ from viewmend import serve
 from viewmend.cli import main, view
 from viewmend.data.native_writer import write_capture
 from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.live.connection import SessionRegistry, ViewerConnection
+from viewmend.live.frame_source import SourceStatus, Span
+from viewmend.live.protocol import Limits
+from viewmend.live.service import RenderService
 from viewmend.live.viewer import Viewer
 from viewmend.models.smooth_fill import SmoothFill
 
@@ -45,6 +53,25 @@ def test_pages_show_what_the_program_wants():
                 viewer.show(**wrong)
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(address, timeout=5)
+
+
+def test_what_is_shown_while_the_first_page_opens_reaches_it():
+    """The program sets it on its own thread, perhaps just after the page was informed."""
+    source = Mock(span=Span(), status=SourceStatus())
+    service = Mock(spec=RenderService, source=source, renderer=Mock(rig_json=None), error=None, now=lambda: 0.0)
+    registry, page, shown = SessionRegistry(service, Limits(), None, {}), Mock(spec=ViewerConnection), []
+
+    async def open_page() -> None:
+        page.inform.side_effect = lambda common: shown.append(common[1]) or math.inf
+        registry.join(page)
+        registry.shown = {"type": "show", "time": 1}
+        end = time.monotonic() + 60
+        while len(shown) < 2 and time.monotonic() < end:
+            await asyncio.sleep(0.01)
+        registry.connections.clear()
+
+    asyncio.run(open_page())
+    assert shown == [None, {"type": "show", "time": 1}]
 
 
 def test_the_command_opens_a_browser(monkeypatch, tmp_path, capsys):

@@ -56,12 +56,14 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
     from viewmend.data.checks.calibration import check_calibration, draw_check
     from viewmend.data.checks.synchronisation import find_desynchronised_cameras
     from viewmend.data.errors import without_consequences
-    from viewmend.data.images import write_image
+    from viewmend.data.images import check_image_name, write_image
     from viewmend.data.native_capture import NativeCapture
     from viewmend.data.prepare import adjustments
     from viewmend.utils.atomic_writes import remove_partial_file
 
     capture = NativeCapture(options.capture, format=options.format)
+    if options.out is not None:
+        check_image_name(options.out)
     if not 0 <= options.frame < len(capture.frame_ids):
         last = len(capture.frame_ids) - 1
         raise ValueError(f"{options.capture}: expected --frame of 0 to {last}, got {options.frame}; choose again")

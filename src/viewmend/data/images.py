@@ -259,9 +259,14 @@ def write_depth(path: Path, depth_m: Float32[np.ndarray, "height width"]) -> Non
     _write(path, np.rint(depth_m * DEPTH_UNITS_PER_M).astype(np.uint16), ())
 
 
-def _write(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
+def check_image_name(path: Path) -> None:
+    """ValueError unless the suffix of a file to write is that of an image format."""
     if not path.suffix or not cv2.haveImageWriter(path.suffix):
         raise ValueError(f"expected the file name of an image, got {path}; use the suffix .png or .jpg")
+
+
+def _write(path: Path, image: np.ndarray, options: tuple[int, ...]) -> None:
+    check_image_name(path)
     done, data = cv2.imencode(path.suffix, image, options)
     if not done:
         got = f"{image.shape} {image.dtype}"

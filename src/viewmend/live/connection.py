@@ -90,13 +90,14 @@ class SessionRegistry:
 
     def join(self, connection: "ViewerConnection") -> None:
         """Inform a viewer from now on."""
-        self.connections[connection] = connection.inform(self.common())
+        common = self.common()
+        self.connections[connection] = connection.inform(common)
         if self._informer is None or self._informer.done():
-            self._informer = asyncio.create_task(self._inform())
+            self._informer = asyncio.create_task(self._inform(common))
 
-    async def _inform(self) -> None:
-        """Let all connections send what is due, while there are any."""
-        common, news, loop = self.common(), asyncio.Event(), asyncio.get_running_loop()
+    async def _inform(self, common: Common) -> None:
+        """Let all connections send what is due, while there are any; they have been informed of `common`."""
+        news, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def note() -> None:
             with contextlib.suppress(RuntimeError):  # the event loop has ended
