@@ -9,7 +9,7 @@ import urllib.request
 from unittest.mock import Mock
 
 import pytest
-from live.live_servers import CAMERAS, PIPELINE, get, say_hello
+from live.live_servers import CAMERAS, PIPELINE, WAIT_S, get, in_own_loop, say_hello
 from reference.ball import BallCapture
 from websockets.sync.client import connect
 
@@ -55,22 +55,19 @@ def test_pages_show_what_the_program_wants():
         urllib.request.urlopen(address, timeout=5)
 
 
-def test_what_is_shown_while_the_first_page_opens_reaches_it():
+@in_own_loop
+async def test_what_is_shown_while_the_first_page_opens_reaches_it():
     """The program sets it on its own thread, perhaps just after the page was informed."""
     source = Mock(span=Span(), status=SourceStatus())
     service = Mock(spec=RenderService, source=source, renderer=Mock(rig_json=None), error=None, now=lambda: 0.0)
     registry, page, shown = SessionRegistry(service, Limits(), None, {}), Mock(spec=ViewerConnection), []
-
-    async def open_page() -> None:
-        page.inform.side_effect = lambda common: shown.append(common[1]) or math.inf
-        registry.join(page)
-        registry.shown = {"type": "show", "time": 1}
-        end = time.monotonic() + 60
-        while len(shown) < 2 and time.monotonic() < end:
-            await asyncio.sleep(0.01)
-        registry.connections.clear()
-
-    asyncio.run(open_page())
+    page.inform.side_effect = lambda common: shown.append(common[1]) or math.inf
+    registry.join(page)
+    registry.shown = {"type": "show", "time": 1}
+    end = time.monotonic() + WAIT_S
+    while len(shown) < 2 and time.monotonic() < end:
+        await asyncio.sleep(0.01)
+    registry.connections.clear()
     assert shown == [None, {"type": "show", "time": 1}]
 
 
