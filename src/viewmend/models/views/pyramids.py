@@ -85,7 +85,8 @@ class MipLevels(NamedTuple):
         view = torch.arange(images.shape[0], device=device)
         pixels = bordered.movedim(1, 3).flatten(0, 2)
         scale = torch.ones_like(view, dtype=torch.double)
-        size = torch.tensor([[rows, columns]], device=device).expand(len(images), 2)
+        # len(images) would make the number of cameras of an exported model constant.
+        size = torch.tensor([[rows, columns]], device=device).expand(images.shape[0], 2)
         return cls(pixels, view * (rows * columns), 0 * view + columns, size, scale)
 
 
