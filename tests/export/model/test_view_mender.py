@@ -1,5 +1,7 @@
 """What is exported computes what the model computes, whatever the sizes, the rig and the holes."""
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
@@ -7,8 +9,8 @@ import torch
 from reference.random_views import holed, images, mended, random_view
 
 from viewmend.export.traceable import ExportedModel, ViewInputs, ViewOutputs, fill_any_size, pull_push_any_size
+from viewmend.models.checkpoint import save_inpainter
 from viewmend.models.smooth_fill import fill, pull_push
-from viewmend.models.views import prediction
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
 
@@ -19,12 +21,6 @@ CONFIG = ViewsConfig(num_views=4, width=8, sample_channels=4, features=8, fine_f
 def net():
     torch.manual_seed(0)
     return ViewSynthNet(CONFIG).eval().requires_grad_(False)
-
-
-@pytest.fixture(autouse=True)
-def remains_stay(monkeypatch):
-    """As in the exported model."""
-    monkeypatch.setattr(prediction, "remains_of_phantoms", lambda colour, alpha, predicted: torch.zeros_like(predicted))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -88,3 +84,14 @@ def test_a_view_that_names_one_camera_is_refused(net):
     alone = replace(view, candidate_views=one, source_views=one, weights=view.weights[:1])
     with pytest.raises(ValueError, match="at least two cameras with a frame, got"):
         ViewInputs.of(alone, context, 4)
+
+
+def test_the_model_is_traced_for_all_sizes(net, tmp_path):
+    """In a process of its own: the type checks of tests are not to be traced."""
+    save_inpainter(net, tmp_path / "tiny", "# card")
+    load = f"load_inpainter({str(tmp_path / 'tiny')!r}, precision='float32')"
+    code = "from viewmend.export.model import trace; from viewmend.models.checkpoint import load_inpainter"
+    command = [sys.executable, "-c", f"{code}; print(trace({load}).range_constraints)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "VR[2, 64]" in done.stdout, "any number of cameras"
