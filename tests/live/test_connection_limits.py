@@ -14,6 +14,7 @@ from live.live_servers import FakeClock, close_code, exchange, in_own_loop, open
 from uvicorn.server import ServerState
 
 from viewmend.live import connection_limits as limits
+from viewmend.live.auth import AccessControl
 from viewmend.live.client import Client
 from viewmend.live.connection_limits import ConnectionLimits, FairScheduler, LimitedConnection
 from viewmend.live.push import PushSource
@@ -471,3 +472,15 @@ def test_the_server_stops_while_clients_are_connected(caplog):
         again.bind(("127.0.0.1", server.port))
     wait_until(lambda: set(threading.enumerate()) <= before)
     assert "Traceback" not in caplog.text
+
+
+def test_a_handshake_that_the_stopping_server_has_ended_is_not_answered_again(monkeypatch, caplog):
+    async def has_token_too_late(access, request):
+        next(iter(server.connections))._uvicorn.shutdown()
+        return False
+
+    monkeypatch.setattr(AccessControl, "has_token", has_token_too_late)
+    with running(token=TOKEN) as server, open_socket(server) as raw:
+        raw.sendall(WRONG)
+        assert read_to_end(raw).count(b"HTTP/1.1") == 1
+    assert not caplog.records

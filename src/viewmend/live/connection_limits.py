@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 from uvicorn.config import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.server import ServerState
 
 MAX_UNAUTHENTICATED = 128
@@ -309,10 +310,19 @@ class ConnectionLimits:
                 connection.message_bytes = 0
                 return message
 
+            def raise_if_ended() -> None:
+                # A stopping server ends handshakes. uvicorn would answer them again, but not after this error.
+                if scope["type"] == "websocket" and connection.is_closing():
+                    raise ClientDisconnected
+
+            async def send_if_open(message: Message) -> None:
+                raise_if_ended()
+                await send(message)
+
             connection.requests += 1
             try:
                 if await connection.wait_for_turn():
-                    await app(scope, receive_next, send)
+                    await app(scope, receive_next, send_if_open)
             except (OSError, WebSocketDisconnect):
                 log.debug("a client has gone while it was answered")
             except Exception:
@@ -321,6 +331,7 @@ class ConnectionLimits:
             finally:
                 connection.requests -= 1
                 connection.idle_since_s = self.now()
+            raise_if_ended()
 
         return limited
 
