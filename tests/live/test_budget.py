@@ -20,6 +20,7 @@ from viewmend.live.budget import (
 )
 from viewmend.live.protocol import FrameTimes, Limits
 from viewmend.models.classical import Telea
+from viewmend.models.paper.config import PAPER_TOP_K
 from viewmend.models.views.config import ViewsConfig
 from viewmend.models.views.model import ViewSynthNet
 
@@ -117,6 +118,7 @@ def test_a_model_that_predicts_errors_refines_a_part_instead_of_using_less_conte
     assert ladder_for(ViewSynthNet(ViewsConfig(error_features=8))) is REFINE_LADDER
     assert ladder_for(ViewSynthNet(ViewsConfig())) is CONTEXT_LADDER and ladder_for(Telea()) is CONTEXT_LADDER
     assert all(level.context_times == FULL.context_times for level in REFINE_LADDER.levels)
+    assert all((level.top_k or 0) <= PAPER_TOP_K for level in CONTEXT_LADDER.levels), "no level keeps more than FULL"
     assert all(0 <= level.refine_fraction < 1 for level in REFINE_LADDER.levels[:-1])
 
 

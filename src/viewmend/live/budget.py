@@ -49,7 +49,7 @@ class QualityLevel:
     context_times: int
     """Number of context frames, the latest first; 0: no camera image is encoded."""
     top_k: int | None
-    """Context tokens that survive pruning; None for all."""
+    """Context tokens that survive pruning; None for the model's own number."""
     refine_fraction: float | None = None
     """Part of the subject that is inpainted; None for all that the error rule selects, 0 fades background only."""
 
@@ -88,7 +88,7 @@ CONTEXT_LADDER = Ladder(
         *(QualityLevel(scale, 0, 256) for scale in SCALES),
         QualityLevel(1.0, 1, 256),
         QualityLevel(1.0, 2, 512),
-        QualityLevel(1.0, 4, 1024),
+        QualityLevel(1.0, 4, 512),
         FULL,
     ),
     moving=QualityLevel(0.5, 0, 256),

@@ -104,7 +104,7 @@ def decide_error_mask(
         view: the view as rendered.
         evidence: what the error rule decides from; None keeps the view's own E.
         rule: name of the error rule.
-        fraction: re-synthesise at most this fraction of the proxy's pixels, in addition to the holes; None: all of E.
+        fraction: re-synthesise this fraction of the proxy's pixels, all holes first; None: all of E.
         inpainter: the inpainter that will complete the view.
         context: the cameras.
         error_model: predicts errors for inpainters that do not.
@@ -134,7 +134,7 @@ def decide_error_mask(
 def select_by_gain(
     view: IncompleteView, gain: Float[Tensor, "height width"], fraction: float
 ) -> Float[Tensor, "height width"]:
-    """1 on holes and on the pixels of highest gain, at most `fraction` of the proxy's pixels in addition to holes."""
+    """1 on holes and on the pixels of highest gain, up to `fraction` of the proxy's pixels, holes included."""
     first = (gain + view.holes).flatten()
     count = min(int(fraction * int((view.mask > 0).sum())), int((first > MIN_GAIN).sum()))
     chosen = torch.zeros_like(first).index_fill(0, first.topk(count).indices, 1.0).view_as(view.mask)

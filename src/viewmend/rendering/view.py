@@ -43,7 +43,7 @@ class RenderConfig:
     """Pixels to inpaint: 'holes', which no source camera colours; 'all' of the subject; 'predicted', those that a model
     predicts to be wrong; or FILE.py:NAME. None: the rule that the inpainter is made for."""
     refine_fraction: float = 0.15
-    """Rule 'predicted': largest fraction of the subject's pixels to inpaint in addition to the holes."""
+    """Rule 'predicted': largest fraction of the subject's pixels to inpaint, all holes first."""
 
     def __post_init__(self) -> None:
         error_rule(self.error_rule or "holes")
