@@ -188,7 +188,12 @@ def test_scenes_of_one_name_and_unknown_methods_are_refused(small_scenes, tmp_pa
 
 def test_other_settings_are_other_cells(small_scenes):
     usual = cell_keys(small_scenes[0], {"telea": "x"}, RunSettings())
-    for other in ({"ssim": "uniform7"}, {"precision": "bfloat16"}, {"background": "white"}):
+    for other in (
+        {"ssim": "uniform7"},
+        {"precision": "bfloat16"},
+        {"background": "white"},
+        {"protocol": "target-mask"},
+    ):
         assert cell_keys(small_scenes[0], {"telea": "x"}, RunSettings(**other)) != usual
     assert cell_keys(small_scenes[0], {"telea": "y"}, RunSettings()) != usual
     assert cell_keys(replace(small_scenes[0], held="cam03"), {"telea": "x"}, RunSettings()) != usual

@@ -7,6 +7,7 @@ import torch
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
 
 from viewmend.data.errors import CaptureError
+from viewmend.data.holdout.capture_scenes import make_splits, read_splits, splits_json
 from viewmend.data.native_writer import write_capture
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.checkpoint import load_network
@@ -57,6 +58,22 @@ def test_what_is_held_back_is_scored(place):
     table = list(held_back_views(place, AUTO, table=True))
     assert [view.camera for view in table] == ["cam02", "cam00", "cam01", "cam03", "cam04"]
     assert {view.truth.time for view in table} == {3}
+
+
+def test_of_a_splits_file_the_last_frames_are_held_back(tmp_path):
+    takes = [tmp_path / name for name in ("ada", "bea", "cleo")]
+    for number, take in enumerate(takes):
+        write_capture(Studio(StudioConfig(seed=number, cameras=5, frames=4, size_px=96)), take)
+    file = tmp_path / "splits.json"
+    file.write_text(splits_json(make_splits(takes, tmp_path)))
+    scenes = replace(SCENES, captures=(file,), captures_fraction=1.0, hold_out=AUTO)
+    rigs = [rig_source(scenes, (0, 1), "tests").rig(number) for number in range(12)]
+    assert {time for own in rigs for time in own.rig.frames} == {0, 1, 2}
+    training = {scene.left_out for scene in read_splits(file).scenes if scene.split == "training"}
+    assert {own.held_out for own in rigs} == training
+    views = list(held_back_views(file, AUTO))
+    assert {view.truth.time for view in views} == {3} and not any(view.trained_on for view in views)
+    assert len(list(held_back_views(file, AUTO, table=True))) == 5
 
 
 def test_the_table_tells_better_weights_from_worse_ones(place, tmp_path):

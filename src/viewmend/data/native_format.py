@@ -153,7 +153,7 @@ def read_calibration(folder: Path) -> NativeCalibration:
         got = "the folder has none" if folder.is_dir() else "there is no such folder"
         raise CaptureError(f"expected a capture folder with {path}, but {got}; check the path")
     try:
-        content = typed(read_json(bounded_bytes(path)), dict[str, Any], "see docs/plain-capture.md")
+        content = typed(read_json(bounded_bytes(path)), dict[str, Any], "see docs/capture-format.md")
         _check_keys(content)
         return calibration_from_content(content, path)
     except ValueError as error:

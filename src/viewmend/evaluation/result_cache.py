@@ -157,7 +157,7 @@ class CellStore:
 def cell_keys(scene: LeaveOneOutScene, identities: dict[str, str], settings: RunSettings) -> tuple[CellKey, ...]:
     """The keys of one scene's cells, for methods by name and their identities."""
     rules = [PROTOCOL, scene.definition, settings.device.split(":")[0], repr(settings.stream), settings.ssim]
-    rules += [] if settings.background == "black" else [settings.background]
+    rules += [value for value in (settings.background, settings.protocol) if value not in ("black", "strict")]
     rules += [error_rule(settings.stream.render.error_rule or "holes").__module__]  # has the hash of a user's file
     scene_digest = _digest([*rules, *settings.networks])
     return tuple(

@@ -10,8 +10,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.data.errors import CaptureError
+from viewmend.data.holdout.capture_scenes import is_splits, training_captures
 from viewmend.data.holdout.scenes import LeaveOneOut
 from viewmend.data.images import write_image
+from viewmend.data.native_capture import NativeCapture
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.data.source import CaptureSource
 from viewmend.frame_cache import CachedFrame
@@ -48,18 +50,21 @@ class HeldBack:
     """The camera and the frames of a capture that training never uses."""
 
     camera: str | None
-    """None for rigs of fewer than `MIN_CAMERAS`."""
+    """None for rigs of fewer than `MIN_CAMERAS`, and for those of a splits file."""
     first_frame: int
     """Frames from this one on; the number of frames if the capture has only one."""
 
     @classmethod
-    def of(cls, capture: CaptureSource, camera: str) -> "HeldBack":
-        """This camera, or with `AUTO` the middle one of the rig, and the last tenth of the frames.
+    def of(cls, capture: CaptureSource, camera: str | None) -> "HeldBack":
+        """This camera, with `AUTO` the middle one of the rig, or none, and the last tenth of the frames.
 
         Raises:
             CaptureError: there is no such camera, or too few others.
         """
         names, count = capture.cameras.names, len(capture.frame_ids)
+        first_frame = count - math.ceil(TAIL * count) if count > 1 else 1
+        if camera is None:
+            return cls(None, first_frame)
         if camera != AUTO and camera not in names:
             raise CaptureError(f"{capture.name}: expected --hold-out among {', '.join(names)}, got '{camera}'")
         if camera != AUTO and len(names) < MIN_CAMERAS:
@@ -68,7 +73,33 @@ class HeldBack:
                 "--hold-out away: only the last frames are held back then"
             )
         chosen = names[len(names) // 2] if camera == AUTO else camera
-        return cls(chosen if len(names) >= MIN_CAMERAS else None, count - math.ceil(TAIL * count) if count > 1 else 1)
+        return cls(chosen if len(names) >= MIN_CAMERAS else None, first_frame)
+
+
+@dataclass(frozen=True)
+class TrainingCapture:
+    """A capture to train on."""
+
+    source: NativeCapture
+    left_out: str | None
+    """The one camera that is the ground truth; None for all in turn."""
+    held_back: HeldBack | None
+
+
+def open_training_captures(place: Path, hold_out: str | None) -> list[TrainingCapture]:
+    """A capture; or the training captures of a splits file, of which only the last frames are held back.
+
+    Raises:
+        CaptureError: a capture cannot be used, or has no camera `hold_out`.
+        ValueError: the splits file has no training captures, or one of them is absent or was recalibrated.
+    """
+    if is_splits(place):
+        return [
+            TrainingCapture(source, left_out, None if hold_out is None else HeldBack.of(source, None))
+            for source, left_out in training_captures(place)
+        ]
+    source = open_masked(place, held=1)
+    return [TrainingCapture(source, None, None if hold_out is None else HeldBack.of(source, hold_out))]
 
 
 @dataclass(frozen=True)
@@ -130,10 +161,16 @@ def held_back_views(place: Path, hold_out: str, table: bool = False) -> Iterator
     """The views on which a run is validated, or with `table` those of its final table, the held-back camera first.
 
     A camera is rendered from all others, as `viewmend mend --leave-out` does. Without a held-back camera, all cameras
-    are rendered at frames that are held back. Raises CaptureError if the capture cannot be used.
+    are rendered at frames that are held back. Of a splits file, the first `MAX_VIEWS` captures are used, for the table
+    the first. Raises as `open_training_captures`.
     """
-    capture = open_masked(place, held=1)
-    own, names, count = HeldBack.of(capture, hold_out), capture.cameras.names, len(capture.frame_ids)
+    for opened in open_training_captures(place, hold_out)[: 1 if table else MAX_VIEWS]:
+        assert opened.held_back is not None, "something is held back"
+        yield from _views_of(opened.source, opened.held_back, table)
+
+
+def _views_of(capture: NativeCapture, own: HeldBack, table: bool) -> Iterator[HeldBackView]:
+    names, count = capture.cameras.names, len(capture.frame_ids)
     late = range(own.first_frame, count) if count > 1 else range(1)
     if table:
         others = [name for name in names if name != own.camera]

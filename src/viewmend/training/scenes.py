@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from random import Random
 from typing import Protocol, runtime_checkable
 
-from viewmend.data.holdout.capture_scenes import is_splits, training_captures
 from viewmend.data.holdout.scenes import PROCEDURAL_SEEDS, LeaveOneOut, Split, recordings
-from viewmend.data.native_capture import NativeCapture
-from viewmend.data.prepare import PreparedCapture, open_masked, prepare
+from viewmend.data.prepare import PreparedCapture, prepare
 from viewmend.data.source import CaptureSource, limit_size
 from viewmend.data.synthetic.imperfections import Imperfections
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.geometry.cameras import Cameras
 from viewmend.training.config import SamplingConfig, SceneConfig
-from viewmend.training.held_back import HeldBack
+from viewmend.training.held_back import HeldBack, open_training_captures
 from viewmend.training.samples import Sample, rig_samples
 from viewmend.types import MultiViewFrame
 
@@ -171,19 +168,11 @@ def rig_source(config: SceneConfig, frames: Sequence[int], seed: str, split: Spl
     studio = StudioRigs(config, frames, seed, split)
     if not (folders := recordings(split, config.captures)):
         return studio
-    opened = [own for folder in folders for own in _open_captures(folder)]
+    opened = [own for folder in folders for own in open_training_captures(folder, config.hold_out)]
     # Only for its checks: each held-out camera has its own alignment.
-    captures = [(prepare(capture, align=False, match_colours=False), held) for capture, held in opened]
-    back = [
-        None if held is not None or config.hold_out is None else HeldBack.of(capture, config.hold_out)
-        for capture, held in opened
-    ]
+    captures = [(prepare(own.source, align=False, match_colours=False), own.left_out) for own in opened]
+    back = [own.held_back for own in opened]
     return MixedRigs(CaptureRigs(captures, config, frames, seed, back), studio, config.captures_fraction, seed)
-
-
-def _open_captures(place: Path) -> Sequence[tuple[NativeCapture, str | None]]:
-    """A capture; or the training captures of a splits file, each with the camera that it holds out."""
-    return training_captures(place) if is_splits(place) else [(open_masked(place, held=1), None)]
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,11 @@ def test_the_calibration_may_be_named_by_its_file(folder):
     assert len(rig.cameras) == 2
 
 
+def test_masks_are_made_by_the_person_network_unless_the_file_says_otherwise(folder):
+    cameras = "".join(f'[[cameras]]\nname = "{name}"\nurl = "{name}.mp4"\n' for name in NAMES)
+    assert {camera.mask.method for camera in read(folder, f'calibration = "take"\n{cameras}').cameras} == {"person"}
+
+
 ONE = '[[cameras]]\nname = "left"\nurl = "a.mp4"\n'
 HEAD = 'calibration = "take"\n[mask]\nmethod = "plate"\n'
 

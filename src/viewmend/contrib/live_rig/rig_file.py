@@ -64,7 +64,7 @@ class RigFile(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fps: Annotated[float, Meta(ge=0.1, le=240)] = 15.0
     tolerance_ms: Milliseconds | None = None
     wait_ms: Milliseconds = 200.0
-    mask: MaskEntry
+    mask: MaskEntry = MaskEntry()
     cameras: Annotated[tuple[RigCameraEntry, ...], Meta(min_length=2, max_length=128)]
 
     def __post_init__(self) -> None:
