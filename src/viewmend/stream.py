@@ -144,7 +144,8 @@ class Stream:
             carving: masks of more cameras that carve the hull, although their images are not used.
 
         Raises:
-            ValueError: no `geometry` is given, and the frame has no masks, no foreground, or a single camera.
+            ValueError: no `geometry` is given, and the frame has no masks, no foreground, a single camera, or cameras
+                that look away from each other.
         """
         if frame.time not in self._frames:
             frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
@@ -180,8 +181,8 @@ class Stream:
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
-            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, no camera is left, or
-                `target_mask` is not a mask of the view.
+            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, no camera is left,
+                `target_mask` is not a mask of the view, or the error rule needs a model that predicts errors.
         """
         part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
         return crop.uncropped(self._with_error_mask(part, evidence, RenderQuality(), exclude), target)
@@ -206,7 +207,8 @@ class Stream:
 
         Raises:
             ValueError: the view's frame is not cached, the view names cameras that are not in the frame, its
-                `target_mask` is not a mask of it, or the inpainter returns numbers that are not finite.
+                `target_mask` is not a mask of it, the inpainter returns numbers that are not finite, or `quality` needs
+                a model that predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)

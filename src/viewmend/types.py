@@ -92,7 +92,7 @@ class MultiViewFrame(_LazyStacks, OnDevice):
     def select(self, names: Sequence[str]) -> "MultiViewFrame":
         """The same frame with only these cameras, in this order; ValueError for an unknown name.
 
-        Nothing is copied until `rgb` or `mask` is read.
+        Images and masks are copied only when they are read; ground-truth depth at once.
         """
         if tuple(names) == self.cameras.names:
             return self
@@ -288,8 +288,8 @@ class CompletedView:
     rgb: Float[Tensor, "3 height width"]
     """Fhat, in [0, 1], on black; equal to `view.cut_rgb` bit for bit where E is 0."""
     alpha: Float[Tensor, "height width"] | None = None
-    """Coverage of each pixel by the subject, in [0, 1]; `rgb` is multiplied by it. None if the model does not predict
-    it: the subject is the view's silhouette then."""
+    """Coverage of each pixel by the subject, in [0, 1]; `rgb` is multiplied by it. None if nothing is
+    known beyond the view's silhouette."""
     confidence: Float[Tensor, "height width"] | None = None
     """Confidence of the model in each pixel, in [0, 1]; 0 where there is no subject. None if it predicts none."""
     depth: Float[Tensor, "height width"] | None = None

@@ -74,7 +74,7 @@ def depth_of_8_bit(plain):
 
 NAN, FILE, B = float("nan"), "cameras.json", "camera 'b'"
 BAD = {
-    "no calibration": (remove("cameras.json"), [FILE, "the folder has none"]),
+    "no calibration": (remove("cameras.json"), [FILE, "the folder has neither"]),
     "no JSON": (write("cameras.json", b'{"format": '), [FILE, "expected JSON", "line 1"]),
     "binary": (write("cameras.json", b"\xff\xfe\x00\x80"), [FILE, "expected JSON"]),
     "a list": (write("cameras.json", b"[1, 2]"), [FILE, "expected an object", "[1, 2]"]),
@@ -116,7 +116,7 @@ BAD = {
     "absolute path": (camera(image="/tmp/b.png"), [FILE, B, "image", "inside the capture", "/tmp/b.png"]),
     "path upwards": (camera(mask="masks/../../b.png"), [FILE, B, "mask", "inside the capture", "../../b.png"]),
     "drive": (camera(image="C:\\b.png"), [FILE, B, "image", "inside the capture"]),
-    "camera without images": (camera(image="nowhere/{frame}.png"), ["nowhere/000.png", B, "in none of 2", FILE]),
+    "camera without images": (camera(image="nowhere/{frame}.png"), ["nowhere/000.png", B, "none in 2 frames", FILE]),
     "camera without masks": (camera(mask="nowhere.png"), ["nowhere.png", B, "the camera's mask", FILE]),
     "never both": (
         remove("images/b_000.png", "masks/b_001.png"),

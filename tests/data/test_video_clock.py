@@ -201,7 +201,7 @@ def test_films_that_are_shorter_than_listed_shorten_the_capture(ball):
         rewrite(ball, name, range(5))
     capture = open_capture(ball[0])
     assert len(capture.frame_ids) == 5
-    assert "expected 8 frames as listed, got films with 5 common times" in capture.issues[0].text
+    assert "expected 8 frames as listed, got videos with 5 common times" in capture.issues[0].text
 
 
 def test_check_reports_the_times_of_each_film(ball, capsys):

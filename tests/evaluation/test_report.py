@@ -57,7 +57,7 @@ def test_a_model_made_for_another_background_is_named(evaluated):
     for background, said in (("black", True), ("white", False)):
         report = make_report(cells, ("telea", "paper-small"), RunSettings(background=background))
         for text in map(markdown, (summary(report), blocks(report))):
-            assert ("another background than black, on which they score lower: paper-small (white)" in text) == said
+            assert ("another background, so they score lower on black: paper-small (white)" in text) == said
 
 
 def test_failures_and_missing_methods_are_in_every_format(evaluated):

@@ -105,6 +105,13 @@ def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):
     assert float(first_weight(out)) == float(kept[0]), "a finished run stays as it is"
 
 
+def test_a_run_without_captures_holds_nothing_back(tmp_path):
+    options = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
+    run = RUN | {"steps": 1, "validate_every": 1}
+    config = TrainConfig(name="finetune", objective=options, scenes=replace(SCENES, hold_out=AUTO), **run)
+    assert (train(config, tmp_path / "run") / "README.md").exists()
+
+
 def first_weight(folder):
     return load_network(str(folder)).depth_logits.weight.detach().flatten()[0]
 

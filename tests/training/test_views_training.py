@@ -261,7 +261,7 @@ def test_every_parameter_gets_a_gradient(view):
 
 def test_the_error_predictor_can_be_trained_alone(tiny_views, tmp_path):
     config = replace(tiny_views, objective=replace(OPTIONS, train_params="errors"), steps=3, batch=1)
-    with pytest.raises(ValueError, match="expected a trained model for --train-params errors"):
+    with pytest.raises(ValueError, match="with an error predictor for --train-params errors"):
         train(config, tmp_path / "none")
     torch.manual_seed(0)
     start = ViewSynthNet(replace(VIEWS_MODEL, error_features=0))

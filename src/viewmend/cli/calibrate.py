@@ -18,7 +18,8 @@ class Options:
     With --board, SOURCE holds a video or a folder of images for each camera, named after it, that shows a ChArUco board
     being carried around; all begin at the same moment. OUT/residuals.png shows the reprojection errors. With
     --silhouettes, SOURCE is a capture with masks, and nothing is written unless held-out cameras agree better with the
-    others afterwards. OUT/cameras.json has the file names of SOURCE: put it there, or next to footage of these names.
+    others afterwards. OUT/cameras.json refers to the files of SOURCE: copy it there, or next to footage with these
+    names.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
@@ -30,7 +31,7 @@ class Options:
     dictionary: str = "DICT_5X5_1000"
     """OpenCV's name of the board's marker dictionary."""
     every: int = 5
-    """Search every n-th frame for the board."""
+    """With --board: search every n-th frame for it."""
     silhouettes: bool = False
     """Refine a capture's poses and focal lengths with its masks."""
     num_frames: int = 12
@@ -109,14 +110,15 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
     scores = [refined_without(frames, name, bounds, hold) for name in track(left_out(names), "cameras left out")]
     for score in scores:
         say(
-            f"{score.camera} left out: its mask and the others' hull agree to {score.before:.4f}, "
-            f"to {score.after:.4f} with these refined"
+            f"{score.camera} left out: IoU of its mask and the others' hull {score.before:.4f}, "
+            f"after refining them {score.after:.4f}"
         )
     before, after = (sum(own) / len(scores) for own in zip(*((s.before, s.after) for s in scores), strict=True))
     if after <= before:
         raise ValueError(
-            "expected cameras that were left out to agree better with the others when these are refined, got an IoU "
-            f"of {after:.4f} for {before:.4f}; keep the calibration, use more frames (--num-frames), or better masks"
+            "expected left-out cameras to agree better with the refined others, got a mean IoU of "
+            f"{after:.4f} after and {before:.4f} before; keep the calibration, or use more frames (--num-frames) or "
+            "better masks"
         )
     with busy("refining all cameras"):
         refined = refined_all(frames, bounds, hold)
@@ -142,6 +144,6 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     frames = [frame for frame in read if frame.cameras.names == most]
     if len(most) < LEAST_CAMERAS + 1:
         raise ValueError(
-            f"expected {LEAST_CAMERAS + 1} cameras or more with masks, got {len(most)}; fewer say too little of another"
+            f"expected {LEAST_CAMERAS + 1} cameras or more with masks, got {len(most)}; use more, or --board"
         )
     return frames, capture.bounds

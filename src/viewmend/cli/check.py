@@ -151,7 +151,7 @@ def _capture_as_text(capture: dict[str, Any]) -> list[str]:
         f"  rig       {_extent(capture['rig_extent_m'])}; cameras {near:.3g} to {far:.3g} from the centre",
     ]
     few = len(capture["cameras"]) < FEW_CAMERAS or capture["camera_spacing_deg"] > WIDE_DEG
-    expected = "; expect fogged bodies and doubled limbs: 8 or more around a person, 45 degrees apart, avoid them"
+    expected = "; expect foggy bodies and doubled limbs; 8 or more cameras, 45 degrees apart, avoid them"
     lines.append(f"  angles    {capture['camera_spacing_deg']:.0f} degrees between neighbours{expected if few else ''}")
     if iou is not None:
         subject = capture["subject_extent_m"]

@@ -19,9 +19,9 @@ class ViewOptions:
     """How views are rendered, and which of their pixels are inpainted."""
 
     num_source_views: int = 3
-    """Number of source cameras: the closest to the view, which colour it and are the inpainter's context."""
+    """Number of source cameras: those closest to the view, which colour it. Our models choose their own context."""
     view_selection: Literal["angle", "direction"] = "angle"
-    """What makes a source camera close: the 'angle' at the subject, or the 'direction' of view, as RIFTCast can."""
+    """How closeness is measured: by the 'angle' at the subject, or by viewing 'direction', an option of RIFTCast."""
     error_rule: str | None = None
     """Pixels to inpaint: 'holes', which no camera colours; 'all' of the subject, for models that leave correct pixels
     unchanged; 'predicted', which a model predicts to be wrong; or FILE.py:NAME, your own rule. By default, the rule
@@ -47,8 +47,9 @@ class PreparationOptions:
     """What is corrected in a capture."""
 
     align: Annotated[bool, NEGATED] = True
-    """Use the calibration as it is. By default, a shift that all images share (for example from another convention for
-    pixel centres) is estimated from the masks of one frame, and undone if the masks then agree better."""
+    """Use the calibration as it is, and do not look for cameras that are out of sync. By default, a shift that all
+    images share (for example from another convention for pixel centres) is estimated from the masks of one frame, and
+    undone if the masks then agree better."""
     match_colours: Annotated[bool, NEGATED] = True
     """Use the cameras' colours as they are. By default, the input cameras are colour-matched in one frame, if they then
     agree better on held-out surface points."""
@@ -76,7 +77,7 @@ def check_people(performers: Path | None, motions: Path | None) -> None:
         raise ValueError("expected both --performers and --motions, got one of them; give both folders")
     for folder in (performers, motions):
         if folder is not None and not folder.exists():
-            raise ValueError(f"{folder}: expected characters or motions, found nothing; check --performers, --motions")
+            raise ValueError(f"{folder}: expected what --performers or --motions names, found nothing; check the path")
 
 
 def load_named(name: str | None, device: str) -> "Inpainter":

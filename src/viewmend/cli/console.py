@@ -143,7 +143,7 @@ def stop_requests() -> Iterator[Callable[[], int]]:
         if received:
             raise KeyboardInterrupt
         received.append(number)
-        say("stopping after this step and saving a checkpoint; press again to stop at once with the last checkpoint")
+        say("stopping after this step and saving a checkpoint; press Ctrl-C again to stop at once")
 
     with _handle(request, signal.SIGINT, signal.SIGTERM):
         yield lambda: sum(received)

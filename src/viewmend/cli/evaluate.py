@@ -90,7 +90,7 @@ class Options(RunOptions):
     a model's folder, a baseline such as dstt-o-def, FILE.py:NAME; 'all' for all shipped methods, 'baselines' for those
     of the paper's Table 1."""
     json: bool = False
-    """Also write the report as JSON to standard output."""
+    """Write the report to standard output as JSON, in place of the tables."""
 
 
 def run(options: Options) -> int:
@@ -141,7 +141,7 @@ def evaluate(options: RunOptions, sets: tuple[str, ...], methods: str) -> "Repor
     """
     check_least(options, frames=1, every=1, scenes=1, size=1, jobs=1, shown=1)
     if not sets:
-        raise ValueError("expected at least one set, got no set; P needs nothing")
+        raise ValueError("expected at least one set, got no set; P needs no data")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     check_device(options.device)
@@ -185,7 +185,9 @@ def _write(options: RunOptions, report: "Report", store: "CellStore") -> None:
     from viewmend.utils.atomic_writes import write_text
 
     if not report.cells and (options.out / "report.json").exists():
-        raise ValueError(f"{options.out}: expected results for the report there, got none; it is unchanged")
+        raise ValueError(
+            f"{options.out}: expected at least one result, got none; the report there is kept. Check --methods and sets"
+        )
     forms = {"md": markdown(blocks(report)), "csv": report_csv(report), "json": report_json(report)}
     forms["html"] = page(report, store, options.shown)
     for name, text in forms.items():
@@ -216,7 +218,7 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         if name[0] == "P":
             scenes = studio.procedural_set(frames, options.size, options.background)
         elif options.performers is None:
-            raise ValueError(f"expected --performers DIR for set {name}, got none; P needs nothing")
+            raise ValueError(f"expected --performers DIR for set {name}, got none; P needs no data")
         else:
             scenes = studio.performer_set(options.performers, options.motions, frames, options.size)
         return list((studio.lengthened(scenes) if name in LONG_SETS else scenes)[part])

@@ -12,12 +12,12 @@ class Options:
     """Export a model as an AOTInductor package (libtorch, C++) or as ONNX.
 
     The file completes one view of one frame: its inputs are the rendered view, its camera, and the rig's images, masks
-    and calibration, of any sizes; its outputs are colours, alpha, confidence and depth (docs/guide/export.md). A
-    package is compiled for the processor of this machine; ONNX runs anywhere.
+    and calibration, of 64 to 4096 pixels a side; its outputs are colours, alpha, confidence and depth
+    (docs/guide/export.md). A package is compiled for the processor of this machine; ONNX runs anywhere.
     """
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = "views"
-    """Name of a shipped model, or a model's folder; a model of the default architecture."""
+    """'views', or the folder of a model trained from it."""
     format: Literal["pt2", "onnx"]
     """pt2 for libtorch and PyTorch, onnx for ONNX Runtime and others."""
     out: Path

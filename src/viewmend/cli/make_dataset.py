@@ -131,8 +131,7 @@ def _position(out: Path) -> Position:
     for number, name in enumerate(names):
         if name != f"shard-{number:05d}.tar":
             raise ValueError(
-                f"{out}: expected shard-{number:05d}.tar before {name}, found none; rename the shards after the gap, "
-                "or choose another --out"
+                f"{out}: expected shard-{number:05d}.tar before {name}, found none; restore it, or choose another --out"
             )
     if not names:
         return Position()

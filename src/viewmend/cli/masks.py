@@ -36,7 +36,7 @@ class Options:
     no_clean: bool = False
     """Do not correct masks by those of other cameras and neighbouring frames."""
     no_despill: bool = False
-    """Do not remove green or blue spill from the outline."""
+    """With plates or a screen: do not remove green or blue spill from the outline."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     frames: str | None = None
@@ -72,7 +72,9 @@ def _check(options: Options) -> None:
 
     plates = (options.plate is not None) + (options.plate_frames is not None)
     if (options.method == "plate" and plates != 1) or plates > 1:
-        raise ValueError("expected one of --plate and --plate-frames with --method plate; give one of them")
+        raise ValueError(
+            f"expected one of --plate and --plate-frames, got {'both' if plates else 'none'}; give one of them"
+        )
     if plates and options.method not in ("plate", "onnx"):
         raise ValueError(f"expected plates only with --method plate or onnx, got --method {options.method}; drop them")
     if (options.method == "onnx") != (options.network is not None):

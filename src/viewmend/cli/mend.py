@@ -23,11 +23,11 @@ class Options:
 
     OUT gets the inpainted views (mended.mp4, or mended/*.png for a single view), the views as rendered
     (rendered/*.png), the error mask (holes/*.png, white where a pixel was to be inpainted), the ground truth of a
-    held-out camera (truth/*.png), all of them side by side (compared.mp4), and contact_sheet.png.
+    held-out camera (truth/*.png), rendered, mended and true views side by side (compared.mp4), and contact_sheet.png.
 
     With --leave-out, that camera's view is rendered without its image and mask, which then score it. PSNR in dB: of the
     whole image (also as rendered), of the subject (inside the true mask), of the pixels that a camera colours
-    ("valid"), and of the holes ("fg": inside the true mask); the last two also for OpenCV's Telea fill. SSIM: of the
+    ("valid"), and of the holes ("fg": inside the true mask), the holes also for OpenCV's Telea fill. SSIM: of the
     whole image. LPIPS (AlexNet): of the whole image and of the subject. IoU: of alpha and the true mask. PSNRs are
     means over frames; in the holes, over frames with at least 50 such pixels, if any. hole_fraction is the fraction of
     the hull's pixels that are holes, mended_fraction the fraction to be inpainted.
@@ -58,7 +58,7 @@ class Options:
     """A shipped model's name, a model's folder, or any method of `viewmend evaluate` ('telea', 'reprojection',
     'dstt-o-mul', FILE.py:NAME). By default 'views'."""
     top_k: int | None = None
-    """For the paper's model: number of context tokens kept by pruning. Fewer is faster; all by default."""
+    """For the paper's model: context tokens kept by pruning; by default the model's own number. Fewer is faster."""
     frames: str | None = None
     """Frames to use, as FIRST:END by index; all by default."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
@@ -129,7 +129,7 @@ def _check(options: Options) -> None:
     if (options.leave_out is None) == (options.path is None):
         raise ValueError("expected either --leave-out CAMERA or --path orbit|FILE, got both or none; give one of them")
     if options.leave_out is None and options.protocol != "strict":
-        raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path: no camera has its mask")
+        raise ValueError(f"expected --leave-out with --protocol {options.protocol}, got --path; leave --protocol out")
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"{options.out}: expected a folder for the results, got a file; choose another --out")
     check_least(options, top_k=1)
@@ -159,7 +159,7 @@ def _usable(capture: "NativeCapture", times: range, held: tuple[str, ...]) -> li
     usable = [time for time in times if capture.present[inputs, time].sum() >= 2]
     left_out = [capture.frame_ids[time] for time in times if time not in usable]
     if not usable:
-        raise ValueError(f"{capture.name}: expected two input cameras in one frame or more, got none; add cameras")
+        raise ValueError(f"{capture.name}: expected a frame with two input cameras, got none; choose other --frames")
     if left_out:
         count = f"{len(left_out)} of {len(times)} frames"
         say(f"{count} have fewer than two input cameras and are left out; the first is '{left_out[0]}'")

@@ -56,7 +56,7 @@ def run(options: Options) -> int:
         methods = paper.ablation_models(options.models)
     else:
         if options.table == 2 and not options.sets:
-            raise ValueError("expected captures for table 2, got none; name their folders after the 2")
+            raise ValueError("expected captures for table 2, got none; give their folders: paper-table 2 CAPTURE ...")
         if not options.ours.strip():
             raise ValueError("expected --ours with a model's name or folder, got none; leave it out for the default")
         ours = method_names(options.ours)

@@ -59,7 +59,8 @@ class Options:
     fps: float | None = None
     """Frames per second; by default those of the capture."""
     budget_ms: float = 100.0
-    """Milliseconds that a view may take; quality is reduced to stay within them. 0: always full quality."""
+    """Milliseconds that a view may take; quality is reduced to stay within them. 0: no limit; moving views
+    are simplified either way."""
     max_image_size: int = 1024
     """Longest side of the cameras' images, in pixels; larger images are reduced when they are read."""
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)

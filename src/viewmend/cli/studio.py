@@ -18,7 +18,7 @@ class Options:
     scenes: int = 1
     """Number of captures. Their seeds are --seed and the numbers after it."""
     cameras: int = 12
-    """Number of cameras, 4 to 60."""
+    """Number of cameras, at least 4."""
     frames: int = 30
     """Number of frames, at 30 per second."""
     size: int = 512

@@ -50,7 +50,7 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
     options = tyro.cli(Options, args=list(rest), default=default, prog=f"{prog} {name}", config=flags)
     config = options.config
     if name == "finetune" and not (config.scenes.captures or config.shards):
-        raise ValueError("expected viewmend train finetune CAPTURE, got no capture; name the folder of yours")
+        raise ValueError("expected viewmend train finetune CAPTURE, got no capture; give its folder")
     check_scenes(config.scenes)
     return options
 

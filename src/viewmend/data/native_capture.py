@@ -134,7 +134,9 @@ class NativeCapture:
         if self.clock is None:
             return ()
         listed, found = self._listed, len(self.frame_ids)
-        text = f"expected {listed} frames as listed, got films with {found} common times; the other frames are left out"
+        text = (
+            f"expected {listed} frames as listed, got videos with {found} common times; the other frames are left out"
+        )
         return ((Issue(text),) if found < listed else ()) + self.clock.issues(self.cameras.names)
 
     def read(self, time: int) -> MultiViewFrame:
@@ -152,7 +154,9 @@ class NativeCapture:
         self._warn_of_rotation()
         views = [view for view, image in zip(views, images, strict=True) if image is not None]
         if not views:
-            raise CaptureError(f"{self.folder}: frame '{frame_id}': expected a frame in one film or more, got none")
+            raise CaptureError(
+                f"{self.folder}: frame '{frame_id}': expected a readable frame in a video, got none; leave it out"
+            )
         frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
         if frame.mask is not None:
             frame = self._from_labels(frame)
@@ -244,9 +248,9 @@ class NativeCapture:
                     k for k in camera.file_kinds if not any(exists(camera.file(k, f)) for f in self.frame_ids)
                 ]
                 wanted = f"{' and '.join(camera.file_kinds)} of the camera in the same frame"
-                wanted = f"the camera's {absent[0]} in one frame or more" if absent else wanted
+                wanted = f"the camera's {absent[0]} in at least one frame" if absent else wanted
                 where, next_step = self._example(camera, absent), f"correct the paths in {self._file}"
-                got = f"found in none of {len(self.frame_ids)}"
+                got = f"found none in {len(self.frame_ids)} frames"
                 raise CaptureError(f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out")
         for frame, column in zip(self.frame_ids, present.T, strict=True):
             if not column.any():
@@ -269,7 +273,9 @@ def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file
     by_name = {camera.name: camera for camera in cameras}
     unknown = [name for name in names if name not in by_name]
     if unknown or not names or len(set(names)) < len(names):
-        raise CaptureError(f"{file}: expected different cameras among {list(by_name)}, got {list(names)}; choose again")
+        raise CaptureError(
+            f"{file}: expected cameras among {list(by_name)}, each once, got {list(names)}; choose again"
+        )
     return tuple(by_name[name] for name in names)
 
 

@@ -150,7 +150,11 @@ def read_calibration(folder: Path) -> NativeCalibration:
     """
     path = folder / CALIBRATION
     if not path.is_file():
-        got = "the folder has none" if folder.is_dir() else "there is no such folder"
+        got = (
+            "the folder has neither it nor another format's files (docs/formats.md)"
+            if folder.is_dir()
+            else "there is no such folder"
+        )
         raise CaptureError(f"expected a capture folder with {path}, but {got}; check the path")
     try:
         content = typed(read_json(bounded_bytes(path)), dict[str, Any], "see docs/capture-format.md")

@@ -29,7 +29,7 @@ class PreparedCapture(CaptureWrapper):
 
     source: CaptureSource
     alignment: Alignment | None = None
-    """The shift of all images that was found in the masks of the input cameras; None if alignment was off."""
+    """The shift of all images that was found in the masks of the input cameras; None if off or impossible."""
     max_image_size: int | None = None
     """Maximum length of the longer image side; None for full size."""
     inputs: tuple[str, ...] | None = None
@@ -95,8 +95,8 @@ def prepare(
         source: the capture.
         inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras have no effect.
         max_image_size: images are reduced to at most this length of their longer side.
-        align: find a shift that all images share, in the masks of one frame at full size, and look for a camera that
-            is out of sync, around it. It is the first frame from `first` on in which two input cameras see anything.
+        align: find the shift that all images share from the masks of one frame at full size, and look for out-of-sync
+            cameras in the frames around it: the first from `first` on with two input cameras and any foreground.
         match_colours: match the input cameras' colours in the same frame, if that improves their agreement on parts
             of the surface that the correction was not fitted to.
         first: index of the first frame that will be used.
@@ -104,7 +104,7 @@ def prepare(
 
     Raises:
         CaptureError: a frame cannot be read, or its masks or calibration are unusable.
-        ValueError: the masks have no common subject.
+        ValueError: the input cameras look away from each other.
 
     Examples:
         >>> from viewmend import prepare

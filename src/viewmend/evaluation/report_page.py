@@ -20,8 +20,8 @@ TILE_PX = 288
 CLOSE_UP_SHARE = 6
 """A close-up is 1/6 of the view's shorter side, or as large as the hole."""
 LEGEND = (
-    "At the frame with the largest hole of each scene: the whole view; a close-up of the largest hole; its difference "
-    f"from the truth, {DIFFERENCE_GAIN} times brighter. Further scenes are in sheets/."
+    "Each scene at its frame with the most hole pixels: the whole view; a close-up of the largest hole; its difference "
+    f"from the truth, {DIFFERENCE_GAIN} times brighter. All scenes are in sheets/."
 )
 
 

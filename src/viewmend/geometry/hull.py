@@ -40,13 +40,13 @@ class HullConfig:
     coarse_resolution: int = 24
     """Blocks along the longest side of the bounds, in each pass of the search for the subject's box."""
     coarse_passes: int = 3
-    """Passes of that search; 0 carves the bounds as they are."""
+    """Passes of that search; with 0, carving begins with the whole bounds."""
     pixels_per_voxel: float = 2.0
     """Masks are pooled until a voxel spans about this many pixels, then smoothed, to avoid staircase artefacts."""
     min_views: int = 2
-    """Space that fewer cameras see is empty."""
+    """Points seen by fewer cameras count as empty."""
     min_fraction: float = 0.5
-    """Space that a smaller share of the cameras sees is empty."""
+    """Points seen by a smaller share of the cameras count as empty."""
 
 
 @dataclass(frozen=True)

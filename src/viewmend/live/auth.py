@@ -69,7 +69,8 @@ class AccessControl:
             return f"expected a request to localhost, got one to '{host[:60]}'; {next_step}"
         origin = connection.headers.get("origin")
         if origin is not None and not (_is_same_origin(origin, host) or origin.lower() == self._public):
-            return f"expected a request from this server's own page, got the origin '{origin[:60]}'"
+            next_step = "open the printed address, or start the server with --public-url"
+            return f"expected a request from this server's own page, got the origin '{origin[:60]}'; {next_step}"
         site = connection.headers.get("sec-fetch-site", "none")
         is_link = connection.headers.get("sec-fetch-dest") == "document"
         if site not in ("none", "same-origin") and not is_link:

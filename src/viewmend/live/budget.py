@@ -51,7 +51,8 @@ class QualityLevel:
     top_k: int | None
     """Context tokens that survive pruning; None for the model's own number."""
     refine_fraction: float | None = None
-    """Part of the subject that is inpainted; None for all that the error rule selects, 0 fades background only."""
+    """Part of the subject that is inpainted; None for all that the error rule selects. 0 fades background and fills
+    holes from around them."""
 
     @property
     def relative_cost(self) -> float:

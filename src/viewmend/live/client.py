@@ -29,7 +29,7 @@ Self = TypeVar("Self", bound="Connection")
 
 
 class ConnectionLostError(ConnectionError):
-    """The connection has ended without a reason; a new one may succeed."""
+    """The connection broke, or could not be made for now; a new one may succeed."""
 
 
 class ServerSocket:
@@ -40,7 +40,7 @@ class ServerSocket:
             from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
             from websockets.sync.client import connect
         except ImportError:
-            raise ImportError("a connection needs websockets: pip install 'viewmend'") from None
+            raise ImportError("expected the package websockets, found none; pip install websockets") from None
         self._closed, self._context = ConnectionClosed, contextlib.ExitStack()
         address = f"{url}{token_query(token)}"
         try:
@@ -245,7 +245,8 @@ class Publisher(Connection):
     """A rig's connection to `viewmend serve live`; a context manager. Frames are undistorted and have masks.
 
     Raises:
-        ConnectionError: the server refuses the rig; the text is its reason.
+        ConnectionError: the server refuses the rig or a frame; the text is its reason.
+        TimeoutError: the server does not answer.
 
     Examples:
         >>> from viewmend import Publisher
@@ -267,7 +268,7 @@ class Publisher(Connection):
 
         Args:
             cameras: the rig, calibrated in metres.
-            url: the server's address, without a path.
+            url: the server's address, without /push.
             token: the server's token.
             fps: frames per second.
             name: the rig's name on the page.

@@ -243,7 +243,7 @@ class ViewerConnection:
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message.get("code", 1000))
         if message.get("text") is None:
-            raise ProtocolError("expected text, got a binary message")
+            raise ProtocolError("expected text, got a binary message; send JSON as text")
         return message["text"]
 
     async def _read(self) -> None:
@@ -253,7 +253,7 @@ class ViewerConnection:
                 if not self._rate.allow():
                     await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
                     self._count_fault(
-                        4429, f"expected at most {self._registry.limits.messages_per_s} messages a second"
+                        4429, f"expected at most {self._registry.limits.messages_per_s} messages a second; send fewer"
                     )
                     continue
                 self._handle(protocol.parse(text, self._registry.limits))
@@ -271,7 +271,7 @@ class ViewerConnection:
             self._send_soon({"type": "pong", "sent_ms": message.sent_ms, "server_ms": now_ms})
             return
         if isinstance(message, Hello):
-            raise ProtocolError("expected one hello, got another")
+            raise ProtocolError("expected one hello, got a second; send it once")
         if isinstance(message, Look) and message.codec not in self._registry.about["codecs"]:
             raise ProtocolError(f"expected a codec among {self._registry.about['codecs']}, got '{message.codec}'")
         with self._service.lock:

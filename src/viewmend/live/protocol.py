@@ -78,7 +78,8 @@ class Limits:
         if max(width, height) > self.max_side_px:
             raise ProtocolError(f"expected sides from 16 to {self.max_side_px} pixels, got {size}; request less")
         if width * height * views > self.max_pixels:
-            raise ProtocolError(f"expected at most {self.max_pixels} pixels, got {size}; request less")
+            size = size if views == 1 else f"{views} times {size}"
+            raise ProtocolError(f"expected at most {self.max_pixels} pixels, got {size}; request smaller images")
 
 
 class Camera(Struct, frozen=True, kw_only=True):
@@ -202,8 +203,8 @@ class ShowView(Struct, frozen=True):
 
 def parse(text: str, limits: Limits) -> Message:
     """Parse a client's message; ProtocolError if it is malformed or exceeds the limits."""
-    if len(text) > limits.max_message_bytes:
-        raise ProtocolError(f"expected at most {limits.max_message_bytes} bytes, got {len(text)}; send less")
+    if (size := len(text.encode())) > limits.max_message_bytes:
+        raise ProtocolError(f"expected at most {limits.max_message_bytes} bytes, got {size}; send less")
     message: Message = read_message(text, Message)
     if isinstance(message, Look):
         limits.check_size(message.width, message.height, len(message.cameras))
@@ -215,7 +216,9 @@ def read_message(message: object, kind: type[Kind] | Any, strict: bool = True) -
     if isinstance(message, str | bytes):
         opening = ("[", "{") if isinstance(message, str) else (b"[", b"{")
         if (nested := sum(map(message.count, opening))) > MAX_NESTED:  # pyright: ignore[reportArgumentType]
-            raise ProtocolError(f"expected at most {MAX_NESTED} lists and objects in a message, got {nested}")
+            raise ProtocolError(
+                f"expected at most {MAX_NESTED} lists and objects in a message, got {nested}; send fewer"
+            )
     try:
         value = read_json(message) if isinstance(message, str | bytes) else message
         return typed(value, kind, "see docs/live-protocol.md", strict)
@@ -261,15 +264,21 @@ class _Part(Struct, frozen=True):
 def unpack(message: bytes, listed: Literal["parts", "images"] = "parts") -> tuple[dict[str, Any], list[bytes]]:
     """Split a binary message into header and parts; ProtocolError if its header is malformed or its length wrong."""
     if len(message) < 8 or message[:4] != MAGIC:
-        raise ProtocolError(f"expected a message that begins with {MAGIC.decode()}, got {message[:4]!r}")
+        raise ProtocolError(
+            f"expected a message that begins with {MAGIC.decode()}, got {message[:4]!r}; see docs/live-protocol.md"
+        )
     start = 8 + struct.unpack("<I", message[4:8])[0]
     if start > min(len(message), 8 + HEADER_BYTES):
-        raise ProtocolError(f"expected a whole header of at most {HEADER_BYTES} bytes, got one of {start - 8}")
+        raise ProtocolError(
+            f"expected a whole header of at most {HEADER_BYTES} bytes, got one of {start - 8}; shorten it"
+        )
     header: dict[str, Any] = read_message(message[8:start], dict[str, Any])
     parts: list[_Part] = read_message(header.get(listed), Annotated[list[_Part], Meta(max_length=MAX_PARTS)])
     sizes = [part.bytes for part in parts]
     if start + sum(sizes) != len(message):
-        raise ProtocolError(f"expected {start + sum(sizes)} bytes by the header, got {len(message)}")
+        raise ProtocolError(
+            f"expected {start + sum(sizes)} bytes, as the header says, got {len(message)}; correct its 'bytes'"
+        )
     ends = [start + sum(sizes[: n + 1]) for n in range(len(sizes))]
     return header, [message[end - size : end] for size, end in zip(sizes, ends, strict=True)]
 

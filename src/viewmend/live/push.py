@@ -203,7 +203,7 @@ def _decode_frame(message: bytes, cameras: Cameras, is_cancelled: Callable[[], b
         images[entry.camera, entry.kind] = _decode_image(data, entry.camera, entry.kind, cameras)
     complete = [n for n in cameras.names if (n, "rgb") in images and (n, "mask") in images]
     if len(complete) < 2:
-        raise ProtocolError(f"expected image and mask of two cameras or more, got {len(complete)}")
+        raise ProtocolError(f"expected image and mask of two cameras or more, got {len(complete)}; send both")
     selected = cameras.select(complete)
     width, height = selected.max_size_px
     rgb = torch.zeros(len(complete), 3, height, width, dtype=torch.uint8)

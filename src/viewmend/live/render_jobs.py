@@ -267,7 +267,7 @@ def source_jpeg(frame: MultiViewFrame, name: str) -> bytes:
     """A camera's undistorted image as JPEG; ProtocolError if the frame has no such camera."""
     if name not in frame.cameras.names:
         raise ProtocolError(
-            f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got another"
+            f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got '{name[:40]}'"
         )
     image = frame.select([name]).rgb[0]
     return to_jpeg(image.movedim(0, -1).contiguous().cpu().numpy(), SOURCE_QUALITY)

@@ -266,7 +266,7 @@ class Renderer:
         frame = self._read(index)
         if name not in frame.cameras.names:
             raise ValueError(
-                f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got another"
+                f"expected a camera of this frame, one of {', '.join(frame.cameras.names)[:200]}, got '{name[:40]}'"
             )
         return frame.select([name])
 

@@ -195,7 +195,7 @@ class LiveServer:
         if renderer.rig_json is not None:
             names = [camera["name"] for camera in renderer.rig_json["cameras"]]
             if asked.camera is not None and asked.camera not in names:
-                raise ProtocolError(f"expected a camera among {', '.join(names)[:200]}, got another")
+                raise ProtocolError(f"expected a camera among {', '.join(names)[:200]}, got '{asked.camera[:40]}'")
             try:
                 renderer.left_out(asked.left_out)
             except ValueError as error:
@@ -249,12 +249,15 @@ class LiveServer:
         asked: AssetQuery = read_message(given, AssetQuery, strict=False)
         span, version = self._service.source.span, self._service.renderer.assets_version
         if version is None or not span.first <= asked.time < span.end:
-            return error_response(404, f"expected a frame from {span.first} to {span.end - 1}; see /health")
+            there = (
+                f"from {span.first} to {span.end - 1}" if span.first < span.end else "that exists (there is none yet)"
+            )
+            return error_response(404, f"expected a frame {there}, got {asked.time}; see /health")
         try:
             without = self._service.renderer.left_out(asked.without.split(","))
             made = await self.assets.get(asked.time, version, without)
         except ValueError as error:
-            return error_response(404, f"this frame has no geometry: {error}"[:400])
+            return error_response(404, f"this frame cannot be drawn: {error}"[:400])
         if asked.camera is not None and asked.camera >= len(made.images):
             return error_response(404, f"expected a camera from 0 to {len(made.images) - 1}, got {asked.camera}")
         asset = made.shape if asked.camera is None else made.images[asked.camera]

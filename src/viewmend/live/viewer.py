@@ -64,19 +64,19 @@ class Viewer:
         time: int | None = None,
         mode: str | None = None,
     ) -> None:
-        """Move all pages that are open or will be opened; what is not given stays as it is.
+        """Move all open pages; what is not given stays as it is. Pages opened later get the last call only.
 
         Args:
             azimuth: degrees around the subject (docs/live-protocol.md).
             elevation: degrees above the horizon.
             distance: metres from the target.
             target: the point to turn around, metres.
-            camera: a pose instead of these four: the first of these cameras.
+            camera: a pose in place of these four; of several cameras, the first.
             time: index of a frame, at which the page pauses.
             mode: what is shown, such as "mended", "rendered" or "depth".
 
         Raises:
-            ValueError: a value is out of range, the mode is unknown, or there is a camera and an angle.
+            ValueError: a value is out of range, the mode is unknown, or a camera is given with one of these four.
         """
         angles = {"azimuth": azimuth, "elevation": elevation, "distance": distance, "target": target}
         given = {name: value for name, value in angles.items() if value is not None}
@@ -123,12 +123,12 @@ def serve(
     """Show a capture in the browser, as `viewmend serve` does, from a script or a notebook.
 
     Args:
-        capture: a path, which is opened and prepared; or what `prepare` returned.
+        capture: a path, which is opened and prepared at full image size; or a source, used as it is.
         model: a method's name or an inpainter; by default the shipped model.
         host: address to bind to; one that other machines can reach needs a token.
         port: 0 takes a free one.
         token: at least 16 characters, if there is one.
-        budget_ms: time that a view may take; None: always full quality.
+        budget_ms: time that a view may take; None: no limit. Moving views are simplified either way.
         config: parameters of geometry, rendering and memory.
         device: cpu or cuda.
 

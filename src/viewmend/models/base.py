@@ -37,7 +37,7 @@ class RenderQuality:
     """
 
     mend: bool = True
-    """False skips inpainting: the view is returned as rendered."""
+    """False skips inpainting: the view is returned as rendered, cut by its `target_mask` if there is one."""
     top_k: int | None = None
     """Context tokens that survive pruning; None for the model's own number."""
     context_times: int | None = None
@@ -208,12 +208,12 @@ class Inpainter:
     def step_on(
         self, background: Background, view: IncompleteView, context: ContextProvider, state: Any
     ) -> tuple[CompletedView, State]:
-        """`step` with a view on black as input and output, but the inpainter's input on this background.
+        """Run `step` on a view on black; the inpainter gets it on this background, and its result is on black.
 
         The completed view is cut by `view.target_mask`, if there is one.
 
         Args:
-            background: ignored by an inpainter that has one of its own, which it composites its input on itself.
+            background: ignored if the inpainter has its own, which it then applies itself.
             view: as for `step`.
             context: as for `step`.
             state: as for `step`.

@@ -48,7 +48,8 @@ def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu",
     """Load a shipped model or a model folder, ready for `Stream`.
 
     Args:
-        name_or_path: one of `shipped_models()`, or a folder written by `save_inpainter`; ./NAME if both exist.
+        name_or_path: one of `shipped_models()`, or a folder written by `save_inpainter` (./NAME if both
+            exist and the folder is meant).
         device: where it runs.
         precision: float32, bfloat16 (by autocast), or auto: bfloat16 for models trained in it, if clearly faster here.
 
@@ -64,7 +65,7 @@ def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu",
         True
     """
     if precision not in (*PRECISIONS, "auto"):
-        raise ValueError(f"expected --precision float32, bfloat16 or auto, got '{precision}'")
+        raise ValueError(f"expected a precision of float32, bfloat16 or auto, got '{precision}'")
     network = load_network(name_or_path, device)
     set_compute_dtype(network, auto_dtype(network) if precision == "auto" else PRECISIONS[precision])
     return network
@@ -122,7 +123,7 @@ def model_folder(name_or_path: str | Path) -> Path:
     folder = SHIPPED / ("views" if name == RAYS else name) if name in shipped_models() else Path(name_or_path)
     if not folder.is_dir():
         raise MissingCheckpointError(
-            f"expected a folder or one of the shipped models {list(shipped_models())}, got {name!r}"
+            f"expected a folder or one of the shipped models {list(shipped_models())}, got {name!r}; check it"
         )
     if missing := [name for name in (WEIGHTS, CONFIG) if not (folder / name).is_file()]:
         raise MissingCheckpointError(
@@ -136,7 +137,7 @@ def _read_config(path: Path) -> Config:
     try:
         values = read_json(bounded_bytes(path))
     except (OSError, ValueError) as error:
-        raise DamagedWeightsError(f"{path}: expected JSON, got {error}; copy the file again") from error
+        raise DamagedWeightsError(f"{path}: {error}; copy the file again") from error
     version = values.pop("viewmend_format", None) if isinstance(values, dict) else None
     if version != FORMAT:
         raise MismatchedWeightsError(

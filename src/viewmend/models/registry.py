@@ -62,14 +62,15 @@ def method_names(selection: str) -> tuple[str, ...]:
     parts = [part.strip() for part in selection.split(",") if part.strip()]
     names = [name for part in parts for name in groups.get(part, (part,))]
     if not names:
-        raise ValueError(f"expected --methods all, or names with commas, got '{selection}'")
+        raise ValueError(f"expected 'all' or names with commas, got '{selection}'; see viewmend evaluate --help")
     return tuple(dict.fromkeys(names))
 
 
 def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpainter:
     """The inpainter of this name: an entry of `METHODS`, a baseline, FILE.py:NAME, a shipped model, a model's folder.
 
-    For FILE.py:NAME, the file's NAME is called with the device; it must return a `viewmend.Inpainter`.
+    For FILE.py:NAME, the file's NAME is called with the device; it must return a `viewmend.Inpainter`. Only models on
+    disk use `precision`, as `load_inpainter`.
 
     Raises:
         MethodMissing: its weights are not installed.
@@ -124,7 +125,7 @@ def _make(name: str, device: str, precision: str) -> object:
     known = ", ".join([*shipped_models(), *METHODS])
     raise ValueError(
         f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
-        f"'{name}'; see --methods"
+        f"'{name}'; see viewmend evaluate --help"
     )
 
 

@@ -119,9 +119,9 @@ def decide_error_mask(
     predictor = inpainter if inpainter.predicts_errors else error_model
     if predictor is None:
         raise ValueError(
-            f"expected a model that predicts errors, to refine at most {fraction:g} of the subject; "
-            f"{type(inpainter).__name__} does not: pass Stream(..., error_model=load_inpainter('views')), or use the "
-            "error rule 'holes' or 'all'"
+            f"expected a model that predicts errors, which a refine_fraction of {fraction:g} needs, got "
+            f"{type(inpainter).__name__} without an error_model; pass "
+            "Stream(..., error_model=load_inpainter('views')), or use the error rule 'holes' or 'all'"
         )
     found = predictor.predict_errors(view, context)
     if found is None:

@@ -36,7 +36,8 @@ class RenderConfig:
     cameras: int = 3
     """Number of source cameras that colour a view: those closest to it (the paper: 3)."""
     selection: str = "angle"
-    """Which cameras are closest: 'angle' at the subject's centre, or 'direction' of view, which RIFTCast offers."""
+    """What makes a camera close: 'angle', a small angle at the subject's centre; 'direction', a similar viewing
+    direction, as in RIFTCast."""
     blend: BlendConfig = field(default_factory=BlendConfig)
     """How the source cameras' colours are weighted."""
     error_rule: str | None = None

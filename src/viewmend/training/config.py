@@ -43,7 +43,7 @@ class SceneConfig:
     imperfect_fraction: float = 0.6
     """Fraction of the studio scenes with noise, colour differences, and errors in masks and calibration."""
     hard_fraction: float = 0.0
-    """Fraction of the imperfect scenes whose errors are up to 4 times as large."""
+    """Fraction of the imperfect scenes whose calibration errors are up to 4 times as large, mask errors twice."""
     performers: Path | None = None
     """Folder of glTF characters for half of the studio scenes; without it, all people are procedural."""
     motions: Path | None = None
@@ -53,8 +53,9 @@ class SceneConfig:
     captures: tuple[Path, ...] = ()
     """Folders of your own captures, or files written by `viewmend splits`, of which only the training part is used."""
     hold_out: str | None = None
-    """Camera of the captures that is never trained on, nor is their last tenth of frames. The run is validated on both
-    and keeps the best weights. 'auto' chooses a camera in rigs of five or more."""
+    """Camera of the captures to hold back from training, with the last tenth of their frames. The run is validated on
+    both, keeps the best weights, and ends early when they stop improving. 'auto' chooses a camera in rigs of
+    five or more."""
     protocols: tuple[Literal["strict", "target-mask", "hull-with-target-mask"], ...] = ("strict",)
     """What is known of a held-out camera's mask (docs/evaluation.md); of several, one is drawn for each camera."""
     captures_fraction: float = 0.75
@@ -136,13 +137,14 @@ class TrainConfig:
     start: Annotated[str | None, tyro.conf.arg(name="from")] = None
     """Name or folder of a model to start from; without one, the run starts from random weights."""
     shards: Path | None = None
-    """Folder written by `viewmend make-dataset`; the run reads its scenes from there instead of generating them."""
+    """Folder written by `viewmend make-dataset`; the run reads its scenes from there and ignores the
+    options of scenes."""
     steps: int
     """Optimisation steps."""
     minutes: float | None = None
-    """End the run after this time, if --steps are not done earlier; the learning rate follows whichever is closer."""
+    """End the run after this time or --steps, whichever is first; the learning rate follows the one further along."""
     batch: int = 8
-    """Samples per step, and per process under torchrun."""
+    """Samples per step; under torchrun, in each process."""
     learning_rate: float = 8e-4
     """Peak learning rate."""
     workers: int = 1
@@ -152,7 +154,7 @@ class TrainConfig:
     checkpoint_minutes: float = 5.0
     """Minutes between checkpoints, from which the same command resumes; 0 writes one after every step."""
     validate_every: int = 500
-    """Steps between validations of the averaged weights on fixed scenes; 0 disables validation."""
+    """Steps between validations of the averaged weights, on fixed scenes or what --hold-out holds back; 0: none."""
     seed: int = 0
     """Seed of the weights, the scenes and the samples."""
     new_per_batch: Annotated[int, HIDDEN] = 3

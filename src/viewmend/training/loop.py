@@ -224,7 +224,7 @@ class Run:
         self.shared = own.wrap_ddp(self.objective)
         self.streams = self._make_streams()
         self.validation = self.objective.validation if config.validate_every and own.first else None
-        self.keeps_best = config.scenes.hold_out is not None and bool(config.validate_every)
+        self.keeps_best = bool(config.scenes.hold_out and config.scenes.captures and config.validate_every)
         if self.keeps_best and own.first:
             self.validation = HeldBackValidation(config.scenes.captures, str(config.scenes.hold_out))
 

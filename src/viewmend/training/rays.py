@@ -120,7 +120,7 @@ class RaysObjectiveConfig(ObjectiveConfig):
     objective = RaysObjective
     item = RayBatch
     log_error: float = 2.0
-    """Weight of log10 of the squared error in the holes of a view, next to their L1."""
+    """Weight of log10 of a view's squared error in the holes; their L1 has weight 1."""
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[RayBatch]:
         """See `ObjectiveConfig.make_scenes`."""

@@ -244,7 +244,9 @@ class ViewsObjective(Objective[ViewSynthNet]):
         self.validation = ViewsValidation(config, options)
         if options.train_params == "errors":
             if self.model.errors is None or start is None:
-                raise ValueError("expected a trained model for --train-params errors, got none; give --from MODEL")
+                raise ValueError(
+                    "expected a model with an error predictor for --train-params errors; give --from MODEL"
+                )
             self.model.requires_grad_(False)
             self.model.errors.requires_grad_(True)
 
@@ -344,7 +346,7 @@ class ViewsObjectiveConfig(ObjectiveConfig):
         default_factory=lambda: SamplingConfig(num_ray_views=8, depth_fraction=0.4)
     )
     train_params: Literal["all", "errors"] = "all"
-    """Parameters to train: all but those of the ray fill, or only the error predictor of the model given by --from."""
+    """'all': everything but the ray fill. 'errors': only the error predictor of the --from model."""
     coarse_from: str = "rays"
     """Name or folder of the model whose ray fill completes holes; its weights are copied and stay fixed."""
     loss: ViewsLossWeights = field(default_factory=ViewsLossWeights)

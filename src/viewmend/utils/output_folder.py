@@ -88,8 +88,8 @@ class OutputFolder:
             changing = any(value == [] and fnmatch(name, pattern) for pattern, value in known.items())
             if not changing and _digest(file) not in known.get(name, ()):
                 raise ValueError(
-                    f"{file}: expected no such file, or an unchanged one from an earlier run, got a file of yours; "
-                    "move it away, or choose another folder"
+                    f"{file}: expected no such file, or an unchanged one from an earlier run, got one that was "
+                    "added or changed since; move it away, or choose another folder"
                 )
 
     def made(self, *patterns: str, changing: bool = False) -> None:

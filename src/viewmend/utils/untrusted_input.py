@@ -84,7 +84,7 @@ def read_json(text: str | bytes) -> Any:
     try:
         return json.loads(text, object_hook=_without_nulls, parse_float=_number)
     except (ValueError, RecursionError) as error:  # bad syntax, bad bytes, numbers with thousands of digits
-        raise ValueError(f"expected JSON, got something else: {str(error)[:80]}; correct it there") from None
+        raise ValueError(f"expected JSON, got something else: {str(error)[:80]}; correct it") from None
 
 
 def typed(value: Any, kind: type[Kind] | Any, next_step: str = "correct the value", strict: bool = True) -> Kind:

@@ -88,7 +88,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     except Exception as error:  # damaged files raise almost any exception
         said = f"{type(error).__name__}: {' '.join(str(error).split()).split('. ')[0][:120]}"
         raise DamagedWeightsError(
-            f"{path}: expected a whole file of tensors alone, got {path.stat().st_size} bytes that do not read "
+            f"{path}: expected a complete file of tensors only, got {path.stat().st_size} bytes that do not read "
             f"({said}); get the file again"
         ) from error
     if isinstance(found, dict) and isinstance(found.get(WRAPPER), dict):

@@ -164,11 +164,11 @@ def _explain(frame: MultiViewFrame, bounds: Bounds | None, iou: float) -> Issue:
         view = frame.cameras.names.index(issue.camera)
         for how in TURNED:
             if _agreement(_turned(frame, [view], how), frame.cameras, bounds)[0] >= best - SAME_IOU:
-                text = f"the mask of camera '{issue.camera}' is {how}, so it is left out; turn it, or all of its files"
+                text = f"the mask of camera '{issue.camera}' is {how}, so it is left out; flip it, or all its files"
                 issue = replace(issue, text=text)
     agreement = f"hull and masks agree only to an IoU of {iou:.3f}"
     if best >= max(LEAST_IOU, iou + MIN_IMPROVEMENT):
-        return replace(issue, text=f"{agreement}, but of {best:.3f} after a correction: {issue.text}")
+        return replace(issue, text=f"{agreement}; a correction would raise it to {best:.3f}: {issue.text}")
     text = f"{agreement}: check axes, units, K and masks; viewmend check --out draws them"
     return Issue(text, fatal=iou == 0.0)
 
@@ -185,7 +185,7 @@ def _changes(frame: MultiViewFrame, bounds: Bounds | None) -> Iterator[tuple[flo
         yield _agreement(frame, replace(frame.cameras, K=K), bounds)[0], Issue(text, fatal=True)
     for how in TURNED:
         turned = _turned(frame, range(len(frame.cameras)), how)
-        text = f"all masks are {how}, by the calibration; turn them, and the images if they lie the same way"
+        text = f"all masks are {how}, judging by the calibration; flip them, and the images too if they are {how}"
         yield _agreement(turned, frame.cameras, bounds)[0], Issue(text, fatal=True)
     if bounds is not None:
         iou, size_m = _agreement(frame, frame.cameras, None)

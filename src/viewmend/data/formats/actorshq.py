@@ -51,7 +51,7 @@ def _read_table(file: Path, columns: tuple[str, ...]) -> list[dict[str, Any]]:
         rows = list(csv.DictReader(decode_text(bounded_bytes(file, MAX_BYTES), file.name).splitlines()))
         found = [{key: row[key] if key == "name" else float(row[key]) for key in columns} for row in rows]
     except (csv.Error, KeyError, TypeError) as error:
-        got = str(error)[:60]
+        got = f"none named {error}" if isinstance(error, KeyError) else str(error)[:60]
         raise ValueError(f"expected columns {','.join(columns)} in {file.name}, got {got}; copy it again") from None
     if not found or any("/" in str(row.get("name", "")) for row in found):
         raise ValueError(f"expected rows of cameras or frames in {file.name}, got none or paths; copy it again")

@@ -89,7 +89,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     views = existing(folder, views, lambda view: prefix + view.name)
     unused = sorted(set(_images_in(folder / "images")) - known) if prefix else []
     if unused:
-        warn(f"{file.parent}: the model has {len(views)} images, and not {', '.join(unused)[:200]}, which is ignored")
+        warn(f"{file.parent}: images that are not in the model are ignored: {', '.join(unused)[:200]}")
     entries = []
     for view, name in zip(views, names_from_paths([view.name for view in views]), strict=True):
         if view.camera not in lenses:

@@ -151,7 +151,7 @@ def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tupl
     cameras = []
     for at_pose in by_pose.values():
         if None in times or len(at_pose) < 2:
-            got = "frames without" if None in times else f"only {next(iter(at_pose.values())).file_path[:60]}"
+            got = "frames without one" if None in times else f"only {next(iter(at_pose.values())).file_path[:60]}"
             raise ValueError(
                 f"expected a 'time' in each frame, and each camera's pose at two or more times, got {got}; add them, "
                 "or write one file for each time (a single moving camera cannot be used)"

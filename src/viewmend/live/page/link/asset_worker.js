@@ -83,7 +83,7 @@ async function fetchPatiently(url) {
   for (let retries = 3; ; retries--) {
     const answer = await fetch(url).catch((error) => (retries > 0 ? null : Promise.reject(error)));
     if (answer?.ok) return answer;
-    if (answer && (answer.status !== 503 || retries === 0)) throw new Error(`the server answered ${answer.status}`);
+    if (answer && (![429, 503].includes(answer.status) || retries === 0)) throw new Error(`the server answered ${answer.status}`);
     await new Promise((resolve) => setTimeout(resolve, (1 + Math.random()) * RETRY_MS * 2 ** (3 - retries)));
   }
 }

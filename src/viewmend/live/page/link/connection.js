@@ -4,10 +4,10 @@ const VERSION = 1;
 const LONGEST_WAIT_MS = 15000;
 /** Close codes after which another try is pointless. */
 const FINAL = {
-  4401: "This server needs a token. Open the address that it printed at start.",
+  4401: "This server needs a token. Open the full address, with its token, that the server printed when it started.",
   4426: "The page and the server have different versions. Reload the page.",
 };
-const REASONS = { 4429: "Too many messages.", 4503: "The maximum number of viewers is reached.", 1012: "The server has stopped." };
+const REASONS = { 4429: "This page sent too many messages; the server closed the connection.", 4503: "The maximum number of viewers is reached.", 1012: "The server has stopped." };
 
 /**
  * The address of a path of the server, which a proxy may serve under a prefix: relative to this file's own address.

@@ -91,7 +91,7 @@ export class Notices {
       return { kind: this.pictured ? "warning" : "error", title: "Source error", text: reason };
     }
     if (this.state.model_error) return { kind: "warning", title: "Model failed; showing the rendered view", text: this.state.model_error };
-    if (this.untold) return { kind: "warning", title: "No confidence", text: "This model predicts no confidence; --model views does." };
+    if (this.untold) return { kind: "warning", title: "No confidence", text: "This model has no confidence map. Start the server with --model views to see one." };
     if (!this.pictured) return { kind: "wait", title: "Rendering the first view", text: "This takes a moment." };
     const late = this.waitingSince && performance.now() - this.waitingSince > STALLED_MS;
     if (late || this.state.buffering) return { kind: "wait", title: "Waiting for the server", text: "" };

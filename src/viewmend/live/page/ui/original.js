@@ -59,7 +59,7 @@ export class Original {
       return;
     }
     const text = `${score.model ? `${score.model}: ` : ""}${score.psnr.toFixed(1)} dB`;
-    name.textContent = name.textContent ? `${name.textContent} · ${text}` : `Error map, subject ${text}`;
+    name.textContent = name.textContent ? `${name.textContent} · ${text}` : `Error map · PSNR of subject ${text}`;
     if (score.model) return;
     picture.onload = () => {
       this.paint("error", asked.camera, picture);

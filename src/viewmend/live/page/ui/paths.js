@@ -90,7 +90,7 @@ export class PathPanel {
       const fov = fovOf({ width, height }, f);
       this.track.turntable({ target, azimuth, elevation, roll: 0, distance, fov }, arc, seconds, time);
     } catch (error) {
-      notices.toast(`No turntable: ${/** @type {Error} */ (error).message}`, "error");
+      notices.toast(`Could not make the turntable: ${/** @type {Error} */ (error).message}`, "error");
     } finally {
       button.disabled = false;
       this.#show();
@@ -173,7 +173,7 @@ export class PathPanel {
     byId("path-save").disabled = !ready;
     byId("path-film").hidden = this.film === null;
     let text = "Record a movement, or add views to fly through.";
-    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} views, ${seconds.toFixed(0)} s${room ? "" : ", the maximum length"}`;
+    if (points.length) text = recordingSince >= 0 ? `${seconds.toFixed(1)} s recorded` : `${points.length} view${points.length === 1 ? "" : "s"}, ${seconds.toFixed(0)} s${room ? "" : ", the maximum length"}`;
     if (this.film && this.progressText) text = this.progressText;
     byId("path-text").setAttribute("aria-live", this.recording ? "off" : "polite");
     if (byId("path-text").textContent !== text) byId("path-text").textContent = text;

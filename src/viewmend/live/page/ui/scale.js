@@ -14,8 +14,8 @@ export function showScale(settings, header) {
   const [near, far] = header?.depth_m ?? [0, 0];
   const scales = {
     depth: far > 0 ? { low: `${far.toFixed(2)} m`, high: `${near.toFixed(2)} m`, colours: COLOURS.turbo } : null,
-    confidence: { low: "guess", high: "certain", colours: COLOURS.viridis },
-    error: { low: "no error", high: "25 % and more", colours: COLOURS.inferno },
+    confidence: { low: "uncertain", high: "certain", colours: COLOURS.viridis },
+    error: { low: "no error", high: "25 % or more", colours: COLOURS.inferno },
   };
   const mode = settings.shown.find((shown) => shown in scales);
   const scale = mode ? /** @type {any} */ (scales)[mode] : null;

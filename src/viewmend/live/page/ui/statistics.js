@@ -65,8 +65,8 @@ export class Statistics {
   #build() {
     for (const [name, text] of [
       ["fps", "frames/s"], ["repaints", "repaints/s"], ["latency", "latency"],
-      ["holes", "holes"], ["size", "picture"], ["kb", "per frame"],
-      ["dropped", "dropped"], ["viewers", "viewers"], ["budget", "budget"],
+      ["holes", "holes"], ["size", "resolution"], ["kb", "per frame"],
+      ["dropped", "dropped"], ["viewers", "viewers"], ["budget", "time budget"],
       ["triangles", "triangles"], ["textures", "textures"],
     ]) {
       const value = element("dd", { id: `figure-${name}`, textContent: "–" });

@@ -5,7 +5,7 @@ import { byId, download } from "./dom.js";
 /** @param {() => string} link @param {import("./notices.js").Notices} notices */
 function copyLink(link, notices) {
   const copied = navigator.clipboard?.writeText(link()) ?? Promise.reject(new Error("no clipboard"));
-  copied.then(() => notices.toast("Link copied"), () => notices.toast(link())); // browsers offer a clipboard over HTTPS and on localhost
+  copied.then(() => notices.toast("Link copied"), () => notices.toast(`Copy this link: ${link()}`)); // browsers offer a clipboard over HTTPS and on localhost
 }
 
 /**

@@ -36,7 +36,7 @@ export function pointsOf(content, rig, fov, time) {
   const recorded = ours.length ? content.recorded === true : true;
   const matrices = Array.isArray(content) ? content : content?.world_from_camera;
   if (!ours.length && !(Array.isArray(matrices) && matrices.length)) {
-    throw new Error("expected a list of 4 x 4 matrices, or an object with world_from_camera");
+    throw new Error("expected a list of 4 x 4 matrices, or an object whose world_from_camera is one, got neither; export it again");
   }
   const { K, height } = content;
   const lens = Array.isArray(K) && height > 0 ? degrees(2 * Math.atan(height / 2 / K[1][1])) : fov;
@@ -45,7 +45,7 @@ export function pointsOf(content, rig, fov, time) {
     : matrices.map((/** @type {any} */ matrix, /** @type {number} */ i) => ({
         pose: poseOfCamera(rig, cameraOf(matrix, i), rig.center, lens), seconds: i / FPS, time: content.times?.[i] ?? time,
       }));
-  if (points.length > MOST_POSES || points.at(-1).seconds * FPS >= MOST_POSES) throw new Error(`expected at most ${MOST_POSES} views at ${FPS} a second`);
+  if (points.length > MOST_POSES || points.at(-1).seconds * FPS >= MOST_POSES) throw new Error(`expected at most ${MOST_POSES} views within ${MOST_POSES / FPS} s, got ${points.length} views and ${points.at(-1).seconds.toFixed(1)} s; shorten the path`);
   return { points, recorded };
 }
 
@@ -53,7 +53,7 @@ export function pointsOf(content, rig, fov, time) {
 function pointOf(given, i, /** @type {any[]} */ all) {
   const pose = poseOf(given?.pose ?? null);
   const after = i === 0 ? given?.seconds === 0 : given?.seconds > all[i - 1].seconds;
-  if (!pose || !after || !(given.time >= 0)) throw new Error(`view ${i}: expected a pose, seconds that grow, and a time`);
+  if (!pose || !after || !(given.time >= 0)) throw new Error(`view ${i + 1}: expected a pose, later seconds than the view before (0 for the first), and a time; correct the file`);
   return { pose, seconds: given.seconds, time: given.time };
 }
 
@@ -61,7 +61,7 @@ function pointOf(given, i, /** @type {any[]} */ all) {
 function cameraOf(matrix, i) {
   const rows = Array.isArray(matrix) && matrix.length === 4 ? matrix.slice(0, 3) : [];
   const whole = rows.every((row) => Array.isArray(row) && row.length === 4 && row.every(Number.isFinite));
-  if (!rows.length || !whole) throw new Error(`pose ${i}: expected a 4 x 4 matrix`);
+  if (!rows.length || !whole) throw new Error(`pose ${i + 1}: expected a 4 x 4 matrix of finite numbers; correct the file`);
   const axes = rows.flatMap((row) => row.slice(0, 3));
   const R = transpose(axes);
   const T = [0, 1, 2].map((k) => -rows.reduce((sum, row) => sum + row[k] * row[3], 0));
