@@ -36,7 +36,7 @@ class Options:
     no_clean: bool = False
     """Do not correct masks by those of other cameras and neighbouring frames."""
     no_despill: bool = False
-    """With plates or a screen: do not remove green or blue spill from the outline."""
+    """Do not remove a screen's or plate's green or blue spill from the outline."""
     format: str | None = None
     """Format of the capture (docs/formats.md); recognised by default."""
     frames: str | None = None
