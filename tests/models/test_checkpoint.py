@@ -160,3 +160,9 @@ def test_auto_precision_is_bfloat16_for_models_trained_in_it_if_clearly_faster(
     assert load_inpainter(tmp_path / "views", precision="float32").compute_dtype == torch.float32
     with pytest.raises(ValueError, match="float32, bfloat16 or auto"):
         load_inpainter(saved, precision="half")
+
+
+@pytest.mark.parametrize(("units", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_a_gpu_computes_in_bfloat16_if_it_has_units_for_it(monkeypatch, units, dtype):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: units or including_emulation)
+    assert network.faster_dtype(torch.device("cuda")) == dtype

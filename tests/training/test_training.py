@@ -10,6 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from training.conftest import log_of
 
+from viewmend.models import network
 from viewmend.models.base import ContextProvider
 from viewmend.models.checkpoint import load_network
 from viewmend.models.classical import Telea
@@ -115,6 +116,20 @@ def test_a_run_resumes_only_with_its_own_config_and_a_whole_file(tiny, tmp_path)
     (tmp_path / FILE).write_bytes(whole[: len(whole) // 2])
     with pytest.raises(RunError, match=r"run\.safetensors: expected a run to resume"):
         train(tiny, tmp_path)
+
+
+@pytest.mark.parametrize(("speedup", "precision"), [(4.0, torch.bfloat16), (0.25, torch.float32)])
+def test_automatic_precision_is_the_faster_one_and_a_run_resumes_where_the_other_is(
+    tiny, tmp_path, monkeypatch, speedup, precision
+):
+    automatic = replace(tiny, precision="auto", steps=1)
+    monkeypatch.setattr(network, "bfloat16_speedup", lambda device: 1 / speedup)
+    train(automatic, tmp_path)
+    monkeypatch.setattr(network, "bfloat16_speedup", lambda device: speedup)
+    with join_processes() as own:
+        run = Run(automatic, tmp_path, None, own)
+    assert run.state.step == 1
+    assert run.model.compute_dtype == precision
 
 
 def test_the_previous_checkpoint_is_kept_and_used_if_the_last_is_missing(tiny, tmp_path, every_two):

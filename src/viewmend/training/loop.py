@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel as Ddp
 from torch.optim.swa_utils import AveragedModel
 
+from viewmend.models.network import faster_dtype
 from viewmend.training.config import TrainConfig
 from viewmend.training.held_back import MIN_GAIN_DB, PATIENCE, HeldBackValidation
 from viewmend.training.objective import StepOutput
@@ -207,7 +208,10 @@ class Run:
         if start is None and config.start is not None:
             start = config.objective.load_start(config.start)
         self.config, self.out, self.own = config, out, own
-        self.objective = config.objective.objective(config, config.objective, start).to(own.device)
+        here = config
+        if config.precision == "auto":  # not stored: a run may be resumed on another machine
+            here = replace(config, precision="bfloat16" if faster_dtype(own.device) == torch.bfloat16 else "float32")
+        self.objective = config.objective.objective(here, config.objective, start).to(own.device)
         self.model = self.objective.model
         self.average = AveragedModel(self.model, multi_avg_fn=averaging(config.ema))
         self.trained = [p for p in self.model.parameters() if p.requires_grad]
