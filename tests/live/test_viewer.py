@@ -48,7 +48,13 @@ def test_pages_show_what_the_program_wants():
             viewer.show(camera=CAMERAS[2], time=1)
             later = next(shown)
             assert later["time"] == 1 and len(later["pose"]["R"]) == 9 and len(later["pose"]["T"]) == 3
-        for wrong in ({"mode": "nice"}, {"elevation": 100.0}, {"azimuth": 1.0, "camera": CAMERAS}, {"time": -1}):
+        for wrong in (
+            {"mode": "nice"},
+            {"mode": "compared"},
+            {"elevation": 100.0},
+            {"azimuth": 1.0, "camera": CAMERAS},
+            {"time": -1},
+        ):
             with pytest.raises(ValueError, match="expected"):
                 viewer.show(**wrong)
     with pytest.raises(urllib.error.URLError):

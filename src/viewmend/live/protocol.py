@@ -198,7 +198,7 @@ class ShowView(Struct, frozen=True):
 
     pose: Camera | None = None
     time: Count | None = None
-    mode: Mode | None = None
+    mode: Annotated[str, one_of(*(mode for mode in MODES if mode != "compared"))] | None = None
 
 
 def parse(text: str, limits: Limits) -> Message:
