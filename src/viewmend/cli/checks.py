@@ -75,9 +75,9 @@ def check_people(performers: Path | None, motions: Path | None) -> None:
     """Raise a ValueError unless both or neither are given, and exist."""
     if (performers is None) != (motions is None):
         raise ValueError("expected both --performers and --motions, got one of them; give both folders")
-    for folder in (performers, motions):
+    for option, folder in (("performers", performers), ("motions", motions)):
         if folder is not None and not folder.exists():
-            raise ValueError(f"{folder}: expected what --performers or --motions names, found nothing; check the path")
+            raise ValueError(f"{folder}: expected the folder of --{option}, found nothing; check the path")
 
 
 def load_named(name: str | None, device: str) -> "Inpainter":

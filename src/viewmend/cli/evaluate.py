@@ -224,6 +224,11 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         return list((studio.lengthened(scenes) if name in LONG_SETS else scenes)[part])
     prepared = asdict(options.preparation)
     if is_splits(Path(name)):
+        if options.inputs != "all" or options.format is not None:
+            raise ValueError(
+                f"expected neither --inputs nor --format with {name}, which says which cameras and format to use, got "
+                "them; leave them out"
+            )
         return [replace(s, **prepared) for s in split_scenes(Path(name), options.frames)[part]]
     inputs = dict.fromkeys(number.strip() for number in options.inputs.split(",") if number.strip())
     if not inputs:

@@ -47,7 +47,8 @@ def parse(arguments: Sequence[str], prog: str) -> Options:
     start = next((after for word, after in pairwise(words) if word == "--from"), None)
     flags = (tyro.conf.FlagCreatePairsOff, tyro.conf.AvoidSubcommands)
     default = Options(config=make_recipe(name, start))
-    options = tyro.cli(Options, args=list(rest), default=default, prog=f"{prog} {name}", config=flags)
+    usage = f"{prog} {name} CAPTURE" if name == "finetune" else f"{prog} {name}"
+    options = tyro.cli(Options, args=list(rest), default=default, prog=usage, config=flags)
     config = options.config
     if name == "finetune" and not (config.scenes.captures or config.shards):
         raise ValueError("expected viewmend train finetune CAPTURE, got no capture; give its folder")

@@ -140,6 +140,9 @@ def test_the_command_writes_what_evaluate_takes(captures, tmp_path, capsys):
         assert [scene.held for scene in scenes] == [scene.left_out for scene in test]
         assert all(len(scene.inputs) == 4 and scene.held not in scene.inputs for scene in scenes)
         assert scenes_of(str(out), RunOptions(out=tmp_path)) == list(scenes)
+        for other in ({"inputs": "8"}, {"format": "bundle"}):
+            with pytest.raises(ValueError, match="expected neither --inputs nor --format"):
+                scenes_of(str(out), RunOptions(out=tmp_path, **other))
         frame = next(iter(scenes[0].frames()))
         assert frame.truth.cameras.names == (scenes[0].held,) and len(frame.inputs.cameras) == 4
         assert main(["splits", *everything, "--out", str(out)]) == 2
