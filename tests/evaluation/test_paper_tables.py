@@ -42,7 +42,7 @@ def test_our_figures_are_means_over_seeds(make_cell, make_frame):
     grid = paper_grid([*paper_rows(3), PaperRow("not in the paper", "no-rope")], report, methods)
     lines = [dict(zip(grid.heads, row, strict=True)) for row in grid.rows]
     _, single, no_past, no_rope, full, other = lines
-    assert (full["PSNR holes (a) (here)"], full["PSNR HOLES (paper)"]) == ("21.000", "42.184")
+    assert (full["PSNR holes (a) (here)"], full["PSNR inpainted, reading (b) (paper)"]) == ("21.000", "42.184")
     assert (no_rope["PSNR holes (a) (here)"], no_rope["PSNR (paper)"]) == ("19.000", "32.046")
     assert no_past["PSNR (here)"] == "n/a" and no_past["here"] == "none" and no_past["FPS (paper)"] == "41.32"
     assert single["PSNR (here)"] == "n/a" and "**1 failed**" in single["here"]
@@ -70,7 +70,7 @@ def test_the_command_writes_the_table_in_every_format(tmp_path, capsys):
     assert len(lines) == 25 and lines[19]["here"] == "none" and lines[1]["PSNR (here)"] == "n/a"
     assert (lines[20]["row"], lines[20]["here"]) == ("not in the paper", "nearest")
     assert "Here: 1 scenes, 1 frames of 128 x 128; holes" in text
-    assert lines[0]["PSNR (here)"] == "n/a" and lines[0]["PSNR (paper)"] == "33.478", "RGVI needs RAFT"
+    assert lines[0]["PSNR (here)"] == "n/a" and lines[0]["PSNR (paper)"] == "33.478", "RGVI needs its networks"
     assert float(lines[20]["PSNR (here)"]) > 10 and 0 < float(lines[20]["LPIPS (here)"]) < 1
     with (tmp_path / "table1.csv").open() as file:
         assert list(csv.DictReader(file)) == lines
@@ -104,7 +104,7 @@ def test_a_network_trained_from_scratch_is_not_called_fine_tuned(tmp_path, monke
     monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
     row = PaperRow("DSTT finetuned, def", "dstt-o-def-finetuned")
     for start, label in (
-        ("random weights", "DSTT finetuned, def (here trained from scratch, 81 minutes)"),
+        ("random weights", "DSTT, trained from scratch (81 minutes), def"),
         ("`dstt.pth`", "DSTT finetuned, def"),
     ):
         (folder / "README.md").write_text(f"Trained by `viewmend train dstt` from {start}: 9 steps in 81 minutes.")

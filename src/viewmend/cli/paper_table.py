@@ -43,7 +43,6 @@ def run(options: Options) -> int:
     from viewmend.cli.evaluate import evaluate, exit_code, report_folder
     from viewmend.evaluation import paper_tables as paper
     from viewmend.evaluation.report import csv_text, markdown_table
-    from viewmend.metrics.weights import find_weights, known_weights
     from viewmend.models.registry import method_names
     from viewmend.utils.atomic_writes import write_text
 
@@ -61,9 +60,7 @@ def run(options: Options) -> int:
             raise ValueError("expected --ours with a model's name or folder, got none; leave it out for the default")
         ours = method_names(options.ours)
         trained = next((name for name in ours if paper.row_label(name).startswith(paper.PAPERS_MODEL)), None)
-        methods = {paper.OURS: () if trained is None else (trained,)}
-        if find_weights(known_weights("raft")) is None:
-            methods["rgvi"] = ()  # without RAFT it is not RGVI
+        methods = {paper.OURS: () if trained is None else (trained,), "rgvi": ()}  # not RGVI without its networks
         rows = [_relabelled(row, trained) for row in rows]
         rows += [paper.PaperRow(paper.row_label(name), name) for name in (*ours, *EXTRA_ROWS) if name != trained]
     names = [name for row in rows for name in methods.get(row.method, (row.method,))]
@@ -93,7 +90,8 @@ def _relabelled(row: "PaperRow", trained: str | None) -> "PaperRow":
     training = weights and training_of(weights.parent)
     if not training or training.start is not None:
         return row
-    return replace(row, label=f"{row.label} (here trained from scratch, {training.minutes} minutes)")
+    name, framing = row.label.replace(" finetuned", "").split(", ")
+    return replace(row, label=f"{name}, trained from scratch ({training.minutes} minutes), {framing}")
 
 
 def _text(table: int, sets: tuple[str, ...], grid: str, report: "Report") -> str:

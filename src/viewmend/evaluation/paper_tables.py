@@ -22,6 +22,11 @@ OURS = "ours"
 """Method of the paper's own row: stands for a model that is named at run time."""
 PAPER_COLUMNS = ("psnr", "ssim", "lpips", "vfid", "psnr_holes", "ssim_holes", "lpips_holes", "fps")
 """`psnr_holes` is over the pixels of E by the paper's text; its values follow reading (b), that of masked images."""
+PAPER_HEADINGS = {
+    "psnr_holes": "PSNR inpainted, reading (b)",
+    "ssim_holes": "SSIM inpainted",
+    "lpips_holes": "LPIPS inpainted",
+}
 PAPERS_MODEL = "the paper's model"
 COLUMNS = (
     ("PSNR", "psnr", "whole", 3),
@@ -125,7 +130,7 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
     """
     of = {row.method: row for row in report.tables[0].rows} if report.tables else {}
     heads = ("row", "here", *(f"{c[0]} (here)" for c in COLUMNS))
-    paper = tuple(f"{name.replace('_', ' ').upper()} (paper)" for name in PAPER_COLUMNS)
+    paper = tuple(f"{PAPER_HEADINGS.get(name, name.upper())} (paper)" for name in PAPER_COLUMNS)
     lines = []
     for row in rows:
         names = methods.get(row.method, (row.method,))
