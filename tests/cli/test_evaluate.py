@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 
 import pytest
 
@@ -32,6 +33,15 @@ def test_every_n_th_scene_covers_all_kinds(tmp_path):
     found = scenes_of("P", RunOptions(out=tmp_path, every=5, frames=1, size=64))
     assert len({(scene.rig, scene.style) for scene in found}) == len(found) == 6
     assert [s.name for s in scenes_of("P", RunOptions(out=tmp_path, every=5, scenes=2))] == ["P-10000", "P-10005"]
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 4, 6, 9, 10])
+def test_one_scene_in_n_covers_both_rigs_and_all_tempos(tmp_path, every):
+    everything = [scene.name for scene in scenes_of("P", RunOptions(out=tmp_path))]
+    found = scenes_of("P", RunOptions(out=tmp_path, every=every))
+    assert len(found) == math.ceil(30 / every) and len({scene.rig for scene in found}) == 2
+    assert len({scene.style for scene in found}) == 3
+    assert [name for name in everything if name in {s.name for s in found}] == [s.name for s in found]
 
 
 def test_out_must_not_be_a_file(tmp_path, capsys):

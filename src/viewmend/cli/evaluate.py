@@ -1,5 +1,7 @@
 """`viewmend evaluate`: compare methods on synthetic scenes and captures, in tables and images."""
 
+import itertools
+import math
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,9 +13,10 @@ from viewmend.cli.checks import PreparationOptions, ViewOptions, check_device, c
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from viewmend.data.holdout.scenes import LeaveOneOutScene
+    from viewmend.data.holdout.studio_scenes import StudioScene
     from viewmend.evaluation.report import Report
     from viewmend.evaluation.result_cache import CellStore
 
@@ -48,7 +51,7 @@ class RunOptions:
     """Number of frames of each scene; by default 10 of P and Q, and all of a capture. Long sets have 41, of which the
     last 10 are scored."""
     every: int = 1
-    """Use only every n-th scene of each set, for a quick look at all kinds of scenes."""
+    """Use one scene in n of each set, for a quick look at all kinds of scenes; of a capture, every n-th camera."""
     scenes: int | None = None
     """Largest number of scenes of each set, after --every."""
     size: int = 512
@@ -213,7 +216,7 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         )
     frames = studio.LONG_FRAMES if name in LONG_SETS else options.frames or studio.FRAMES
     if name == "P-turn":
-        return list(studio.turning_set(options.size)[part])
+        return _one_in(options, studio.turning_set(options.size))
     if name in ("P", "P-long", "Q", "Q-long"):
         if name[0] == "P":
             scenes = studio.procedural_set(frames, options.size, options.background)
@@ -221,7 +224,7 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
             raise ValueError(f"expected --performers DIR for set {name}, got none; P needs no data")
         else:
             scenes = studio.performer_set(options.performers, options.motions, frames, options.size)
-        return list((studio.lengthened(scenes) if name in LONG_SETS else scenes)[part])
+        return _one_in(options, studio.lengthened(scenes) if name in LONG_SETS else scenes)
     prepared = asdict(options.preparation)
     if is_splits(Path(name)):
         if options.inputs != "all" or options.format is not None:
@@ -235,6 +238,13 @@ def scenes_of(name: str, options: RunOptions) -> "list[LeaveOneOutScene]":
         raise ValueError("expected --inputs all or a number of cameras, got none; leave it out for all")
     captured = [s for number in inputs for s in capture_set(Path(name), number, options.frames, options.format)[part]]
     return [replace(scene, **prepared) for scene in captured]
+
+
+def _one_in(options: RunOptions, scenes: "Sequence[StudioScene]") -> "list[LeaveOneOutScene]":
+    """One scene in `options.every`, and not every n-th: rigs alternate, and tempos have a period of three."""
+    stride = next(n for n in itertools.count(options.every) if math.gcd(n, 6 * len(scenes)) == 1)
+    numbers = sorted(n * stride % len(scenes) for n in range(math.ceil(len(scenes) / options.every)))
+    return [scenes[number] for number in numbers[: options.scenes]]
 
 
 def _search_first(folder: Path) -> None:
