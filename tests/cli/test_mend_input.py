@@ -98,7 +98,7 @@ def test_what_is_not_of_an_earlier_run_is_not_replaced(folder, tmp_path, mend):
 
 
 def test_check_says_what_mend_would_change(folder, shifted, capsys):
-    (change,) = adjustments(open_capture(shifted), open_capture(shifted).read(0))
+    (change,) = adjustments(open_capture(shifted), open_capture(shifted).read(0), ())
     assert "principal points moved by (-" in change
     for capture, said in ((shifted, True), (folder, False)):
         assert main(["check", str(capture)]) == 0

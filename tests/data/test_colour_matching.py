@@ -95,6 +95,34 @@ def test_a_few_cameras_or_none_that_share_surface_are_left_alone(studio):
     assert match_colours(replace(frame, mask=None), studio.bounds) is None
 
 
+@pytest.mark.parametrize("change", ["black", "grey", "dark"])
+def test_one_camera_that_differs_does_not_change_the_others(studio, change):
+    """A black image is left out, a grey one stays as it is, and a dark one is matched to the others."""
+
+    class Changed(CaptureWrapper):
+        source = Tinted(studio)
+
+        def read(self, time):
+            frame, rgb = self.source.read(time), self.source.read(time).rgb.clone()
+            grey = rgb[0].float().mean(0, keepdim=True).to(torch.uint8)
+            rgb[0] = {"black": 0 * rgb[0], "grey": grey.expand(3, -1, -1), "dark": rgb[0] // 3}[change]
+            return replace(frame, rgb=rgb)
+
+    rest = studio.cameras.names[1:]
+    clean = prepare(Tinted(studio), rest, align=False).read(0).select(rest)
+    capture = prepare(Changed(), align=False)
+    frame, raw = capture.read(0), Changed().read(0)
+    inside = clean.mask[:, None].expand_as(clean.rgb) == 255
+    difference = (frame.select(rest).rgb.float() - clean.rgb.float()).abs()[inside]
+    assert difference.mean() < 1.5, "of 255; another camera's mask makes another hull"
+    assert (studio.cameras.names[0] in frame.cameras.names) == (change != "black")
+    if change == "grey":
+        assert torch.equal(frame.rgb[0], raw.rgb[0])
+    if change == "dark":
+        own, others = frame.rgb[0][:, raw.mask[0] == 255].float().mean(), clean.rgb[inside].float().mean()
+        assert 0.7 < own / others < 1.4, "a third before"
+
+
 def test_a_camera_that_is_left_out_is_not_looked_at_and_stays(studio):
     inputs = studio.cameras.names[1:]
     clean, spoiled = (prepare(Tinted(studio, spoiled=s), inputs, align=False) for s in (False, True))

@@ -73,7 +73,7 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
         check = replace(check, issues=(*capture.issues, *without_consequences(check.issues, late), *late))
-        changes = () if fatal or len(good.cameras) < 2 else adjustments(capture, good)
+        changes = () if fatal or len(good.cameras) < 2 else adjustments(capture, good, check.issues)
     if options.out is not None:
         remove_partial_file(options.out)
         with busy("drawing the picture"):

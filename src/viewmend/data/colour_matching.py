@@ -6,6 +6,7 @@ so that all cameras agree on the colour of a point. The mean map is the identity
 right. `SurfacePoints` and `best_agreement` are also used by the capture checks.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import torch
@@ -48,6 +49,9 @@ FOLDS = 4
 """Cross-validation folds. Points are in spatial order, so each fold is another part of the surface."""
 MAX_RATIO = 0.9
 """Maps are used if they reduce the disagreement on held-out points to less than this share."""
+MAX_ODD = 2.0
+"""An odd camera keeps its map if its colours then disagree with the others' at most this many times as much as theirs
+among themselves."""
 MIN_DISAGREEMENT = 0.012
 """A smaller disagreement is not corrected, as the error of the hull alone causes that much."""
 TINY = 1e-9
@@ -164,8 +168,11 @@ class ColourMatch:
         return replace(frame, rgb=rgb)
 
 
-def match_colours(frame: MultiViewFrame, bounds: Bounds | None) -> ColourMatch | None:
-    """Fit colour maps to the cameras of one frame with masks; None if too few cameras share surface."""
+def match_colours(frame: MultiViewFrame, bounds: Bounds | None, odd: Collection[str] = ()) -> ColourMatch | None:
+    """Fit colour maps to the cameras of one frame with masks; None if too few cameras share surface.
+
+    `odd` cameras have no effect on the others: they are matched to them afterwards, if a map can do it.
+    """
     small = limit_size(frame, LONGEST_PX)
     if small.mask is None or len(small.cameras) < MIN_CAMERAS:
         return None
@@ -179,10 +186,37 @@ def match_colours(frame: MultiViewFrame, bounds: Bounds | None) -> ColourMatch |
     enough = seen.sum(1) >= MIN_SHARED_POINTS
     if int(enough.sum()) < MIN_CAMERAS:
         return None
-    names = tuple(name for name, used in zip(small.cameras.names, enough.tolist(), strict=True) if used)
-    colours = SurfaceColours(colours.rgb[enough].double(), seen[enough])
-    before, after = _cross_validate(colours)
-    return ColourMatch(names, _fit(colours.rgb, colours.seen).float(), before, after)
+    unlike = torch.tensor([name in odd for name in small.cameras.names]).to(enough)
+    good = SurfaceColours(colours.rgb[enough & ~unlike].double(), seen[enough & ~unlike])
+    if len(good.rgb) < MIN_CAMERAS:
+        return None
+    before, after = _cross_validate(good)
+    maps = _fit(good.rgb, good.seen)
+    matched = _map(good.rgb, maps)
+    own = {
+        view: _fit_to(matched, good.seen, colours.rgb[view].double(), seen[view], after)
+        for view in (enough & unlike).nonzero()[:, 0].tolist()
+    }
+    own |= dict(zip((enough & ~unlike).nonzero()[:, 0].tolist(), maps, strict=True))
+    found = {small.cameras.names[view]: own for view, own in sorted(own.items()) if own is not None}
+    return ColourMatch(tuple(found), torch.stack([*found.values()]).float(), before, after)
+
+
+def _fit_to(
+    matched: Colours,
+    seen: Bool[Tensor, "view point"],
+    rgb: Float[Tensor, "point 3"],
+    own: Bool[Tensor, "point"],
+    typical: float,
+) -> Float[Tensor, "3 4"] | None:
+    """The map of one more camera to the mean colours of cameras that are matched; None if no map makes it agree."""
+    both = own & seen.any(0)
+    mean = ((seen[..., None] * matched).sum(0) / seen.sum(0).clamp(min=1)[:, None])[both]
+    values = torch.cat([rgb, torch.ones_like(rgb[:, :1])], -1)[both]
+    if len(values) < MIN_SHARED_POINTS:
+        return None
+    found = torch.linalg.lstsq(values, mean).solution.mT
+    return found if float((values @ found.mT - mean).norm(dim=-1).mean()) <= MAX_ODD * typical else None
 
 
 def _cross_validate(colours: SurfaceColours) -> tuple[float, float]:

@@ -31,6 +31,8 @@ class Issue:
     """The camera to leave out; the other cameras are correct."""
     always: bool = False
     """Whether to leave the camera out of all frames, because its calibration is in doubt."""
+    odd_image: str | None = None
+    """The camera whose image differs from the others', so that their colours are not matched to it."""
     timing: bool = False
     """Whether a late camera, this one or another, would explain the fault."""
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from viewmend.data.checks.colours import find_blank_images
 from viewmend.data.checks.diagnosis import diagnose, find_bad_masks
 from viewmend.data.checks.synchronisation import find_desynchronised_cameras
 from viewmend.data.colour_matching import ColourMatch, match_colours
@@ -62,7 +63,8 @@ class PreparedCapture(CaptureWrapper):
     def read(self, time: int) -> MultiViewFrame:
         """Read the frame at index `time` with the calibration of `cameras`.
 
-        A camera whose mask is inverted, or wrongly empty, is left out of the frame and reported once. CaptureError if
+        A camera whose mask is inverted or wrongly empty, or whose image is black, is left out of the frame and reported
+        once. CaptureError if
         the source cannot be read, half of the masks are inverted, or no camera is left.
         """
         frame = self.source.read(time).without(self.left_out)
@@ -70,6 +72,8 @@ class PreparedCapture(CaptureWrapper):
         absent = [name for name in inputs if name not in frame.cameras.names and name not in self.left_out]
         text = "camera '{}' has no image or no mask in this frame and is absent; viewmend check lists all gaps"
         issues = tuple(Issue(text.format(name)) for name in absent) + find_bad_masks(frame, inputs, self.bounds)
+        good = [name for name in frame.cameras.names if name in inputs and all(name != i.camera for i in issues)]
+        issues += find_blank_images(frame.select(good))
         where, bad = f"{self.name}: frame '{self.frame_ids[time]}'", [issue.camera for issue in issues if issue.camera]
         _raise_or_warn(where, issues, self._reported)
         if len(bad) == len(frame.cameras):
@@ -127,23 +131,26 @@ def prepare(
     _raise_or_warn(at, without_consequences(issues, late), reported)
     _raise_or_warn(where, late, reported)
     prepared = PreparedCapture(source, None, max_image_size, names, left_out, None, reported)
-    return _adjusted(prepared, frame, align, match_colours)
+    return _adjusted(prepared, frame, issues, align, match_colours)
 
 
-def adjustments(source: CaptureSource, frame: MultiViewFrame) -> tuple[str, ...]:
-    """What `prepare` would change, by a frame of good cameras, in the same words."""
+def adjustments(source: CaptureSource, frame: MultiViewFrame, issues: Sequence[Issue]) -> tuple[str, ...]:
+    """What `prepare` would change, by a frame of good cameras and its issues, in the same words."""
     if frame.mask is None or not bool((frame.mask > 0).any()):
         return ()
-    return _adjusted(PreparedCapture(source), frame, align=True, colours=True).changes
+    return _adjusted(PreparedCapture(source), frame, issues, align=True, colours=True).changes
 
 
-def _adjusted(prepared: PreparedCapture, frame: MultiViewFrame, align: bool, colours: bool) -> PreparedCapture:
+def _adjusted(
+    prepared: PreparedCapture, frame: MultiViewFrame, issues: Sequence[Issue], align: bool, colours: bool
+) -> PreparedCapture:
     """The capture with the shift of all images undone, and with matched colours, as found in a frame."""
     if align and frame.mask is not None and len(frame.cameras) >= 2:
         prepared = replace(prepared, alignment=shared_offset(frame.mask, frame.cameras, prepared.bounds))
     if colours:
         cameras = replace(prepared, max_image_size=None).cameras.select(frame.cameras.names)
-        found = match_colours(replace(frame, cameras=cameras), prepared.bounds)
+        odd = [issue.odd_image for issue in issues if issue.odd_image]
+        found = match_colours(replace(frame, cameras=cameras), prepared.bounds, odd)
         prepared = replace(prepared, colours=found if found is not None and found.helps else None)
     return prepared
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from viewmend.data.colour_matching import SurfaceColours, SurfacePoints, agreement, best_agreement
@@ -16,6 +16,8 @@ from viewmend.geometry.sampling import sample_bilinear
 from viewmend.types import MultiViewFrame
 
 LONGEST_PX = 256
+BLANK_PX = 128
+"""Every n-th pixel is looked at, so that at least this many remain along the longer side."""
 HULL = HullConfig(resolution=64)
 FAR, FAR_AT_LEAST = 2.5, 0.09
 """An image shows something else if its colour distance to the others is this many times the median, and at least the
@@ -40,12 +42,7 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
     small = limit_size(frame, LONGEST_PX)
     if small.mask is None or len(small.cameras) < 3:
         return ()
-    brightness, detail, saturation = _measures(small)
-    flat = (detail < FLAT * detail.nanmedian()) | (brightness < DARK)
-    if bool(flat.any()):  # these are not compared
-        names = [name for name, empty in zip(small.cameras.names, flat.tolist(), strict=True) if empty]
-        text = "camera '{}': its images are of one colour, or black; check its exposure and its files"
-        return (*(Issue(text.format(name)) for name in names), *find_odd_images(small.without(names), bounds))
+    _, detail, saturation = _measures(small.rgb, small.mask)
     try:
         surface = SurfacePoints.from_proxy(small, reconstruct(small.mask, small.cameras, bounds, HULL))
     except ValueError:
@@ -73,7 +70,20 @@ def find_odd_images(frame: MultiViewFrame, bounds: Bounds | None) -> tuple[Issue
         elif bool(blurred[view] | noisy[view]):
             fault = "blurred" if bool(blurred[view]) else "noisy"
             texts[view] = f"its images are {fault} compared with the others'; check focus and gain"
-    return tuple(Issue(f"camera '{small.cameras.names[view]}': {text}") for view, text in texts.items())
+    names = small.cameras.names
+    return tuple(Issue(f"camera '{names[view]}': {text}", odd_image=names[view]) for view, text in texts.items())
+
+
+def find_blank_images(frame: MultiViewFrame) -> tuple[Issue, ...]:
+    """Find cameras whose images show nothing on the subject: all black, or all of one colour, unlike the others'."""
+    if frame.mask is None or len(frame.cameras) < 3:
+        return ()
+    step = max(1, max(frame.mask.shape[1:]) // BLANK_PX)
+    brightness, detail, _ = _measures(frame.rgb[..., ::step, ::step], frame.mask[:, ::step, ::step])
+    blank = (detail < FLAT * detail.nanmedian()) | ((brightness < DARK) & (brightness.nanmedian() > DARK))
+    text = "camera '{}': its image is black or of one colour, so it is left out; check its exposure and its files"
+    names = zip(frame.cameras.names, blank.tolist(), strict=True)
+    return tuple(Issue(text.format(name), camera=name) for name, shows_nothing in names if shows_nothing)
 
 
 def _find_better_fits(
@@ -105,13 +115,14 @@ def _find_better_fits(
     return found
 
 
-def _measures(frame: MultiViewFrame) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"], Float[Tensor, "view"]]:
+def _measures(
+    images: UInt8[Tensor, "view 3 height width"], masks: UInt8[Tensor, "view height width"]
+) -> tuple[Float[Tensor, "view"], Float[Tensor, "view"], Float[Tensor, "view"]]:
     """The subject's mean brightness of 255, difference of neighbouring pixels, and saturation; NaN without foreground.
 
     Saturation is the difference of the colour channels, relative to brightness.
     """
-    assert frame.mask is not None
-    rgb, inside = frame.rgb.float(), frame.mask > FOREGROUND
+    rgb, inside = images.float(), masks > FOREGROUND
     grey, both = rgb.mean(1), inside[:, :, 1:] & inside[:, :, :-1]
     total = (grey * inside).sum((1, 2))
     detail = ((grey[:, :, 1:] - grey[:, :, :-1]).abs() * both).sum((1, 2)) / both.sum((1, 2))

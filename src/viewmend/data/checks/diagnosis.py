@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.data.checks.colours import find_odd_images
+from viewmend.data.checks.colours import find_blank_images, find_odd_images
 from viewmend.data.checks.leave_one_out import find_outlier_by_hull, find_outlier_by_outlines
 from viewmend.data.errors import Issue
 from viewmend.data.source import limit_size
@@ -67,6 +67,7 @@ def diagnose(frame: MultiViewFrame, bounds: Bounds | None = None) -> tuple[Issue
         expected = f"a subject of about {MIN_SIZE_M} to {MAX_SIZE_M:g} m"
         issues = (*issues, Issue(f"expected {expected}, got {size_m:.3g} m; check metres_per_unit"))
     issues = (*issues, *_find_outlier(frame, bounds))
+    issues = (*issues, *find_blank_images(frame.without([issue.camera for issue in issues if issue.camera])))
     consistent = frame.without([issue.camera for issue in issues if issue.camera])
     return (*issues, *find_odd_images(consistent, bounds))
 
