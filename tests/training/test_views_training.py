@@ -1,12 +1,14 @@
 """Training of `views`: stored scenes, crops, the loss, captures, and the error predictor."""
 
 import zlib
+from contextlib import nullcontext
 from dataclasses import replace
 from random import Random
 
 import pytest
 import torch
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_RENDER, VIEWS_SAMPLING, VIEWS_SCENES, log_of
+from training.other_device import DEVICE, other_device
 
 from viewmend.data.holdout.scenes import LeaveOneOut
 from viewmend.data.native_writer import write_capture
@@ -35,6 +37,7 @@ from viewmend.training.views import (
     recolour,
     visible_cameras,
 )
+from viewmend.utils.tensors import to_device
 
 OPTIONS = ViewsObjectiveConfig(model=VIEWS_MODEL, sampling=VIEWS_SAMPLING)
 
@@ -243,6 +246,31 @@ def test_each_term_alone_can_be_minimised(view, term):
         optimizer.step()
         losses.append(float(loss.detach()))
     assert min(losses) < losses[0] - 0.02 * abs(losses[0]), losses
+
+
+def test_steps_are_made_on_any_device(view, monkeypatch):
+    losses = []
+    for device in ("cpu", DEVICE):
+        with other_device(monkeypatch) if device == DEVICE else nullcontext():
+            objective = make_objective(OPTIONS).to(device)
+            batch = [to_device(view, device)] * 6
+            torch.manual_seed(0)
+            total = objective(batch).total
+            total.backward()
+            assert total.device == objective.model.depth_logits.weight.grad.device == torch.device(device)
+            losses.append(float(total.detach()))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-2)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("precision", ["float32", "auto"])
+def test_cuda_makes_the_steps_of_both_recipes(tiny_views, capture, tmp_path, precision):
+    """With validation."""
+    config = replace(tiny_views, steps=2, validate_every=1, validation_views=1, precision=precision)
+    scenes = replace(VIEWS_SCENES, captures=(capture,), captures_fraction=1.0, hold_out="auto")
+    for name, own in (("views", config), ("finetune", replace(config, scenes=scenes, shards=None))):
+        out = train(own, tmp_path / name)
+        assert [entry["step"] for entry in log_of(out) if "losses" in entry] == [1, 2]
 
 
 def make_objective(options, start=None):

@@ -212,7 +212,7 @@ def random_selection(crop: TrainingView) -> Mask | None:
     """Pixels to predict: sometimes only those around erroneous ones, as an error rule would select; None for all."""
     if float(torch.rand(())) > SPARSE:
         return None
-    scattered = torch.rand(crop.view.mask.shape) < 0.01 * float(torch.rand(()))
+    scattered = (torch.rand(crop.view.mask.shape) < 0.01 * float(torch.rand(()))).to(crop.view.mask.device)
     radius = int(torch.randint(5, ()))
     seeds = (crop.wrong | crop.view.holes | scattered).float()
     selected = (F.max_pool2d(seeds[None], 2 * radius + 1, 1, radius)[0] > 0) & (rim_depth(crop.view.depth) > 0)
