@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 from training.conftest import RUN, SCENES, VIEWS_MODEL, VIEWS_SAMPLING, log_of
+from training.other_device import other_device
 
 from viewmend.data.errors import CaptureError
 from viewmend.data.holdout.capture_scenes import make_splits, read_splits, splits_json
 from viewmend.data.native_writer import write_capture
 from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.metrics.lpips import load_lpips
 from viewmend.models.checkpoint import load_network
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.training import held_back
@@ -86,6 +88,17 @@ def test_the_table_tells_better_weights_from_worse_ones(place, tmp_path):
     for line in lines[2:]:
         _, psnr_before, psnr_after, lpips_before, lpips_after = (part.strip() for part in line.strip("|").split("|"))
         assert float(psnr_after) > float(psnr_before) and float(lpips_after) < float(lpips_before)
+
+
+def test_a_model_on_any_device_is_scored(place, monkeypatch):
+    model, metric, view = ViewSynthNet(VIEWS_MODEL).eval(), load_lpips(), next(held_back_views(place, AUTO))
+    with torch.no_grad():
+        expected, _ = view.score(model, metric)
+        with other_device(monkeypatch) as device:
+            found, completed = view.score(model.to(device), metric)
+    assert completed.rgb.device.type == "cpu"
+    assert found.psnr_db == pytest.approx(expected.psnr_db, abs=0.1)
+    assert found.lpips == pytest.approx(expected.lpips, abs=0.01)
 
 
 def test_a_run_keeps_its_best_weights_and_stops(place, tmp_path, monkeypatch):

@@ -24,6 +24,7 @@ from viewmend.models.compositing import Background, composite
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
+from viewmend.utils.tensors import to_device
 
 AUTO = "auto"
 """Value of `SceneConfig.hold_out` that leaves the choice to `HeldBack.of`."""
@@ -113,11 +114,11 @@ class HeldBackView:
     truth: MultiViewFrame
 
     def score(self, model: Inpainter, metric: Lpips) -> tuple["ViewScore", CompletedView]:
-        """The view by this model, and its scores on the background that the model paints."""
-        background = model.background or "black"
+        """The view by this model, on the CPU, and its scores on the background that the model paints."""
+        background, device = model.background or "black", next(model.parameters()).device
         stream = Stream(model, StreamConfig(memory_mb=None, background=background))
-        stream.add_frame(self.inputs.frame, self.inputs.proxy)
-        completed = stream.view(self.truth.cameras).completed
+        stream.add_frame(*to_device((self.inputs.frame, self.inputs.proxy), device))
+        completed = to_device(stream.view(self.truth.cameras.to(device)).completed, "cpu")
         rgb, truth = composite(background, completed.rgb, completed.opacity), self.true_image(background)
         found = psnr(rgb, truth, torch.ones_like(truth[0], dtype=torch.bool))
         assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
