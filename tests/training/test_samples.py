@@ -162,6 +162,7 @@ def test_samples_depend_neither_on_workers_nor_on_where_a_stream_resumes():
     first = [next(alone) for _ in range(3)]
     for (scene, number, sample), (other_scene, other_number, other) in zip(first, helped, strict=False):
         assert (scene, number) == (other_scene, other_number) and same(sample, other)
+        assert not other.truth.is_shared(), "containers have little shared memory"
     helped.close()
     stream = SampleReplay(source, "7", new_per_batch=1, replay_size=3, workers=0)
     batches = [stream.batch(step, 2) for step in range(4)]

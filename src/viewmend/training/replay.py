@@ -1,6 +1,7 @@
 """Batches that depend only on the config, the seed and the step, so that a resumed run makes the same steps."""
 
 import gc
+import io
 import signal
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -81,6 +82,17 @@ class _Numbered(Dataset[tuple[int, Sequence[Item] | Exception]]):
             return index, error
 
 
+def _to_bytes(scene: object) -> bytes:
+    """A scene as it comes from a worker: tensors would come through /dev/shm, which is 64 MB in many containers."""
+    file = io.BytesIO()
+    torch.save(scene, file)
+    return file.getvalue()
+
+
+def _from_bytes(data: bytes) -> tuple[int, Sequence[Item] | Exception]:
+    return torch.load(io.BytesIO(data), weights_only=False)  # a worker of this process wrote it
+
+
 def _ignore_signals(_: int) -> None:
     """Let the main process alone handle Ctrl-C and SIGTERM, which reach the whole process group."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -91,14 +103,13 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
     """(scene, index, sample) of all scenes from `first`. ValueError, OSError: one cannot be made, or many are empty."""
     numbered = _Numbered(scenes)
     if workers:
-        # Through files: descriptors would run out with a buffer of samples.
-        torch.multiprocessing.set_sharing_strategy("file_system")
         loader = DataLoader(
             numbered,
             batch_size=None,
             sampler=count(first),  # pyright: ignore[reportArgumentType]
             num_workers=workers,
             prefetch_factor=2,
+            collate_fn=_to_bytes,
             worker_init_fn=_ignore_signals,
         )
         # Forked workers must not collect what this process left behind: a decoder, say, would wait for its threads,
@@ -106,7 +117,7 @@ def samples_in_order(scenes: SceneSource[Item], first: int, workers: int) -> Ite
         gc.collect()
         gc.freeze()
         try:
-            loaded = iter(loader)
+            loaded = map(_from_bytes, iter(loader))
         finally:
             gc.unfreeze()
     else:
