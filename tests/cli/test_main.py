@@ -121,16 +121,31 @@ def test_an_empty_value_is_refused(arguments, capsys, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_request_ends_a_step_and_the_second_everything(number, capsys):
+def test_one_request_ends_a_step_and_only_a_later_ctrl_c_everything(number, monkeypatch, capsys):
     before = signal.getsignal(number)
+    monkeypatch.setattr(console, "REPEATED_S", 1e9)
     with console.stop_requests() as stopped:
         assert not stopped()
         os.kill(os.getpid(), number)
         assert stopped() == number and "saving a checkpoint" in capsys.readouterr().err
+        for again in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):  # torchrun and `timeout` signal several times
+            os.kill(os.getpid(), again)
+        monkeypatch.setattr(console, "REPEATED_S", -1.0)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stopped() == number and capsys.readouterr().err == ""
         with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGINT)
             sleep(1)
     assert signal.getsignal(number) == before
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-u", "-m", "viewmend", "--help"]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, check=False)
+    os.close(writing)
+    assert done.returncode and done.stderr == b""
 
 
 def test_sigterm_lets_a_command_clean_up(tmp_path):

@@ -16,6 +16,8 @@ from viewmend.utils.logging import printable
 _Item = TypeVar("_Item")
 INTERVAL_S = 30.0
 """Seconds between progress lines if standard error is not a terminal."""
+REPEATED_S = 1.0
+"""Ctrl-C so soon after the first signal is the same request: torchrun and `timeout` pass it on, and signal again."""
 
 
 def track(items: Iterable[_Item], description: str, total: int | None = None) -> Iterator[_Item]:
@@ -133,20 +135,22 @@ def exit_on_sigterm() -> Iterator[None]:
 
 @contextlib.contextmanager
 def stop_requests() -> Iterator[Callable[[], int]]:
-    """Let a loop finish its step after Ctrl-C or SIGTERM; a second signal interrupts it at once.
+    """Let a loop finish its step after Ctrl-C or SIGTERM; Ctrl-C after more than `REPEATED_S` interrupts it at once.
 
-    Yields a function that returns the number of the signal, or 0 if there was none.
+    Yields a function that returns the number of the first signal, or 0 if there was none.
     """
-    received: list[int] = []
+    first, at_s = 0, 0.0
 
     def request(number: int, _: object) -> None:
-        if received:
+        nonlocal first, at_s
+        if not first:
+            first, at_s = number, time.monotonic()
+            say("stopping after this step and saving a checkpoint; press Ctrl-C again to stop at once")
+        elif number == signal.SIGINT and time.monotonic() - at_s > REPEATED_S:
             raise KeyboardInterrupt
-        received.append(number)
-        say("stopping after this step and saving a checkpoint; press Ctrl-C again to stop at once")
 
     with _handle(request, signal.SIGINT, signal.SIGTERM):
-        yield lambda: sum(received)
+        yield lambda: first
 
 
 @contextlib.contextmanager
