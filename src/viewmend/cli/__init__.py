@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from viewmend import __version__
-from viewmend.cli.console import exit_on_sigterm, say
+from viewmend.cli.console import exit_on_sigterm, say, show
 from viewmend.utils.logging import escaped_traceback, log_to_terminal
 
 
@@ -56,12 +56,16 @@ ALIASES = {"info": "check"}
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `viewmend` with these arguments (by default those of the process) and return the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    with exit_on_sigterm():
+        return _run(list(sys.argv[1:] if argv is None else argv))
+
+
+def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_overview())
+        show(*_overview().splitlines())
         return 0 if arguments else 2
     if arguments[0] == "--version":
-        print(f"viewmend {__version__}")
+        show(f"viewmend {__version__}")
         return 0
     by_name = {command.name: command for command in COMMANDS}
     command = by_name.get(" ".join(arguments[:2])) or by_name.get(ALIASES.get(arguments[0], arguments[0]))
@@ -73,21 +77,21 @@ def main(argv: Sequence[str] | None = None) -> int:
             option = arguments[number - (not word.strip())].rstrip("= ")
             return _fail(f"expected a value after '{option}', got an empty one; is a variable unset?")
     log_to_terminal()
-    with exit_on_sigterm():
-        return _run(command, arguments[len(command.name.split()) :])
+    import tyro
+
+    arguments = arguments[len(command.name.split()) :]
+    module = importlib.import_module(command.module)
+    prog, flags = f"viewmend {command.name}", (tyro.conf.FlagCreatePairsOff,)
+    if hasattr(module, "parse"):
+        options = module.parse(arguments, prog)
+    else:
+        options = tyro.cli(module.Options, args=arguments, prog=prog, config=flags)
+    return int(module.run(options) or 0)
 
 
-def _run(command: Command, arguments: list[str]) -> int:
+def _run(arguments: list[str]) -> int:
     try:
-        import tyro
-
-        module = importlib.import_module(command.module)
-        prog, flags = f"viewmend {command.name}", (tyro.conf.FlagCreatePairsOff,)
-        if hasattr(module, "parse"):
-            options = module.parse(arguments, prog)
-        else:
-            options = tyro.cli(module.Options, args=arguments, prog=prog, config=flags)
-        return int(module.run(options) or 0)
+        return _dispatch(arguments)
     except SystemExit as request:  # from tyro: 0 after --help, 2 after a wrong option
         return request.code if isinstance(request.code, int) else 2
     except KeyboardInterrupt:
