@@ -17,7 +17,7 @@ class Provenance:
 
     viewmend: str
     commit: str
-    """Commit of the code, with "+" if files differed from it; "unknown" outside a checkout."""
+    """Commit of the code, with "+" if files differed from it; "unknown" if no commit has the code."""
     python: str
     torch: str
     device: str
@@ -33,7 +33,9 @@ class Provenance:
 def provenance(device: str, threads: int, jobs: int) -> Provenance:
     """The provenance of figures that are computed now."""
     name = torch.cuda.get_device_name(device) if device.startswith("cuda") else _processor()
-    head, load = _git("rev-parse", "--short", "HEAD"), round(os.getloadavg()[0], 1)
+    # An environment may lie in another project's repository, which does not track the package.
+    head = _git("ls-files", "--", Path(__file__).name) and _git("rev-parse", "--short", "HEAD")
+    load = round(os.getloadavg()[0], 1)
     changed = head and _git("status", "--porcelain", "--untracked-files=no", "--", ".")
     commit, python = f"{head}{'+' if changed else ''}" or "unknown", platform.python_version()
     return Provenance(__version__, commit, python, torch.__version__, name, threads, jobs, load)
@@ -41,7 +43,7 @@ def provenance(device: str, threads: int, jobs: int) -> Provenance:
 
 def _processor() -> str:
     file = Path("/proc/cpuinfo")
-    lines = file.read_text().splitlines() if file.is_file() else []
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.processor() or platform.machine())
 
