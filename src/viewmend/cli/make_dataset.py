@@ -155,8 +155,8 @@ def _check_plan(options: Options) -> None:
     plan = f"{options.recipe}, seed {options.seed}, {options.scenes}, {options.objective.sampling}\n"
     if not file.exists():
         write_text(file, plan)
-    elif file.read_text() != plan:
+    elif (found := file.read_text("utf-8", "replace")) != plan:
         raise ValueError(
-            f"{options.out}: expected samples with the same options and seed, found {file.read_text().strip()}; pass "
-            "the options that the folder was begun with, or choose another --out"
+            f"{options.out}: expected samples with the same options and seed, found {found.strip()}; pass the options "
+            "that the folder was begun with, or choose another --out"
         )

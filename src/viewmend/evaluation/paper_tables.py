@@ -58,7 +58,7 @@ class PaperRow:
 
 def paper_rows(table: int) -> list[PaperRow]:
     """The rows of table 1, 2 or 3 (`paper_tables.csv`)."""
-    text = (files("viewmend.evaluation") / "paper_tables.csv").read_text()
+    text = (files("viewmend.evaluation") / "paper_tables.csv").read_text(encoding="utf-8")
     rows = [row for row in csv.DictReader(text.splitlines()) if row["table"] == str(table)]
     return [PaperRow(row["label"], row["method"], tuple(row[name] for name in PAPER_COLUMNS)) for row in rows]
 

@@ -36,7 +36,7 @@ def page(report: Report, store: CellStore, shown: int = 12) -> str:
             data = base64.b64encode(cv2.imencode(".jpg", sheet[..., ::-1])[1].tobytes()).decode()
             image = f'<img alt="{escape(scene)}" src="data:image/jpeg;base64,{data}">'
             parts.append(f'<h3>{escape(scene)}</h3><div class="wide">{image}</div>')
-    style = (files("viewmend.evaluation") / "report.css").read_text()
+    style = (files("viewmend.evaluation") / "report.css").read_text(encoding="utf-8")
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>Evaluation</title><style>{style}</style>"

@@ -97,7 +97,7 @@ class CellStore:
     def load(self, key: CellKey) -> Cell | None:
         """The cell; None if it is absent or damaged."""
         try:
-            values = json.loads((self.folder / f"{key.stem}.json").read_text())
+            values = json.loads((self.folder / f"{key.stem}.json").read_text(encoding="utf-8"))
             if values["key"] != asdict(key):
                 return None
             features, truth = (self._read_features(f"{stem}.npz") for stem in (key.stem, key.scene_stem))

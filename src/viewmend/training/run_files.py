@@ -160,9 +160,9 @@ class Log:
         if not writes:
             return
         self._path = path = out / "log.jsonl"
-        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
         write_text(path, "".join(line for line in lines if line.endswith("\n") and not _is_later(line, step)))
-        self._file = path.open("a")
+        self._file = path.open("a", encoding="utf-8")
         try:
             from torch.utils.tensorboard import SummaryWriter  # type: ignore[attr-defined]
         except ImportError:

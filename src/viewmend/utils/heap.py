@@ -57,7 +57,7 @@ def freeze_loaded_objects() -> None:
 def resident_bytes() -> int | None:
     """Physical memory of the process; None if /proc does not provide it."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
     except (OSError, IndexError, ValueError):
         return None
     return pages * os.sysconf("SC_PAGE_SIZE")
