@@ -10,8 +10,9 @@ from reference.ball import BallCapture, camera_at, ring
 from viewmend.data.holdout.scenes import LeaveOneOut, revealed
 from viewmend.evaluation.mending import Mender
 from viewmend.geometry.hull import HullConfig
-from viewmend.models.checkpoint import build
+from viewmend.models.checkpoint import build, load_inpainter
 from viewmend.models.classical import Telea
+from viewmend.models.compositing import opaque_in_mask
 from viewmend.models.paper.config import paper, paper_small
 from viewmend.models.paper.tokenizer import build_context_input, build_target_input
 from viewmend.models.smooth_fill import SmoothFill
@@ -19,7 +20,7 @@ from viewmend.rendering.view import RenderConfig, select_closest
 from viewmend.stream import Stream
 from viewmend.training.config import SamplingConfig
 from viewmend.training.samples import HeldOutCamera
-from viewmend.types import check_target_mask
+from viewmend.types import CompletedView, check_target_mask
 
 TARGET = camera_at(75, "t", height_m=0.3)
 
@@ -89,6 +90,30 @@ def test_the_papers_model_sees_m_t_white_where_it_is_0_and_black_where_it_is_mis
     assert not completed.rgb[:, :, :40].any()
     assert torch.equal(completed.opacity, torch.maximum(incomplete.mask, error) * mask)
     assert (net([given], [[context(5)]])[0].composited[:, :, :40] == 1).all(), "training sees what is scored"
+
+
+def test_what_the_target_mask_shows_is_opaque():
+    """A model's own alpha is replaced in E; where it is too low to have a colour, the neighbours' colour is taken."""
+    incomplete, error = view(5), torch.zeros_like(view(5).error)
+    error[10:30, 20:60] = 1
+    mask = error * torch.ones_like(error)
+    mask[:12] = 0
+    colour = torch.tensor([0.8, 0.4, 0.2])[:, None, None]
+    alpha = torch.full_like(error, 0.5)
+    alpha[14:20, 30:40] = 0
+    given = replace(incomplete, error=error, target_mask=mask)
+    completed = CompletedView(given, colour * alpha, alpha=alpha)
+    made = opaque_in_mask(completed)
+    known = (mask > 0) & (error > 0)
+    assert (made.alpha[known] == 1).all() and torch.equal(made.alpha[~known], alpha[~known])
+    torch.testing.assert_close(made.rgb[:, known], colour[:, 0].expand(3, int(known.sum())), atol=1e-3, rtol=0)
+    assert torch.equal(made.rgb[:, ~known], completed.rgb[:, ~known])
+    without = CompletedView(replace(given, target_mask=None), completed.rgb, alpha=alpha)
+    assert opaque_in_mask(without) is without
+    net = load_inpainter("views")
+    seen = mended("target-mask", net).completed
+    inside = (seen.view.target_mask == 1) & (seen.view.refine_mask > 0) & (seen.view.depth > 0)
+    assert inside.any() and (seen.opacity[inside] == 1).all()
 
 
 def test_without_masks_nothing_is_cut_and_no_patch_is_dropped():

@@ -9,12 +9,17 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional as F
 
 from viewmend.types import CompletedView, IncompleteView
 
 Background = Literal["black", "white"]
 Image = Float[Tensor, "3 height width"]
 Plane = Float[Tensor, "height width"]
+RELIABLE = 0.25
+"""From this alpha on, a pixel's own colour is used where the target mask makes it opaque."""
+BLOCKS_PX, OPAQUE_ENOUGH = (4, 8, 16, 32, 64, 128), 0.1
+"""Sizes of the blocks whose mean colour others take, and the mean alpha that a block must have."""
 
 
 def composite(background: Background, rgb: Image, alpha: Plane) -> Image:
@@ -60,3 +65,26 @@ def from_background(background: Background, completed: CompletedView, view: Inco
     alpha = painted_alpha(view)
     rgb = torch.where(view.error > 0, completed.rgb - (1 - alpha), view.rgb)
     return replace(completed, view=view, rgb=rgb, alpha=alpha if completed.alpha is None else completed.alpha)
+
+
+def opaque_in_mask(completed: CompletedView) -> CompletedView:
+    """The view with alpha 1 where E > 0 and the target mask shows the subject; unchanged without a target mask.
+
+    There a lower alpha is an error: it would let the background through. Pixels whose own colour is unreliable, because
+    their alpha is low, take the mean colour of the smallest block around them that is opaque enough.
+    """
+    view, alpha = completed.view, completed.alpha
+    if view.target_mask is None or alpha is None:
+        return completed
+    straight, found = completed.rgb / alpha.clamp(min=RELIABLE), alpha >= RELIABLE
+    premultiplied = torch.cat([completed.rgb, alpha[None]])[None]
+    for block in BLOCKS_PX:
+        sides = [max(1, side // block) for side in alpha.shape]
+        small = F.interpolate(premultiplied, sides, mode="area")
+        *colour, opacity = F.interpolate(small, alpha.shape, mode="bilinear")[0]
+        new = ~found & (opacity >= OPAQUE_ENOUGH)
+        straight = torch.where(new, torch.stack(colour) / opacity.clamp(min=OPAQUE_ENOUGH), straight)
+        found = found | new
+    known = (view.target_mask > 0) & (view.error > 0)
+    rgb = torch.where(known, straight.clamp(0, 1), completed.rgb)
+    return replace(completed, rgb=rgb, alpha=torch.where(known, 1.0, alpha))

@@ -18,6 +18,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.threads import heavy_operations, light_operations
 from viewmend.models.base import ContextProvider, ErrorMap, RenderQuality, State
+from viewmend.models.compositing import opaque_in_mask
 from viewmend.models.network import Network
 from viewmend.models.smooth_fill import fill
 from viewmend.models.views.aggregation import AggregatedSamples, SampleAggregator
@@ -157,7 +158,8 @@ class ViewSynthNet(Network):
         quick = context.quality.refine_fraction is not None
         guess = self.coarse_guess(view, sources, quick)
         ray_fill = guess if not quick and self.coarse is not None else None
-        return self(view, sources, where=where, guess=guess).composite_into(view, where, fades, ray_fill), state
+        completed = self(view, sources, where=where, guess=guess).composite_into(view, where, fades, ray_fill)
+        return opaque_in_mask(completed), state
 
     def _depth_distribution(
         self, view: IncompleteView, sources: SourceCameras, scale: SceneScale, where: Mask, image: Inputs
