@@ -301,6 +301,59 @@ def test_images_named_by_clocks_are_refused(tmp_path):
         open_capture(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["000{}_cam{}", "cam{1}", "IMG_04{1}{1}", "0001"])
+def test_a_single_image_of_each_camera_is_one_moment(tmp_path, caplog, name):
+    ids = [[name.format(1, camera)] for camera in range(1, 5)]
+    cameras = mocap(tmp_path, ids)
+    capture = open_capture(tmp_path)
+    assert len(capture.frame_ids) == 1 and not capture.gaps and capture.has_masks
+    assert capture.read(0).cameras.names == tuple(cameras) and bool((capture.read(0).mask[:, 0, 0] == 255).all())
+    said = f"names differ: images/{cameras[0]}/{ids[0][0]}.png, images/{cameras[1]}/{ids[1][0]}.png"
+    assert (said in caplog.text) == (name != "0001")
+
+
+def test_masks_may_have_other_names_than_single_images(tmp_path):
+    names = mocap(tmp_path, [["0001"]] * 3)
+    for number, name in enumerate(names):
+        (tmp_path / f"masks/{name}/0001.png").rename(tmp_path / f"masks/{name}/mask_{number}.png")
+    capture = open_capture(tmp_path)
+    assert capture.frame_ids == ("0001",) and not capture.gaps and capture.has_masks
+
+
+@pytest.mark.parametrize(
+    ("ids", "got"),
+    [
+        ([["0001", "0002"]] * 3 + [["1", "2"]], r"for {3} \(such as 0001 of {0}, 1 of {3}\)"),
+        ([["451", "452"], ["461", "462"], ["471", "472"]], "for {0}, {1}, {2} "),
+        ([["1"], ["1"], ["1", "2", "3"]], r"for {2} \(such as 1 of {0}, 2 of {2}\)"),
+    ],
+)
+def test_short_footage_with_other_ids_is_refused(tmp_path, ids, got):
+    names = mocap(tmp_path, ids)
+    with pytest.raises(CaptureError, match=f"expected the same frame ids .* got others {got.format(*names)}.*rename"):
+        open_capture(tmp_path)
+
+
+def test_masks_with_other_ids_are_refused_and_further_masks_are_not_used(tmp_path):
+    names = mocap(tmp_path / "a", [["1", "2"]] * 3)
+    for name in names:
+        for number in (1, 2):
+            (tmp_path / f"a/masks/{name}/{number}.png").rename(tmp_path / f"a/masks/{name}/00{number}.png")
+    with pytest.raises(CaptureError, match=rf"{names[2]} \(masks\) \(such as 1 of {names[0]}, 001 of {names[0]} \(m"):
+        open_capture(tmp_path / "a")
+    names = mocap(tmp_path / "b", [["1", "2", "3", "4", "5"]] * 3)
+    for name in names:
+        for number in (1, 3, 4, 5):
+            (tmp_path / f"b/images/{name}/{number}.png").unlink()
+    capture = open_capture(tmp_path / "b")
+    assert capture.frame_ids == ("2",) and not capture.gaps
+
+
+def test_cameras_of_short_footage_may_miss_images(tmp_path):
+    names = mocap(tmp_path, [["1", "2"], ["1"], ["2"], ["1", "2"]])
+    assert open_capture(tmp_path).gaps == ((names[1], "2"), (names[2], "1"))
+
+
 def test_numbers_that_begin_elsewhere_are_mentioned(tmp_path, caplog):
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()

@@ -37,8 +37,6 @@ IMAGE_SUFFIXES = (
 )
 HIDDEN = ("__MACOSX", "@eaDir", "#recycle", "$RECYCLE.BIN")
 """Folders of file managers; other files and folders of theirs start with a dot."""
-COMPARABLE = 3
-"""Cameras with fewer images are not compared by their frame ids."""
 MAX_CROP_PX = 16
 """Encoders round sizes down to whole blocks; the calibration of a slightly larger image stays valid."""
 
@@ -204,7 +202,8 @@ def find_footage(folder: Path, names: Sequence[str], places: Sequence[str] = PLA
 def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     """Collect the footage of cameras whose videos or folders of images are known, by name, and find their masks.
 
-    ValueError for fewer than two cameras, one without footage, and masks of only some.
+    Cameras with one image each show one moment, whatever its name. ValueError for fewer than two cameras, one without
+    footage, masks of only some, and cameras whose frame ids are not the others'.
     """
     if len(paths) < 2:
         raise ValueError(f"expected images or videos of two cameras or more, got {len(paths)}; add them")
@@ -225,9 +224,12 @@ def collect_footage(folder: Path, paths: dict[str, str]) -> Footage:
     if ignored:
         warn(f"images of {ignored[0]}, are ignored, as their names follow another pattern than the others'")
     masks = _find_masks(folder, tuple(paths))
-    _compare_ids(ids | {f"{name} (masks)": found for name, (_, found) in masks.items() if found and name in ids})
     for name, (mask, _) in masks.items():
         entries[name] |= mask
+    mask_ids = {name: found for name, (_, found) in masks.items() if found and name in ids}
+    if not videos and all(len(found) == 1 for found in (*ids.values(), *mask_ids.values())):
+        return _one_moment(entries, ids, mask_ids)
+    _compare_ids(ids, mask_ids)
     if not videos:
         return Footage(tuple(sorted(frozenset().union(*ids.values()), key=frame_order)), None, entries)
     tracks = [video_track(name, "images", folder / paths[name]) for name in videos]
@@ -263,20 +265,44 @@ def list_images(folder: Path, place: str) -> ImageList | None:
     return ImageList(f"{place}/{pattern}".removeprefix("/"), frozenset(frames), ignored)
 
 
-def _compare_ids(ids: dict[str, frozenset[str]]) -> None:
+def _one_moment(
+    entries: dict[str, dict[str, Any]], ids: dict[str, frozenset[str]], mask_ids: dict[str, frozenset[str]]
+) -> Footage:
+    """The footage of cameras with one image each: one frame, even if their names have other numbers."""
+    frame = min(frozenset().union(*ids.values()), key=frame_order)
+    for kind, found in (("image", ids), ("mask", mask_ids)):
+        for name, (own,) in found.items():
+            if own != frame:
+                entries[name][kind] = entries[name][kind].replace("{frame}", own)
+    if len(set(ids.values())) > 1:
+        names = ", ".join(str(entries[name]["image"]).replace("{frame}", frame) for name in list(ids)[:3])
+        warn(f"each camera has one image; they are taken as images of one moment, although their names differ: {names}")
+    return Footage((frame,), None, entries)
+
+
+def _compare_ids(images: dict[str, frozenset[str]], masks: dict[str, frozenset[str]]) -> None:
     """Compare the frame ids of cameras, which have to be equal for images of one moment.
 
-    ValueError if a camera shares fewer than half of its ids with most others, as with each camera's own clock.
+    ValueError if a camera shares fewer than half of its ids with most others, as with each camera's own clock, or its
+    masks with its images.
     """
-    ids = {name: found for name, found in ids.items() if len(found) >= COMPARABLE}
-    counts = Counter(frame for found in ids.values() for frame in found)
-    usual = {frame for frame, count in counts.items() if 2 * count > len(ids)}
-    strangers = [name for name, found in ids.items() if 2 * len(found & usual) < len(found)]
+    counts = Counter(frame for found in images.values() for frame in found)
+    usual = {frame for frame, count in counts.items() if 2 * count > len(images)}
+    strangers = [name for name, found in images.items() if 2 * len(found & usual) < len(found)]
+    for name, found in masks.items():
+        if 2 * len(found & images[name]) < min(len(found), len(images[name])):
+            strangers.append(f"{name} (masks)")
+    ids = images | {f"{name} (masks)": found for name, found in masks.items()}
     if strangers:
-        example = ", ".join(f"{min(ids[name], key=frame_order)} of {name}" for name in list(ids)[:3])
-        expected = "the same frame ids in the names of all cameras' images"
-        got = f"others for {', '.join(strangers)[:200]} (first ids: {example})"
-        raise ValueError(f"expected {expected}, got {got}; rename images of one moment alike")
+        examples: dict[str, str] = {}
+        for name, found in ids.items():
+            own = found - usual if name in strangers else found
+            examples.setdefault(min(own or found, key=frame_order), name)
+        example = ", ".join(f"{frame} of {name}" for frame, name in list(examples.items())[:3])
+        expected = "the same frame ids in the names of all cameras' images and masks"
+        got = f"others for {', '.join(strangers)[:200]} (such as {example})"
+        next_step = "rename images of one moment alike, or remove those that few cameras have"
+        raise ValueError(f"expected {expected}, got {got}; {next_step}")
     numbers = {name: sorted(map(int, found)) for name, found in ids.items() if all(map(str.isdecimal, found))}
     spans = Counter((found[0], found[-1]) for found in numbers.values())
     if len(spans) > 1:
