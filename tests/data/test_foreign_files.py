@@ -389,6 +389,19 @@ def test_names_with_several_numbers_are_matched_as_a_whole(tmp_path, clock):
         open_capture(tmp_path / "own")
 
 
+def test_captures_inside_the_folder_are_named(plain, tmp_path):
+    mocap(tmp_path / "take_1", [["1"]] * 2)
+    (tmp_path / "notes").mkdir()
+    for format, takes in ((None, "ball, take_1"), ("plain", "ball"), ("easymocap", "take_1")):
+        first = tmp_path / takes.split(",")[0]
+        with pytest.raises(CaptureError, match=rf"got a folder of captures \({takes}\); open one, such as {first}"):
+            open_capture(tmp_path, format=format)
+    with pytest.raises(CaptureError, match="the folder has neither it nor another format's files"):
+        open_capture(tmp_path / "notes")
+    with pytest.raises(CaptureError, match="expected a capture of format 'colmap', got none of its files"):
+        open_capture(tmp_path, format="colmap")
+
+
 # Folders of tools.
 
 

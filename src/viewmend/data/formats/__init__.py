@@ -71,6 +71,14 @@ def _find(path: Path, names: Iterable[str]) -> tuple[str, Path | None]:
     return "", None
 
 
+def _is_capture(folder: Path, names: Iterable[str], native: bool) -> bool:
+    """Whether a folder that is only looked at has the files of one of these formats, or of our own."""
+    try:
+        return (native and (folder / CALIBRATION).is_file()) or any(FORMATS[name].find(folder) for name in names)
+    except (ValueError, OSError):
+        return False
+
+
 def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
     """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
 
@@ -79,9 +87,10 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
     """
     if format not in (None, *FORMAT_NAMES):
         raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")
-    if format == "plain" or (format is None and (path / CALIBRATION).is_file()):
+    native, names = format in (None, "plain"), [name for name in FORMATS if format in (None, name)]
+    if native and (path / CALIBRATION).is_file():
         return read_calibration(path)
-    name, file = _find(path, FORMATS if format is None else (format,))
+    name, file = _find(path, names)
     if file is not None:
         try:
             with np.errstate(all="ignore"):  # overflow becomes infinity, which is rejected
@@ -89,6 +98,9 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
                 return replace(calibration, folder=FORMATS[name].root(path, file))
         except (ValueError, OSError) as error:
             raise CaptureError(f"{file}: {error}") from None
-    if format is None:
+    if inner := [place for place in folders_containing(path, "")[1:] if _is_capture(place, names, native)]:
+        got = f"a folder of captures ({', '.join(place.name for place in inner)[:200]})"
+        raise CaptureError(f"{path}: expected a capture, got {got}; open one, such as {inner[0]}")
+    if native:
         return read_calibration(path)  # its error message lists what a capture folder contains
     raise CaptureError(f"{path}: expected a capture of format '{format}', got none of its files; see docs/formats.md")
