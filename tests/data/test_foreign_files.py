@@ -126,6 +126,19 @@ def test_alpha_of_any_image_counts(tmp_path, caplog):
             open_capture(tmp_path).read(0)
 
 
+def test_images_without_suffix_may_have_any(tmp_path):
+    pictures = {name: np.full((20, 30, 3), 60, np.uint8) for name in "abcd"}
+    blender(tmp_path, pictures)
+    for name, suffix in (("a", ".jpg"), ("b", ".JPG"), ("c", ".tif")):
+        cv2.imwrite(str(tmp_path / f"{name}{suffix}"), pictures[name])
+        (tmp_path / f"{name}.png").unlink()
+    assert open_capture(tmp_path).read(0).cameras.names == ("a", "b", "c", "d")
+    for file in [file for file in tmp_path.iterdir() if file.suffix != ".json"]:
+        file.unlink()
+    with pytest.raises(CaptureError, match=r"expected an image 'a', or this with an image suffix .* got none; add"):
+        open_capture(tmp_path)
+
+
 # COLMAP's models.
 
 

@@ -10,7 +10,15 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, structs
 
-from viewmend.data.formats.files import existing, frame_pattern, image_size_px, names_from_paths, warn
+from viewmend.data.containers import container_of
+from viewmend.data.formats.files import (
+    IMAGE_SUFFIXES,
+    existing,
+    frame_pattern,
+    image_size_px,
+    names_from_paths,
+    warn,
+)
 from viewmend.data.images import uses_alpha
 from viewmend.data.native_format import stays_inside
 from viewmend.utils.untrusted_input import Number, bounded_bytes, read_json, typed
@@ -32,6 +40,8 @@ WITHOUT_EFFECT = (
     *("transform_matrix_start", "transform_matrix_end"),
 )
 """Keys that change neither images nor cameras."""
+SUFFIXES = ("", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
+"""What is added to the path of an image without such a file."""
 Row = tuple[Number, Number, Number, Number]
 Angle = Annotated[float, Meta(gt=0, lt=3.14)]
 Side = Annotated[int, Meta(ge=1, le=2**16)]
@@ -90,6 +100,7 @@ def content(folder: Path, file: Path) -> dict[str, Any]:
     frames = [_with_local_paths(folder, frame) for frame in read.frames]
     if len({frame.time for frame in frames}) <= 1:
         frames = existing(folder, frames, lambda frame: frame.file_path)
+    _check_suffixes(folder, frames)
     scales = {read.integer_depth_scale, read.depth_unit_scale_factor}
     if read.from_na or (scales != {MILLIMETRES} and any(frame.depth_file_path for frame in frames)):
         got = "from_na" if read.from_na else f"a scale of {max(scales)}"
@@ -126,12 +137,21 @@ def _check_keys(file: Path, parsed: dict[str, Any]) -> None:
 
 
 def _with_local_paths(folder: Path, frame: _Entry) -> _Entry:
-    """The frame with paths as on this system, and with the suffix of the image, which files of Blender omit."""
+    """The frame with paths as on this system, and with the suffix of the image, which Blender omits."""
     mask, depth = (path and path.replace("\\", "/") for path in (frame.mask_path, frame.depth_file_path))
     image = str(PurePosixPath(frame.file_path.replace("\\", "/")))
-    if stays_inside(image) and not (folder / image).is_file() and (folder / f"{image}.png").is_file():
-        image = f"{image}.png"
+    if stays_inside(image):
+        found = (f"{image}{suffix}" for suffix in SUFFIXES)
+        image = next((path for path in found if (folder / path).is_file()), image)
     return structs.replace(frame, file_path=image, mask_path=mask, depth_file_path=depth)
+
+
+def _check_suffixes(folder: Path, frames: list[_Entry]) -> None:
+    """ValueError for an image without suffix that was not found under any."""
+    for path in (frame.file_path for frame in frames if stays_inside(frame.file_path)):
+        if PurePosixPath(path).suffix.lower() not in IMAGE_SUFFIXES and not container_of(folder / path).is_file():
+            expected = f"an image {path[:200]!r}, or this with an image suffix such as .png or .jpg"
+            raise ValueError(f"expected {expected}, got none; add the file, or correct file_path")
 
 
 def _cameras_of(frames: list[_Entry]) -> tuple[list[tuple[_Entry, _Entry]], tuple[str, ...]]:
