@@ -308,6 +308,28 @@ def test_paths_of_windows_are_read(plain):
         open_capture(plain.path)
 
 
+def test_files_are_found_in_each_unicode_form(plain, tmp_path):
+    composed, decomposed = "\u00fc", "u\u0308"
+    for folder, place in (("images", composed), ("masks", decomposed)):
+        (plain.path / folder).rename(plain.path / f"{folder} {decomposed}")
+        for file in sorted((plain.path / f"{folder} {decomposed}").iterdir()):
+            file.rename(file.with_name(f"{place} {file.name}"))
+    plain.edit(
+        lambda d: [
+            c.update({k: f"{k}s {composed}/{composed} {c['name']}_{{frame}}.png" for k in ("image", "mask")})
+            for c in d["cameras"]
+        ]
+    )
+    capture = open_capture(plain.path)
+    assert not capture.gaps and capture.read(1).mask is not None
+    plain.edit(lambda d: d["cameras"][1].update(image=f"{composed * 300}.png"))
+    with pytest.raises(CaptureError, match="expected the camera's image in at least one frame"):
+        open_capture(plain.path)
+    blender(tmp_path, dict.fromkeys((f"a {decomposed}", f"b {decomposed}"), np.zeros((20, 30, 3), np.uint8)))
+    blender(tmp_path, dict.fromkeys((f"a {composed}", f"b {composed}")))
+    assert open_capture(tmp_path).cameras.names == (f"a {decomposed}", f"b {decomposed}")
+
+
 def test_images_named_by_clocks_are_refused(tmp_path):
     names = mocap(tmp_path, [[f"{1700000000000 + 33 * time + camera}" for time in range(4)] for camera in range(4)])
     with pytest.raises(CaptureError, match=f"expected the same frame ids .* 1700000000001 of {names[1]}.* rename"):

@@ -210,6 +210,7 @@ def test_videos_may_be_cropped_but_not_scaled(tmp_path):
         (["A", "B"], ["v/2019-vid01-camA.avi", "v/2019-vid01-camB.avi"]),
         (["cam_01", "cam_02"], ["videos/GX01.mp4", "videos/GX02.mp4"]),
         (["cam01_x2", "cam02_x2"], ["cam1.mp4", "cam2.mp4"]),
+        (["K\u00fcche", "Flur"], ["videos/Ku\u0308che.mp4", "videos/Flur.mp4"]),
     ],
 )
 def test_names_are_matched(names, paths):

@@ -1,7 +1,8 @@
 """Reading files on disk, and data sets in HDF5 files by path: `take.smc/Camera_5mp/0/color/17`."""
 
 import os
-from collections.abc import Iterator
+import unicodedata
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,23 @@ def container_of(path: Path) -> Path:
         if part.lower().endswith(SUFFIXES) and (file := Path(*path.parts[:number])).is_file():
             return file
     return path
+
+
+def stored_path(folder: Path, path: str, frames: Sequence[str] = ("",)) -> str:
+    """A path in the folder with names as they are on disk, where "ä" is one character or two: systems differ.
+
+    `{frame}` stands for each of `frames`; one that exists is enough. The path is unchanged if none does.
+    """
+    if path.isascii():
+        return path
+    parent, slash, name = path.rpartition("/")
+    there = stored_path(folder, parent, frames)
+    forms = (path, *(f"{there}{slash}{unicodedata.normalize(form, name)}" for form in ("NFC", "NFD")))
+    files = ((form, folder / form.replace("{frame}", frame)) for form in forms for frame in frames)
+    try:
+        return next((form for form, file in files if file.exists()), path)
+    except OSError:  # such as a name that is too long, which its reader reports
+        return path
 
 
 def names_in(folder: Path) -> frozenset[str]:

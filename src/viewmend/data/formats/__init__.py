@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from viewmend.data.containers import stored_path
 from viewmend.data.errors import CaptureError
 from viewmend.data.formats import (
     actorshq,
@@ -79,6 +80,16 @@ def _is_capture(folder: Path, names: Iterable[str], native: bool) -> bool:
         return False
 
 
+def _as_stored(calibration: NativeCalibration) -> NativeCalibration:
+    """The calibration with the paths of its files as they are on disk."""
+    folder, frames = calibration.folder, calibration.frames
+    cameras = []
+    for camera in calibration.cameras:
+        files: Any = {kind: stored_path(folder, getattr(camera, kind), frames) for kind in camera.file_kinds}
+        cameras.append(replace(camera, **files))
+    return replace(calibration, cameras=tuple(cameras))
+
+
 def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibration:
     """Read the calibration of a capture folder, or of a file that stands for one, in any supported format.
 
@@ -89,13 +100,13 @@ def read_any_calibration(path: Path, format: str | None = None) -> NativeCalibra
         raise CaptureError(f"expected a format among {', '.join(FORMAT_NAMES)}, got '{format}'; choose one of them")
     native, names = format in (None, "plain"), [name for name in FORMATS if format in (None, name)]
     if native and (path / CALIBRATION).is_file():
-        return read_calibration(path)
+        return _as_stored(read_calibration(path))
     name, file = _find(path, names)
     if file is not None:
         try:
             with np.errstate(all="ignore"):  # overflow becomes infinity, which is rejected
                 calibration = calibration_from_content(FORMATS[name].content(path, file), file)
-                return replace(calibration, folder=FORMATS[name].root(path, file))
+                return _as_stored(replace(calibration, folder=FORMATS[name].root(path, file)))
         except (ValueError, OSError) as error:
             raise CaptureError(f"{file}: {error}") from None
     if inner := [place for place in folders_containing(path, "")[1:] if _is_capture(place, names, native)]:

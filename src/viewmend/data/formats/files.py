@@ -5,16 +5,18 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
+from unicodedata import normalize
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 import cv2
 import numpy as np
 
-from viewmend.data.containers import read_bytes
+from viewmend.data.containers import read_bytes, stored_path
 from viewmend.data.images import size_from_header
 from viewmend.data.native_format import stays_inside
 from viewmend.data.video_clock import match_tracks, video_track
@@ -68,10 +70,10 @@ def warn(text: str) -> None:
 
 def image_size_px(folder: Path, name: str) -> tuple[int, int]:
     """Width and height of an image in the folder, from its header; ValueError without one inside the folder."""
-    try:
-        size = size_from_header(read_bytes(folder / name, HEADER_BYTES)) if stays_inside(name) else None
-    except OSError:
-        size = None
+    size = None
+    if stays_inside(name):
+        with suppress(OSError):
+            size = size_from_header(read_bytes(folder / stored_path(folder, name), HEADER_BYTES))
     if size is None:
         raise ValueError(f"expected an image {name[:200]!r} in the folder to find the size, got none; add the file")
     return size
@@ -87,7 +89,8 @@ def names_from_paths(paths: Sequence[str]) -> list[str]:
 
 def existing(folder: Path, items: Sequence[Item], path: Callable[[Item], str]) -> list[Item]:
     """The items whose image is in the folder, with a warning of the others; all of them if fewer than two exist."""
-    missing = [n for n, item in enumerate(items) if stays_inside(path(item)) and not (folder / path(item)).is_file()]
+    paths = [(number, path(item)) for number, item in enumerate(items) if stays_inside(path(item))]
+    missing = [number for number, image in paths if not (folder / stored_path(folder, image)).is_file()]
     if not missing or len(items) - len(missing) < 2:
         return list(items)
     names = ", ".join(path(items[number]) for number in missing)
@@ -113,7 +116,7 @@ def find_mask(folder: Path, image: str) -> str | None:
     """The path of an image's mask in `masks`: `a.jpg.png`, as in COLMAP, or `a.png`; None without that folder."""
     if not (folder / "masks").is_dir():
         return None
-    replaced = f"masks/{image.rpartition('.')[0]}.png"
+    replaced = stored_path(folder, f"masks/{image.rpartition('.')[0]}.png")
     return replaced if (folder / replaced).is_file() else f"masks/{image}.png"
 
 
@@ -322,7 +325,8 @@ def frame_order(frame: str) -> tuple[int, str]:
 
 def match_names(names: Sequence[str], paths: Iterable[str]) -> list[str] | None:
     """The path of each camera name, by the first of several comparisons that assigns exactly one to each; else None."""
-    stems = {path: Path(path).stem if is_video(path) else Path(path).name for path in paths}
+    names = [normalize("NFC", name) for name in names]
+    stems = {path: normalize("NFC", Path(path).stem if is_video(path) else Path(path).name) for path in paths}
     for key in _KEYS:
         by_key: dict[Hashable, list[str]] = {}
         for path, stem in stems.items():

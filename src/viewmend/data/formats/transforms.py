@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta, Struct, structs
 
-from viewmend.data.containers import container_of
+from viewmend.data.containers import container_of, stored_path
 from viewmend.data.formats.files import (
     IMAGE_SUFFIXES,
     existing,
@@ -141,7 +141,7 @@ def _with_local_paths(folder: Path, frame: _Entry) -> _Entry:
     mask, depth = (path and path.replace("\\", "/") for path in (frame.mask_path, frame.depth_file_path))
     image = str(PurePosixPath(frame.file_path.replace("\\", "/")))
     if stays_inside(image):
-        found = (f"{image}{suffix}" for suffix in SUFFIXES)
+        found = (stored_path(folder, f"{image}{suffix}") for suffix in SUFFIXES)
         image = next((path for path in found if (folder / path).is_file()), image)
     return structs.replace(frame, file_path=image, mask_path=mask, depth_file_path=depth)
 
