@@ -115,7 +115,8 @@ class HeldBackView:
 
     def score(self, model: Inpainter, metric: Lpips) -> tuple["ViewScore", CompletedView]:
         """The view by this model, on the CPU, and its scores on the background that the model paints."""
-        background, device = model.background or "black", next(model.parameters()).device
+        background = model.background or "black"
+        device = next(model.parameters()).device if isinstance(model, nn.Module) else torch.device("cpu")
         stream = Stream(model, StreamConfig(memory_mb=None, background=background))
         stream.add_frame(*to_device((self.inputs.frame, self.inputs.proxy), device))
         completed = to_device(stream.view(self.truth.cameras.to(device)).completed, "cpu")

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count, islice
 from random import Random
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch.utils.data import DataLoader, Dataset
@@ -89,7 +89,7 @@ def _to_bytes(scene: object) -> bytes:
     return file.getvalue()
 
 
-def _from_bytes(data: bytes) -> tuple[int, Sequence[Item] | Exception]:
+def _from_bytes(data: bytes) -> tuple[int, Sequence[Any] | Exception]:
     return torch.load(io.BytesIO(data), weights_only=False)  # a worker of this process wrote it
 
 
