@@ -42,7 +42,7 @@ def test_a_shift_of_all_images_is_undone_for_inputs_and_the_camera_left_out():
 def test_colours_are_matched_where_the_moved_cameras_look(monkeypatch):
     """At full size, by the inputs' images alone."""
     looked = []
-    monkeypatch.setattr(preparing, "match_colours", lambda frame, bounds: looked.append(frame))
+    monkeypatch.setattr(preparing, "match_colours", lambda frame, bounds, odd: looked.append(frame))
     capture = Shifted()
     prepared = prepare(capture, capture.cameras.names[1:], max_image_size=48)
     [frame] = looked
