@@ -27,6 +27,11 @@ class There(Tensor):
         made.values = values
         return made
 
+    def __getitem__(self, index):
+        # Lists would become tensors without an operator.
+        parts = [torch.as_tensor(p) if isinstance(p, list) else p for p in (index if type(index) is tuple else [index])]
+        return super().__getitem__(tuple(parts))
+
     def tolist(self) -> list:
         return self.values.tolist()
 
@@ -46,6 +51,7 @@ class _Operators(TorchDispatchMode):
 def _compute(operator, args, kwargs):
     tensors = [value for value in tree_iter((args, kwargs)) if isinstance(value, Tensor)]
     there = [isinstance(tensor, There) for tensor in tensors]
+    assert sum(there) == sum(tensor.device == DEVICE for tensor in tensors), f"{operator}: a tensor without values"
     if operator not in COPIES:
         indexing = operator._schema.name in INDEXING
         compared = [args[0], *args[2:3]] if indexing else tensors
