@@ -2,8 +2,12 @@
 
 import numpy as np
 import pytest
+from reference.foreign_formats import write_easymocap
+from reference.foreign_studios import write_take
 
 from viewmend.cli import main
+from viewmend.data.errors import CaptureError
+from viewmend.data.native_capture import open_capture
 
 
 def camera(**values):
@@ -126,6 +130,14 @@ BAD = {
         remove(*(f"images/{name}_001.png" for name in "abcd")),
         ["images/a_001.png", "frame '001'", "of any camera"],
     ),
+    "masks of nobody": (
+        remove(*(f"masks/{name}_001.png" for name in "abcd")),
+        ["masks/a_001.png", "frame '001'", "no mask of any camera", "black ones", FILE],
+    ),
+    "image or mask": (
+        remove("images/a_001.png", "images/b_001.png", "masks/c_001.png", "masks/d_001.png"),
+        ["a_001.png", "frame '001'", "image and mask of the same camera"],
+    ),
     "mask of some": (camera(mask=None), [FILE, B, "'mask' for every camera or for none"]),
     "depth of some": (camera(depth="masks/b_000.png"), [FILE, "camera 'a'", "'depth' for every camera"]),
     "image cut short": (cut("images/b_000.png"), ["images/b_000.png", B, "frame '000'", "truncated"]),
@@ -162,3 +174,14 @@ def test_one_line_says_what_is_wrong(plain, capfd, spoil, words):
 def test_a_time_that_is_not_there(plain, capfd):
     assert main(["check", str(plain.path), "--frame", "2"]) == 2
     assert "0 to 1, got 2" in capfd.readouterr().err
+
+
+def test_a_frame_without_masks_of_a_format_that_lists_no_frames(tmp_path):
+    lens = {"K": np.array([[50.0, 0, 20], [0, 50, 16], [0, 0, 1]]), "dist": np.zeros(5), "width": 40, "height": 32}
+    rig = [lens | {"name": name, "R": np.eye(3), "t": np.zeros(3)} for name in "12"]
+    write_easymocap(tmp_path, rig)
+    write_take(tmp_path, rig, ("000000", "000001"), (), "images/{c}/{f}.png", "masks/{c}/{f}.png")
+    for name in "12":
+        (tmp_path / f"masks/{name}/000001.png").unlink()
+    with pytest.raises(CaptureError, match=r"masks/1/000001.*no mask of any.*or remove the frame's images$"):
+        open_capture(tmp_path)

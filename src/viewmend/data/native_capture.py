@@ -29,7 +29,14 @@ from viewmend.data.images import (
     to_mask,
     uses_alpha,
 )
-from viewmend.data.native_format import CALIBRATION, FileKind, NativeCalibration, NativeCamera, stays_inside
+from viewmend.data.native_format import (
+    CALIBRATION,
+    FILE_KINDS,
+    FileKind,
+    NativeCalibration,
+    NativeCamera,
+    stays_inside,
+)
 from viewmend.data.video_clock import ABSENT, Track, TrackKind, VideoClock, match_tracks, video_track
 from viewmend.data.videos import VideoFile, is_video, video_properties
 from viewmend.geometry.bounds import Bounds
@@ -249,22 +256,30 @@ class NativeCapture:
                 ]
                 wanted = f"{' and '.join(camera.file_kinds)} of the camera in the same frame"
                 wanted = f"the camera's {absent[0]} in at least one frame" if absent else wanted
-                where, next_step = self._example(camera, absent), f"correct the paths in {self._file}"
+                path, frame = camera.file((*absent, *camera.file_kinds)[0], self.frame_ids[0]), self.frame_ids[0]
+                where = f"{self.folder / path}: camera '{camera.name}', frame '{frame}'"
                 got = f"found none in {len(self.frame_ids)} frames"
+                next_step = f"correct the paths in {self._file}" if self._file.name == CALIBRATION else "add them"
                 raise CaptureError(f"{where}: expected {wanted}, {got}; {next_step}, or leave the camera out")
-        for frame, column in zip(self.frame_ids, present.T, strict=True):
-            if not column.any():
-                raise CaptureError(
-                    f"{self._example(self._entries[0], frame=frame)}: expected this file or another camera's, got none "
-                    f"of any camera; add them, or remove the frame from {self._file}"
-                )
+        for time in np.flatnonzero(~present.any(0)).tolist():
+            raise CaptureError(self._without_cameras(time, exists))
         return present
 
-    def _example(self, camera: NativeCamera, kinds: Sequence[FileKind] = (), frame: str | None = None) -> str:
-        """A missing file of a camera, to start an error message."""
-        frame = self.frame_ids[0] if frame is None else frame
-        path = self.folder / camera.file((*kinds, *camera.file_kinds)[0], frame)
-        return f"{path}: camera '{camera.name}', frame '{frame}'"
+    def _without_cameras(self, time: int, exists: Callable[[str], bool]) -> str:
+        """What is wrong with a frame in which no camera has all of its files, and what to do about it."""
+        kinds: list[FileKind] = [k for k in FILE_KINDS if any(k in camera.file_kinds for camera in self._entries)]
+        own = {kind: [reader for reader in self._readers if kind in reader.camera.file_kinds] for kind in kinds}
+        absent: list[FileKind] = [k for k in kinds if all(reader.lacks(k, time, exists) for reader in own[k])]
+        first: FileKind = (absent or kinds)[0]
+        _, where = own[first][0].locate(first, time)
+        wanted = "this file or another camera's" if absent else f"{' and '.join(kinds)} of the same camera"
+        got = f"no {' and no '.join(absent)} of any camera" if absent else "no camera that has all"
+        steps = ["add them, black ones if there is no subject" if absent == ["mask"] else "add them"]
+        if self._file.name == CALIBRATION and self.clock is None:
+            steps.append(f"remove the frame from {self._file}")
+        elif self._file.name != CALIBRATION and "image" in kinds and "image" not in absent:
+            steps.append("remove the frame's images")
+        return f"{where}: expected {wanted}, got {got}; {', or '.join(steps)}"
 
 
 def _select(cameras: tuple[NativeCamera, ...], names: Sequence[str] | None, file: Path) -> tuple[NativeCamera, ...]:
@@ -372,9 +387,12 @@ class CameraReader:
 
     def has(self, time: int, exists: Callable[[str], bool]) -> bool:
         """Whether the camera has all of its files in the frame at index `time`; `exists` looks a path up."""
-        if any(index[time] == ABSENT for index in self._index.values()):
-            return False
-        return all(exists(self.camera.file(kind, self._file_id(kind, time))) for kind in self.camera.file_kinds)
+        return not any(self.lacks(kind, time, exists) for kind in self.camera.file_kinds)
+
+    def lacks(self, kind: FileKind, time: int, exists: Callable[[str], bool]) -> bool:
+        """Whether the camera has no file of this kind in the frame, as `has`."""
+        number = self._index["masks" if kind == "mask" else "images"][time]
+        return number == ABSENT or not exists(self.camera.file(kind, self._file_id(kind, time)))
 
     def read(self, time: int) -> CameraImages | None:
         """Read and undistort the images of the frame at index `time`, in which the camera is present.
@@ -382,7 +400,7 @@ class CameraReader:
         None if its film is damaged there. CaptureError if a file is missing, unreadable, or not of the camera's size.
         """
         camera = self.camera
-        path, where = self._locate("video" if camera.video else "image", time)
+        path, where = self.locate("video" if camera.video else "image", time)
         rgb = self._video.read(int(self._index["images"][time]), where) if self._video else read_rgb(path, where)
         if rgb is None:
             return None
@@ -391,12 +409,12 @@ class CameraReader:
         self._check_size(rgb, where, self.rotation)
         mask, depth = None, None
         if camera.mask:
-            path, where = self._locate("mask", time)
+            path, where = self.locate("mask", time)
             if (mask := self._read_mask(path, where, time)) is None:
                 return None
             self._check_size(mask, where)
         if camera.depth:
-            path, where = self._locate("depth", time)
+            path, where = self.locate("depth", time)
             depth = read_depth(path, where)
             self._check_size(depth, where)
         return self._undistortion.apply(CameraImages(self._correct_colours(rgb), mask, depth))
@@ -427,7 +445,8 @@ class CameraReader:
             return self._frames[time]
         return self._frames[int(self._index["masks" if kind == "mask" else "images"][time])]
 
-    def _locate(self, kind: FileKind, time: int) -> tuple[Path, str]:
+    def locate(self, kind: FileKind, time: int) -> tuple[Path, str]:
+        """Path of the camera's file of this kind in the frame at index `time`, and how errors name it."""
         path = self._folder / self.camera.file(kind, self._file_id(kind, time))
         return path, f"{path}: camera '{self.camera.name}', frame '{self._frames[time]}'"
 
