@@ -119,7 +119,7 @@ def cache_frame(
     The masks of more cameras, `carving`, carve the hull, although the images of these are not used.
 
     Raises:
-        ValueError: the frame has no masks, no foreground, or a single camera.
+        ValueError: the frame has no masks, a single camera, or cameras that look away from each other.
     """
     if frame.mask is None:
         raise ValueError(

@@ -136,7 +136,7 @@ class Stream:
     ) -> CachedFrame:
         """Add a frame and compute its geometry proxy. A frame whose time is cached already is not replaced.
 
-        Frames may come in any order and with gaps.
+        Frames may come in any order and with gaps. Views of a frame whose masks are empty show the background alone.
 
         Args:
             frame: the cameras' images; masks are needed unless `geometry` is given.
@@ -144,8 +144,8 @@ class Stream:
             carving: masks of more cameras that carve the hull, although their images are not used.
 
         Raises:
-            ValueError: no `geometry` is given, and the frame has no masks, no foreground, a single camera, or cameras
-                that look away from each other.
+            ValueError: no `geometry` is given, and the frame has no masks, a single camera, or cameras that look away
+                from each other.
         """
         if frame.time not in self._frames:
             frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used

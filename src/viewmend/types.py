@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.utils.tensors import OnDevice
 
 RIM_PX = 2
@@ -88,6 +89,11 @@ class MultiViewFrame(_LazyStacks, OnDevice):
     """Index of the frame in its capture or stream."""
     depth: Float[Tensor, "view height width"] | None = None
     """Ground-truth z-depth in metres, if known (synthetic captures); 0 where there is no surface."""
+
+    @property
+    def has_subject(self) -> bool:
+        """Whether any mask has foreground; False without masks."""
+        return any(bool((mask > FOREGROUND).any()) for mask in self.per_camera("mask"))
 
     def select(self, names: Sequence[str]) -> "MultiViewFrame":
         """The same frame with only these cameras, in this order; ValueError for an unknown name.

@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from cli.conftest import rig
 from live.live_servers import wait_until
 from reference import tells_all
-from reference.ball import camera_at
+from reference.ball import AwayBall, camera_at
 
 from viewmend.cli import serve
 from viewmend.cli.mend_output import depth_image_m
 from viewmend.data.images import write_depth
+from viewmend.data.native_writer import write_capture
 from viewmend.data.prepare import open_masked, prepare
 from viewmend.live.renderer import Renderer, RenderRequest
 from viewmend.metrics.image_quality import psnr, ssim_map
@@ -199,3 +201,31 @@ def test_the_page_shows_the_same_pixels(shifted, tmp_path, mend):
         source.stop()
     mended = cv2.imread(str(tmp_path / "out" / "mended" / "000000.png"))[..., ::-1]
     assert mended.std() > 20 and np.abs(picture(view.rgb).astype(int) - mended).max() <= 1
+
+
+@pytest.fixture(scope="module")
+def away(tmp_path_factory):
+    """A capture of five frames, of which the first and the fourth are empty."""
+    path = tmp_path_factory.mktemp("away") / "ball"
+    write_capture(AwayBall(rig(), 5, {0, 3}), path, images="png")
+    return path
+
+
+def test_frames_without_a_subject_show_the_background_and_keep_their_time(away, tmp_path, mend):
+    code, report, said = mend(away, tmp_path / "out", "--leave-out", "held", "--alpha", "--depth")
+    assert code == 0 and report["frames"] == 5
+    assert "2 of 5 frames have no subject ('000', '003'); they show only the background" in said
+    seen = [cv2.imread(str(file)).any() for file in sorted((tmp_path / "out" / "rendered").iterdir())]
+    assert seen == [False, True, True, False, True]
+    with av.open(str(tmp_path / "out" / "mended.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 5
+    assert 20 < report["psnr_whole"] < 30, "empty frames, of 100 dB, are not scored"
+
+
+def test_an_orbit_goes_around_the_subject_while_it_is_there(away, tmp_path, mend):
+    code, report, said = mend(away, tmp_path / "out", "--path", "orbit:seconds=0.5,loop=repeat")
+    assert code == 0 and report["frames"] == 5 and "2 of 5 frames have no subject" in said
+    code, report, said = mend(away, tmp_path / "none", "--path", "orbit:seconds=0.2", "--frames", "3:4")
+    assert code == 2 and "expected a subject to circle, got none" in said
+    code, report, said = mend(away, tmp_path / "one", "--leave-out", "held", "--frames", "3:4")
+    assert code == 0 and report["psnr_whole"] is None and "1 of 1 frames" in said

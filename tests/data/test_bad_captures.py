@@ -45,7 +45,8 @@ def remove(*files):
 def every_mask(image):
     def spoil(plain):
         for name in "abcd":
-            plain.put(f"masks/{name}_000.png", image)
+            for frame in ("000", "001"):
+                plain.put(f"masks/{name}_{frame}.png", image)
 
     return spoil
 
@@ -149,8 +150,8 @@ BAD = {
         picture("masks/b_000.png", np.arange(32 * 40, dtype=np.uint16).reshape(32, 40)),
         ["masks/b_000.png", B, "frame '000'", "8-bit mask", "uint16"],
     ),
-    "empty masks": (every_mask(of_pixels(32, 40) * 0), ["masks/a_000.png", "frame '000'", "no value above 0"]),
-    "faint masks": (every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))), ["masks/a_000.png", "above 39"]),
+    "empty masks": (every_mask(of_pixels(32, 40) * 0), ["expected foreground", "none in 2 frames"]),
+    "faint masks": (every_mask(np.tile(np.arange(40, dtype=np.uint8), (32, 1))), ["above 127", "none in 2 frames"]),
     "no video": (lambda p: (video(2)(p), (p.path / "b.avi").unlink()), ["b.avi", B, "the camera's video"]),
     "video is text": (lambda p: (video(2)(p), write("b.avi", b"hello" * 99)(p)), ["b.avi", B, "a video"]),
     "depth of 8 bit": (depth_of_8_bit, ["depth.png", "camera 'a'", "frame '000'", "16-bit", "uint8"]),

@@ -507,3 +507,29 @@ def test_a_displaced_camera_is_diagnosed_once(studio, step_m, words):
 def test_three_cameras_of_a_rough_rig_do_not_outvote_one(shared, held):
     capture = open_capture(shared / "captures/utrecht")
     assert not find_odd_images(capture.read(0).without([held]), capture.bounds)
+
+
+def test_a_late_camera_is_found_beside_frames_without_a_subject(moving, tmp_path):
+    """Also where the frame in the middle, and the last, have none."""
+    folder = shutil.copytree(moving, tmp_path / "studio")
+    name, files = names_of(folder)[3], sorted(folder.glob("mask/*/*.png"))
+    own = [file for file in files if file.parent.name == name]
+    for late, early in reversed(list(zip(own[2:], own[:-2], strict=True))):
+        shutil.copy(early, late)
+        shutil.copy(folder / "image" / name / early.name, folder / "image" / name / late.name)
+    for file in files:
+        if file.stem in {own[3].stem, own[6].stem}:
+            cv2.imwrite(str(file), empty(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)))
+    capture = open_capture(folder)
+    [issue] = find_desynchronised_cameras(capture, capture.read(2), 6)
+    assert f"camera '{name}': late by about 2 frames" in issue.text
+
+
+def test_the_first_frame_with_a_subject_is_checked(folder, capsys):
+    for file in folder.glob("mask/*/*.png"):
+        if file.stem == "000000":
+            cv2.imwrite(str(file), np.zeros((96, 96), np.uint8))
+    assert main(["check", str(folder)]) == 0
+    assert "hull of frame '000001'" in capsys.readouterr().out
+    assert main(["check", str(folder), "--frame", "0"]) == 2
+    assert "masks of frame '000000', got none; choose another --frame" in capsys.readouterr().err

@@ -270,3 +270,12 @@ def test_written_videos_keep_size_and_colour(tmp_path):
     assert read.shape == (32, 40, 3)
     assert np.abs(read[5:25, 2:16].astype(int) - (200, 30, 60)).max() < 12
     assert read[:, 26:].max() < 12
+
+
+def test_a_frame_without_a_subject_has_empty_masks(plain):
+    """What a compressed video leaves in them is no subject."""
+    for name in "abcd":
+        plain.put(f"masks/{name}_001.png", np.tile(np.arange(40, dtype=np.uint8), (32, 1)))
+    capture = open_capture(plain.path)
+    assert [capture.read(time).has_subject for time in (0, 1)] == [True, False]
+    assert not capture.read(1).mask.any() and capture.read(1).rgb.any()

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from reference.ball import BallCapture, camera_at, photograph, ring
+from reference.ball import AwayBall, BallCapture, camera_at, photograph, ring
 
 from viewmend.data import prepare as preparing
 from viewmend.data.errors import CaptureError
-from viewmend.data.prepare import prepare
+from viewmend.data.prepare import first_with_subject, prepare
 from viewmend.data.source import FRAMES_AHEAD, limit_size, prefetch
 from viewmend.geometry.cameras import concatenate_cameras
 
@@ -149,3 +149,26 @@ def test_closing_leaves_no_thread():
     assert next(frames) == 0 and threading.active_count() == before + 1
     frames.close()
     assert threading.active_count() == before
+
+
+class Entering(BallCapture):
+    """The ball, which no camera sees at first, then one, then all."""
+
+    def read(self, time):
+        frame = super().read(time)
+        return replace(frame, mask=frame.mask * (torch.arange(6) < (0, 1, 6)[time])[:, None, None])
+
+
+def test_a_capture_is_checked_where_most_cameras_see_the_subject():
+    capture = Entering(ring(6), frames=3)
+    assert first_with_subject(capture).time == 2
+    assert prepare(capture).read(0).has_subject is False
+    assert first_with_subject(AwayBall(ring(6), 3, {1, 2}), first=1).time == 0, "the last before"
+
+
+def test_frames_without_a_subject_are_read_and_a_capture_without_any_is_refused():
+    prepared = prepare(AwayBall(ring(6), 4, {0, 2}), last=3)
+    assert [prepared.read(time).has_subject for time in range(4)] == [False, True, False, True]
+    assert len(prepared.read(2).cameras) == 6
+    with pytest.raises(CaptureError, match=r"ball: expected foreground .* none in 4 frames"):
+        prepare(AwayBall(ring(6), 4, {0, 1, 2, 3}))

@@ -18,6 +18,7 @@ from viewmend.geometry.hull import (
     occupied_bounds,
     visual_hull,
 )
+from viewmend.geometry.proxy import reconstruct
 
 SMALL = HullConfig(resolution=16)
 
@@ -134,14 +135,20 @@ def test_bounds_hold_what_cameras_look_at_and_cameras_that_look_apart_have_none(
         bounds_from_cameras(concatenate_cameras(apart))
 
 
-def test_one_camera_or_no_foreground_is_an_error():
+def test_one_camera_is_an_error():
     cameras = dome(3)
     masks = ball_masks(cameras)
     with pytest.raises(ValueError, match="at least two cameras"):
         visual_hull(masks[:1], cameras[0], around(1.0), SMALL)
-    for find, more in ((visual_hull, (around(1.0), SMALL)), (bounds_from_masks, ())):
-        with pytest.raises(ValueError, match="foreground"):
-            find(torch.zeros_like(masks), cameras, *more)
+
+
+def test_empty_masks_have_an_empty_hull_where_all_cameras_look():
+    cameras = dome(3)
+    masks = torch.zeros_like(ball_masks(cameras))
+    assert not visual_hull(masks, cameras, around(1.0), SMALL).values.any()
+    for found in (bounds_from_masks(masks, cameras), reconstruct(masks, cameras).bounds):
+        assert torch.equal(found.low, bounds_from_cameras(cameras).low)
+    assert len(reconstruct(masks, cameras).mesh.vertices) == 0
 
 
 @pytest.mark.gpu

@@ -154,16 +154,17 @@ def test_an_invalid_frame_disconnects_its_rig_only(message):
             assert server.is_serving()
 
 
-def test_an_empty_frame_is_an_error_of_its_views_only():
+def test_an_empty_frame_shows_the_background():
     with running(PushSource(), ready=False) as server, Client(server.ws) as viewer:
         frame = photograph(CAMERAS)
         with publisher(server) as rig:
             rig.push(frame)
             viewer.frame(viewer.look(width=32, height=32))
-            rig.push(replace(frame, mask=torch.zeros_like(frame.mask)))
-            assert "no" in viewer.wait_for("error")["message"]
-            rig.push(frame)
-            assert viewer.frame().header["time"] == 2
+            for time, mask in enumerate((torch.zeros_like(frame.mask), frame.mask), 1):
+                rig.push(replace(frame, mask=mask))
+                while (shown := viewer.frame()).header["time"] < time:
+                    pass
+                assert (shown.images[0, "mended"].max() > 50) == bool(mask.any())
 
 
 def test_the_client_refuses_frames_without_masks():

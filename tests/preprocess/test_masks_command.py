@@ -127,3 +127,15 @@ def test_whoever_needs_masks_hears_of_the_command(unmasked, tmp_path, capsys):
     assert f"viewmend masks {unmasked.path} OUT" in capsys.readouterr().err
     assert main(["info", str(unmasked.path)]) == 0
     assert "none (viewmend masks makes them)" in capsys.readouterr().out
+
+
+def test_frames_without_a_subject_are_named_and_a_capture_of_such_alone_is_refused(unmasked, tmp_path, capsys):
+    for name in "abcd":
+        unmasked.put(f"images/{name}_001.png", unmasked.get(f"plates/{name}.png"))
+    options = ["--method", "plate", "--no-clean", "--plate", str(unmasked.path / "plates")]
+    command = ["masks", str(unmasked.path), str(tmp_path / "out"), *options]
+    assert main(command) == 0
+    assert "1 of 2 frames have no subject ('001'); their masks are empty" in capsys.readouterr().err
+    command[2] = str(tmp_path / "none")
+    assert main([*command, "--frames", "1:2"]) == 2
+    assert "expected a subject, got none in 1 frame; remove the folder" in capsys.readouterr().err

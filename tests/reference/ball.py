@@ -73,3 +73,16 @@ class BallCapture:
         """The ball at this time, exact."""
         frame = photograph(self.cameras, time)
         return replace(frame, rgb=(frame.rgb.float() * (1 - 0.1 * time)).byte(), depth=None)
+
+
+class AwayBall(BallCapture):
+    """The ball, which is out of all cameras' sight at some times."""
+
+    def __init__(self, cameras: Cameras, frames: int, away: set[int]):
+        super().__init__(cameras, frames)
+        self.away = away
+
+    def read(self, time: int) -> MultiViewFrame:
+        """The ball at this time, or black images and masks."""
+        frame = super().read(time)
+        return replace(frame, rgb=0 * frame.rgb, mask=0 * frame.mask) if time in self.away else frame

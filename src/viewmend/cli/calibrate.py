@@ -130,7 +130,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
 
 
 def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
-    """Some times at which all cameras are there and right, and the capture's bounds."""
+    """Some times at which all cameras are there and right and a subject is, and the capture's bounds."""
     from viewmend.cli.checks import chosen_times
     from viewmend.data.prepare import open_masked, prepare
     from viewmend.preprocess.calibration.silhouettes import LEAST_CAMERAS
@@ -140,6 +140,9 @@ def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
     count = min(options.num_frames, len(times))
     prepared = prepare(capture, match_colours=False, first=times[0])
     read = [prepared.read(times[len(times) * number // count]) for number in range(count)]
+    read = [frame for frame in read if frame.has_subject]
+    if not read:
+        raise ValueError(f"expected a subject in one of {count} frames, got none; choose other --frames")
     most = max((frame.cameras.names for frame in read), key=len)
     frames = [frame for frame in read if frame.cameras.names == most]
     if len(most) < LEAST_CAMERAS + 1:

@@ -11,6 +11,7 @@ import tyro
 if TYPE_CHECKING:
     from viewmend.data.checks.calibration import CalibrationCheck
     from viewmend.data.native_capture import NativeCapture
+    from viewmend.types import MultiViewFrame
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +28,8 @@ class Options:
     """Format of the capture (docs/formats.md); recognised by default."""
     out: Path | None = None
     """Write a picture of the calibration check to this file (.png or .jpg)."""
-    frame: int = 0
-    """Index of the frame to check."""
+    frame: int | None = None
+    """Index of the frame to check; by default the first one with a subject."""
     json: bool = False
     """Write one JSON object to standard output."""
 
@@ -64,11 +65,9 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
     capture = NativeCapture(options.capture, format=options.format)
     if options.out is not None:
         check_image_name(options.out)
-    if not 0 <= options.frame < len(capture.frame_ids):
-        last = len(capture.frame_ids) - 1
-        raise ValueError(f"{options.capture}: expected --frame of 0 to {last}, got {options.frame}; choose again")
+    frame = _frame(capture, options)
     with busy("computing the hull"):
-        check = check_calibration(capture.read(options.frame), capture.bounds)
+        check = check_calibration(frame, capture.bounds)
         good = check.frame.without([issue.camera for issue in check.issues if issue.camera])
         fatal = any(issue.fatal for issue in check.issues)  # then nothing else can be judged
         late = () if fatal else find_desynchronised_cameras(capture, good, len(capture.frame_ids) - 1)
@@ -80,6 +79,22 @@ def _check_capture(options: Options) -> "tuple[NativeCapture, CalibrationCheck, 
             write_image(options.out, draw_check(check, capture.up))
         say(f"wrote {options.out}")
     return capture, check, changes
+
+
+def _frame(capture: "NativeCapture", options: Options) -> "MultiViewFrame":
+    """The frame to check; ValueError if there is no such frame, or no subject in it."""
+    from viewmend.data.prepare import first_with_subject
+
+    if options.frame is None:
+        return first_with_subject(capture) or capture.read(0)
+    if not 0 <= options.frame < len(capture.frame_ids):
+        last = len(capture.frame_ids) - 1
+        raise ValueError(f"{options.capture}: expected --frame of 0 to {last}, got {options.frame}; choose again")
+    frame = capture.read(options.frame)
+    if capture.has_masks and not frame.has_subject:
+        expected = f"foreground in the masks of frame '{capture.frame_ids[options.frame]}'"
+        raise ValueError(f"{options.capture}: expected {expected}, got none; choose another --frame")
+    return frame
 
 
 def describe_capture(capture: "NativeCapture", check: "CalibrationCheck") -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Options, checks of options, and messages that several commands share."""
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,8 +11,12 @@ from viewmend.training.config import NEGATED
 
 if TYPE_CHECKING:
     from viewmend.data.prepare import PreparedCapture
+    from viewmend.data.source import CaptureSource
     from viewmend.models.base import Inpainter
     from viewmend.rendering.view import RenderConfig
+
+MAX_NAMED = 5
+"""Messages name up to this many frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,3 +121,10 @@ def log_preparation(capture: "PreparedCapture") -> None:
     """Report what preparation changed in a capture. Issues have already been logged as warnings."""
     for text in capture.changes:
         say(text)
+
+
+def without_subject(source: "CaptureSource", times: Collection[int], count: int) -> str:
+    """Which of `count` frames, those at these times, have no subject, in words."""
+    ids = [f"'{source.frame_ids[time]}'" for time in sorted(times)]
+    more = f" and {len(ids) - MAX_NAMED} more" if len(ids) > MAX_NAMED else ""
+    return f"{len(ids)} of {count} frames have no subject ({', '.join(ids[:MAX_NAMED])}{more})"

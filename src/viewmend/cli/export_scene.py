@@ -56,7 +56,7 @@ def run(options: Options) -> int:
         raise ValueError(f"expected --min-confidence from 0 to 1, got {options.min_confidence}; choose again")
     from viewmend.cli.checks import chosen_times, load_named, log_preparation
     from viewmend.cli.console import say, track
-    from viewmend.data.prepare import open_masked, prepare
+    from viewmend.data.prepare import first_with_subject, open_masked, prepare
     from viewmend.data.source import prefetch
     from viewmend.export.scene import RESULTS, check_openexr, export_scene
     from viewmend.stream import Stream
@@ -71,7 +71,8 @@ def run(options: Options) -> int:
         prepared, size = asdict(options.preparation), options.max_image_size
         capture = prepare(opened, max_image_size=size, **prepared, first=times[0])
         log_preparation(capture)
-        first = stream.add_frame(capture.read(times[0]).to(options.device))
+        shown = first_with_subject(capture, first=times[0]) or capture.read(times[0])
+        first = stream.add_frame(shown.to(options.device))
         views = _views(options, first, capture.cameras, capture.up)
         frames = (frame.to(options.device) for frame in prefetch(capture, times))
         more = {"up": capture.up, "fps": capture.fps, "min_confidence": options.min_confidence}

@@ -49,8 +49,9 @@ class Options:
 
 def run(options: Options) -> int:
     """Run the command and return the exit code."""
-    from viewmend.cli.checks import chosen_times
+    from viewmend.cli.checks import chosen_times, without_subject
     from viewmend.cli.console import say, track
+    from viewmend.data.errors import CaptureError
     from viewmend.data.native_capture import open_capture
     from viewmend.data.native_writer import write_capture
     from viewmend.data.source import CaptureSubset
@@ -60,7 +61,12 @@ def run(options: Options) -> int:
     capture = open_capture(options.source, options.cameras or None, options.format, alpha=alpha)
     part = CaptureSubset(capture, chosen_times(options.frames, len(capture.frame_ids)))
     source = part if alpha else _masked(options, capture, part)
-    write_capture(source, options.out, images=options.images, progress=lambda times: track(times, "masks"))
+    empty = write_capture(source, options.out, images=options.images, progress=lambda times: track(times, "masks"))
+    if len(empty) == len(part.frame_ids):
+        got = f"none in {len(empty)} frame{'s' if len(empty) > 1 else ''}"
+        raise CaptureError(f"{options.out}: expected a subject, got {got}; remove the folder and try another --method")
+    if empty:
+        say(f"{without_subject(part, empty, len(part.frame_ids))}; their masks are empty")
     say(f"{options.out}: masks of {len(part.cameras)} cameras, {len(part.frame_ids)} frames; check them with")
     say(f"  viewmend check {options.out} --out check.png")
     return 0

@@ -77,7 +77,7 @@ class Options:
 def run(options: Options) -> int:
     """Run the command; returns the exit code."""
     _check(options)
-    from viewmend.cli.checks import chosen_times, load_named, log_preparation
+    from viewmend.cli.checks import chosen_times, load_named, log_preparation, without_subject
     from viewmend.cli.console import print_json, say, show, track
     from viewmend.cli.mend_output import MendOutput, in_words
     from viewmend.data.camera_path import STATIC_FPS, parse_turntable
@@ -105,6 +105,7 @@ def run(options: Options) -> int:
     mender.background = (turntable and turntable.background) or mender.background
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
     frames, frame = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)]), None
+    empty: set[int] = set()
     fps = (turntable and turntable.fps) or capture.fps or STATIC_FPS
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
@@ -112,11 +113,14 @@ def run(options: Options) -> int:
         for time, target in track(plan, "inpainting"):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
+                empty |= set() if frame.without(held).has_subject else {time}
             truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
             step = mender.mend(frame.without(held), target.to(options.device), truth)
             summary.add(step)
             output.add(step)
     say(f"wrote {options.out}")
+    if empty:
+        say(f"{without_subject(capture, empty, len({time for time, _ in plan}))}; they show only the background")
     if options.json:
         print_json(summary.as_json())
     else:
@@ -192,6 +196,10 @@ def _circle(turntable: "Turntable", capture: "CaptureSource", usable: list[int])
         assert frame.mask is not None, "captures without masks are refused"
         points.append(coarse_surface(frame.mask, frame.cameras, capture.bounds))
     extent, views = torch.cat(points), len(shown)
+    if not len(extent):
+        raise ValueError(
+            f"{capture.name}: expected a subject to circle, got none in these frames; choose other --frames"
+        )
     center = (extent.amin(0) + extent.amax(0)) / 2
     arc_rad = None if turntable.arc is None else math.radians(turntable.arc)
     path = orbit_around(center, capture.cameras, capture.up, views, views, arc_rad, turntable.size_px)

@@ -152,7 +152,7 @@ def in_words(summary: MendSummary) -> list[str]:
     lines = [
         f"{summary.frames} view{'s' if summary.frames != 1 else ''}; holes {100 * (summary.hole_fraction or 0):.2f} % "
         f"of the hull's pixels, {100 * (summary.mended_fraction or 0):.2f} % to be inpainted; "
-        f"hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}",
+        + (f"hull IoU {sum(iou) / len(iou):.3f}, lowest {min(iou):.3f}" if iou else "no subject"),
         "a frame takes " + ", ".join(f"{name} {ms:.1f} ms" for name, ms in summary.stage_ms().items()),
     ]
     if summary.mean("ours", "psnr_whole") is None:

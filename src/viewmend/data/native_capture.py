@@ -41,7 +41,6 @@ from viewmend.data.video_clock import ABSENT, Track, TrackKind, VideoClock, matc
 from viewmend.data.videos import VideoFile, is_video, video_properties
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
-from viewmend.geometry.hull import FOREGROUND
 from viewmend.geometry.rigid import rigid
 from viewmend.types import MultiViewFrame
 
@@ -149,8 +148,8 @@ class NativeCapture:
     def read(self, time: int) -> MultiViewFrame:
         """Read all cameras of the frame at index `time` of `frame_ids`, in parallel.
 
-        A camera whose film is damaged at this time is absent. CaptureError if a file is unreadable or has the wrong
-        size, or no mask has any foreground; IndexError if `time` is not in the capture.
+        A camera whose film is damaged at this time is absent. Masks are 0 in a frame without a subject. CaptureError if
+        a file is unreadable or has the wrong size; IndexError if `time` is not in the capture.
         """
         if not 0 <= time < len(self.frame_ids):
             raise IndexError(f"{self._file}: expected a frame index of 0 to {len(self.frame_ids) - 1}, got {time}")
@@ -167,13 +166,8 @@ class NativeCapture:
         frame = stack_images([image for image in images if image is not None], self.cameras[views], time)
         if frame.mask is not None:
             frame = self._from_labels(frame)
-        if frame.mask is not None and (highest := int(frame.mask.max())) <= FOREGROUND:
-            camera = self._entries[views[0]]
-            raise CaptureError(
-                f"{self.folder / camera.file('mask', frame_id)}: camera '{camera.name}', frame '{frame_id}': expected "
-                f"foreground (255) in this or another camera's mask, got no value above {highest} in any; segment the "
-                f"images, or remove the frame from {self._file.name}"
-            )
+        if frame.mask is not None and not frame.has_subject:  # what remains is noise, as of a compressed video
+            frame = replace(frame, mask=torch.zeros_like(frame.mask))
         return frame
 
     def undistort(self, camera: str, rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:

@@ -35,17 +35,18 @@ def write_capture(
     *,
     images: Literal["jpeg", "png"] = "jpeg",
     progress: Callable[[Iterable[int]], Iterable[int]] | None = None,
-) -> None:
+) -> tuple[int, ...]:
     """Write all frames of a source to the folder `out`: images, masks and depth if present, and `cameras.json`.
 
     With PNG, reading the folder returns the same frames bit for bit (depth to half a millimetre). JPEG (quality 95,
     no chroma subsampling) is smaller; masks and depth are always PNG. The folder is complete or absent, see
-    `atomic_folder`. `progress` wraps the iterated frame indices. CaptureError if `out` exists and is not empty, or
-    the source cannot be read.
+    `atomic_folder`. `progress` wraps the iterated frame indices. Returns the indices of frames with masks but without a
+    subject. CaptureError if `out` exists and is not empty, or the source cannot be read.
     """
     with atomic_folder(out) as unfinished:
         writer = _Writer(source, unfinished, ".jpg" if images == "jpeg" else ".png")
-        writer.write(range(len(source.frame_ids)) if progress is None else progress(range(len(source.frame_ids))))
+        times = range(len(source.frame_ids))
+        return writer.write(times if progress is None else progress(times))
 
 
 @contextmanager
@@ -96,11 +97,15 @@ class _Writer:
             raise CaptureError(f"{source.name}: expected {expected}, got {unsafe}; rename the frames")
         folder.mkdir()
 
-    def write(self, times: Iterable[int]) -> None:
+    def write(self, times: Iterable[int]) -> tuple[int, ...]:
+        """Write these frames; the return value is that of `write_capture`."""
+        empty = []
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             for frame in prefetch(self.source, times):
                 list(pool.map(lambda view, frame=frame: self._write_view(frame, view), range(len(frame.cameras))))
+                empty += [frame.time] if frame.mask is not None and not frame.has_subject else []
         write_calibration(self.folder, self._calibration())
+        return tuple(empty)
 
     def _write_view(self, frame: MultiViewFrame, view: int) -> None:
         name, frame_id = frame.cameras.names[view], self.source.frame_ids[frame.time]

@@ -18,10 +18,13 @@ from viewmend.data.native_capture import NativeCapture, open_capture
 from viewmend.data.source import CaptureSource, CaptureWrapper, limit_camera_size, limit_size
 from viewmend.geometry.alignment import Alignment, shared_offset
 from viewmend.geometry.cameras import Cameras
+from viewmend.geometry.hull import FOREGROUND
 from viewmend.types import MultiViewFrame
 
 MAX_NAMED = 3
 """Warnings name the cameras that are not inputs if there are at most this many."""
+ENTERING_FRAMES = 30
+"""Frames from a subject's first sight on, in which half of the cameras are expected to see it."""
 
 
 @dataclass(frozen=True)
@@ -100,14 +103,14 @@ def prepare(
         inputs: names of the input cameras; None for all. Pixels of other (held-out) cameras have no effect.
         max_image_size: images are reduced to at most this length of their longer side.
         align: find the shift that all images share from the masks of one frame at full size, and look for out-of-sync
-            cameras in the frames around it: the first from `first` on with two input cameras and any foreground.
+            cameras in the frames around it: `first_with_subject`.
         match_colours: match the input cameras' colours in the same frame, if that improves their agreement on parts
             of the surface that the correction was not fitted to.
         first: index of the first frame that will be used.
         last: index of the last frame that will be used, at which synchronisation is checked again.
 
     Raises:
-        CaptureError: a frame cannot be read, or its masks or calibration are unusable.
+        CaptureError: a frame cannot be read, its masks or calibration are unusable, or no frame has a subject.
         ValueError: the input cameras look away from each other.
 
     Examples:
@@ -118,7 +121,7 @@ def prepare(
         torch.Size([4, 3, 32, 32])
     """
     names = None if inputs is None else tuple(inputs)
-    frame = _first_masked(source, names, first)
+    frame = first_with_subject(source, names, first, least=2)
     if frame is None:
         return PreparedCapture(source, None, max_image_size, names)
     reported: set[str] = set()
@@ -136,7 +139,7 @@ def prepare(
 
 def adjustments(source: CaptureSource, frame: MultiViewFrame, issues: Sequence[Issue]) -> tuple[str, ...]:
     """What `prepare` would change, by a frame of good cameras and its issues, in the same words."""
-    if frame.mask is None or not bool((frame.mask > 0).any()):
+    if not frame.has_subject:
         return ()
     return _adjusted(PreparedCapture(source), frame, issues, align=True, colours=True).changes
 
@@ -188,12 +191,33 @@ def open_masked(
     return capture
 
 
-def _first_masked(source: CaptureSource, inputs: Sequence[str] | None, first: int) -> MultiViewFrame | None:
-    """The input cameras in the first frame from `first` on in which two of them are present with any foreground."""
-    for time in range(first, len(source.frame_ids)):
+def first_with_subject(
+    source: CaptureSource, inputs: Sequence[str] | None = None, first: int = 0, least: int = 1
+) -> MultiViewFrame | None:
+    """The input cameras in a frame in which `least` of them are present and see the subject; None without masks.
+
+    It is the first one from the index `first` on, or else the last one before. While a subject enters, a later frame is
+    taken, in which half of the cameras see it, or the most. CaptureError if no frame has foreground.
+    """
+    count, has_subject = len(source.frame_ids), False
+    best, most, left = None, 0, ENTERING_FRAMES
+    for time in (*range(first, count), *reversed(range(first))):
         frame = source.read(time)
+        if frame.mask is None:
+            return None
         if inputs is not None:
             frame = frame.select([name for name in inputs if name in frame.cameras.names])
-        if len(frame.cameras) >= 2 and frame.mask is not None and bool((frame.mask > 0).any()):
-            return frame
-    return None
+        seeing = sum(bool((mask > FOREGROUND).any()) for mask in frame.per_camera("mask"))
+        has_subject |= seeing > 0
+        if len(frame.cameras) >= least and seeing > most:
+            best, most = frame, seeing
+        left -= best is not None
+        if best is not None and (2 * most >= len(best.cameras) or left == 0):
+            break
+    if has_subject:
+        return best
+    where = source.folder if isinstance(source, NativeCapture) else source.name
+    raise CaptureError(
+        f"{where}: expected foreground (values above {FOREGROUND}) in a mask, got none in "
+        f"{count} frame{'s' if count > 1 else ''}; segment the images again, with 255 as the subject"
+    )

@@ -119,7 +119,8 @@ class Mender:
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> "MendStep":
         """Complete and score the next view; several views of the same frame may follow each other.
 
-        The image of a camera at the target's pose, `truth` (one view), is used for scores only.
+        The image of a camera at the target's pose, `truth` (one view), is used for scores only. There are none where
+        neither the frame nor the truth has a subject.
 
         Raises:
             ValueError: the inpainter returns colours that are not finite.
@@ -128,9 +129,10 @@ class Mender:
         cached = self.add_frame(frame, carving)
         made = self.view(target, frame.time, target_mask=target_mask)
         iou = _input_iou(cached)
-        if truth is None:
-            return MendStep(frame, made.completed, self.background, None, None, iou, made.times)
-        true = true_view(truth, self.background)
+        true = None if truth is None else true_view(truth, self.background)
+        if truth is None or true is None or not (frame.has_subject or truth.has_subject):
+            shown = None if true is None else true.rgb
+            return MendStep(frame, made.completed, self.background, shown, None, iou, made.times)
         psnr_only = Scorers(self.background, ssim=None)
         if self._scorers is None:
             self._scorers = load_scorers(self.background, "gaussian", ("lpips-alex",), str(true.rgb.device))
@@ -167,7 +169,7 @@ class MendStep:
     truth: Float[Tensor, "3 height width"] | None
     """The target image on the background; None if there is none."""
     scores: FillScores | None
-    """None without truth."""
+    """None without truth, or without a subject."""
     hull_iou: dict[str, float]
     """IoU of the hull's silhouette and the mask, for each input camera and the truth."""
     times: StageTimes

@@ -306,7 +306,7 @@ def export_scene(
         min_confidence: pixels below this confidence make no points, if the model predicts a confidence.
 
     Raises:
-        ValueError: a frame has no masks, or no foreground.
+        ValueError: a frame has no masks.
         OSError: a file cannot be written.
     """
     rotation = engine_from_world(upright(rig).cpu() if up is None else up.cpu())

@@ -53,7 +53,7 @@ def shared_offset(
     that a rig cannot tell from a move of the subject (all cameras level: up and down) stay near zero.
 
     Raises:
-        ValueError: there is one camera only, or no mask has any foreground.
+        ValueError: there is one camera only, or the cameras look away from each other.
     """
     found = reconstruct(mask, cameras, bounds, config).bounds
     box = Bounds(found.low - MARGIN * found.size_m, found.high + MARGIN * found.size_m)

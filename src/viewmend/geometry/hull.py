@@ -93,9 +93,9 @@ def visual_hull(
     minimum, unlike RIFTCast's product, does not thin the subject as cameras are added.
 
     Raises:
-        ValueError: there is one camera only, or no mask has any foreground.
+        ValueError: there is one camera only.
     """
-    check_masks(mask, cameras)
+    check_views(cameras)
     voxels, needed = Cubes.of(bounds, config.resolution), needed_views(len(cameras), config)
     pool = max(1, int(_footprint_px(cameras, bounds, voxels.side_m) / config.pixels_per_voxel))
     if _has_kernels(mask):
@@ -185,15 +185,10 @@ def _occupied_cpu(
     return occupied
 
 
-def check_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> None:
-    """Raise ValueError if no hull can be carved from these masks."""
+def check_views(cameras: Cameras) -> None:
+    """Raise ValueError if there are too few cameras to carve a hull."""
     if len(cameras) < 2:
         raise ValueError(f"expected masks of at least two cameras, got {len(cameras)}; a hull needs several views")
-    if not bool(mask.any()):
-        raise ValueError(
-            f"expected foreground in the masks, got none in any of {len(cameras)} cameras; check the masks' "
-            "files and that 255 means foreground"
-        )
 
 
 def bounds_from_cameras(cameras: Cameras) -> Bounds:
@@ -212,10 +207,12 @@ def bounds_from_cameras(cameras: Cameras) -> Bounds:
 def bounds_from_masks(mask: UInt8[Tensor, "view height width"], cameras: Cameras) -> Bounds:
     """A cube that holds the masks' subject: centred where the rays through the masks' middles come closest.
 
+    If fewer than two masks have any foreground, that of `bounds_from_cameras`.
+
     Raises:
-        ValueError: there is one camera only, no mask has any foreground, or the cameras look away from each other.
+        ValueError: there is one camera only, or the cameras look away from each other.
     """
-    check_masks(mask, cameras)
+    check_views(cameras)
     some = [v for v in range(len(cameras)) if bool(mask[v].any())]
     if len(some) < 2:
         return bounds_from_cameras(cameras)

@@ -12,7 +12,7 @@ from viewmend.geometry.hull import (
     HullConfig,
     OccupancyGrid,
     bounds_from_masks,
-    check_masks,
+    check_views,
     occupied_bounds,
     visual_hull,
 )
@@ -60,13 +60,13 @@ def reconstruct(
 
     A search over `bounds` (estimated from the masks where None) finds the box that the subject fills; all voxels are
     spent there. So bounds much larger than the subject cost no detail. Where the masks agree on no
-    point of space, the proxy is empty.
+    point of space, or are empty, the proxy is empty.
 
     Raises:
-        ValueError: there is one camera only, or no mask has any foreground.
+        ValueError: there is one camera only, or the cameras look away from each other.
     """
     config = config or HullConfig()
-    check_masks(mask, cameras)
+    check_views(cameras)
     bounds = bounds or bounds_from_masks(mask, cameras)
     box = occupied_bounds(mask, cameras, bounds, config)
     if box is None:

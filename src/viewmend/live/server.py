@@ -241,6 +241,8 @@ class LiveServer:
                     return error_response(503, str(error))
                 if await request.is_disconnected():
                     break
+        if not any(map(len, points)):
+            return error_response(503, "there is no subject in these frames; choose others")
         fitted = render_jobs.frame_motion(asked, torch.cat(points), home)
         return JSONResponse(fitted, headers={"Cache-Control": "no-store"})
 

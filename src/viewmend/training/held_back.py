@@ -189,7 +189,7 @@ def _views_of(capture: NativeCapture, own: HeldBack, table: bool) -> Iterator[He
         others = tuple(name for name in names if name != camera)
         prepared = prepare(capture, others)
         frame = prepared.read(time)
-        if camera not in frame.cameras.names or len(frame.cameras) < 3:
+        if camera not in frame.cameras.names or len(frame.cameras) < 3 or not frame.has_subject:
             continue
         seen = LeaveOneOut({time: frame}, prepared.bounds).frame(camera, time)
         stream = Stream(Inpainter(), bounds=prepared.bounds)
@@ -211,6 +211,8 @@ class HeldBackValidation:
         assert isinstance(model, Inpainter), "a network that completes views"
         if not self._views:
             self._views = [view for place in self.captures for view in held_back_views(place, self.hold_out)]
+        if not self._views:
+            raise ValueError("expected a subject in what is held back, got none; choose another --hold-out")
         self._metric = self._metric or load_lpips("alex")
         training = model.training  # pyright: ignore
         model.eval()  # pyright: ignore

@@ -66,10 +66,13 @@ def test_a_stream_has_nothing_left_to_compute():
 
 
 def test_a_frame_without_a_hull():
+    frame = photograph(CAMERAS[:1], 0)
+    got, *_ = send(SharedFrame.prepare(frame, None, PIPELINE.hull, SmoothFill()))
+    assert got.cached is None and torch.equal(got.frame.rgb, frame.rgb)
     frame = photograph(CAMERAS, 0)
     empty = replace(frame, mask=0 * frame.mask)
     got, *_ = send(SharedFrame.prepare(empty, None, PIPELINE.hull, SmoothFill()))
-    assert got.cached is None and torch.equal(got.frame.rgb, frame.rgb)
+    assert len(got.cached.proxy.mesh.vertices) == 0
 
 
 class Link:

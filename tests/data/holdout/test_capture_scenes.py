@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.ball import BallCapture, ring
+from reference.ball import AwayBall, BallCapture, ring
 from reference.capture_folder import edit_description
 
 from viewmend.cli import main
@@ -196,3 +196,8 @@ def test_by_default_7_of_79_are_for_tests_and_scenes_are_a_random_subset(capture
     assert drawn[0] != {path.name for path in paths[:10]}
     with pytest.raises(ValueError, match=r"at least the 101 captures of --scenes, got 100"):
         make_splits(paths, captures, scenes=101)
+
+
+def test_frames_without_a_subject_are_not_scored(tmp_path):
+    write_capture(AwayBall(ring(6), 4, {0, 2}), tmp_path / "ball", images="png")
+    assert [frame.inputs.time for frame in capture_set(tmp_path / "ball")[2].frames()] == [1, 3]

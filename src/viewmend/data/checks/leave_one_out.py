@@ -76,6 +76,8 @@ def leave_one_out(frame: MultiViewFrame, bounds: Bounds | None, hull: HullConfig
     if mask is None or len(names) < MIN_CAMERAS:
         return None
     inside, step = mask > FOREGROUND, max(1, -(-len(names) // MAX_PEERS))
+    if int(inside.flatten(1).any(1).sum()) < 2:
+        return None
     try:
         missed = missed_share(inside, reconstruct(mask, frame.cameras, bounds, hull).depth(frame.cameras) > 0)
         silhouettes, removed = [], []

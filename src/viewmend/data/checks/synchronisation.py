@@ -52,13 +52,14 @@ def find_desynchronised_cameras(
 def _frames_around(source: CaptureSource, frame: MultiViewFrame, time: int) -> tuple[list[MultiViewFrame], int]:
     """Frames around a time, of the cameras of `frame` that all of them have, and the position of the one to judge.
 
-    That is the nearest one with as many frames before as after it, if there are enough.
+    That is the nearest one with as many frames before as after it, if there are enough, and with a subject, if any has.
     """
     count = len(source.frame_ids)
     time = min(max(time, min(MAX_DELAY, count // 2)), max(count - 1 - MAX_DELAY, count // 2))
     times = list(range(max(0, time - MAX_DELAY), min(count, time + MAX_DELAY + 1)))
     frames = [frame if other == frame.time else source.read(other) for other in times]
-    wanted, middle = set(frame.cameras.names), times.index(time)
+    seen = [at for at, other in enumerate(frames) if other.has_subject]
+    wanted, middle = set(frame.cameras.names), min(seen or [0], key=lambda at: abs(times[at] - time))
     while middle < len(frames) - 2 and not wanted <= set(frames[-1].cameras.names):  # where some cameras have ended
         frames.pop()
     while middle > 1 and not wanted <= set(frames[0].cameras.names):  # or have not begun

@@ -48,12 +48,12 @@ class CaptureScene(LeaveOneOutScene):
         return repr((self.fingerprint, self.held, self.inputs, self.count, *raw))
 
     def frames(self) -> Iterator[LeaveOneOutFrame]:
-        """Frames in which the camera that was left out, and at least two of the inputs, have images."""
+        """Frames with a subject in which the camera that was left out, and at least two of the inputs, have images."""
         opened = open_masked(self.folder, (*self.inputs, self.held), held=1, format=self.format)
         capture = prepare(opened, self.inputs, align=self.align, match_colours=self.match_colours)
         for time in range(self.count):
             frame = capture.read(time)
-            if self.held in frame.cameras.names and len(frame.cameras) >= 3:
+            if self.held in frame.cameras.names and len(frame.cameras) >= 3 and frame.has_subject:
                 yield LeaveOneOut({time: frame}, capture.bounds).frame(self.held, time)
 
 
