@@ -1,4 +1,4 @@
-"""Selecting cameras of a frame: nothing is copied until a stack is read."""
+"""Frames and views: selections copy nothing until a stack is read, and wrong tensors are refused."""
 
 import pickle
 from dataclasses import replace
@@ -6,8 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 from reference.ball import photograph, ring
+from reference.forged import forged
+from torch.nn import functional as F
 
 from viewmend.data.synthetic.stage import Studio, StudioConfig
+from viewmend.models.classical import Telea
+from viewmend.stream import Stream
+from viewmend.types import Silhouettes
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +55,60 @@ def test_all_cameras_of_a_frame_are_the_frame_itself():
     turned = frame.select(frame.cameras.names[::-1])
     assert turned.cameras.names == ("c2", "c1", "c0") and torch.equal(turned.rgb[0], frame.rgb[2])
     assert len(frame.select([]).cameras) == 0 == len(frame.select([]).rgb)
+
+
+# What a frame's check refuses.
+
+RIG = photograph(ring(3, 16))
+CAMERAS = RIG.cameras
+TALL = torch.tensor([[16, 20]]).expand(3, 2)
+
+
+def of_cameras(**fields):
+    return forged(RIG, cameras=forged(CAMERAS, **fields))
+
+
+@pytest.mark.parametrize(
+    "frame, message",
+    [
+        (forged(RIG, rgb=RIG.rgb / 255), r"expected rgb as torch.uint8, got torch.float32; scale it to 0 to 255"),
+        (
+            forged(RIG, rgb=RIG.rgb.movedim(1, -1)),
+            r"rgb of shape \(3, 3, 16, 16\).*got \(3, 16, 16, 3\).*channels first",
+        ),
+        (forged(RIG, rgb=RIG.rgb[:2]), r"expected rgb of shape \(3, 3, 16, 16\).*got \(2, 3, 16, 16\); give one image"),
+        (forged(RIG, rgb=RIG.rgb[..., :9]), r"rgb of shape \(3, 3, 16, 16\).*got \(3, 3, 16, 9\); .* size_px"),
+        (forged(RIG, rgb=RIG.rgb.numpy()), "expected rgb as a tensor, got ndarray; convert it with torch.as_tensor"),
+        (forged(RIG, mask=RIG.mask > 0), "expected mask as torch.uint8, got torch.bool; scale it to 0 to 255"),
+        (forged(RIG, mask=RIG.mask / 255), "expected mask as torch.uint8, got torch.float32; scale it to 0 to 255"),
+        (forged(RIG, mask=RIG.mask // 255), "expected masks of 0 to 255, got at most 1; multiply by 255"),
+        (forged(RIG, mask=RIG.mask // 3), "expected masks of 0 to 255, got at most 85; scale them"),
+        (forged(RIG, mask=RIG.mask[:, :9]), r"mask of shape \(3, 16, 16\).*got \(3, 9, 16\); give one mask per camera"),
+        (of_cameras(names=("a", "b", "a")), r"expected a different name for each camera, got .*\['a'\]; rename"),
+        (of_cameras(names=("a", "b")), r"expected K of shape \(2, 3, 3\), got \(3, 3, 3\); give one"),
+        (of_cameras(K=CAMERAS.K.double()), r"expected K as torch.float32, got torch.float64; .*\.float\(\)"),
+        (of_cameras(camera_from_world=CAMERAS.camera_from_world[:, :3]), r"\(3, 4, 4\), got \(3, 3, 4\); .* 0 0 0 1"),
+        (
+            of_cameras(size_px=CAMERAS.size_px.float()),
+            r"expected size_px as torch.int64 .*got torch.float32; .*\.long\(\)",
+        ),
+        (of_cameras(size_px=TALL), r"rgb of shape \(3, 3, 20, 16\).*got \(3, 3, 16, 16\)"),
+        (RIG.select([]), "expected at least one camera, got none"),
+    ],
+)
+def test_frames_of_wrong_types_or_sizes_are_refused(frame, message):
+    with pytest.raises(ValueError, match=message):
+        frame.check()
+    with pytest.raises(ValueError, match=message):
+        Stream(Telea()).add_frame(frame)
+    if frame.mask is not RIG.mask and len(frame.cameras):
+        with pytest.raises(ValueError, match=message):
+            forged(Silhouettes(RIG.mask, CAMERAS), mask=frame.mask).check()
+
+
+def test_right_frames_pass(frame):
+    padded = replace(frame, rgb=F.pad(frame.rgb, (0, 3)), mask=F.pad(frame.mask, (0, 3)), depth=None)
+    some = frame.without(frame.cameras.names[1:2])
+    for right in (frame, padded, some, replace(frame, mask=None), replace(frame, mask=0 * frame.mask)):
+        right.check()
+    Silhouettes(padded.mask, frame.cameras).check()

@@ -144,10 +144,14 @@ class Stream:
             carving: masks of more cameras that carve the hull, although their images are not used.
 
         Raises:
-            ValueError: no `geometry` is given, and the frame has no masks, a single camera, or cameras that look away
-                from each other.
+            ValueError: images, masks or cameras have another type, shape or range than their fields say; or no
+                `geometry` is given, and the frame has no masks, a single camera, or cameras that look
+                away from each other.
         """
         if frame.time not in self._frames:
+            frame.check()
+            if carving is not None:
+                carving.check()
             frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
             given = None if geometry is None else CachedFrame(frame, geometry)
             self._frames[frame.time] = given or cache_frame(frame, self.bounds, self.config.hull, carving)

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
-from viewmend.utils.tensors import OnDevice
+from viewmend.utils.tensors import OnDevice, check_tensor
 
 RIM_PX = 2
 """How far the subject may extend beyond the proxy, pixels: silhouettes and grids cut off up to this much."""
@@ -117,6 +117,17 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         absent = {} if "mask" in found else {"mask": None}
         return MultiViewFrame._of_parts(found, cameras=cameras, time=self.time, depth=depth, **absent)
 
+    def check(self) -> None:
+        """ValueError unless cameras, `rgb` and `mask` have the types and shapes of the fields, and masks reach 255."""
+        self.cameras.check()
+        width, height = self.cameras.max_size_px
+        convert = "scale it to 0 to 255, and convert it with .byte()"
+        arrange = "give one image per camera, channels first, each at least as large as its camera's size_px"
+        shape = (len(self.cameras), 3, height, width)
+        check_tensor("rgb", self.rgb, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True)
+        if self.mask is not None:
+            _check_mask(self.mask, (len(self.cameras), *self.rgb.shape[2:]))
+
     def without(self, names: Sequence[str]) -> "MultiViewFrame":
         """The same frame without these cameras; names that are not in the frame are ignored."""
         return self.select([n for n in self.cameras.names if n not in names])
@@ -169,10 +180,26 @@ class Silhouettes(OnDevice):
     """Foreground, 0 to 255."""
     cameras: Cameras
 
+    def check(self) -> None:
+        """ValueError unless masks and cameras have the types and shapes of the fields, and masks reach 255."""
+        self.cameras.check()
+        width, height = self.cameras.max_size_px
+        _check_mask(self.mask, (len(self.cameras), height, width))
+
     def select(self, names: Sequence[str]) -> "Silhouettes":
         """The masks of these cameras, in this order; ValueError for an unknown name."""
         index = [self.cameras.names.index(name) for name in names]
         return Silhouettes(self.mask[index], self.cameras.select(names))
+
+
+def _check_mask(mask: object, shape: tuple[int, ...]) -> None:
+    """ValueError unless these are masks of 0 to 255, of this shape or padded; they may be empty."""
+    convert = "scale it to 0 to 255, and convert it with .byte()"
+    arrange = "give one mask per camera, as large as the images"
+    most = int(check_tensor("mask", mask, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True).max())
+    if 0 < most <= FOREGROUND:
+        how = "multiply by 255" if most == 1 else "scale them so that foreground is 255"
+        raise ValueError(f"expected masks of 0 to 255, got at most {most}; {how}")
 
 
 @dataclass(frozen=True)

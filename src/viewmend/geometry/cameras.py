@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from viewmend.geometry.rigid import invert_rigid
-from viewmend.utils.tensors import OnDevice
+from viewmend.utils.tensors import OnDevice, check_tensor
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,22 @@ class Cameras(OnDevice):
         names = tuple(self.names[view] for view in index)
         at = torch.tensor(list(index), dtype=torch.long, device=self.K.device)
         return Cameras(names, self.K[at], self.camera_from_world[at], self.size_px[at])
+
+    def check(self) -> None:
+        """ValueError unless names differ, and K, poses and sizes are tensors of the fields' types, one per name."""
+        count = len(self.names)
+        if not count:
+            raise ValueError("expected at least one camera, got none; name the cameras")
+        twice = sorted({name for name in self.names if self.names.count(name) > 1})
+        if twice:
+            raise ValueError(f"expected a different name for each camera, got several cameras {twice}; rename them")
+        matrix, text = (torch.float32,), "convert it with .float()"
+        arrange = "give one 3 x 3 matrix per camera"
+        check_tensor("K", self.K, matrix, (count, 3, 3), convert=text, arrange=arrange)
+        pose, arrange = self.camera_from_world, "give one pose per camera, with the last row 0 0 0 1"
+        check_tensor("camera_from_world", pose, matrix, (count, 4, 4), convert=text, arrange=arrange)
+        size, arrange = (torch.int64, torch.int32), "give width and height of each camera"
+        check_tensor("size_px", self.size_px, size, (count, 2), convert="convert it with .long()", arrange=arrange)
 
     def select(self, names: Sequence[str]) -> "Cameras":
         """The cameras of these names, in this order.

@@ -1,11 +1,11 @@
-"""Tensors in dataclasses and tuples: moved to a device, copied to memory of their own, counted.
+"""Tensors in dataclasses and tuples: moved to a device, copied to memory of their own, counted; checks of one tensor.
 
 Long-lived tensors between short-lived ones keep the C library from returning memory: a server that runs for hours
 would occupy several times what it stores. So they are copied to their own memory mappings.
 """
 
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -67,3 +67,36 @@ def size_bytes(value: Any) -> int:
     if is_dataclass(value) and not isinstance(value, type):
         value = [getattr(value, f.name) for f in fields(value)]
     return sum(map(size_bytes, value)) if isinstance(value, (tuple, list)) else 0
+
+
+def check_tensor(
+    name: str,
+    value: object,
+    dtypes: Sequence[torch.dtype],
+    shape: Sequence[int],
+    *,
+    convert: str,
+    arrange: str,
+    padded: bool = False,
+) -> Tensor:
+    """The value; ValueError unless it is a tensor of one of these types and of this shape.
+
+    Args:
+        name: what the message calls it.
+        value: the tensor.
+        dtypes: allowed types.
+        shape: expected shape; with `padded`, height and width (the last two) may be larger.
+        convert: what to do about another type.
+        arrange: what to do about another shape.
+        padded: whether larger images are allowed.
+    """
+    if not isinstance(value, Tensor):
+        raise ValueError(f"expected {name} as a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
+    fixed = len(shape) - 2 if padded else len(shape)
+    same = value.ndim == len(shape) and tuple(value.shape[:fixed]) == tuple(shape[:fixed])
+    if not same or any(own < least for own, least in zip(value.shape[fixed:], shape[fixed:], strict=True)):
+        least = " or larger images" if padded else ""
+        raise ValueError(f"expected {name} of shape {tuple(shape)}{least}, got {tuple(value.shape)}; {arrange}")
+    if value.dtype not in dtypes:
+        raise ValueError(f"expected {name} as {' or '.join(map(str, dtypes))}, got {value.dtype}; {convert}")
+    return value
