@@ -289,6 +289,31 @@ def test_excluded_cameras_reach_neither_renderer_nor_inpainter():
     assert requester.given[1] is None
 
 
+@pytest.mark.parametrize(
+    "exclude, message",
+    [
+        ("c4", r"expected exclude as a list of names, got the string 'c4'; write \['c4'\]"),
+        (["c4", "C7"], r"expected exclude to name cameras .*'c7', 'c9'\], got \['C7'\]; check the spelling"),
+    ],
+)
+def test_a_wrong_exclude_is_refused(exclude, message):
+    requester = Requester((0, ("c4",)))
+    stream = Stream(requester, CONFIG)
+    stream.add_frame(photograph(SPARSE))
+    view = stream.render(A)
+    for look in (stream.view, stream.render, lambda _, exclude: stream.mend(view, exclude=exclude)):
+        with pytest.raises(ValueError, match=message):
+            look(A, exclude=exclude)
+    assert not requester.given
+
+
+def test_a_camera_that_has_no_image_in_this_frame_may_be_excluded():
+    stream = Stream(Requester((0, ("c4", "c7"))), CONFIG)
+    for time in range(2):
+        stream.add_frame(photograph(SPARSE, time).without(["c4"] * time))
+    assert stream.view(A, exclude=("c4",)).completed.view.time == 1
+
+
 def test_viewers_share_the_depth_of_the_cameras(monkeypatch):
     rendered, own = [], GeometryProxy.depth
     monkeypatch.setattr(GeometryProxy, "depth", lambda self, at: rendered.extend(at.names) or own(self, at))

@@ -19,7 +19,7 @@ from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.geometry.threads import heavy_operations, light_operations
-from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State
+from viewmend.models.base import ContextProvider, Inpainter, Memory, RenderQuality, State, check_exclude
 from viewmend.models.compositing import Background, to_background
 from viewmend.rendering.crop import BORDER_PX, Crop, grid_px, mesh_crop, subject_crop
 from viewmend.rendering.error_mask import Evidence, decide_error_mask
@@ -127,6 +127,11 @@ class Stream:
         """Indices of the cached frames, in order."""
         return tuple(sorted(self._frames))
 
+    @property
+    def _names(self) -> set[str]:
+        """The cameras of all cached frames: one may have no image in some."""
+        return {name for cached in self._frames.values() for name in cached.frame.cameras.names}
+
     def viewer(self) -> State:
         """The state of a new viewer."""
         return self.inpainter.initial_state()
@@ -181,12 +186,13 @@ class Stream:
         Args:
             target: the novel view's camera (one view), on the frames' device.
             time: index of the frame, by default the latest.
-            exclude: names of cameras whose images must not be used.
+            exclude: names of cameras of the cached frames whose images must not be used.
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
-            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, no camera is left,
-                `target_mask` is not a mask of the view, or the error rule needs a model that predicts errors.
+            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, no camera is left, `exclude` is
+                a string or has an unknown name, `target_mask` is not a mask of the view, or the error rule needs a
+                model that predicts errors.
         """
         part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
         return crop.uncropped(self._with_error_mask(part, evidence, RenderQuality(), exclude), target)
@@ -207,15 +213,16 @@ class Stream:
             view: the view to complete.
             viewer: the state that this viewer's last view returned; None for its first.
             quality: how much work the view may cost.
-            exclude: names of cameras whose images must not be used.
+            exclude: names of cameras of the cached frames whose images must not be used.
 
         Raises:
             ValueError: the view's frame is not cached, the view names cameras that are not in the frame, its
-                `target_mask` is not a mask of it, the inpainter returns numbers that are not finite, or `quality` needs
-                a model that predicts errors.
+                `target_mask` is not a mask of it, `exclude` is a string or has an unknown name, the inpainter returns
+                numbers that are not finite, or `quality` needs a model that predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)
+        check_exclude(exclude, self._names)
         margin_px = self.inpainter.crop_margin_px(quality) if quality.mend else None
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
@@ -243,7 +250,7 @@ class Stream:
             viewer: the state that this viewer's last view returned; None for its first.
             time: index of the frame, by default the latest.
             quality: how much work the view may cost.
-            exclude: names of cameras whose images must not be used.
+            exclude: names of cameras of the cached frames whose images must not be used.
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
@@ -265,6 +272,7 @@ class Stream:
         target_mask: Float[Tensor, "height width"] | None,
     ) -> tuple[IncompleteView, Evidence, Crop]:
         """Render the part of a view that shows the subject, with the inpainter's margin."""
+        check_exclude(exclude, self._names)
         check_target_mask(target_mask, target.max_size_px[::-1])
         stop_if_cancelled()
         cached = self.cached_frame(time)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 from models.plates import NAMES, Rig
 
 from viewmend.models.base import REMEMBERED_FRAMES, ContextProvider
@@ -39,3 +40,8 @@ def test_excluded_cameras_are_never_provided():
     shared = {"left": "encoded for another viewer"}
     context = ContextProvider(rig, exclude=("left",), memory=lambda time: shared)
     assert context.encoded((3,), ("left",), lambda many: []) == []
+
+
+def test_a_string_is_not_taken_for_a_list_of_names():
+    with pytest.raises(ValueError, match=r"exclude as a list of names, got the string 'left'; write \['left'\]"):
+        ContextProvider(Rig(), exclude="left")

@@ -5,7 +5,7 @@ calls. What one viewer's view leaves for the next is the state; what is computed
 viewers is kept by the `ContextProvider`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
@@ -49,6 +49,18 @@ class RenderQuality:
     that are predicted to be background are attenuated."""
 
 
+def check_exclude(exclude: Sequence[str], known: Collection[str] | None = None) -> None:
+    """ValueError if this is a string and no list of names, or has names that are not `known`, if that is given."""
+    if isinstance(exclude, str):
+        raise ValueError(f"expected exclude as a list of names, got the string '{exclude}'; write ['{exclude}']")
+    unknown = [] if known is None else sorted(set(exclude) - set(known))
+    if unknown:
+        raise ValueError(
+            f"expected exclude to name cameras of the cached frames, {sorted(known or ())}, got {unknown}; check the "
+            "spelling, or leave them out"
+        )
+
+
 class ContextProvider:
     """The camera images that an inpainter may use, and a memory of what it computed from them.
 
@@ -82,7 +94,11 @@ class ContextProvider:
             quality: how much the view may cost.
             exclude: names of cameras that must not be used.
             memory: returns the memory of a frame; by default the provider keeps one for each of the last frames.
+
+        Raises:
+            ValueError: `exclude` is a string.
         """
+        check_exclude(exclude)
         self.quality = quality or RenderQuality()
         self.encoding_ms = 0.0
         """Milliseconds spent in `encoded` so far."""
