@@ -1,18 +1,19 @@
 """Frames and views: selections copy nothing until a stack is read, and wrong tensors are refused."""
 
+import math
 import pickle
 from dataclasses import replace
 
 import pytest
 import torch
-from reference.ball import photograph, ring
+from reference.ball import camera_at, photograph, ring
 from reference.forged import forged
 from torch.nn import functional as F
 
 from viewmend.data.synthetic.stage import Studio, StudioConfig
 from viewmend.models.classical import Telea
 from viewmend.stream import Stream
-from viewmend.types import Silhouettes
+from viewmend.types import IncompleteView, Silhouettes
 
 
 @pytest.fixture(scope="module")
@@ -112,3 +113,66 @@ def test_right_frames_pass(frame):
     for right in (frame, padded, some, replace(frame, mask=None), replace(frame, mask=0 * frame.mask)):
         right.check()
     Silhouettes(padded.mask, frame.cameras).check()
+
+
+# What a view's check refuses.
+
+TARGET = camera_at(100, "t", 16)
+CLOSE = ("c1", "c0")
+SEEN = photograph(TARGET)
+ALPHA = SEEN.mask[0] / 255
+VIEW = IncompleteView(TARGET, SEEN.rgb[0] / 255, ALPHA, 0 * ALPHA, SEEN.depth[0], CLOSE, ALPHA.expand(2, 16, 16) / 2, 0)
+FLOAT = r"convert it with \.float\(\), and divide 8-bit images by 255"
+
+
+@pytest.mark.parametrize(
+    "view, message",
+    [
+        (
+            forged(VIEW, rgb=VIEW.rgb * 255),
+            "expected rgb in \\[0, 1\\], got values from 0 to .*; divide 8-bit images by 255",
+        ),
+        (forged(VIEW, rgb=VIEW.rgb - 0.1), "expected rgb in \\[0, 1\\], got values from -0.1 to .*clamp"),
+        (forged(VIEW, rgb=(VIEW.rgb * 255).byte()), f"expected rgb as torch.float32, got torch.uint8; {FLOAT}"),
+        (forged(VIEW, rgb=VIEW.rgb.double()), f"expected rgb as torch.float32, got torch.float64; {FLOAT}"),
+        (forged(VIEW, mask=VIEW.mask.bfloat16()), f"expected mask as torch.float32, got torch.bfloat16; {FLOAT}"),
+        (forged(VIEW, error=VIEW.error > 0), f"expected error as torch.float32, got torch.bool; {FLOAT}"),
+        (forged(VIEW, error=VIEW.error + 255), "expected error in .*, got values from 255 to 255; divide"),
+        (forged(VIEW, rgb=VIEW.rgb.numpy()), "expected rgb as a tensor, got ndarray; convert it with torch.as_tensor"),
+        (forged(VIEW, depth=None), "expected depth as a tensor, got NoneType"),
+        (
+            forged(VIEW, rgb=VIEW.rgb.movedim(0, -1)),
+            r"rgb of shape \(3, 16, 16\), got \(16, 16, 3\); .* channels first",
+        ),
+        (forged(VIEW, depth=VIEW.depth[:9]), r"depth of shape \(16, 16\), got \(9, 16\); .* the view's camera"),
+        (
+            forged(VIEW, camera=TARGET.resized(20, 20)),
+            r"rgb of shape \(3, 20, 20\), got \(3, 16, 16\); .* the view's camera",
+        ),
+        (forged(VIEW, camera=CAMERAS), "expected the camera of one view, got 3; choose one"),
+        (
+            forged(VIEW, source_views=("c1",)),
+            r"weights of shape \(1, 16, 16\), got \(2, 16, 16\); .* each of source_views",
+        ),
+        (forged(VIEW, source_views=(), weights=VIEW.weights[:0]), "expected source_views with a camera, got none"),
+        (forged(VIEW, weights=VIEW.weights / 2), "expected weights that sum to 1 or 0 .*; divide them by their sum"),
+        (forged(VIEW, weights=VIEW.weights * 2), "expected weights that sum to 1 or 0 .*; divide them by their sum"),
+        (forged(VIEW, fade=VIEW.mask * 2), "expected fade in .*, got values from 0 to 2"),
+        (
+            forged(VIEW, target_mask=VIEW.mask.double()),
+            f"expected target_mask as torch.float32, got torch.float64; {FLOAT}",
+        ),
+        (forged(VIEW, rgb=VIEW.rgb * math.nan), "expected finite numbers in rgb, got NaN or infinity; use 0"),
+        (forged(VIEW, mask=VIEW.mask / 0), "expected finite numbers in mask, got NaN or infinity; use 0"),
+        (forged(VIEW, silhouettes=Silhouettes(RIG.mask // 255, CAMERAS)), "expected masks of 0 to 255, got at most 1"),
+    ],
+)
+def test_views_of_wrong_types_sizes_or_ranges_are_refused(view, message):
+    VIEW.check(CAMERAS.names)
+    with pytest.raises(ValueError, match=message):
+        view.check(CAMERAS.names)
+
+
+def test_a_view_may_leave_its_range_by_rounding():
+    view = replace(VIEW, rgb=VIEW.rgb * 1.001 - 0.001, weights=VIEW.weights.half().float() * 1.001, fade=VIEW.error)
+    replace(view, target_mask=VIEW.mask, silhouettes=Silhouettes(RIG.mask, CAMERAS)).check(CAMERAS.names)

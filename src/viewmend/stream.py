@@ -216,9 +216,10 @@ class Stream:
             exclude: names of cameras of the cached frames whose images must not be used.
 
         Raises:
-            ValueError: the view's frame is not cached, the view names cameras that are not in the frame, its
-                `target_mask` is not a mask of it, `exclude` is a string or has an unknown name, the inpainter returns
-                numbers that are not finite, or `quality` needs a model that predicts errors.
+            ValueError: the view's frame is not cached; the view names no camera or one that is not in the frame; an
+                image of it has another type, shape or range than its field says; `exclude` is a string or has an
+                unknown name; the inpainter returns numbers that are not finite; or `quality` needs a model that
+                predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)

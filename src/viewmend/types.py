@@ -10,6 +10,7 @@ are in [0, 1] and on black, that is, multiplied by alpha. Camera axes are OpenCV
 are in metres. The symbols I, M, F, E and G, and the section numbers, are those of the paper.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
@@ -29,6 +30,10 @@ FAINT = 1 / 16
 """Opacity below which a pixel's colour divided by its opacity is noise."""
 NEAR_PX = 4
 """Radius within which faint pixels take the colour of their neighbours."""
+
+TOLERANCE = 1e-2
+"""How far images in [0, 1] may leave it, for rounding."""
+TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
 
 
 class _LazyStacks:
@@ -276,30 +281,62 @@ class IncompleteView:
         return tuple(dict.fromkeys((*self.source_views, *self.candidate_views)))[:count]
 
     def check(self, known: Sequence[str]) -> None:
-        """ValueError if the view names cameras that are not among these, or its `target_mask` is not a mask of it."""
-        check_target_mask(self.target_mask, self.mask.shape)
+        """ValueError unless the view is what its fields say, and its cameras are among these."""
         unknown = sorted({*self.source_views, *self.candidate_views} - set(known))
         if unknown:
             raise ValueError(
                 f"expected a view of cameras among {list(known)}, got {unknown}; correct source_views and "
                 "candidate_views"
             )
+        if not self.source_views:
+            raise ValueError("expected source_views with a camera, got none; name those that coloured the view")
+        self.camera.check_single()
+        width, height = self.camera.max_size_px
+        check_target_mask(self.target_mask, (height, width))
+        self._check_images(height, width)
+        if self.silhouettes is not None:
+            self.silhouettes.check()
+
+    def _check_images(self, height: int, width: int) -> None:
+        """The checks of the images but `target_mask`: their types and shapes, then their ranges."""
+        channels = {"rgb": (3,), "weights": (len(self.source_views),), "mask": (), "error": (), "depth": ()}
+        for name, more in (channels | ({} if self.fade is None else {"fade": ()})).items():
+            what = "one image for each of source_views" if name == "weights" else "it channels first"
+            arrange = f"give {what}, at the size of the view's camera"
+            shape = (*more, height, width)
+            check_tensor(name, getattr(self, name), (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
+        images = {"rgb": self.rgb, "mask": self.mask, "error": self.error, "weights": self.weights}
+        if self.fade is not None:
+            images["fade"] = self.fade
+        sums = self.weights.sum(0)
+        off = sums * (1 - sums)  # 0 where the sum is 0 or 1
+        extremes = torch.stack([torch.stack(image.aminmax()) for image in (*images.values(), off)])
+        *ranges, (low, high) = extremes.tolist()  # waits for a GPU only once
+        for name, pair in zip(images, ranges, strict=True):
+            check_range(name, *pair)
+        if low < -TOLERANCE or high > TOLERANCE:
+            raise ValueError("expected weights that sum to 1 or 0 in each pixel, got others; divide them by their sum")
 
 
-def check_target_mask(mask: Tensor | None, shape: Sequence[int]) -> None:
+def check_range(name: str, low: float, high: float) -> None:
+    """ValueError unless an image's smallest and largest value are in [0, 1], up to a tolerance."""
+    if not math.isfinite(low + high):
+        raise ValueError(f"expected finite numbers in {name}, got NaN or infinity; use 0 where there is no surface")
+    if low < -TOLERANCE or high > 1 + TOLERANCE:
+        raise ValueError(
+            f"expected {name} in [0, 1], got values from {low:.3g} to {high:.3g}; divide 8-bit images by 255, and "
+            "clamp others"
+        )
+
+
+def check_target_mask(mask: object, shape: Sequence[int]) -> None:
     """ValueError unless this is None, or numbers in [0, 1] of this height and width."""
     if mask is None:
         return
-    if tuple(mask.shape) != tuple(shape) or not mask.is_floating_point():
-        got = f"{mask.dtype} of shape {tuple(mask.shape)}"
-    elif not bool(((mask >= 0) & (mask <= 1)).all()):
-        got = f"values from {float(mask.min()):.3g} to {float(mask.max()):.3g}"
-    else:
-        return
-    raise ValueError(
-        f"expected a target_mask of floats in [0, 1] of shape {tuple(shape)} (height, width), got {got}; divide 8-bit "
-        "masks by 255, and give the mask of this view at its size"
-    )
+    arrange = "give the mask of this view at its size, (height, width)"
+    image = check_tensor("target_mask", mask, (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
+    low, high = image.aminmax()
+    check_range("target_mask", float(low), float(high))
 
 
 @dataclass(frozen=True)

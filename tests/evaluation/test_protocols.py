@@ -134,13 +134,15 @@ def test_a_wrong_target_mask_is_refused():
     stream.add_frame(source)
     rendered = stream.render(TARGET)
     for mask, got in (
-        (torch.ones(3, 4), r"of shape \(3, 4\)"),
-        (torch.full(rendered.mask.shape, 255.0), "values from 255 to 255"),
-        (torch.ones(rendered.mask.shape, dtype=torch.uint8), "uint8"),
+        (torch.ones(3, 4), r"\(3, 4\); give the mask of this view"),
+        (torch.full(rendered.mask.shape, 255.0), "values from 255 to 255; divide"),
+        (torch.ones(rendered.mask.shape, dtype=torch.uint8), r"torch.uint8; convert it with .float\(\)"),
+        (rendered.mask.double(), r"torch.float64; convert it with .float\(\)"),
+        (rendered.mask.numpy(), "ndarray; convert it with torch.as_tensor"),
     ):
-        with pytest.raises(ValueError, match=f"expected a target_mask of floats .* got .*{got}.*; divide"):
+        with pytest.raises(ValueError, match=f"expected target_mask .* got {got}"):
             check_target_mask(mask, rendered.mask.shape)
-    with pytest.raises(ValueError, match=r"of shape \(48, 48\) \(height, width\), got .* of shape \(3, 4\)"):
+    with pytest.raises(ValueError, match=r"of shape \(48, 48\), got \(3, 4\); give the mask of this view"):
         stream.view(TARGET, target_mask=torch.ones(3, 4))
     with pytest.raises(ValueError, match="values from 255 to 255"):
         stream.mend(replace(rendered, target_mask=torch.full(rendered.mask.shape, 255.0)))

@@ -59,6 +59,12 @@ class Cameras(OnDevice):
         size, arrange = (torch.int64, torch.int32), "give width and height of each camera"
         check_tensor("size_px", self.size_px, size, (count, 2), convert="convert it with .long()", arrange=arrange)
 
+    def check_single(self) -> None:
+        """ValueError unless this is one camera that passes `check`."""
+        self.check()
+        if len(self) != 1:
+            raise ValueError(f"expected the camera of one view, got {len(self)}; choose one, as in cameras[0]")
+
     def select(self, names: Sequence[str]) -> "Cameras":
         """The cameras of these names, in this order.
 
