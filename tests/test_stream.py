@@ -322,3 +322,27 @@ def test_viewers_share_the_depth_of_the_cameras(monkeypatch):
     for angle in (30, 32, 65):
         stream.view(camera_at(angle, "t"))
     assert sorted(rendered) == ["c0", "c1", "c2", "c4"]
+
+
+class Wall:
+    """A geometry of which `change` changes the depth."""
+
+    def __init__(self, change):
+        self.change = change
+
+    def depth(self, cameras):
+        return self.change(photograph(cameras).depth)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda depth: torch.where(depth > 0, depth, torch.inf), "finite numbers in the depth of Wall, .*; use 0 where"),
+        (lambda depth: torch.where(depth > 0, depth, torch.nan), "finite numbers in the depth of Wall, .*; use 0 where"),
+    ],
+)
+def test_a_wrong_depth_of_a_provider_is_refused(change, message):
+    cached = Stream(Telea(), CONFIG).add_frame(photograph(SPARSE), Wall(change))
+    for look in (cached.context, cached.depth):
+        with pytest.raises(ValueError, match=message):
+            look(("c0", "c4"))

@@ -157,6 +157,15 @@ FLOAT = r"convert it with \.float\(\), and divide 8-bit images by 255"
         (forged(VIEW, source_views=(), weights=VIEW.weights[:0]), "expected source_views with a camera, got none"),
         (forged(VIEW, weights=VIEW.weights / 2), "expected weights that sum to 1 or 0 .*; divide them by their sum"),
         (forged(VIEW, weights=VIEW.weights * 2), "expected weights that sum to 1 or 0 .*; divide them by their sum"),
+        (
+            forged(VIEW, depth=1 / VIEW.mask),
+            "expected finite numbers in depth, got NaN or infinity; use 0 where there is no",
+        ),
+        (
+            forged(VIEW, depth=VIEW.depth * math.nan),
+            "expected finite numbers in depth, got NaN or infinity; use 0 where",
+        ),
+        (forged(VIEW, depth=VIEW.depth - 1), r"expected depth in \[0, inf\], got values from -1 to .*; use 0 where"),
         (forged(VIEW, fade=VIEW.mask * 2), "expected fade in .*, got values from 0 to 2"),
         (
             forged(VIEW, target_mask=VIEW.mask.double()),

@@ -1,5 +1,6 @@
 """One frame of a stream with its geometry proxy, and everything computed from it that does not depend on a view."""
 
+import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.models.base import Memory
-from viewmend.types import ContextViews, MultiViewFrame, Silhouettes
+from viewmend.types import ContextViews, MultiViewFrame, Silhouettes, check_range
 from viewmend.utils.tensors import size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
@@ -77,11 +78,20 @@ class CachedFrame:
         """Render the proxy's depth in those of these cameras where it is not known yet."""
         new = [name for name in names if name not in self.depths]
         if new:
-            rendered = self.proxy.depth(self.frame.cameras.select(new))
+            rendered = self._checked_depth(self.frame.cameras.select(new))
             right, below = (self.frame.rgb.shape[i] - rendered.shape[i - 1] for i in (3, 2))
             if right or below:
                 rendered = F.pad(rendered, (0, right, 0, below))  # padded as the images are
             self.depths.update(zip(new, to_mmap(rendered), strict=True))
+
+    def _checked_depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
+        """The proxy's depth; ValueError if a provider's is not finite."""
+        depth = self.proxy.depth(cameras)
+        if isinstance(self.proxy, GeometryProxy):
+            return depth
+        low, high = depth.aminmax()
+        check_range(f"the depth of {type(self.proxy).__name__}", float(low), float(high), math.inf)
+        return depth
 
     def context(self, names: Sequence[str]) -> ContextViews | None:
         """These cameras with the proxy's depth, without copying; names that are not in the frame are left out.

@@ -305,7 +305,8 @@ class IncompleteView:
             arrange = f"give {what}, at the size of the view's camera"
             shape = (*more, height, width)
             check_tensor(name, getattr(self, name), (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
-        images = {"rgb": self.rgb, "mask": self.mask, "error": self.error, "weights": self.weights}
+        names = ("rgb", "mask", "error", "depth", "weights")
+        images = {name: getattr(self, name) for name in names}
         if self.fade is not None:
             images["fade"] = self.fade
         sums = self.weights.sum(0)
@@ -313,20 +314,18 @@ class IncompleteView:
         extremes = torch.stack([torch.stack(image.aminmax()) for image in (*images.values(), off)])
         *ranges, (low, high) = extremes.tolist()  # waits for a GPU only once
         for name, pair in zip(images, ranges, strict=True):
-            check_range(name, *pair)
+            check_range(name, *pair, most=math.inf if name == "depth" else 1.0)
         if low < -TOLERANCE or high > TOLERANCE:
             raise ValueError("expected weights that sum to 1 or 0 in each pixel, got others; divide them by their sum")
 
 
-def check_range(name: str, low: float, high: float) -> None:
-    """ValueError unless an image's smallest and largest value are in [0, 1], up to a tolerance."""
+def check_range(name: str, low: float, high: float, most: float = 1.0) -> None:
+    """ValueError unless an image's smallest and largest value are finite and in [0, most], up to a tolerance."""
     if not math.isfinite(low + high):
         raise ValueError(f"expected finite numbers in {name}, got NaN or infinity; use 0 where there is no surface")
-    if low < -TOLERANCE or high > 1 + TOLERANCE:
-        raise ValueError(
-            f"expected {name} in [0, 1], got values from {low:.3g} to {high:.3g}; divide 8-bit images by 255, and "
-            "clamp others"
-        )
+    if low < -TOLERANCE or high > most + TOLERANCE:
+        how = "divide 8-bit images by 255, and clamp others" if most == 1 else "use 0 where there is no surface"
+        raise ValueError(f"expected {name} in [0, {most:g}], got values from {low:.3g} to {high:.3g}; {how}")
 
 
 def check_target_mask(mask: object, shape: Sequence[int]) -> None:
