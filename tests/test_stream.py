@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from inspect import unwrap
 
 import pytest
 import torch
@@ -337,12 +338,33 @@ class Wall:
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda depth: torch.where(depth > 0, depth, torch.inf), "finite numbers in the depth of Wall, .*; use 0 where"),
-        (lambda depth: torch.where(depth > 0, depth, torch.nan), "finite numbers in the depth of Wall, .*; use 0 where"),
+        (lambda depth: torch.where(depth > 0, depth, torch.inf), "expected finite numbers in {}, .*; use 0 where"),
+        (lambda depth: torch.where(depth > 0, depth, torch.nan), "expected finite numbers in {}, .*; use 0 where"),
+        (lambda depth: depth - 1, r"expected {} in \[0, inf\], got values from -1 to .*; use 0 where"),
+        (lambda depth: (1000 * depth).int(), "expected {} as torch.float32, got torch.int32; convert it to metres"),
+        (lambda depth: depth.half(), "expected {} as torch.float32, got torch.float16; convert it to metres"),
+        (lambda depth: depth[:, :40], r"expected {} of shape \(2, 48, 48\) or larger images, got \(2, 40, 48\)"),
+        (lambda depth: depth[:, None], r"expected {} of shape .*, got \(2, 1, 48, 48\); give one image per camera"),
+        (lambda depth: depth[:1], r"expected {} of shape .*, got \(1, 48, 48\); give one image per camera"),
+        (lambda depth: depth.numpy(), "expected {} as a tensor, got ndarray; convert it with torch.as_tensor"),
     ],
 )
 def test_a_wrong_depth_of_a_provider_is_refused(change, message):
     cached = Stream(Telea(), CONFIG).add_frame(photograph(SPARSE), Wall(change))
     for look in (cached.context, cached.depth):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=message.format("the depth of Wall")):
             look(("c0", "c4"))
+
+
+def test_a_providers_images_may_be_padded():
+    cached = Stream(Telea(), CONFIG).add_frame(
+        photograph(SPARSE), Wall(lambda depth: torch.nn.functional.pad(depth, (0, 9)))
+    )
+    assert torch.equal(cached.depth(("c4",)), photograph(SPARSE).depth[3:4])
+
+
+@pytest.mark.parametrize("geometry", [photograph(SPARSE).depth, lambda cameras: None, Wall, photograph(SPARSE)])
+def test_a_geometry_that_provides_no_depth_is_refused(geometry):
+    add_frame = unwrap(Stream.add_frame)  # without the checks of types
+    with pytest.raises(ValueError, match=r"expected a geometry with a method depth\(cameras\), got .*; pass an object"):
+        add_frame(Stream(Telea(), CONFIG), photograph(SPARSE), geometry)

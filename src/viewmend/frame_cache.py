@@ -17,7 +17,7 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.models.base import Memory
 from viewmend.types import ContextViews, MultiViewFrame, Silhouettes, check_range
-from viewmend.utils.tensors import size_bytes, to_mmap
+from viewmend.utils.tensors import check_tensor, size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 WINDOW = 33
@@ -40,8 +40,17 @@ class DepthProvider(Protocol):
     """
 
     def depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
-        """z-depth of the surface in each camera, metres; 0 where there is none."""
+        """z-depth of the surface in each camera, float32, metres; 0 where there is none. Images may be padded."""
         ...
+
+
+def check_provider(geometry: object) -> None:
+    """ValueError unless this is an object with a method `depth`."""
+    if isinstance(geometry, type) or not callable(getattr(geometry, "depth", None)):
+        got = f"the class {geometry.__name__}" if isinstance(geometry, type) else type(geometry).__name__
+        raise ValueError(
+            f"expected a geometry with a method depth(cameras), got {got}; pass an object as DepthProvider describes it"
+        )
 
 
 @dataclass
@@ -85,12 +94,16 @@ class CachedFrame:
             self.depths.update(zip(new, to_mmap(rendered), strict=True))
 
     def _checked_depth(self, cameras: Cameras) -> Float[Tensor, "view height width"]:
-        """The proxy's depth; ValueError if a provider's is not finite."""
+        """The proxy's depth; ValueError if a provider's is not what `DepthProvider` says."""
         depth = self.proxy.depth(cameras)
         if isinstance(self.proxy, GeometryProxy):
             return depth
+        name, (width, height) = f"the depth of {type(self.proxy).__name__}", cameras.max_size_px
+        convert, arrange = "convert it to metres with .float()", "give one image per camera, as large as its size_px"
+        shape = (len(cameras), height, width)
+        check_tensor(name, depth, (torch.float32,), shape, convert=convert, arrange=arrange, padded=True)
         low, high = depth.aminmax()
-        check_range(f"the depth of {type(self.proxy).__name__}", float(low), float(high), math.inf)
+        check_range(name, float(low), float(high), math.inf)
         return depth
 
     def context(self, names: Sequence[str]) -> ContextViews | None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from jaxtyping import Float
 from torch import Tensor
 
-from viewmend.frame_cache import CachedFrame, DepthProvider, cache_frame, evict
+from viewmend.frame_cache import CachedFrame, DepthProvider, cache_frame, check_provider, evict
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import HullConfig
@@ -149,14 +149,16 @@ class Stream:
             carving: masks of more cameras that carve the hull, although their images are not used.
 
         Raises:
-            ValueError: images, masks or cameras have another type, shape or range than their fields say; or no
-                `geometry` is given, and the frame has no masks, a single camera, or cameras that look
-                away from each other.
+            ValueError: images, masks or cameras have another type, shape or range than their fields say; `geometry` has
+                no method `depth`; or none is given, and the frame has no masks, a single camera, or
+                cameras that look away from each other.
         """
         if frame.time not in self._frames:
             frame.check()
             if carving is not None:
                 carving.check()
+            if geometry is not None:
+                check_provider(geometry)
             frame = replace(frame, depth=None)  # the ground truth of synthetic captures must not be used
             given = None if geometry is None else CachedFrame(frame, geometry)
             self._frames[frame.time] = given or cache_frame(frame, self.bounds, self.config.hull, carving)
@@ -217,9 +219,9 @@ class Stream:
 
         Raises:
             ValueError: the view's frame is not cached; the view names no camera or one that is not in the frame; an
-                image of it has another type, shape or range than its field says; `exclude` is a string or has an
-                unknown name; the inpainter returns numbers that are not finite; or `quality` needs a model that
-                predicts errors.
+                image of it, or the depth of the frame's geometry, has another type, shape or range than its field says;
+                `exclude` is a string or has an unknown name; the inpainter returns numbers that are not finite; or
+                `quality` needs a model that predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)
