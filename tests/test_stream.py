@@ -7,6 +7,7 @@ from inspect import unwrap
 import pytest
 import torch
 from reference.ball import camera_at, photograph, proxy, ring
+from reference.forged import forged
 
 from viewmend.frame_cache import WINDOW, cache_frame
 from viewmend.geometry.hull import HullConfig
@@ -16,7 +17,7 @@ from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.classical import ReprojectionFill, Telea
 from viewmend.models.paper.config import paper_small
 from viewmend.models.paper.patch_transformer import PatchTransformer
-from viewmend.rendering.view import render_view
+from viewmend.rendering.view import RenderConfig, render_view
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.cancellation import CancelledError, cancellable
@@ -323,6 +324,39 @@ def test_viewers_share_the_depth_of_the_cameras(monkeypatch):
     for angle in (30, 32, 65):
         stream.view(camera_at(angle, "t"))
     assert sorted(rendered) == ["c0", "c1", "c2", "c4"]
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: RenderQuality(refine_fraction=-1.0), "refine_fraction from 0 to 1 or None, got -1.0"),
+        (lambda: RenderQuality(refine_fraction=2.0), "refine_fraction from 0 to 1 or None, got 2.0"),
+        (lambda: RenderConfig(cameras=0), "source cameras, at least 1, got 0"),
+        (lambda: RenderConfig(cameras=-1), "source cameras, at least 1, got -1"),
+        (forged(RenderConfig(), cameras=2.5).__post_init__, "source cameras, at least 1, got 2.5"),
+        (forged(StreamConfig(), background="grey").__post_init__, "background 'black' or 'white', got 'grey'"),
+        (lambda: StreamConfig(memory_mb=-5.0), "memory_mb of 0 or more, or None for no limit, got -5.0"),
+        (
+            lambda: unwrap(Stream.__init__)(object.__new__(Stream), "views"),
+            "expected an inpainter, got 'views'; make one",
+        ),
+        (
+            lambda: unwrap(Stream.__init__)(object.__new__(Stream), Telea),
+            "expected an inpainter, got <class .*; make one",
+        ),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_a_target_is_one_camera():
+    stream = Stream(Telea(), CONFIG)
+    stream.add_frame(photograph(SPARSE))
+    for look in (stream.view, stream.render):
+        with pytest.raises(ValueError, match="expected the camera of one view, got 6; choose one"):
+            look(SPARSE)
 
 
 class Wall:

@@ -9,6 +9,7 @@ a frame is computed once and shared by all viewers; what depends on a viewer is 
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 from jaxtyping import Float
 from torch import Tensor
@@ -48,6 +49,12 @@ class StreamConfig:
     memory_mb: float | None = 1000.0
     """Above this, the least recently used frames are dropped. None: frames are dropped once no temporal window
     reaches back to them."""
+
+    def __post_init__(self) -> None:
+        if self.background not in get_args(Background):
+            raise ValueError(f"expected a background 'black' or 'white', got '{self.background}'")
+        if self.memory_mb is not None and not self.memory_mb >= 0:
+            raise ValueError(f"expected memory_mb of 0 or more, or None for no limit, got {self.memory_mb}")
 
 
 @dataclass(frozen=True)
@@ -104,7 +111,15 @@ class Stream:
             bounds: the volume that may contain the subject; None to find it from the masks.
             error_model: predicts errors in place of `inpainter`, if that does not; needed for the error rule
                 'predicted' and for `RenderQuality.refine_fraction` (`registry.error_model_for`).
+
+        Raises:
+            ValueError: `inpainter` is a name, a class or anything else than an inpainter.
         """
+        if not isinstance(inpainter, Inpainter):
+            raise ValueError(
+                f"expected an inpainter, got {inpainter!r}; make one: make_method('telea') for a name, Class() for a "
+                "class, which must be a subclass of viewmend.Inpainter"
+            )
         self.inpainter = inpainter
         self.config = config or StreamConfig()
         self.bounds = bounds
@@ -192,9 +207,9 @@ class Stream:
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
-            ValueError: the frame is not cached, its geometry is not a `GeometryProxy`, no camera is left, `exclude` is
-                a string or has an unknown name, `target_mask` is not a mask of the view, or the error rule needs a
-                model that predicts errors.
+            ValueError: `target` is not one camera, the frame is not cached, its geometry is not a `GeometryProxy`, no
+                camera is left, `exclude` is a string or has an unknown name, `target_mask` is not a mask of the view,
+                or the error rule needs a model that predicts errors.
         """
         part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
         return crop.uncropped(self._with_error_mask(part, evidence, RenderQuality(), exclude), target)
@@ -276,6 +291,7 @@ class Stream:
     ) -> tuple[IncompleteView, Evidence, Crop]:
         """Render the part of a view that shows the subject, with the inpainter's margin."""
         check_exclude(exclude, self._names)
+        target.check_single()
         check_target_mask(target_mask, target.max_size_px[::-1])
         stop_if_cancelled()
         cached = self.cached_frame(time)

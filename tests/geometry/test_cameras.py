@@ -80,6 +80,12 @@ def test_looking_at_a_point():
     torch.testing.assert_close(invert_rigid(camera)[:3, 3], torch.tensor([1.0, 2.0, 3.0]))
 
 
+@pytest.mark.parametrize("fov", [50.0, 0.0, -0.8, math.pi, math.nan])
+def test_a_field_of_view_is_in_radians(fov):
+    with pytest.raises(ValueError, match=f"between 0 and pi radians, got {fov}; convert degrees to radians"):
+        pinhole(fov, 40, 30, torch.eye(4))
+
+
 @pytest.mark.parametrize(("eye", "up"), [((0.0, 0.0, 0.0), UP), ((0.0, 3.0, 0.0), UP)])
 def test_looking_nowhere_is_an_error(eye, up):
     with pytest.raises(ValueError, match="choose another up"):

@@ -35,6 +35,19 @@ def messages(socket, kind):
             yield json.loads(message)
 
 
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        ({"port": 99999}, "expected a port from 0 to 65535, got 99999"),
+        ({"port": -1}, "expected a port from 0 to 65535, got -1"),
+        ({"budget_ms": -1.0}, "expected a budget_ms above 0, or None for no limit, got -1.0"),
+    ],
+)
+def test_a_port_or_a_budget_out_of_range_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        serve(BallCapture(CAMERAS, 1), SmoothFill(), **wrong)
+
+
 def test_pages_show_what_the_program_wants():
     with serve(BallCapture(CAMERAS, 3), SmoothFill(), token=TOKEN, config=PIPELINE) as viewer:
         address, _, query = viewer.address.partition("/?")

@@ -1,5 +1,6 @@
 """Pinhole cameras in OpenCV axes: projection, unprojection, and changes of the image grid."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -181,6 +182,9 @@ def pinhole(
         camera_from_world: the pose (OpenCV axes), metres; `look_at` makes one.
         name: what the camera is called.
 
+    Raises:
+        ValueError: the angle is not between 0 and pi, as one in degrees.
+
     Examples:
         >>> import torch
         >>> from viewmend import pinhole
@@ -189,6 +193,10 @@ def pinhole(
                 [  0., 240., 240.],
                 [  0.,   0.,   1.]])
     """
+    if not 0 < fov_y_rad < math.pi:
+        raise ValueError(
+            f"expected a field of view between 0 and pi radians, got {fov_y_rad}; convert degrees to radians"
+        )
     f = 0.5 * height / float(torch.tan(torch.tensor(fov_y_rad / 2)))
     K = torch.tensor([[f, 0.0, width / 2], [0.0, f, height / 2], [0.0, 0.0, 1.0]])
     cameras = Cameras((name,), K[None], camera_from_world[None], torch.tensor([[width, height]]))

@@ -64,6 +64,12 @@ class ServerConfig:
     limits: Limits = field(default_factory=Limits)
     extensions: tuple["ExtensionFactory", ...] = ()
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"expected a port from 0 to 65535, got {self.port}; 0 takes a free one")
+        if self.budget_ms is not None and not self.budget_ms > 0:
+            raise ValueError(f"expected a budget_ms above 0, or None for no limit, got {self.budget_ms}")
+
 
 ExtensionFactory = Callable[[RenderService, ServerConfig], Extension]
 

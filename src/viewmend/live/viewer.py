@@ -34,6 +34,7 @@ class Viewer:
         """Start a server on a thread, which `serve` does; the other arguments are those of `ServerConfig`.
 
         Raises:
+            ValueError: the port or budget_ms is out of range.
             OSError: the port is in use.
         """
         from viewmend.live.listener import Server
@@ -133,7 +134,7 @@ def serve(
         device: cpu or cuda.
 
     Raises:
-        ValueError: the capture, the model or the token cannot be used.
+        ValueError: the capture, the model or the token cannot be used, or port or budget_ms is out of range.
         OSError: the port is in use.
 
     Examples:

@@ -48,6 +48,10 @@ class RenderQuality:
     always filled. None: all pixels of the error mask. With 0, holes are filled from their surroundings, and pixels
     that are predicted to be background are attenuated."""
 
+    def __post_init__(self) -> None:
+        if self.refine_fraction is not None and not 0 <= self.refine_fraction <= 1:
+            raise ValueError(f"expected a refine_fraction from 0 to 1 or None, got {self.refine_fraction}")
+
 
 def check_exclude(exclude: Sequence[str], known: Collection[str] | None = None) -> None:
     """ValueError if this is a string and no list of names, or has names that are not `known`, if that is given."""

@@ -48,6 +48,8 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         error_rule(self.error_rule or "holes")
+        if not isinstance(self.cameras, int) or self.cameras < 1:
+            raise ValueError(f"expected a whole number of source cameras, at least 1, got {self.cameras}")
         if self.selection not in SELECTIONS:
             raise ValueError(f"expected a selection of views by 'angle' or 'direction', got '{self.selection}'")
         if not 0 < self.refine_fraction <= 1:
