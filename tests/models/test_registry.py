@@ -23,6 +23,17 @@ class Mine(Telea):
     device: str
 class Bare:
     pass
+class Plain(Telea):
+    pass
+class Faded(Telea):
+    def __init__(self, fading=0.9):
+        self.fading = fading
+class Named(Telea):
+    def __init__(self, where):
+        self.where = where
+class Demanding(Telea):
+    def __init__(self, device, fading):
+        self.fading = fading
 number = 3
 """
 
@@ -64,12 +75,21 @@ def test_a_class_in_a_file_is_a_method_and_a_changed_file_another(tmp_path):
     assert identity(make_method(f"{path}:Mine")) != identity(made)
 
 
+def test_a_class_need_not_take_the_device(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(OWN)
+    assert type(make_method(f"{path}:Plain")).__name__ == "Plain"
+    assert make_method(f"{path}:Faded").fading == 0.9, "a parameter with a default is not the device"
+    assert make_method(f"{path}:Named", "cpu").where == "cpu"
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         *(("{}:Other", "check FILE.py:NAME"), ("{}:number", "check FILE.py:NAME")),
         ("absent.py:Mine", "check the path"),
-        ("{}:Bare", r"own\.py:Bare: expected a callable that takes the device"),
+        ("{}:Bare", r"own\.py:Bare: expected an inpainter, got Bare; make its class a subclass"),
+        ("{}:Demanding", r"Demanding: expected .* no argument but the device, got .*fading\); give the others"),
     ],
 )
 def test_names_that_a_file_does_not_have_and_other_classes_are_refused(name, message, tmp_path):

@@ -9,7 +9,6 @@ from enum import Enum
 from functools import partial
 from inspect import signature
 from pathlib import Path
-from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -69,8 +68,8 @@ def method_names(selection: str) -> tuple[str, ...]:
 def make_method(name: str, device: str = "cpu", precision: str = "auto") -> Inpainter:
     """The inpainter of this name: an entry of `METHODS`, a baseline, FILE.py:NAME, a shipped model, a model's folder.
 
-    For FILE.py:NAME, the file's NAME is called with the device; it must return a `viewmend.Inpainter`. Only models on
-    disk use `precision`, as `load_inpainter`.
+    For FILE.py:NAME, the file's NAME is called, with the device if it takes one; it must return a `viewmend.Inpainter`.
+    Only models on disk use `precision`, as `load_inpainter`.
 
     Raises:
         MethodMissing: its weights are not installed.
@@ -106,17 +105,11 @@ def own_background(name: str) -> str | None:
 
 def _make(name: str, device: str, precision: str) -> object:
     if name in METHODS:
-        make = import_object(METHODS[name])
-        return make(device) if "device" in signature(make).parameters else make()
+        return _call(import_object(METHODS[name]), name, device)
     if name in shipped_models() or Path(name).is_dir():
         return load_inpainter(name, device, precision)
     if ".py:" in name:
-        make = cast(Callable[[str], Inpainter], load_from_file(name))
-        try:
-            signature(make).bind(device)
-        except TypeError as error:
-            raise ValueError(f"{name}: expected a callable that takes the device ('{device}'), got {error}") from error
-        return make(device)
+        return _call(load_from_file(name), name, device)
     if (family := re.split("[-@]", name)[0]) in FAMILIES:
         try:
             return import_object(FAMILIES[family])(name, device)
@@ -126,6 +119,22 @@ def _make(name: str, device: str, precision: str) -> object:
     raise ValueError(
         f"expected a method among {known}, a baseline like dstt-o-def, FILE.py:NAME, or a model's folder, got "
         f"'{name}'; see viewmend evaluate --help"
+    )
+
+
+def _call(make: Callable[..., object], name: str, device: str) -> object:
+    """Call a class or a factory: with the device if it has a parameter of that name, or needs exactly one argument."""
+    takes = signature(make)
+    named = {"device": device} if "device" in takes.parameters else {}
+    for arguments in (partial(takes.bind, **named), partial(takes.bind, device)):
+        try:
+            bound = arguments()
+        except TypeError:
+            continue
+        return make(*bound.args, **bound.kwargs)
+    raise ValueError(
+        f"{name}: expected a class or function that needs no argument but the device, got the parameters {takes}; give "
+        "the others defaults"
     )
 
 
