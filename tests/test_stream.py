@@ -222,8 +222,51 @@ def test_non_finite_results_are_refused(part, value):
     stream = Stream(Broken(), CONFIG)
     stream.add_frame(photograph(SPARSE, 0))
     for look in (stream.view, lambda camera: stream.mend(stream.render(camera))):
-        with pytest.raises(ValueError, match="expected finite colours from Broken, got others"):
+        with pytest.raises(ValueError, match=rf"Broken: expected `step` to return .* got {part} from (nan|\d)"):
             look(A)
+
+
+def with_rgb(view, rgb):
+    """A completed view with any object as its colours, past the type checks of tests."""
+    completed = CompletedView(view, view.rgb)
+    vars(completed)["rgb"] = rgb
+    return completed
+
+
+@pytest.mark.parametrize(
+    ("returned", "got"),
+    [
+        (lambda view, state: CompletedView(view, view.rgb), "a CompletedView alone"),
+        (lambda view, state: view.rgb, "a Tensor alone"),
+        (lambda view, state: (view.rgb, state), r"\(Tensor, State\)"),
+        (lambda view, state: (with_rgb(view, (255 * view.rgb).byte()), state), r"rgb as torch\.uint8 of shape \(3, "),
+        (lambda view, state: (with_rgb(view, 255 * view.rgb), state), r"rgb from 0 to \d\d"),
+        (lambda view, state: (with_rgb(view, view.rgb - 0.1), state), r"rgb from -0\.1 to"),
+        (lambda view, state: (with_rgb(view, view.rgb.movedim(0, -1)), state), r"rgb as .* of shape \(\d+, \d+, 3\)"),
+        (lambda view, state: (with_rgb(view, view.rgb.numpy()), state), "rgb as ndarray"),
+        (lambda view, state: (with_rgb(view, None), state), "rgb as NoneType"),
+        (lambda view, state: (CompletedView(view, view.rgb, alpha=2 * view.mask), state), "alpha from 0 to 2"),
+    ],
+)
+def test_what_a_step_returns_is_checked(returned, got):
+    class Own(Inpainter):
+        def step(self, view, context, state):
+            return returned(view, state)
+
+    stream = Stream(Own(), CONFIG)
+    stream.add_frame(photograph(SPARSE, 0))
+    with pytest.raises(ValueError, match=rf"Own: expected `step` to return \(CompletedView, State\), .* got {got}.*; "):
+        stream.view(A)
+
+
+def test_a_step_may_round_and_return_any_floats():
+    class Rounding(Inpainter):
+        def step(self, view, context, state):
+            return with_rgb(view, (view.rgb + 0.001).double()), state
+
+    stream = Stream(Rounding(), CONFIG)
+    stream.add_frame(photograph(SPARSE, 0))
+    assert float(stream.view(A).completed.rgb.max()) > 0
 
 
 # The context that a stream gives an inpainter: cameras, past frames, and no excluded camera.

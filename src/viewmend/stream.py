@@ -235,8 +235,8 @@ class Stream:
         Raises:
             ValueError: the view's frame is not cached; the view names no camera or one that is not in the frame; an
                 image of it, or the depth of the frame's geometry, has another type, shape or range than its field says;
-                `exclude` is a string or has an unknown name; the inpainter returns numbers that are not finite; or
-                `quality` needs a model that predicts errors.
+                `exclude` is a string or has an unknown name; the inpainter does not return a completed view
+                of it; or `quality` needs a model that predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)
@@ -342,7 +342,6 @@ class Stream:
         if quality.mend:
             with heavy_operations():
                 completed, viewer = self.inpainter.step_on(self.config.background, part, context, viewer)
-            completed.check_finite(type(self.inpainter).__name__)
         inpainting_ms = ms_since(start, part.rgb.device) - context.encoding_ms if quality.mend else 0.0
         completed = crop.pasted(completed, whole or crop.uncropped(part, target or part.camera))
         self._frames.move_to_end(part.time)

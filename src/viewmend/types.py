@@ -364,11 +364,6 @@ class CompletedView:
     depth: Float[Tensor, "height width"] | None = None
     """Refined z-depth of the subject, metres, 0 where there is none. None if the model predicts none."""
 
-    def check_finite(self, by: str) -> None:
-        """ValueError unless all images contain finite numbers only; its message names the model, `by`."""
-        if not all(bool(image.isfinite().all()) for image in self.images.values()):
-            raise ValueError(f"expected finite colours from {by}, got others; use another model, or train it again")
-
     @property
     def opacity(self) -> Float[Tensor, "height width"]:
         """`alpha`, or the view's silhouette if the model predicts none."""

@@ -291,7 +291,7 @@ def test_a_failing_source_is_reported_and_recovers(monkeypatch):
         wait_until(lambda: get(f"{server.url}/health")[0] == 200)
 
 
-@pytest.mark.parametrize("said", ["RuntimeError: out of memory", "ValueError: expected finite colours from Fragile"])
+@pytest.mark.parametrize("said", ["RuntimeError: out of memory", "ValueError: Fragile: expected `step`"])
 def test_a_failing_model_leaves_holes_and_recovers(said):
     class Fragile(SmoothFill):
         broken = False

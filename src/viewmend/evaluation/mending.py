@@ -123,7 +123,7 @@ class Mender:
         neither the frame nor the truth has a subject.
 
         Raises:
-            ValueError: the inpainter returns colours that are not finite.
+            ValueError: the inpainter does not return a completed view (`Inpainter.step_on`).
         """
         target_mask, carving = revealed(self._protocol, truth)
         cached = self.add_frame(frame, carving)

@@ -5,6 +5,7 @@ calls. What one viewer's view leaves for the next is the state; what is computed
 viewers is kept by the `ContextProvider`.
 """
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
@@ -23,6 +24,8 @@ in that frame are left out; None if all are."""
 Memory = dict[Any, Any]
 """What was computed from one frame: encoded images by camera name, everything else by (kind, camera name)."""
 T = TypeVar("T")
+TOLERANCE = 0.01
+"""By how much the images of a completed view may leave [0, 1]: rounding, also in bfloat16."""
 REMEMBERED_FRAMES = 34
 """Frames that a provider with a memory of its own keeps: the view's own, and k_w n_w + n_c before it."""
 
@@ -237,9 +240,19 @@ class Inpainter:
             view: as for `step`.
             context: as for `step`.
             state: as for `step`.
+
+        Raises:
+            ValueError: `step` returns no completed view of this view with a state.
         """
         given = "black" if self.background is not None else background
-        completed, state = self.step(to_background(given, view), context, state)
+        made = self.step(to_background(given, view), context, state)
+        if fault := _fault(made, view):
+            raise ValueError(
+                f"{type(self).__name__}: expected `step` to return (CompletedView, State), with images of floats in "
+                f"[0, 1], of the view's height and width {tuple(view.mask.shape)}, got {fault}; correct `step`, or use "
+                "another model"
+            )
+        completed, state = made
         return cut(from_background(given, completed, view)), state
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
@@ -269,3 +282,24 @@ class Inpainter:
     def predict_errors(self, view: IncompleteView, context: ContextProvider) -> ErrorMap | None:
         """Predict which pixels of a rendered view are wrong; None if no camera is available."""
         return None
+
+
+def _fault(made: object, view: IncompleteView) -> str | None:
+    """What is wrong with the result of a `step`; None if nothing is."""
+    if not isinstance(made, tuple):
+        return f"a {type(made).__name__} alone"
+    if len(made) != 2 or not isinstance(made[0], CompletedView):
+        return f"({', '.join(type(part).__name__ for part in made)})"
+    for name in ("rgb", "alpha", "confidence", "depth"):
+        image = getattr(made[0], name)
+        if image is None and name != "rgb":
+            continue
+        if not isinstance(image, Tensor):
+            return f"{name} as {type(image).__name__}"
+        wanted = (view.rgb if name == "rgb" else view.mask).shape
+        if image.shape != wanted or not image.is_floating_point():
+            return f"{name} as {image.dtype} of shape {tuple(image.shape)}"
+        low, high = map(float, image.detach().aminmax())  # both are NaN if any pixel is
+        if not (-TOLERANCE <= low <= high < math.inf and (name == "depth" or high <= 1 + TOLERANCE)):
+            return f"{name} from {low:.3g} to {high:.3g}"
+    return None
