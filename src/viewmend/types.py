@@ -262,6 +262,11 @@ class IncompleteView:
         return self.rgb if self.target_mask is None else self.rgb * self.target_mask
 
     @property
+    def cut_depth(self) -> Float[Tensor, "height width"]:
+        """The proxy's depth, 0 outside of `target_mask` if there is one."""
+        return self.depth if self.target_mask is None else self.depth * (self.target_mask > 0)
+
+    @property
     def missing(self) -> Float[Tensor, "height width"]:
         """E where the subject may be: not outside of `target_mask`, if there is one."""
         return self.error if self.target_mask is None else self.error * (self.target_mask > 0)
@@ -372,7 +377,7 @@ class CompletedView:
     @property
     def surface_depth(self) -> Float[Tensor, "height width"]:
         """`depth`, or the proxy's if the model predicts none; metres, 0 where there is no subject."""
-        return self.view.depth if self.depth is None else self.depth
+        return self.view.cut_depth if self.depth is None else self.depth
 
     @property
     def straight_rgb(self) -> Float[Tensor, "3 height width"]:

@@ -74,6 +74,21 @@ def test_classical_fills_see_the_uncut_view_and_are_cut_afterwards():
     assert torch.equal(seen[-1].rgb, cut.completed.view.rgb) and seen[-1].rgb[:, seen[-1].target_mask == 0].any()
 
 
+def test_outside_of_the_target_mask_there_is_neither_confidence_nor_depth():
+    class Sure(Telea):
+        def step(self, view, context, state):
+            completed, state = super().step(view, context, state)
+            return replace(completed, confidence=torch.ones_like(view.mask), depth=view.depth + 0.1), state
+
+    for inpainter in (Sure(), Telea()):
+        cut = mended("target-mask", inpainter).completed
+        inside = cut.view.target_mask > 0
+        assert int((cut.view.depth > 0)[~inside].sum()) > 50
+        shown = cut.view.depth > 0 if cut.depth is None else torch.ones_like(inside)
+        assert torch.equal(cut.surface_depth > 0, shown & inside)
+        assert cut.confidence is None or torch.equal(cut.confidence, inside.float())
+
+
 def test_the_papers_model_sees_m_t_white_where_it_is_0_and_black_where_it_is_missing():
     incomplete = view(5)
     mask = torch.ones_like(incomplete.mask)

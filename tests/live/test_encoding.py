@@ -51,6 +51,15 @@ def test_a_soft_outline_has_the_depth_of_the_neighbouring_surface(ball_view):
     assert (shown[20, 10:20] == 2).all() and shown[21].max() == 0 == shown[25, 25]
 
 
+def test_depth_is_drawn_and_sent_within_the_target_mask(ball_view):
+    inside = (torch.arange(48) < 24).float().expand(48, 48)
+    cut = replace(ball_view, view=replace(ball_view.view, target_mask=inside))
+    whole, image = draw_mode(ball_view, "depth"), draw_mode(cut, "depth")
+    assert whole[:, 24:].any() and not image[:, 24:].any() and image[:, :24].any()
+    assert (draw_mode(cut, "depth", "0040ff")[:, 24:] == (0, 0x40, 0xFF)).all()
+    assert torch.equal(surface_depth(cut), ball_view.view.depth * inside)
+
+
 @pytest.mark.parametrize("stride", [1, 2, 4])
 @pytest.mark.parametrize("size", [(48, 48), (47, 50), (3, 2)])
 def test_depth_comes_back_where_it_was_taken(size, stride):

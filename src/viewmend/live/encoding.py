@@ -49,7 +49,10 @@ def draw_mode(
     image = _draw_on_black(completed, mode) if own is None else _to_8bit(own[:3])
     if background == BLACK:
         return image
-    opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if own is None else own[3]
+    if mode == "depth":
+        opacity = (completed.view.cut_depth > 0).float()
+    else:
+        opacity = completed.opacity if mode in MENDED_MODES else completed.view.mask if own is None else own[3]
     transparency = (1 - opacity.clamp(0, 1)).cpu().numpy()
     channels = [np.rint(transparency * level).astype(np.uint8) for level in bytes.fromhex(background)]
     return cv2.add(image, cv2.merge(channels))
@@ -65,9 +68,10 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
         heat = torch.from_numpy(heat_map(completed.confidence, "viridis"))
         return _to_8bit(heat.movedim(-1, 0).to(completed.rgb) / 255 * completed.opacity)
     if mode == "depth":
-        near, far = depth_range(view.depth)
-        colours = heat_map((far - view.depth) / max(far - near, 1e-6), "turbo")
-        return colours * (view.depth > 0).cpu().numpy()[..., None]
+        depth = view.cut_depth
+        near, far = depth_range(depth)
+        colours = heat_map((far - depth) / max(far - near, 1e-6), "turbo")
+        return colours * (depth > 0).cpu().numpy()[..., None]
     base = _draw_coverage(view) if mode == "coverage" else view.rgb
     if mode == "rendered":
         return _to_8bit(base)
@@ -78,7 +82,7 @@ def _draw_on_black(completed: CompletedView, mode: str) -> Image:
 def surface_depth(completed: CompletedView) -> Float[Tensor, "height width"]:
     """Depth in metres, 0 for background, on soft outlines that of the surface; the proxy's if no depth is predicted."""
     if completed.depth is None:
-        return completed.view.depth
+        return completed.surface_depth
     return torch.where(completed.opacity > FAINT, rim_depth(completed.depth), 0.0)
 
 
@@ -217,7 +221,7 @@ def encode_frame(
         "colours": [COLOURS[n % len(COLOURS)] for n in range(len(first.source_views))],
         "holes": round(float(first.holes.sum()) / max(1.0, float((first.mask > 0).sum())), 5),
         "confidence": mean_confidence(result.completed[0]),
-        "depth_m": [round(value, 3) for value in depth_range(first.depth)],
+        "depth_m": [round(value, 3) for value in depth_range(first.cut_depth)],
         "top_k": request.quality.top_k,
         "context_times": request.quality.context_times,
         "refine_fraction": request.quality.refine_fraction,
