@@ -31,8 +31,10 @@ FAINT = 1 / 16
 NEAR_PX = 4
 """Radius within which faint pixels take the colour of their neighbours."""
 
-TOLERANCE = 1e-2
-"""How far images in [0, 1] may leave it, for rounding."""
+OVERSHOOT = 0.4
+"""How far images in [0, 1] may leave it, as renderers and networks do; those in [-1, 1] or [0, 255] leave it farther."""
+SUM_TOLERANCE = 1e-2
+"""Of the product of the weights' sum and what it lacks to 1."""
 TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
 
 
@@ -202,9 +204,8 @@ def _check_mask(mask: object, shape: tuple[int, ...]) -> None:
     convert = "scale it to 0 to 255, and convert it with .byte()"
     arrange = "give one mask per camera, as large as the images"
     most = int(check_tensor("mask", mask, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True).max())
-    if 0 < most <= FOREGROUND:
-        how = "multiply by 255" if most == 1 else "scale them so that foreground is 255"
-        raise ValueError(f"expected masks of 0 to 255, got at most {most}; {how}")
+    if most == 1:
+        raise ValueError("expected masks of 0 to 255, got masks of 0 and 1; multiply them by 255")
 
 
 @dataclass(frozen=True)
@@ -320,7 +321,7 @@ class IncompleteView:
         *ranges, (low, high) = extremes.tolist()  # waits for a GPU only once
         for name, pair in zip(images, ranges, strict=True):
             check_range(name, *pair, most=math.inf if name == "depth" else 1.0)
-        if low < -TOLERANCE or high > TOLERANCE:
+        if low < -SUM_TOLERANCE or high > SUM_TOLERANCE:
             raise ValueError("expected weights that sum to 1 or 0 in each pixel, got others; divide them by their sum")
 
 
@@ -328,7 +329,7 @@ def check_range(name: str, low: float, high: float, most: float = 1.0) -> None:
     """ValueError unless an image's smallest and largest value are finite and in [0, most], up to a tolerance."""
     if not math.isfinite(low + high):
         raise ValueError(f"expected finite numbers in {name}, got NaN or infinity; use 0 where there is no surface")
-    if low < -TOLERANCE or high > most + TOLERANCE:
+    if low < -OVERSHOOT or high > most + OVERSHOOT:
         how = "divide 8-bit images by 255, and clamp others" if most == 1 else "use 0 where there is no surface"
         raise ValueError(f"expected {name} in [0, {most:g}], got values from {low:.3g} to {high:.3g}; {how}")
 

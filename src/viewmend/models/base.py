@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from viewmend.models.compositing import Background, cut, from_background, to_background
-from viewmend.types import CompletedView, ContextViews, IncompleteView
+from viewmend.types import OVERSHOOT, CompletedView, ContextViews, IncompleteView
 from viewmend.utils.tensors import to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
@@ -24,8 +24,6 @@ in that frame are left out; None if all are."""
 Memory = dict[Any, Any]
 """What was computed from one frame: encoded images by camera name, everything else by (kind, camera name)."""
 T = TypeVar("T")
-TOLERANCE = 0.01
-"""By how much the images of a completed view may leave [0, 1]: rounding, also in bfloat16."""
 REMEMBERED_FRAMES = 34
 """Frames that a provider with a memory of its own keeps: the view's own, and k_w n_w + n_c before it."""
 
@@ -300,6 +298,6 @@ def _fault(made: object, view: IncompleteView) -> str | None:
         if image.shape != wanted or not image.is_floating_point():
             return f"{name} as {image.dtype} of shape {tuple(image.shape)}"
         low, high = map(float, image.detach().aminmax())  # both are NaN if any pixel is
-        if not (-TOLERANCE <= low <= high < math.inf and (name == "depth" or high <= 1 + TOLERANCE)):
+        if not (-OVERSHOOT <= low <= high < math.inf and (name == "depth" or high <= 1 + OVERSHOOT)):
             return f"{name} from {low:.3g} to {high:.3g}"
     return None
