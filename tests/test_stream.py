@@ -241,7 +241,7 @@ def with_rgb(view, rgb):
         (lambda view, state: (view.rgb, state), r"\(Tensor, State\)"),
         (lambda view, state: (with_rgb(view, (255 * view.rgb).byte()), state), r"rgb as torch\.uint8 of shape \(3, "),
         (lambda view, state: (with_rgb(view, 255 * view.rgb), state), r"rgb from 0 to \d\d"),
-        (lambda view, state: (with_rgb(view, view.rgb - 0.1), state), r"rgb from -0\.1 to"),
+        (lambda view, state: (with_rgb(view, view.rgb - 1), state), "rgb from -1 to"),
         (lambda view, state: (with_rgb(view, view.rgb.movedim(0, -1)), state), r"rgb as .* of shape \(\d+, \d+, 3\)"),
         (lambda view, state: (with_rgb(view, view.rgb.numpy()), state), "rgb as ndarray"),
         (lambda view, state: (with_rgb(view, None), state), "rgb as NoneType"),

@@ -32,7 +32,7 @@ NEAR_PX = 4
 """Radius within which faint pixels take the colour of their neighbours."""
 
 OVERSHOOT = 0.4
-"""How far images in [0, 1] may leave it, as renderers and networks do; those in [-1, 1] or [0, 255] leave it farther."""
+"""How far images in [0, 1] may leave it, as those of renderers and networks do."""
 SUM_TOLERANCE = 1e-2
 """Of the product of the weights' sum and what it lacks to 1."""
 TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"

@@ -121,10 +121,7 @@ def run(options: Options) -> int:
     say(f"wrote {options.out}")
     if empty:
         say(f"{without_subject(capture, empty, len({time for time, _ in plan}))}; they show only the background")
-    if options.json:
-        print_json(summary.as_json())
-    else:
-        show(*in_words(summary))
+    print_json(summary.as_json()) if options.json else show(*in_words(summary))
     return 0
 
 

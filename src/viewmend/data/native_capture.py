@@ -74,7 +74,7 @@ def open_capture(
         >>> from viewmend.data.native_writer import write_capture
         >>> from viewmend.data.synthetic.stage import Studio, StudioConfig
         >>> folder = Path(tempfile.mkdtemp()) / "take"
-        >>> write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), folder)
+        >>> _ = write_capture(Studio(StudioConfig(cameras=4, frames=1, size_px=64)), folder)
         >>> capture = open_capture(folder)
         >>> len(capture.cameras), len(capture.frame_ids), capture.has_masks
         (4, 1, True)
