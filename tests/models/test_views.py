@@ -72,6 +72,16 @@ def test_colours_come_from_the_source_cameras(scene):
     assert float(found.rgb[:, 0].max()) == 0 and float(found.rgb[:, 1].mean()) > 5 * float(found.rgb[:, 2].max())
 
 
+@torch.no_grad()
+def test_colours_of_holes_do_not_exceed_alpha(scene):
+    stream, view, sources = scene
+    found, predicted = stream.inpainter(view, sources), rim_depth(view.depth) > 0
+    found = found._replace(alpha=0.5 * found.alpha, rgb=0.5 * found.rgb)
+    open_view = replace(view, weights=torch.zeros_like(view.weights))
+    completed = found.composite_into(open_view, predicted, ~predicted, torch.ones_like(view.rgb))
+    assert bool((completed.rgb <= completed.alpha).all()) and int((completed.rgb == completed.alpha).sum()) > 500
+
+
 def test_without_cameras_the_view_stays(scene):
     stream, view, _ = scene
     completed, state = stream.inpainter.step(view, ContextProvider(lambda *_: None), State())
@@ -146,9 +156,9 @@ def test_holes_are_mostly_the_ray_fill(scene, small_views):
     guess = net.coarse_guess(holed, sources)
     assert torch.equal(guess, net.coarse(replace(holed, error=holes.float()), sources))
     own = image_of(net(holed, sources, guess=guess, where=where), view)
-    found = net.step(holed, context_of(stream), State())[0].rgb
-    wanted = torch.where(holes, 0.7 * guess + 0.3 * own, own)
-    torch.testing.assert_close(found[:, where], wanted[:, where], atol=1e-4, rtol=0)
+    found = net.step(holed, context_of(stream), State())[0]
+    wanted = torch.where(holes, torch.minimum(0.7 * guess + 0.3 * own, found.alpha), own)
+    torch.testing.assert_close(found.rgb[:, where], wanted[:, where], atol=1e-4, rtol=0)
     guess = net.coarse_guess(holed, sources, quick=True)
     own = image_of(net(holed, sources, guess=guess, where=where), view)
     found = net.step(holed, context_of(stream, RenderQuality(refine_fraction=0.5)), State())[0].rgb

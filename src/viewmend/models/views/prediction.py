@@ -87,7 +87,8 @@ class ViewPrediction(NamedTuple):
             for values in (self.rgb, self.alpha[:, None], self.confidence[:, None], self.depth[:, None])
         )
         if fill is not None:
-            rgb = torch.where(predicted & view.holes, HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb, rgb)
+            guess = torch.minimum(HOLE_GUESS * fill + (1 - HOLE_GUESS) * rgb, alpha)  # `fill` has no alpha of its own
+            rgb = torch.where(predicted & view.holes, guess, rgb)
         if not keep_remains:
             colour = torch.where(predicted, rgb.amax(0), view.rgb.amax(0))
             keep = ~remains_of_phantoms(colour, torch.where(predicted, alpha[0], view.mask), predicted)
