@@ -21,6 +21,10 @@ rows = lambda evidence: holes(evidence)[1:]
 nothing = lambda evidence: 0 * holes(evidence)
 no_number = lambda evidence: holes(evidence) / 0
 none = lambda evidence: None
+unasked = lambda: None
+demanding = lambda evidence, threshold: holes(evidence)
+double = lambda evidence: holes(evidence).double()
+half = lambda evidence: holes(evidence).half()
 """
 
 
@@ -58,10 +62,12 @@ def test_an_impossible_fraction_is_refused(fraction):
     [
         ("thrice", "values from 0 to 3"),
         ("boolean", "torch.bool"),
-        ("rows", "float32 of shape"),
+        ("rows", r'float32 of shape .*; begin with torch\.maximum\(error_rule\("holes"\)\(evidence\), \.\.\.\)'),
         ("nothing", r"less on \d+ pixels of holes"),
         ("no_number", "values from nan"),
         ("none", "NoneType"),
+        ("unasked", r"unasked': expected a function of one argument, .* got parameters \(\); write def"),
+        ("demanding", r"got parameters \(evidence, threshold\)"),
         ("lost", "to be a class or a function, found none"),
     ],
 )
@@ -76,3 +82,10 @@ def test_a_custom_rule_decides_the_mask(tmp_path):
     soft, holes = rendered(f"{tmp_path / 'own.py'}:soft"), rendered("holes")
     subject = holes.mask > 0
     assert torch.equal(soft.error[subject], holes.error[subject].clamp_min(0.5)) and 0 < float(holes.error.mean()) < 1
+
+
+@pytest.mark.parametrize("name", ["double", "half"])
+def test_floats_of_a_custom_rule_become_float32(tmp_path, name):
+    (tmp_path / "own.py").write_text(CUSTOM_RULES)
+    error = rendered(f"{tmp_path / 'own.py'}:{name}").error
+    assert error.dtype == torch.float32 and torch.equal(error, rendered("holes").error)

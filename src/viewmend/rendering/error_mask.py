@@ -6,6 +6,7 @@ renderer knows; then, if only a fraction of them may be re-synthesised, a model 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from inspect import signature
 from typing import cast
 
 import torch
@@ -150,15 +151,25 @@ def attenuate_background(view: IncompleteView, found: ErrorMap, fraction: float)
 
 
 def _apply_rule(name: str, evidence: Evidence) -> Float[Tensor, "height width"]:
-    """E by the rule of this name; the result of a custom rule is checked."""
+    """E by the rule of this name, as float32; a custom rule's parameters and result are checked."""
     rule = error_rule(name)
+    if rule in (holes, all_covered):
+        return rule(evidence)
+    takes = signature(rule)
+    try:
+        takes.bind(evidence)
+    except TypeError as error:
+        raise ValueError(
+            f"error rule '{name}': expected a function of one argument, the evidence, got parameters {takes}; write "
+            "def NAME(evidence)"
+        ) from error
     E = rule(evidence)
-    if rule not in (holes, all_covered) and (fault := _fault(E, evidence)):
+    if fault := _fault(E, evidence):
         raise ValueError(
             f"error rule '{name}': expected E as floats of shape {tuple(evidence.mask.shape)} in [0, 1], 1 in all "
-            f"holes, got {fault}; begin with torch.maximum(holes(evidence), ...)"
+            f'holes, got {fault}; begin with torch.maximum(error_rule("holes")(evidence), ...)'
         )
-    return E
+    return E.float()
 
 
 def _fault(E: object, evidence: Evidence) -> str | None:
