@@ -109,12 +109,29 @@ def test_every_camera_image_is_encoded_once_for_all_viewers(model, encoded):
     assert len(encoded) == before
 
 
-def test_the_first_view_of_a_frame_is_charged_for_shared_work(model):
-    stream = Stream(model, CONFIG)
+@pytest.mark.parametrize("name", ["model", "views", "predicted"])
+def test_the_first_view_of_a_frame_is_charged_for_shared_work(model, name):
+    """`predicted`: the first to encode cameras is the prediction of errors."""
+    render = RenderConfig(error_rule="predicted", refine_fraction=0.5) if name == "predicted" else CONFIG.render
+    stream = Stream(model if name == "model" else load_inpainter("views"), replace(CONFIG, render=render))
     stream.add_frame(photograph(SPARSE, 0))
     first, second = stream.view(A).times, stream.view(A).times
     assert min(first.geometry, first.context, first.rendering, first.inpainting) > 0
     assert second.geometry == second.context == 0 and min(second.rendering, second.inpainting) > 0
+
+
+def test_encoding_within_encoding_is_timed_once(monkeypatch):
+    seconds = map(float, itertools.count())
+    monkeypatch.setattr("viewmend.utils.timing.now_s", lambda device: next(seconds))
+    monkeypatch.setattr("viewmend.models.base.now_s", lambda device: next(seconds))
+    provider, cpu = ContextProvider(lambda *_: None), torch.device("cpu")
+
+    def outer(names):
+        return provider.remembered(0, "inner", names, lambda names: ["inner"], cpu)
+
+    assert provider.remembered(0, "outer", ["c0"], outer, cpu) == ["inner"] and provider.encoding_ms == 3000
+    provider.remembered(0, "outer", ["c1"], outer, cpu)
+    assert provider.encoding_ms == 6000
 
 
 @pytest.mark.parametrize("inpainter", ["model", "reprojection"])

@@ -212,7 +212,8 @@ class Stream:
                 or the error rule needs a model that predicts errors.
         """
         part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
-        return crop.uncropped(self._with_error_mask(part, evidence, RenderQuality(), exclude), target)
+        part, _ = self._with_error_mask(part, evidence, RenderQuality(), exclude)
+        return crop.uncropped(part, target)
 
     def mend(
         self,
@@ -309,13 +310,17 @@ class Stream:
 
     def _with_error_mask(
         self, view: IncompleteView, evidence: Evidence | None, quality: RenderQuality, exclude: Sequence[str]
-    ) -> IncompleteView:
-        """The view, or a part of one, with its final E; without evidence E is only limited by the quality."""
+    ) -> tuple[IncompleteView, float]:
+        """The view, or a part of one, with its final E, and the milliseconds spent on encoding cameras for it.
+
+        Without evidence E is only limited by the quality.
+        """
         by_rule = evidence is not None and self.error_rule == "predicted"
         fractions = (quality.refine_fraction, self.config.render.refine_fraction if by_rule else None)
         fraction = min((own for own in fractions if own is not None), default=None) if quality.mend else None
         context = ContextProvider(self._context, RenderQuality(refine_fraction=fraction), exclude, self._memory)
-        return decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
+        view = decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
+        return view, context.encoding_ms
 
     def _complete(
         self,
@@ -334,7 +339,7 @@ class Stream:
         context = ContextProvider(self._context, quality, exclude, self._memory)
         start = now_s(part.rgb.device)
         stop_if_cancelled()
-        part = self._with_error_mask(part, evidence, quality, exclude)
+        part, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
         stop_if_cancelled()
         if target is not None and self.inpainter.crop_margin_px(quality) is None:
             part, crop = crop.uncropped(part, target), Crop.all_of(target)
@@ -342,11 +347,12 @@ class Stream:
         if quality.mend:
             with heavy_operations():
                 completed, viewer = self.inpainter.step_on(self.config.background, part, context, viewer)
-        inpainting_ms = ms_since(start, part.rgb.device) - context.encoding_ms if quality.mend else 0.0
+        encoding_ms += context.encoding_ms
+        inpainting_ms = ms_since(start, part.rgb.device) - encoding_ms if quality.mend else 0.0
         completed = crop.pasted(completed, whole or crop.uncropped(part, target or part.camera))
         self._frames.move_to_end(part.time)
         evict(self._frames, part.time, self.config.memory_mb)
-        times = StageTimes(geometry=cached.pop_geometry_ms(), context=context.encoding_ms, inpainting=inpainting_ms)
+        times = StageTimes(geometry=cached.pop_geometry_ms(), context=encoding_ms, inpainting=inpainting_ms)
         return StreamView(completed, viewer, times)
 
     def _context(self, time: int, names: tuple[str, ...]) -> ContextViews | None:

@@ -6,10 +6,12 @@ viewers is kept by the `ContextProvider`.
 """
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -106,7 +108,7 @@ class ContextProvider:
         check_exclude(exclude)
         self.quality = quality or RenderQuality()
         self.encoding_ms = 0.0
-        """Milliseconds spent in `encoded` so far."""
+        """Milliseconds spent on encoding camera images so far."""
         self._views = views
         self._exclude = frozenset(exclude)
         self._own: dict[int, Memory] = {}
@@ -130,16 +132,19 @@ class ContextProvider:
         absent = [self(time, [n for n in names if n not in memory]) for time, memory in memories.items()]
         new = [views for views in absent if views is not None and len(views.frame.cameras)]
         if new:
-            device = new[0].depth.device
-            start = now_s(device)
-            for views, results in zip(new, encode(new), strict=True):
-                pairs = zip(views.frame.cameras.names, results, strict=True)
-                memories[views.frame.time].update({name: to_mmap(result) for name, result in pairs})
-            self.encoding_ms += ms_since(start, device)
+            with self._timed(new[0].depth.device):
+                for views, results in zip(new, encode(new), strict=True):
+                    pairs = zip(views.frame.cameras.names, results, strict=True)
+                    memories[views.frame.time].update({name: to_mmap(result) for name, result in pairs})
         return [memory[name] for memory in memories.values() for name in names if name in memory]
 
     def remembered(
-        self, time: int, kind: str, names: Sequence[str], make: Callable[[Sequence[str]], Sequence[T]]
+        self,
+        time: int,
+        kind: str,
+        names: Sequence[str],
+        make: Callable[[Sequence[str]], Sequence[T]],
+        device: torch.device,
     ) -> list[T]:
         """One result per camera of one frame, computed now or for an earlier view.
 
@@ -148,12 +153,21 @@ class ContextProvider:
             kind: distinguishes these results from others of the same cameras.
             names: the cameras.
             make: computes one result for each of the names that it is given; called with those that are missing.
+            device: where `make` computes; its time is counted as encoding.
         """
         memory = self._memory(time)
         absent = [name for name in names if (kind, name) not in memory]
         if absent:
-            memory.update({(kind, n): to_mmap(made) for n, made in zip(absent, make(absent), strict=True)})
+            with self._timed(device):
+                memory.update({(kind, n): to_mmap(made) for n, made in zip(absent, make(absent), strict=True)})
         return [memory[kind, name] for name in names]
+
+    @contextmanager
+    def _timed(self, device: torch.device) -> Iterator[None]:
+        """Add the time of the `with` block to `encoding_ms`; that of blocks within it is not added twice."""
+        before, start = self.encoding_ms, now_s(device)
+        yield
+        self.encoding_ms = before + ms_since(start, device)
 
     def _own_memory(self, time: int) -> Memory:
         memory = self._own.setdefault(time, {})

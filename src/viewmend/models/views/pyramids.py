@@ -139,8 +139,11 @@ class SourceCameras:
         if context is None:
             return cls(views, view_pyramids(views), silhouettes, silhouette_pyramids(silhouettes))
         time, names, rig = views.frame.time, views.frame.cameras.names, silhouettes.cameras.names
-        pyramids = context.remembered(time, "views", names, lambda new: view_pyramids(views.select(new)))
-        masks = context.remembered(time, "silhouettes", rig, lambda new: silhouette_pyramids(silhouettes.select(new)))
+        device = silhouettes.mask.device
+        pyramids = context.remembered(time, "views", names, lambda new: view_pyramids(views.select(new)), device)
+        masks = context.remembered(
+            time, "silhouettes", rig, lambda new: silhouette_pyramids(silhouettes.select(new)), device
+        )
         return cls(views, tuple(pyramids), silhouettes, tuple(masks))
 
     @classmethod
