@@ -91,10 +91,11 @@ MISTAKES = {
         "--frames 5:": "expected --frames",
     },
     "export": {
-        "paper-small --format onnx --out m.onnx": "got 'paper-small', a PatchTransformer; export 'views'",
+        "paper-small --format onnx --out m.onnx": "train views, got 'paper-small', a PatchTransformer; other models",
+        "telea --format onnx --out m.onnx": "got 'telea', which is neither a shipped model nor a folder; other models",
         "views --format pt2 --out m.onnx": "expected --out to end in .pt2, got",
         "views --format onnx --out none/m.onnx": "expected a folder to write to, found none",
-        "no-such-model --format onnx --out m.onnx": "one of the shipped models",
+        "no-such-model --format onnx --out m.onnx": "expected 'views', or the folder",
     },
 }
 

@@ -31,13 +31,12 @@ def run(options: Options) -> int:
     if not options.out.parent.is_dir():
         raise ValueError(f"{options.out.parent}: expected a folder to write to, found none; create it first")
     from viewmend.cli.console import busy, say
-    from viewmend.export.model import FORMATS, check_exportable, metadata, trace
-    from viewmend.models.checkpoint import load_network
+    from viewmend.export.model import FORMATS, load_exportable, metadata, trace
     from viewmend.utils.atomic_writes import remove_partial_file
 
     check_packages, write = FORMATS[options.format]
     check_packages()
-    net = check_exportable(load_network(options.model), options.model)
+    net = load_exportable(options.model)
     remove_partial_file(options.out)
     with busy("tracing the model"):
         program = trace(net)

@@ -13,6 +13,7 @@ from torch.export import Dim, ExportedProgram
 
 from viewmend import __version__
 from viewmend.export.traceable import LARGEST_PX, ExportedModel, ViewInputs, ViewOutputs
+from viewmend.models.checkpoint import load_network, shipped_models
 from viewmend.models.views.model import ViewSynthNet
 from viewmend.utils.atomic_writes import write_atomically
 
@@ -41,16 +42,19 @@ def sizes(net: ViewSynthNet) -> dict[str, tuple[int, int]]:
     return pixels | {"chosen": (2, max(3, net.config.num_views)), "camera": (2, MOST_CAMERAS)}
 
 
-def check_exportable(model: object, name: str) -> ViewSynthNet:
-    """The model, if it is one that can be exported.
+def load_exportable(name: str) -> ViewSynthNet:
+    """Load a model that can be exported.
 
     Raises:
-        ValueError: it is no `ViewSynthNet`.
+        ValueError: it is no `ViewSynthNet`, or cannot be loaded (`WeightsError`).
     """
+    known = name in shipped_models() or Path(name).is_dir()
+    model = load_network(name) if known else None
     if not isinstance(model, ViewSynthNet):
+        got = f"a {type(model).__name__}" if known else "which is neither a shipped model nor a folder"
         raise ValueError(
-            f"expected a model of the default architecture, got '{name}', a {type(model).__name__}; export 'views', or "
-            "a model trained by viewmend train views"
+            f"expected 'views', or the folder of a model trained by viewmend train views, got '{name}', {got}; other "
+            "models and methods cannot be exported"
         )
     return model
 
