@@ -68,7 +68,7 @@ def reconstruct(
     config = config or HullConfig()
     check_views(cameras)
     bounds = bounds or bounds_from_masks(mask, cameras)
-    box = occupied_bounds(mask, cameras, bounds, config)
+    box = occupied_bounds(mask, cameras, bounds, config) if bool(mask.any()) else None
     if box is None:
         nothing = torch.zeros(0, 3, device=mask.device)
         return GeometryProxy(Mesh(nothing, nothing.int()), nothing, bounds)
