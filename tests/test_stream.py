@@ -239,7 +239,7 @@ def test_non_finite_results_are_refused(part, value):
     stream = Stream(Broken(), CONFIG)
     stream.add_frame(photograph(SPARSE, 0))
     for look in (stream.view, lambda camera: stream.mend(stream.render(camera))):
-        with pytest.raises(ValueError, match=rf"Broken: expected `step` to return .* got {part} from (nan|\d)"):
+        with pytest.raises(ValueError, match=rf"Broken: expected `step` .* numbers in {part} that are not finite"):
             look(A)
 
 
@@ -351,21 +351,14 @@ def test_excluded_cameras_reach_neither_renderer_nor_inpainter():
     assert requester.given[1] is None
 
 
-@pytest.mark.parametrize(
-    "exclude, message",
-    [
-        ("c4", r"expected exclude as a list of names, got the string 'c4'; write \['c4'\]"),
-        (["c4", "C7"], r"expected exclude to name cameras .*'c7', 'c9'\], got \['C7'\]; check the spelling"),
-    ],
-)
-def test_a_wrong_exclude_is_refused(exclude, message):
+def test_a_string_as_exclude_is_refused():
     requester = Requester((0, ("c4",)))
     stream = Stream(requester, CONFIG)
     stream.add_frame(photograph(SPARSE))
     view = stream.render(A)
     for look in (stream.view, stream.render, lambda _, exclude: stream.mend(view, exclude=exclude)):
-        with pytest.raises(ValueError, match=message):
-            look(A, exclude=exclude)
+        with pytest.raises(ValueError, match=r"exclude as a list of names, got the string 'c4'; write \['c4'\]"):
+            look(A, exclude="c4")
     assert not requester.given
 
 

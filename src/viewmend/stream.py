@@ -142,11 +142,6 @@ class Stream:
         """Indices of the cached frames, in order."""
         return tuple(sorted(self._frames))
 
-    @property
-    def _names(self) -> set[str]:
-        """The cameras of all cached frames: one may have no image in some."""
-        return {name for cached in self._frames.values() for name in cached.frame.cameras.names}
-
     def viewer(self) -> State:
         """The state of a new viewer."""
         return self.inpainter.initial_state()
@@ -203,12 +198,12 @@ class Stream:
         Args:
             target: the novel view's camera (one view), on the frames' device.
             time: index of the frame, by default the latest.
-            exclude: names of cameras of the cached frames whose images must not be used.
+            exclude: names of cameras whose images must not be used; those without an image are ignored.
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
             ValueError: `target` is not one camera, the frame is not cached, its geometry is not a `GeometryProxy`, no
-                camera is left, `exclude` is a string or has an unknown name, `target_mask` is not a mask of the view,
+                camera is left, `exclude` is a string, `target_mask` is not a mask of the view,
                 or the error rule needs a model that predicts errors.
         """
         part, evidence, crop = self._render(target, time, exclude, RenderQuality(), target_mask)
@@ -231,17 +226,17 @@ class Stream:
             view: the view to complete.
             viewer: the state that this viewer's last view returned; None for its first.
             quality: how much work the view may cost.
-            exclude: names of cameras of the cached frames whose images must not be used.
+            exclude: names of cameras whose images must not be used; those without an image are ignored.
 
         Raises:
             ValueError: the view's frame is not cached; the view names no camera or one that is not in the frame; an
                 image of it, or the depth of the frame's geometry, has another type, shape or range than its field says;
-                `exclude` is a string or has an unknown name; the inpainter does not return a completed view
+                `exclude` is a string; the inpainter does not return a completed view
                 of it; or `quality` needs a model that predicts errors.
         """
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)
-        check_exclude(exclude, self._names)
+        check_exclude(exclude)
         margin_px = self.inpainter.crop_margin_px(quality) if quality.mend else None
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
@@ -269,7 +264,7 @@ class Stream:
             viewer: the state that this viewer's last view returned; None for its first.
             time: index of the frame, by default the latest.
             quality: how much work the view may cost.
-            exclude: names of cameras of the cached frames whose images must not be used.
+            exclude: names of cameras whose images must not be used; those without an image are ignored.
             target_mask: the subject's mask in the novel view, if it is known (`IncompleteView.target_mask`).
 
         Raises:
@@ -291,7 +286,7 @@ class Stream:
         target_mask: Float[Tensor, "height width"] | None,
     ) -> tuple[IncompleteView, Evidence, Crop]:
         """Render the part of a view that shows the subject, with the inpainter's margin."""
-        check_exclude(exclude, self._names)
+        check_exclude(exclude)
         target.check_single()
         check_target_mask(target_mask, target.max_size_px[::-1])
         stop_if_cancelled()

@@ -79,7 +79,7 @@ def test_weights_that_make_no_finite_colours_are_refused(command, capture, tmp_p
     model = model_with(tmp_path / "model", lambda weights: weights * 1e30)
     code = main(COMMANDS[command](model, str(capture), str(tmp_path / "out")))
     said = capsys.readouterr()
-    (line,) = [line for line in said.err.splitlines() if "expected finite colours" in line]
+    (line,) = [line for line in said.err.splitlines() if "not finite" in line]
     if command == "evaluate":
         assert code == 1 and "failed: ValueError" in line, "its row says so, the other rows stand"
     else:

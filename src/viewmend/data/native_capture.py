@@ -386,7 +386,7 @@ class CameraReader:
     def lacks(self, kind: FileKind, time: int, exists: Callable[[str], bool]) -> bool:
         """Whether the camera has no file of this kind in the frame, as `has`."""
         number = self._index["masks" if kind == "mask" else "images"][time]
-        return number == ABSENT or not exists(self.camera.file(kind, self._file_id(kind, time)))
+        return bool(number == ABSENT) or not exists(self.camera.file(kind, self._file_id(kind, time)))
 
     def read(self, time: int) -> CameraImages | None:
         """Read and undistort the images of the frame at index `time`, in which the camera is present.

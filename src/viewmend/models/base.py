@@ -6,7 +6,7 @@ viewers is kept by the `ContextProvider`.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
@@ -56,16 +56,10 @@ class RenderQuality:
             raise ValueError(f"expected a refine_fraction from 0 to 1 or None, got {self.refine_fraction}")
 
 
-def check_exclude(exclude: Sequence[str], known: Collection[str] | None = None) -> None:
-    """ValueError if this is a string and no list of names, or has names that are not `known`, if that is given."""
+def check_exclude(exclude: Sequence[str]) -> None:
+    """ValueError if this is a string and no list of names: its letters would exclude nothing."""
     if isinstance(exclude, str):
         raise ValueError(f"expected exclude as a list of names, got the string '{exclude}'; write ['{exclude}']")
-    unknown = [] if known is None else sorted(set(exclude) - set(known))
-    if unknown:
-        raise ValueError(
-            f"expected exclude to name cameras of the cached frames, {sorted(known or ())}, got {unknown}; check the "
-            "spelling, or leave them out"
-        )
 
 
 class ContextProvider:
@@ -312,6 +306,8 @@ def _fault(made: object, view: IncompleteView) -> str | None:
         if image.shape != wanted or not image.is_floating_point():
             return f"{name} as {image.dtype} of shape {tuple(image.shape)}"
         low, high = map(float, image.detach().aminmax())  # both are NaN if any pixel is
-        if not (-OVERSHOOT <= low <= high < math.inf and (name == "depth" or high <= 1 + OVERSHOOT)):
+        if not math.isfinite(low + high):
+            return f"numbers in {name} that are not finite"
+        if low < -OVERSHOOT or (name != "depth" and high > 1 + OVERSHOOT):
             return f"{name} from {low:.3g} to {high:.3g}"
     return None
