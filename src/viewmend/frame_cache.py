@@ -17,7 +17,7 @@ from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
 from viewmend.models.base import Memory
 from viewmend.types import ContextViews, MultiViewFrame, Silhouettes, check_range
-from viewmend.utils.tensors import check_tensor, size_bytes, to_mmap
+from viewmend.utils.tensors import check_tensor, extremes, size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 WINDOW = 33
@@ -102,8 +102,7 @@ class CachedFrame:
         convert, arrange = "convert it to metres with .float()", "give one image per camera, as large as its size_px"
         shape = (len(cameras), height, width)
         check_tensor(name, depth, (torch.float32,), shape, convert=convert, arrange=arrange, padded=True)
-        low, high = depth.aminmax()
-        check_range(name, float(low), float(high), math.inf)
+        check_range(name, *extremes([depth])[0], math.inf)
         return depth
 
     def context(self, names: Sequence[str]) -> ContextViews | None:

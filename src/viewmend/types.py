@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from viewmend.geometry.cameras import Cameras
 from viewmend.geometry.hull import FOREGROUND
-from viewmend.utils.tensors import OnDevice, check_tensor
+from viewmend.utils.tensors import OnDevice, check_tensor, extremes
 
 RIM_PX = 2
 """How far the subject may extend beyond the proxy, pixels: silhouettes and grids cut off up to this much."""
@@ -317,8 +317,7 @@ class IncompleteView:
             images["fade"] = self.fade
         sums = self.weights.sum(0)
         off = sums * (1 - sums)  # 0 where the sum is 0 or 1
-        extremes = torch.stack([torch.stack(image.aminmax()) for image in (*images.values(), off)])
-        *ranges, (low, high) = extremes.tolist()  # waits for a GPU only once
+        *ranges, (low, high) = extremes([*images.values(), off])
         for name, pair in zip(images, ranges, strict=True):
             check_range(name, *pair, most=math.inf if name == "depth" else 1.0)
         if low < -SUM_TOLERANCE or high > SUM_TOLERANCE:
@@ -340,8 +339,7 @@ def check_target_mask(mask: object, shape: Sequence[int]) -> None:
         return
     arrange = "give the mask of this view at its size, (height, width)"
     image = check_tensor("target_mask", mask, (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
-    low, high = image.aminmax()
-    check_range("target_mask", float(low), float(high))
+    check_range("target_mask", *extremes([image])[0])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What is kept for long has memory of its own, and is the same."""
+"""What is kept for long has memory of its own, and is the same; smallest and largest numbers."""
 
 import gc
 import re
@@ -10,7 +10,7 @@ import torch
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.mesh import Mesh
 from viewmend.geometry.proxy import GeometryProxy
-from viewmend.utils.tensors import LARGE_BYTES, to_mmap
+from viewmend.utils.tensors import LARGE_BYTES, extremes, to_mmap
 
 
 def proxy(vertices: int) -> GeometryProxy:
@@ -56,3 +56,10 @@ def test_its_pages_go_with_it():
     gc.collect()
     assert mapped_mb() - before < 20
     assert view.tolist() == [1.0] * 4, "a view keeps its pages"
+
+
+def test_extremes_of_images_of_any_shape_and_precision():
+    part = torch.tensor([[0.5, -2.0]], requires_grad=True)  # its numbers must not be read one by one, with a warning
+    images = [part, torch.ones(3, 2, dtype=torch.float64), torch.tensor([3.0, torch.nan]).half()]
+    found = extremes(images)
+    assert found[:2] == [(-2.0, 0.5), (1.0, 1.0)] and torch.tensor(found[2]).isnan().all()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from viewmend.models.compositing import Background, cut, from_background, to_background
 from viewmend.types import OVERSHOOT, CompletedView, ContextViews, IncompleteView
-from viewmend.utils.tensors import to_mmap
+from viewmend.utils.tensors import extremes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
 ViewsAt = Callable[[int, tuple[str, ...]], ContextViews | None]
@@ -296,6 +296,7 @@ def _fault(made: object, view: IncompleteView) -> str | None:
         return f"a {type(made).__name__} alone"
     if len(made) != 2 or not isinstance(made[0], CompletedView):
         return f"({', '.join(type(part).__name__ for part in made)})"
+    images: dict[str, Tensor] = {}
     for name in ("rgb", "alpha", "confidence", "depth"):
         image = getattr(made[0], name)
         if image is None and name != "rgb":
@@ -305,7 +306,8 @@ def _fault(made: object, view: IncompleteView) -> str | None:
         wanted = (view.rgb if name == "rgb" else view.mask).shape
         if image.shape != wanted or not image.is_floating_point():
             return f"{name} as {image.dtype} of shape {tuple(image.shape)}"
-        low, high = map(float, image.detach().aminmax())  # both are NaN if any pixel is
+        images[name] = image
+    for name, (low, high) in zip(images, extremes(images.values()), strict=True):
         if not math.isfinite(low + high):
             return f"numbers in {name} that are not finite"
         if low < -OVERSHOOT or (name != "depth" and high > 1 + OVERSHOOT):

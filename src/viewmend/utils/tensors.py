@@ -5,7 +5,7 @@ would occupy several times what it stores. So they are copied to their own memor
 """
 
 import mmap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -100,3 +100,9 @@ def check_tensor(
     if value.dtype not in dtypes:
         raise ValueError(f"expected {name} as {' or '.join(map(str, dtypes))}, got {value.dtype}; {convert}")
     return value
+
+
+def extremes(images: Iterable[Tensor]) -> list[tuple[float, float]]:
+    """The smallest and the largest number of each image, both NaN if any is; waits for a GPU only once."""
+    pairs = torch.stack([torch.stack(image.detach().aminmax()).float() for image in images])
+    return [(low, high) for low, high in pairs.tolist()]
