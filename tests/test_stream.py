@@ -12,6 +12,7 @@ from reference.forged import forged
 from viewmend.frame_cache import WINDOW, cache_frame
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
+from viewmend.live.encoding import draw_mode
 from viewmend.models.base import ContextProvider, Inpainter, RenderQuality
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.classical import ReprojectionFill, Telea
@@ -276,14 +277,18 @@ def test_what_a_step_returns_is_checked(returned, got):
         stream.view(A)
 
 
-def test_a_step_may_round_and_return_any_floats():
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_a_step_may_round_and_return_any_floats(dtype):
     class Rounding(Inpainter):
         def step(self, view, context, state):
-            return with_rgb(view, (view.rgb + 0.001).double()), state
+            completed = CompletedView(view, (view.rgb + 0.001).to(dtype), view.mask.to(dtype), view.mask.to(dtype))
+            return completed, state
 
     stream = Stream(Rounding(), CONFIG)
     stream.add_frame(photograph(SPARSE, 0))
-    assert float(stream.view(A).completed.rgb.max()) > 0
+    completed = stream.view(A).completed
+    assert float(completed.rgb.max()) > 0 and {image.dtype for image in completed.images.values()} == {torch.float32}
+    assert draw_mode(completed, "confidence", "ff0000").any(), "NumPy has no bfloat16"
 
 
 # The context that a stream gives an inpainter: cameras, past frames, and no excluded camera.

@@ -8,7 +8,7 @@ viewers is kept by the `ContextProvider`.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -239,7 +239,7 @@ class Inpainter:
     ) -> tuple[CompletedView, State]:
         """Run `step` on a view on black; the inpainter gets it on this background, and its result is on black.
 
-        The completed view is cut by `view.target_mask`, if there is one.
+        The completed view is cut by `view.target_mask`, if there is one, and its images are cast to float32.
 
         Args:
             background: ignored if the inpainter has its own, which it then applies itself.
@@ -259,6 +259,7 @@ class Inpainter:
                 "another model"
             )
         completed, state = made
+        completed = replace(completed, **{name: image.float() for name, image in completed.images.items()})
         return cut(from_background(given, completed, view)), state
 
     def crop_margin_px(self, quality: RenderQuality) -> int | None:
