@@ -109,7 +109,9 @@ def test_frames_of_wrong_types_or_sizes_are_refused(frame, message):
 def test_right_frames_pass(frame):
     padded = replace(frame, rgb=F.pad(frame.rgb, (0, 3)), mask=F.pad(frame.mask, (0, 3)), depth=None)
     some = frame.without(frame.cameras.names[1:2])
-    for right in (frame, padded, some, replace(frame, mask=None), replace(frame, mask=0 * frame.mask)):
+    noise = torch.zeros_like(frame.mask)
+    noise[0, 0, :2] = 1
+    for right in (frame, padded, some, *(replace(frame, mask=mask) for mask in (None, 0 * frame.mask, noise))):
         right.check()
     Silhouettes(padded.mask, frame.cameras).check()
 

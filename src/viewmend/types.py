@@ -35,6 +35,8 @@ OVERSHOOT = 0.4
 """How far images in [0, 1] may leave it, as those of renderers and networks do."""
 SUM_TOLERANCE = 1e-2
 """Of the product of the weights' sum and what it lacks to 1."""
+NOISE = 0.01
+"""Masks with at most this share of ones, and nothing above, are those of no subject, as a matting leaves them."""
 TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
 
 
@@ -203,8 +205,8 @@ def _check_mask(mask: object, shape: tuple[int, ...]) -> None:
     """ValueError unless these are masks of 0 to 255, of this shape or padded; they may be empty."""
     convert = "scale it to 0 to 255, and convert it with .byte()"
     arrange = "give one mask per camera, as large as the images"
-    most = int(check_tensor("mask", mask, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True).max())
-    if most == 1:
+    masks = check_tensor("mask", mask, (torch.uint8,), shape, convert=convert, arrange=arrange, padded=True)
+    if int(masks.max()) == 1 and int(masks.sum()) > NOISE * masks.numel():
         raise ValueError("expected masks of 0 to 255, got masks of 0 and 1; multiply them by 255")
 
 
