@@ -4,6 +4,7 @@ import itertools
 from dataclasses import replace
 from inspect import unwrap
 
+import numpy as np
 import pytest
 import torch
 from reference.ball import camera_at, photograph, proxy, ring
@@ -382,6 +383,10 @@ def test_viewers_share_the_depth_of_the_cameras(monkeypatch):
     for angle in (30, 32, 65):
         stream.view(camera_at(angle, "t"))
     assert sorted(rendered) == ["c0", "c1", "c2", "c4"]
+
+
+def test_settings_may_be_numbers_of_numpy():
+    forged(RenderConfig(), cameras=np.int64(3)).__post_init__()
 
 
 @pytest.mark.parametrize(

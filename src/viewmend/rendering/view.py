@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import NamedTuple
 
 import torch
@@ -48,7 +49,7 @@ class RenderConfig:
 
     def __post_init__(self) -> None:
         error_rule(self.error_rule or "holes")
-        if not isinstance(self.cameras, int) or self.cameras < 1:
+        if not isinstance(self.cameras, Integral) or self.cameras < 1:
             raise ValueError(f"expected a whole number of source cameras, at least 1, got {self.cameras}")
         if self.selection not in SELECTIONS:
             raise ValueError(f"expected a selection of views by 'angle' or 'direction', got '{self.selection}'")
