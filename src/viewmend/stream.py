@@ -237,6 +237,8 @@ class Stream:
         quality = quality or RenderQuality()
         view.check(self.cached_frame(view.time).frame.cameras.names)
         check_exclude(exclude)
+        if view.target_mask is not None:  # resampling may overshoot
+            view = replace(view, target_mask=view.target_mask.clamp(0, 1).contiguous())
         margin_px = self.inpainter.crop_margin_px(quality) if quality.mend else None
         crop = Crop.all_of(view.camera) if margin_px is None else subject_crop(view, margin_px)
         return self._complete(crop.of_view(view), None, crop, viewer, quality, exclude, whole=view)
@@ -300,7 +302,7 @@ class Stream:
         camera, depth = crop.of_camera(target), cached.depth
         part, evidence = render_view(cached.frame, cached.proxy, camera, self.config.render, exclude, depth)
         if target_mask is not None:
-            part = replace(part, target_mask=crop.of_image(target_mask).contiguous())
+            part = replace(part, target_mask=crop.of_image(target_mask).clamp(0, 1))
         return part, evidence, crop
 
     def _with_error_mask(

@@ -143,6 +143,16 @@ def test_without_masks_nothing_is_cut_and_no_patch_is_dropped():
     assert made.channels.shape[1] == 4, "RGB and depth"
 
 
+def test_a_target_mask_that_overshoots_is_clamped():
+    stream = Stream(Telea())
+    stream.add_frame(BallCapture(ring(6), 1).read(0))
+    mask = torch.ones(stream.render(TARGET).mask.shape)
+    mask[:, 20:24], mask[:, 24:28] = 1.2, -0.2
+    exact = stream.view(TARGET, target_mask=mask.clamp(0, 1)).completed
+    for own in (stream.view(TARGET, target_mask=mask), stream.mend(replace(stream.render(TARGET), target_mask=mask))):
+        assert torch.equal(own.completed.rgb, exact.rgb) and torch.equal(own.completed.opacity, exact.opacity)
+
+
 def test_a_wrong_target_mask_is_refused():
     source = BallCapture(ring(6), 1).read(0)
     stream = Stream(SmoothFill())
