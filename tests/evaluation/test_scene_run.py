@@ -59,6 +59,13 @@ def turning() -> Precomputed:
     return Precomputed(made=list(scene.frames()), **kind)
 
 
+def test_a_scene_without_frames_fails(turning):
+    run = evaluate_scene(replace(turning, made=[]), ("telea",), RunSettings()).runs[0]
+    assert run.error.endswith(
+        "expected frames with a subject and an image of the held-out camera, got none; evaluate more frames"
+    )
+
+
 def test_long_sets_are_the_same_scenes_with_a_full_window_before_the_scored_frames():
     short, long = procedural_set(), lengthened(procedural_set())
     assert [s.name for s in long[:2]] == ["P-long-10000", "P-long-10001"] and {s.set for s in long} == {"P-long"}

@@ -118,7 +118,8 @@ def evaluate_scene(
                 for stream in streams:
                     stream.add(frame)
         if images is None:
-            raise ValueError(f"{scene.name}: expected frames of the held-out camera, got none")
+            wanted = "frames with a subject and an image of the held-out camera"
+            raise ValueError(f"{scene.name}: expected {wanted}, got none; evaluate more frames")
     except Exception as error:
         return SceneRun(scene.name, tuple(MethodRun(name, error=_message(error)) for name in methods))
     return SceneRun(scene.name, tuple(stream.result() for stream in streams), images, videos.features())
