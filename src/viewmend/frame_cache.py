@@ -99,7 +99,7 @@ class CachedFrame:
         if isinstance(self.proxy, GeometryProxy):
             return depth
         name, (width, height) = f"the depth of {type(self.proxy).__name__}", cameras.max_size_px
-        convert, arrange = "convert it to metres with .float()", "give one image per camera, as large as its size_px"
+        convert, arrange = "convert it with .float(), in metres", "give one image per camera, as large as its size_px"
         shape = (len(cameras), height, width)
         check_tensor(name, depth, (torch.float32,), shape, convert=convert, arrange=arrange, padded=True)
         check_range(name, *extremes([depth])[0], math.inf)
