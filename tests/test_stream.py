@@ -1,7 +1,7 @@
 """Streams and their viewers: what is shared is computed once, the rest is separate."""
 
 import itertools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from inspect import unwrap
 
 import numpy as np
@@ -14,7 +14,7 @@ from viewmend.frame_cache import WINDOW, cache_frame
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy
 from viewmend.live.encoding import draw_mode
-from viewmend.models.base import ContextProvider, Inpainter, RenderQuality
+from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, State
 from viewmend.models.checkpoint import load_inpainter
 from viewmend.models.classical import ReprojectionFill, Telea
 from viewmend.models.paper.config import paper_small
@@ -290,6 +290,27 @@ def test_a_step_may_round_and_return_any_floats(dtype):
     completed = stream.view(A).completed
     assert float(completed.rgb.max()) > 0 and {image.dtype for image in completed.images.values()} == {torch.float32}
     assert draw_mode(completed, "confidence", "ff0000").any(), "NumPy has no bfloat16"
+
+
+def test_a_state_may_be_empty():
+    @dataclass(frozen=True)
+    class Seen(State):
+        times: tuple[int, ...] = ()
+
+        def __len__(self):
+            return len(self.times)
+
+    given = []
+
+    class Own(Inpainter):
+        def step(self, view, context, state):
+            given.append(state)
+            return CompletedView(view, view.rgb), carried
+
+    carried, stream = Seen(), Stream(Own(), CONFIG)
+    stream.add_frame(photograph(SPARSE))
+    stream.view(A, stream.view(A).viewer)
+    assert given[1] is carried
 
 
 # The context that a stream gives an inpainter: cameras, past frames, and no excluded camera.

@@ -247,7 +247,8 @@ class Stream:
         """The state after a view whose completion is not needed; None if only `mend` can compute it."""
         inpainter = self.inpainter
         background = self.config.background if inpainter.background is None else "black"
-        return inpainter.advance_state(to_background(background, view), viewer or self.viewer())
+        viewer = self.viewer() if viewer is None else viewer
+        return inpainter.advance_state(to_background(background, view), viewer)
 
     @light_operations()
     def view(
@@ -332,7 +333,7 @@ class Stream:
         target: Cameras | None = None,
     ) -> StreamView:
         """Complete a part of a view, and paste it into `whole`, or into an empty view of `target`."""
-        cached, viewer = self.cached_frame(part.time), viewer or self.viewer()
+        cached, viewer = self.cached_frame(part.time), self.viewer() if viewer is None else viewer
         context = ContextProvider(self._context, quality, exclude, self._memory)
         start = now_s(part.rgb.device)
         stop_if_cancelled()

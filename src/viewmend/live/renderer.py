@@ -174,7 +174,7 @@ class Renderer:
         without = self.left_out(request.without)
         stream = self._stream_of(None, without)
         cached = self._add_frame(stream, request.time, without)
-        before = viewer or stream.viewer()
+        before = stream.viewer() if viewer is None else viewer
         truth = None if request.truth is None else self._true_frame(request.time, request.truth)
         if request.error_rule is not None:
             stream = stream.with_render_config(replace(stream.config.render, error_rule=request.error_rule))
