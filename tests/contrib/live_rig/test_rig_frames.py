@@ -4,6 +4,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,6 +126,27 @@ def test_a_camera_that_is_gone_is_missed_and_comes_back(rig):
         unplugged.clear()
         wait_until(lambda: "c2" in newest(supply).cameras.names)
         assert worker.counts["connects"] == 2
+
+
+def test_without_a_subject_the_background_is_shown(rig):
+    supply, gone = RigSource(rig, align=False), threading.Event()
+    show = supply._show
+
+    def show_with_or_without(together):
+        if gone.is_set():
+            for name, taken in together.taken.items():
+                images = replace(taken.images, mask=np.zeros_like(taken.images.mask))
+                together.taken[name] = replace(taken, images=images)
+        show(together)
+
+    supply._show = show_with_or_without
+    with reading(supply):
+        wait_until(lambda: of_all(supply) is not None)
+        gone.set()
+        wait_until(lambda: not newest(supply).has_subject)
+        assert supply.status.state == "ready"
+        gone.clear()
+        wait_until(lambda: newest(supply).has_subject)
 
 
 def test_a_rig_that_cannot_be_is_one_line_before_any_address(rig, capsys):

@@ -292,7 +292,7 @@ class RigSource(LiveSource):
             return  # the first frame waits for more cameras
         frame = stack_images([taken[name].images for name in names], self._cameras.select(names), 0)
         assert frame.mask is not None, "live cameras are masked"
-        if int((frame.mask.amax((1, 2)) > FOREGROUND).sum()) < 2:
+        if self._prepared is None and int((frame.mask.amax((1, 2)) > FOREGROUND).sum()) < 2:
             self.status = replace(self.status, error="the masks are empty: no subject is visible")
             return
         rig = self.rig
