@@ -308,15 +308,12 @@ class IncompleteView:
     def _check_images(self, height: int, width: int) -> None:
         """The checks of the images but `target_mask`: their types and shapes, then their ranges."""
         channels = {"rgb": (3,), "weights": (len(self.source_views),), "mask": (), "error": (), "depth": ()}
+        images: dict[str, Tensor] = {}
         for name, more in (channels | ({} if self.fade is None else {"fade": ()})).items():
             what = "one image for each of source_views" if name == "weights" else "it channels first"
-            arrange = f"give {what}, at the size of the view's camera"
+            arrange, value = f"give {what}, at the size of the view's camera", getattr(self, name)
             shape = (*more, height, width)
-            check_tensor(name, getattr(self, name), (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
-        names = ("rgb", "mask", "error", "depth", "weights")
-        images = {name: getattr(self, name) for name in names}
-        if self.fade is not None:
-            images["fade"] = self.fade
+            images[name] = check_tensor(name, value, (torch.float32,), shape, convert=TO_FLOAT, arrange=arrange)
         sums = self.weights.sum(0)
         off = sums * (1 - sums)  # 0 where the sum is 0 or 1
         *ranges, (low, high) = extremes([*images.values(), off])

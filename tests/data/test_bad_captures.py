@@ -131,7 +131,7 @@ BAD = {
         remove(*(f"images/{name}_001.png" for name in "abcd")),
         ["images/a_001.png", "frame '001'", "of any camera"],
     ),
-    "masks of nobody": (
+    "masks without a subject": (
         remove(*(f"masks/{name}_001.png" for name in "abcd")),
         ["masks/a_001.png", "frame '001'", "no mask of any camera", "black ones", FILE],
     ),

@@ -105,7 +105,6 @@ def run(options: Options) -> int:
     mender.background = (turntable and turntable.background) or mender.background
     plan = [pair for pair in _plan(options, capture, times, usable, turntable) if pair[0] in usable]
     frames, frame = prefetch(capture, [time for time, _ in groupby(time for time, _ in plan)]), None
-    empty: set[int] = set()
     fps = (turntable and turntable.fps) or capture.fps or STATIC_FPS
     with MendOutput(options.out, fps, options.alpha, options.depth) as output:
         if output.replaces:
@@ -113,15 +112,17 @@ def run(options: Options) -> int:
         for time, target in track(plan, "inpainting"):
             if frame is None or frame.time != time:
                 frame = next(frames).to(options.device)
-                empty |= set() if frame.without(held).has_subject else {time}
             truth = frame.select(held) if set(held) & set(frame.cameras.names) else None
             step = mender.mend(frame.without(held), target.to(options.device), truth)
             summary.add(step)
             output.add(step)
     say(f"wrote {options.out}")
-    if empty:
-        say(f"{without_subject(capture, empty, len({time for time, _ in plan}))}; they show only the background")
-    print_json(summary.as_json()) if options.json else show(*in_words(summary))
+    if summary.empty:
+        say(f"{without_subject(capture, summary.empty, len({time for time, _ in plan}))}; they show the background")
+    if options.json:
+        print_json(summary.as_json())
+    else:
+        show(*in_words(summary))
     return 0
 
 

@@ -129,10 +129,11 @@ class Mender:
         cached = self.add_frame(frame, carving)
         made = self.view(target, frame.time, target_mask=target_mask)
         iou = _input_iou(cached)
-        true = None if truth is None else true_view(truth, self.background)
-        if truth is None or true is None or not (frame.has_subject or truth.has_subject):
-            shown = None if true is None else true.rgb
-            return MendStep(frame, made.completed, self.background, shown, None, iou, made.times)
+        if truth is None:
+            return MendStep(frame, made.completed, self.background, None, None, iou, made.times)
+        true = true_view(truth, self.background)
+        if not (frame.has_subject or truth.has_subject):
+            return MendStep(frame, made.completed, self.background, true.rgb, None, iou, made.times)
         psnr_only = Scorers(self.background, ssim=None)
         if self._scorers is None:
             self._scorers = load_scorers(self.background, "gaussian", ("lpips-alex",), str(true.rgb.device))
@@ -193,6 +194,8 @@ class MendSummary:
         self.background: Background = "black"
         self.hull_iou: dict[str, list[float]] = {}
         """IoU of each camera, frame by frame."""
+        self.empty: set[int] = set()
+        """Indices of the frames without a subject in the input cameras."""
         self._hull_px = self._hole_px = self._mended_px = 0
         self._scores: list[FillScores] = []
         self._times: list[StageTimes] = []
@@ -204,6 +207,8 @@ class MendSummary:
         self._hull_px += int((view.mask > 0.5).sum())
         self._hole_px += int(view.holes.sum())
         self._mended_px += int(((view.mask > 0.5) & view.refine_mask).sum())
+        if not step.frame.has_subject:
+            self.empty.add(step.frame.time)
         if step.scores is not None:
             self._scores.append(step.scores)
         for name, iou in step.hull_iou.items():
