@@ -46,3 +46,9 @@ def test_other_shards_are_not_overwritten(tmp_path, capsys):
     assert make(tmp_path, 99) == 2
     assert "expected shard-00000.tar before shard-00001.tar, found none" in capsys.readouterr().err
     assert (tmp_path / "shard-00001.tar").read_bytes() == b"mine"
+
+
+def test_views_are_trained_without_the_mask_of_the_held_out_camera(tmp_path, capsys):
+    assert make(tmp_path / "out", 1, "--protocols", "target-mask") == 2
+    assert "expected --protocols strict for views, got target-mask" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

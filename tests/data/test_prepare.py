@@ -172,3 +172,6 @@ def test_frames_without_a_subject_are_read_and_a_capture_without_any_is_refused(
     assert len(prepared.read(2).cameras) == 6
     with pytest.raises(CaptureError, match=r"ball: expected foreground .* none in 4 frames"):
         prepare(AwayBall(ring(6), 4, {0, 1, 2, 3}))
+    blind = Entering(ring(6), frames=2)
+    with pytest.raises(CaptureError, match=r"in a mask of the input cameras, got none in 2 frames"):
+        prepare(blind, blind.cameras.names[1:])

@@ -78,12 +78,12 @@ def _make(options: Options) -> None:
     from viewmend.utils.atomic_writes import write_text
 
     at = _position(options.out)
+    source = options.objective.make_scenes(options.scenes, f"{options.seed}/0")
     _check_plan(options)
     count = options.count - at.samples
     if count <= 0:
         say(f"{options.out}: already holds {at.samples} samples")
         return
-    source = options.objective.make_scenes(options.scenes, f"{options.seed}/0")
     began, shards = time.monotonic(), []
     samples = islice(_missing(at, samples_in_order(source, at.scene, options.workers)), count)
     for shard in write_shards(track(samples, "samples", count), options.out, options.objective.shard_size, at.shards):

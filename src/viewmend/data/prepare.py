@@ -217,7 +217,8 @@ def first_with_subject(
     if has_subject:
         return best
     where = source.folder if isinstance(source, NativeCapture) else source.name
+    masks = "a mask" if inputs is None else "a mask of the input cameras"
     raise CaptureError(
-        f"{where}: expected foreground (values above {FOREGROUND}) in a mask, got none in "
+        f"{where}: expected foreground (values above {FOREGROUND}) in {masks}, got none in "
         f"{count} frame{'s' if count > 1 else ''}; segment the images again, with 255 as the subject"
     )

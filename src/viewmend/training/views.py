@@ -357,6 +357,9 @@ class ViewsObjectiveConfig(ObjectiveConfig):
 
     def make_scenes(self, scenes: SceneConfig, seed: str) -> SceneSource[StoredScene]:
         """See `ObjectiveConfig.make_scenes`."""
+        if scenes.protocols != ("strict",):
+            found = " ".join(scenes.protocols)
+            raise ValueError(f"expected --protocols strict for views, got {found}; leave --protocols out")
         return StoredSceneMaker(rig_source(scenes, self.sampling.frames, seed), scenes)
 
 
