@@ -8,7 +8,8 @@ import torch
 
 from viewmend.evaluation import scores as module
 from viewmend.evaluation.averages import tables, vfid
-from viewmend.evaluation.report import main_grid
+from viewmend.evaluation.paper_tables import PaperRow, paper_grid
+from viewmend.evaluation.report import main_grid, make_report
 from viewmend.evaluation.result_cache import CellStore
 from viewmend.evaluation.runner import run_evaluation
 from viewmend.evaluation.scene_run import RunSettings
@@ -228,6 +229,8 @@ def test_cells_store_features_and_tables_have_vfid(networks, small_scenes, tmp_p
     assert table.rows[0].vfid["whole_eval"] == pytest.approx(expected) and expected > 0
     shown = dict(zip(main_grid(table).heads, main_grid(table).rows[0], strict=True))
     assert shown["VFID"] == f"{expected:.4f}" and float(shown["LPIPS whole"]) > 0
+    grid = paper_grid([PaperRow("Telea", "telea")], make_report(again, methods, settings), {})
+    assert dict(zip(grid.heads, grid.rows[0], strict=True))["VFID (here)"] == f"{expected:.4f}"
     assert vfid(cells[:1])["whole_eval"] is None, "a single video"
     for path in tmp_path.glob("*.npz"):
         path.write_bytes(path.read_bytes()[:100])

@@ -142,6 +142,13 @@ def paper_grid(rows: Sequence[PaperRow], report: Report, methods: Mapping[str, S
 
 
 def _mean(rows: Sequence[Row], metric: str, of: str) -> float | None:
-    """Mean over the rows of a record, or of a field of a row's field."""
-    parts = [getattr(row, metric, None) for row in rows]
-    return mean(getattr(part, of, None) or row.scores.mean(metric, of) for part, row in zip(parts, rows, strict=True))
+    """Mean over the rows of a record, or of a value of their `speed` or `vfid`."""
+    return mean(_value(row, metric, of) for row in rows)
+
+
+def _value(row: Row, metric: str, of: str) -> float | None:
+    if metric == "vfid":
+        return row.vfid[of]
+    if metric == "speed":
+        return None if row.speed is None else getattr(row.speed, of)
+    return row.scores.mean(metric, of)
