@@ -15,12 +15,12 @@ from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras, concatenate_cameras
 from viewmend.geometry.hull import HullConfig
 from viewmend.geometry.proxy import GeometryProxy, reconstruct
-from viewmend.models.base import Memory
+from viewmend.models.base import REMEMBERED_FRAMES, Memory
 from viewmend.types import ContextViews, MultiViewFrame, Silhouettes, check_range
 from viewmend.utils.tensors import check_tensor, extremes, size_bytes, to_mmap
 from viewmend.utils.timing import ms_since, now_s
 
-WINDOW = 33
+WINDOW = REMEMBERED_FRAMES - 1
 """k_w n_w + n_c: how many frames back the inpainters' temporal windows reach."""
 
 

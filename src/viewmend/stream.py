@@ -2,7 +2,7 @@
 
     MultiViewFrame ──add_frame──▶ CachedFrame ──render──▶ IncompleteView ──mend──▶ CompletedView
 
-Every command, the live server, the evaluation and the examples use `Stream` (section 9). What depends on the rig or on
+All commands that render, the live server and the evaluation use `Stream` (section 9). What depends on the rig or on
 a frame is computed once and shared by all viewers; what depends on a viewer is a `State`, passed in and returned.
 """
 
@@ -316,7 +316,7 @@ class Stream:
         by_rule = evidence is not None and self.error_rule == "predicted"
         fractions = (quality.refine_fraction, self.config.render.refine_fraction if by_rule else None)
         fraction = min((own for own in fractions if own is not None), default=None) if quality.mend else None
-        context = ContextProvider(self._context, RenderQuality(refine_fraction=fraction), exclude, self._memory)
+        context = self.context_provider(RenderQuality(refine_fraction=fraction), exclude)
         view = decide_error_mask(view, evidence, self.error_rule, fraction, self.inpainter, context, self.error_model)
         return view, context.encoding_ms
 
@@ -334,7 +334,7 @@ class Stream:
     ) -> StreamView:
         """Complete a part of a view, and paste it into `whole`, or into an empty view of `target`."""
         cached, viewer = self.cached_frame(part.time), self.viewer() if viewer is None else viewer
-        context = ContextProvider(self._context, quality, exclude, self._memory)
+        context = self.context_provider(quality, exclude)
         start = now_s(part.rgb.device)
         stop_if_cancelled()
         part, encoding_ms = self._with_error_mask(part, evidence, quality, exclude)
@@ -352,6 +352,10 @@ class Stream:
         evict(self._frames, part.time, self.config.memory_mb)
         times = StageTimes(geometry=cached.pop_geometry_ms(), context=encoding_ms, inpainting=inpainting_ms)
         return StreamView(completed, viewer, times)
+
+    def context_provider(self, quality: RenderQuality | None = None, exclude: Sequence[str] = ()) -> ContextProvider:
+        """The cameras of all frames in memory, except `exclude`, and what was computed from them."""
+        return ContextProvider(self._context, quality, exclude, self._memory)
 
     def _context(self, time: int, names: tuple[str, ...]) -> ContextViews | None:
         return self._frames[time].context(names) if time in self._frames else None

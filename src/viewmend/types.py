@@ -34,7 +34,7 @@ NEAR_PX = 4
 OVERSHOOT = 0.4
 """How far images in [0, 1] may leave it, as those of renderers and networks do."""
 SUM_TOLERANCE = 1e-2
-"""Of the product of the weights' sum and what it lacks to 1."""
+"""Of s (1 - s), with s the sum of a pixel's weights."""
 NOISE = 0.01
 """Masks with at most this share of ones, and nothing above, are those of no subject, as a matting leaves them."""
 TO_FLOAT = "convert it with .float(), and divide 8-bit images by 255"
@@ -127,7 +127,7 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         return MultiViewFrame._of_parts(found, cameras=cameras, time=self.time, depth=depth, **absent)
 
     def check(self) -> None:
-        """ValueError unless cameras, `rgb` and `mask` have the types and shapes of the fields, and masks reach 255."""
+        """ValueError unless all fields have the types and shapes above; or if masks are 0 and 1."""
         self.cameras.check()
         width, height = self.cameras.max_size_px
         convert = "scale it to 0 to 255, and convert it with .byte()"
@@ -190,7 +190,7 @@ class Silhouettes(OnDevice):
     cameras: Cameras
 
     def check(self) -> None:
-        """ValueError unless masks and cameras have the types and shapes of the fields, and masks reach 255."""
+        """ValueError unless masks and cameras have the types and shapes of the fields; or if masks are 0 and 1."""
         self.cameras.check()
         width, height = self.cameras.max_size_px
         _check_mask(self.mask, (len(self.cameras), height, width))

@@ -55,7 +55,7 @@ def test_the_installed_package_is_typed_and_has_a_version():
 
 
 def test_names_can_be_imported_without_the_extras():
-    missing = "for name in ('websockets', 'starlette', 'uvicorn', 'av', 'matplotlib'): sys.modules[name] = None"
-    code = chr(10).join(["import sys", missing, "from viewmend import *", "with Client(): pass"])
+    missing = "for name in ('tensorboard', 'OpenEXR', 'onnx', 'onnxscript', 'ray'): sys.modules[name] = None"
+    code = chr(10).join(["import sys", missing, "from viewmend import *", "Client, Stream"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and done.stderr.strip().endswith("pip install websockets"), done.stderr
+    assert done.returncode == 0, done.stderr

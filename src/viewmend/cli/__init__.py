@@ -6,8 +6,9 @@ command whose defaults depend on its first argument also has `parse(arguments, p
 imports torch, cv2 or rich at the top, so that help appears at once. Results go to standard output, all other messages
 to standard error (`console.py`); with `--json`, standard output is one JSON value.
 
-Exit codes: 2 for a `ValueError` (`CaptureError` is one) or an `OSError`, reported in one line; 1 with a traceback for
-any other exception, which is a bug; 130 after Ctrl-C and 143 after SIGTERM. Partial output is always removed.
+Exit codes: 2 for a `ValueError` (`CaptureError` is one) or an `OSError`, reported in one line; 1 for failures that a
+report lists, or with a traceback for any other exception, which is a bug; 130 after Ctrl-C and 143 after SIGTERM.
+Partial output is removed, except what a repeated command resumes from.
 """
 
 import importlib

@@ -105,7 +105,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
 
     frames, bounds = _frames(options)
     names = frames[0].cameras.names
-    with busy("how strongly cameras are held"):
+    with busy("choosing how far cameras may move"):
         hold = best_hold(frames, bounds)
     scores = [refined_without(frames, name, bounds, hold) for name in track(left_out(names), "cameras left out")]
     for score in scores:
@@ -130,7 +130,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
 
 
 def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
-    """Some times at which all cameras are there and right and a subject is, and the capture's bounds."""
+    """Frames that show a subject to the same cameras, as many as possible; and the capture's bounds."""
     from viewmend.cli.checks import chosen_times
     from viewmend.data.prepare import open_masked, prepare
     from viewmend.preprocess.calibration.silhouettes import LEAST_CAMERAS

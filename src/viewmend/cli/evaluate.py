@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from viewmend.evaluation.report import Report
     from viewmend.evaluation.result_cache import CellStore
 
-WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3", "ablation")), "sheets/*.png")
-"""Files in OUT besides cells, models and samples."""
+WRITTEN = (*(f"{n}.*" for n in ("report", "table1", "table2", "table3")), "sheets/*.png")
+"""Files in OUT besides cells."""
 LONG_SETS = ("P-long", "Q-long", "P-turn")
 
 

@@ -46,7 +46,7 @@ def _describe(known: "KnownWeights", path: Path | None) -> dict[str, str]:
 
     status, problem = "missing", ""
     if path is not None:
-        status = "right" if known.sha256 else "there (no hash was published; loading checks shapes)"
+        status = "verified" if known.sha256 else "found (no hash was published; loading checks shapes)"
         try:
             verify_weights(path, known)
         except WeightsError as error:

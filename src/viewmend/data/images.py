@@ -101,7 +101,7 @@ def uses_alpha(path: Path) -> bool:
 def read_mask(path: Path, where: str) -> UInt8[np.ndarray, "height width"]:
     """Read a mask file: grey or alpha (see `to_mask`), labels of several colours or a palette, or 16 bit.
 
-    Background are index 0 of a coloured palette, black among other colours, and 0 among few values of 16 bit.
+    Background is index 0 of a coloured palette, black among other colours, and 0 among few values of 16 bit.
     CaptureError if its values have no known meaning, or no colour is black.
     """
     data = _read_file(path, where)

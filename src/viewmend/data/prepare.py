@@ -1,7 +1,8 @@
 """Preparing a capture: check it, align it on its input cameras, match colours, limit the image size.
 
-`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`, so they use the same pixels. Serious
-faults of a capture raise a `CaptureError`; others are logged once as warnings of the logger `viewmend`.
+`mend`, `serve`, `evaluate` and `train` all read their frames through `prepare`; `train` does not match colours, and
+`serve` limits the image size. Serious faults of a capture raise a `CaptureError`; others are logged once as warnings
+of the logger `viewmend`.
 """
 
 import logging

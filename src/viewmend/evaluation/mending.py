@@ -19,7 +19,7 @@ from viewmend.models.base import ContextProvider, Inpainter, RenderQuality, Stat
 from viewmend.models.classical import Telea
 from viewmend.models.compositing import Background, composite
 from viewmend.stream import Stream, StreamConfig, StreamView
-from viewmend.types import CompletedView, ContextViews, IncompleteView, MultiViewFrame, Silhouettes
+from viewmend.types import CompletedView, IncompleteView, MultiViewFrame, Silhouettes
 from viewmend.utils.timing import StageTimes
 
 Fill = Literal["unfilled", "telea", "ours"]
@@ -99,7 +99,7 @@ class Mender:
             if stream is None:
                 continue
             if history_of is not None:
-                stream.inpainter.encode_history(history_of, _context(stream))
+                stream.inpainter.encode_history(history_of, stream.context_provider())
             made = stream.view(target, self.state, time, self._quality, self._exclude, target_mask)
             if stream is self._warm_up and made.times.inpainting >= SLOW_MS:
                 self.stream = stream
@@ -119,8 +119,8 @@ class Mender:
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> "MendStep":
         """Complete and score the next view; several views of the same frame may follow each other.
 
-        The image of a camera at the target's pose, `truth` (one view), is used for scores only. There are none where
-        neither the frame nor the truth has a subject.
+        Of `truth`, one view at the target's pose, the image is used for scores only, and the mask as the protocol says.
+        There are no scores where neither the frame nor the truth has a subject.
 
         Raises:
             ValueError: the inpainter does not return a completed view (`Inpainter.step_on`).
@@ -254,15 +254,6 @@ class MendSummary:
         """Median milliseconds of each stage."""
         times = [asdict(stages) for stages in self._times]
         return {stage: median(t[stage] for t in times) for stage in times[0]} if times else {}
-
-
-def _context(stream: Stream) -> ContextProvider:
-    """All frames of a stream, and its memory of them."""
-
-    def views(time: int, names: tuple[str, ...]) -> ContextViews | None:
-        return stream.cached_frame(time).context(names) if time in stream.times else None
-
-    return ContextProvider(views, memory=lambda time: stream.cached_frame(time).encoded if time in stream.times else {})
 
 
 def _input_iou(cached: CachedFrame) -> dict[str, float]:

@@ -13,7 +13,7 @@ from viewmend.geometry.hull import FOREGROUND
 from viewmend.metrics.image_quality import SsimWindow, change, mask_iou, psnr, ssim_map, warp_error
 from viewmend.metrics.lpips import load_lpips
 from viewmend.metrics.vfid import MODES, I3d, load_i3d, video_features
-from viewmend.models.compositing import Background, composite
+from viewmend.models.compositing import Background, camera_image, composite
 from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 from viewmend.utils.weight_files import MissingWeightsError
 
@@ -171,8 +171,7 @@ def true_view(
 ) -> TrueView:
     """The image of a camera (a frame of one view with a mask), composited on a background by its mask."""
     assert frame.mask is not None, "held-out cameras have masks"
-    alpha = frame.mask[0].float() / 255
-    rgb = composite(background, frame.rgb[0].float() / 255 * alpha, alpha)
+    rgb = camera_image(frame, background)
     return TrueView(rgb, frame.mask[0] > FOREGROUND, backward_flow_px, by_past_alone)
 
 

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.sync.client import connect
 
 from viewmend.geometry.bounds import Bounds
 from viewmend.geometry.cameras import Cameras
@@ -36,12 +38,7 @@ class ServerSocket:
     """A connection to the server's path `ws` or `push`."""
 
     def __init__(self, url: str, token: str | None) -> None:
-        try:  # an optional package: without it, this module can still be imported
-            from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-            from websockets.sync.client import connect
-        except ImportError:
-            raise ImportError("expected the package websockets, found none; pip install websockets") from None
-        self._closed, self._context = ConnectionClosed, contextlib.ExitStack()
+        self._context = contextlib.ExitStack()
         address = f"{url}{token_query(token)}"
         try:
             self._socket = self._context.enter_context(connect(address, max_size=None, compression=None))
@@ -54,7 +51,7 @@ class ServerSocket:
 
     def send(self, message: str | bytes) -> None:
         """Send a message. If the connection is closed already, `receive` raises the reason."""
-        with contextlib.suppress(self._closed):
+        with contextlib.suppress(ConnectionClosed):
             self._socket.send(message)
 
     def receive(self, timeout_s: float) -> dict[str, Any] | bytes:
@@ -64,7 +61,7 @@ class ServerSocket:
         """
         try:
             message = self._socket.recv(timeout=max(0.0, timeout_s))
-        except self._closed as closed:
+        except ConnectionClosed as closed:
             raise ConnectionLostError(f"the server has closed the connection: {closed}") from None
         if isinstance(message, bytes):
             return message

@@ -25,7 +25,7 @@ from viewmend.live.protocol import BLACK, WHITE, Camera
 from viewmend.metrics.image_quality import psnr
 from viewmend.models.base import Inpainter, RenderQuality, State
 from viewmend.models.checkpoint import load_inpainter
-from viewmend.models.compositing import Background, composite
+from viewmend.models.compositing import Background, camera_image, composite
 from viewmend.rendering.proxy_views import hull_points, shaded_hull, vertex_colours
 from viewmend.stream import Stream, StreamConfig, StreamView
 from viewmend.types import CompletedView, MultiViewFrame
@@ -273,10 +273,9 @@ class Renderer:
     def _score(
         self, completed: CompletedView, truth: MultiViewFrame, background: Background
     ) -> tuple[float | None, Tensor]:
-        """PSNR inside the true mask on a background, as `evaluation.scores` has it, and each pixel's largest error."""
+        """PSNR inside the true mask on a background, and each pixel's largest error."""
         assert truth.mask is not None, "frames with geometry have masks"
-        alpha = truth.mask[0].float() / 255
-        true = composite(background, truth.rgb[0].float() / 255 * alpha, alpha)
+        true = camera_image(truth, background)
         seen = composite(background, completed.rgb, completed.opacity)
         errors = (seen - true).abs().amax(0)
         return psnr(seen, true, truth.mask[0] > FOREGROUND), torch.stack([*[errors] * 3, torch.ones_like(errors)])

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from viewmend.types import CompletedView, IncompleteView
+from viewmend.types import CompletedView, IncompleteView, MultiViewFrame
 
 Background = Literal["black", "white"]
 Image = Float[Tensor, "3 height width"]
@@ -25,6 +25,13 @@ BLOCKS_PX, OPAQUE_ENOUGH = (4, 8, 16, 32, 64, 128), 0.1
 def composite(background: Background, rgb: Image, alpha: Plane) -> Image:
     """An image on black, of this alpha, composited on a background; in [0, 1]."""
     return rgb if background == "black" else (rgb + (1 - alpha)).clamp(0, 1)
+
+
+def camera_image(frame: MultiViewFrame, background: Background) -> Image:
+    """The image of a frame of one view, composited on a background by its mask, which it must have; in [0, 1]."""
+    assert frame.mask is not None, "expected a frame with a mask"
+    alpha = frame.mask[0].float() / 255
+    return composite(background, frame.rgb[0].float() / 255 * alpha, alpha)
 
 
 def blend(known: Image, error: Plane, inpainted: Image, coverage: Plane, clamp: bool = True) -> Image:

@@ -41,7 +41,7 @@ class DepthErrors:
 
     @classmethod
     def draw(cls, random: Random) -> "DepthErrors":
-        """None, or a few of all kinds."""
+        """No errors, or some of all kinds."""
         if random.random() < EXACT:
             return cls()
 

@@ -20,7 +20,7 @@ from viewmend.frame_cache import CachedFrame
 from viewmend.metrics.image_quality import psnr
 from viewmend.metrics.lpips import MIN_PX, Lpips, load_lpips
 from viewmend.models.base import Inpainter
-from viewmend.models.compositing import Background, composite
+from viewmend.models.compositing import Background, camera_image, composite
 from viewmend.stream import Stream, StreamConfig
 from viewmend.types import CompletedView, MultiViewFrame
 from viewmend.utils.contact_sheet import Tile, contact_sheet, picture
@@ -70,8 +70,8 @@ class HeldBack:
             raise CaptureError(f"{capture.name}: expected --hold-out among {', '.join(names)}, got '{camera}'")
         if camera != AUTO and len(names) < MIN_CAMERAS:
             raise CaptureError(
-                f"{capture.name}: expected at least {MIN_CAMERAS} cameras to hold one back, got {len(names)}; leave "
-                "--hold-out away: only the last frames are held back then"
+                f"{capture.name}: expected at least {MIN_CAMERAS} cameras to hold one back, got {len(names)}; omit "
+                "--hold-out to hold back only the last frames"
             )
         chosen = names[len(names) // 2] if camera == AUTO else camera
         return cls(chosen if len(names) >= MIN_CAMERAS else None, first_frame)
@@ -129,9 +129,7 @@ class HeldBackView:
 
     def true_image(self, background: Background) -> Float[Tensor, "3 height width"]:
         """What the camera saw, on a background."""
-        assert self.truth.mask is not None, "fine-tuning needs masks"
-        alpha = self.truth.mask[0].float() / 255
-        return composite(background, self.truth.rgb[0].float() / 255 * alpha, alpha)
+        return camera_image(self.truth, background)
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def capture_set(
     if inputs != "all" and not (inputs.isdecimal() and 3 <= int(inputs) <= len(names)):
         raise ValueError(f"expected --inputs all or a number from 3 to {len(names)} for {folder}, got '{inputs}'")
     if frames is not None and frames < 1:
-        raise ValueError(f"expected --frames of at least 1, got {frames}; leave it away for all")
+        raise ValueError(f"expected --frames of at least 1, got {frames}; omit it for all")
     looking = names if inputs == "all" else evenly_around(capture.cameras, int(inputs))
     fingerprint, count = _fingerprint(folder, format), min(frames or len(capture.frame_ids), len(capture.frame_ids))
     return tuple(

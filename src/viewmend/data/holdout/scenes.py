@@ -32,8 +32,8 @@ TEST_FOLDER = "test"
 def recordings(split: Split, places: Sequence[Path]) -> tuple[Path, ...]:
     """Folders or files of characters, motions or captures, as this split may use them.
 
-    Validation is given none: whatever a model may have learned by heart, its scores are of procedural people that are
-    new to it. What a model gains on recordings is measured on such that were put aside: `viewmend evaluate`.
+    Validation uses none: its procedural people are new to every model. `viewmend evaluate` measures what a model gains
+    on recordings that were kept for tests.
     ValueError if training or validation would look at what is kept for tests.
     """
     kept = [place for place in places if TEST_FOLDER in (place.resolve().name, place.resolve().parent.name)]

@@ -1,1 +1,1 @@
-"""The paper's transformer. Read config, patches, tokenizer, attention, transformer, decoder, patch_transformer."""
+"""The paper's transformer. Read config, patches, tokenizer, transformer, context, patch_transformer."""

@@ -34,13 +34,13 @@ class PaperConfig:
     ffn_ratio: int = 4
     """Hidden size of a block's feed-forward network, as a multiple of `dim`."""
     use_mask: bool = True
-    """False (`--model.no-use-mask`): omit the mask from the encoder input; costs the paper 5.6 dB in holes."""
+    """False: no matting, no pruning of background patches, and no mask in the encoder input (Table 3)."""
     use_depth: bool = True
-    """False (`--model.no-use-depth`): omit the proxy's depth, relative to its median, from the encoder input."""
+    """False: omit the proxy's depth, relative to its median, from the encoder input."""
     background: Background = "white"
     """Background of all images: white as in the paper, or black."""
     rope: bool = True
-    """False (`--model.no-rope`): omit the rotary embedding of (u, v, s) from the attention scores."""
+    """False: omit the rotary embedding of (u, v, s) from the attention scores."""
     top_k: int | None = None
     """Context tokens kept by pruning, in training too; None keeps all. `RenderQuality.top_k` overrides it."""
     num_source_views: int = 3
@@ -85,7 +85,7 @@ class PaperConfig:
 
     @property
     def window(self) -> int:
-        """Number of frames the temporal window spans, k_w n_w, by which s is normalised (section 5); at least 1."""
+        """Frames that the temporal window spans, by which s is normalised: k_w n_w, or n_c if greater (section 5)."""
         return max(self.k_w * self.n_w, self.n_c, 1)
 
     def to_dict(self) -> dict[str, Any]:

@@ -170,11 +170,11 @@ class _Problem:
         return [sight.refine_depths(rig, depth) for sight, depth in zip(self.sights, depths, strict=True)]
 
     def cost(self, x: Moves, depths: Depths) -> float:
-        """What all places are outside of masks, half of its squares, and what it costs to be moved."""
+        """Half the sum of squared distances to the masks, plus the cost of moving the cameras."""
         return float(0.5 * sum(self._missed(x, depths)) + 0.5 * self.hold * (x**2).sum())
 
     def missed_px(self, x: Moves, depths: Depths) -> float:
-        """Root mean square of what the places are outside of masks."""
+        """Root mean square distance of the places to the masks."""
         return float(np.sqrt(sum(self._missed(x, depths)) / sum(len(sight.view) for sight in self.sights)))
 
     def _missed(self, x: Moves, depths: Depths) -> list[float]:
@@ -265,7 +265,7 @@ def refined_all(frames: Sequence[MultiViewFrame], bounds: Bounds | None, hold: f
 
 
 def best_hold(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> float:
-    """Which of `HOLDS` serves times best that the refinement has not seen, or of a single time, cameras."""
+    """The one of `HOLDS` that serves left-out frames best; with a single frame, left-out cameras."""
     if len(frames) > 1:
         times = range(min(LEFT_OUT_TIMES, len(frames)))
         return min(HOLDS, key=lambda hold: sum(missed_px(frames, time, bounds, hold) for time in times))
@@ -274,7 +274,7 @@ def best_hold(frames: Sequence[MultiViewFrame], bounds: Bounds | None) -> float:
 
 
 def left_out(names: Sequence[str]) -> list[str]:
-    """Whom to leave out in turn."""
+    """The cameras to leave out in turn."""
     count = min(LEFT_OUT, len(names))
     return [names[len(names) * number // count] for number in range(count)]
 

@@ -77,7 +77,7 @@ MOVES = 1 / 60
 
 
 def lasting(mask: Mask, before: Mask | None, after: Mask | None) -> Mask:
-    """The mask without parts that neither the time before nor the time after has anything of; None is no such time."""
+    """The mask without parts that are absent from both neighbouring frames; None: there is no such frame."""
     others = [other for other in (before, after) if other is not None]
     if not others:
         return mask

@@ -57,7 +57,7 @@ def median_plate(images: Iterable[Rgb]) -> Rgb:
 
 
 def exposure_gain(image: Colours, plate: Colours) -> Float32[np.ndarray, "3"]:
-    """What each channel of an image is multiplied by to be as bright as its plate: medians, the subject is the less."""
+    """Factors of an image's channels that make it as bright as its plate: medians, since most of it is background."""
     image, plate = image[::4, ::4], plate[::4, ::4]
     usable = ((image > 0.05) & (image < 0.95) & (plate > 0.05) & (plate < 0.95)).all(-1)
     if usable.mean() < 0.05:
