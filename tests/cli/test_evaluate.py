@@ -54,14 +54,14 @@ def test_out_must_not_be_a_file(tmp_path, capsys):
 def test_weights_lists_known_files_and_searched_folders(tmp_path, monkeypatch, capsys):
     assert cli.main(["weights"]) == 0
     out = capsys.readouterr().out
-    said = ("lpips-alex: right", "i3d: missing", "dstt: missing", "viewmend weights get i3d", str(tmp_path / "nowhere"))
+    said = ("lpips-alex: verified", "i3d: missing", "dstt: missing", "viewmend weights get i3d", str(tmp_path / "nowhere"))
     assert [word for word in said if word not in out] == []
     monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
     (tmp_path / "DSTT.pth").touch()
     (tmp_path / "i3d.safetensors").write_bytes(b"another")
     assert cli.main(["weights", "--json"]) == 1
     found = {line["name"]: line for line in json.loads(capsys.readouterr().out)}
-    assert found["dstt"]["status"].startswith("there") and found["dstt"]["path"] == str(tmp_path / "DSTT.pth")
+    assert found["dstt"]["status"].startswith("found") and found["dstt"]["path"] == str(tmp_path / "DSTT.pth")
     assert found["i3d"]["status"] == "wrong" and hashlib.sha256(b"another").hexdigest() in found["i3d"]["error"]
     assert found["lpips-vgg"]["status"] == "missing"
 
