@@ -54,7 +54,7 @@ def test_out_must_not_be_a_file(tmp_path, capsys):
 def test_weights_lists_known_files_and_searched_folders(tmp_path, monkeypatch, capsys):
     assert cli.main(["weights"]) == 0
     out = capsys.readouterr().out
-    said = ("lpips-alex: verified", "i3d: missing", "dstt: missing", "viewmend weights get i3d", str(tmp_path / "nowhere"))
+    said = ("lpips-alex: verified", "i3d: missing", "dstt: missing", "weights get i3d", str(tmp_path / "nowhere"))
     assert [word for word in said if word not in out] == []
     monkeypatch.setenv(FOLDERS_VARIABLE, str(tmp_path))
     (tmp_path / "DSTT.pth").touch()
