@@ -127,7 +127,7 @@ class MultiViewFrame(_LazyStacks, OnDevice):
         return MultiViewFrame._of_parts(found, cameras=cameras, time=self.time, depth=depth, **absent)
 
     def check(self) -> None:
-        """ValueError unless all fields have the types and shapes above; or if masks are 0 and 1."""
+        """ValueError if a field does not have the type and shape stated above, or if masks are 0 and 1."""
         self.cameras.check()
         width, height = self.cameras.max_size_px
         convert = "scale it to 0 to 255, and convert it with .byte()"
@@ -190,7 +190,7 @@ class Silhouettes(OnDevice):
     cameras: Cameras
 
     def check(self) -> None:
-        """ValueError unless masks and cameras have the types and shapes of the fields; or if masks are 0 and 1."""
+        """ValueError if a field does not have the type and shape stated above, or if masks are 0 and 1."""
         self.cameras.check()
         width, height = self.cameras.max_size_px
         _check_mask(self.mask, (len(self.cameras), height, width))

@@ -130,7 +130,7 @@ def _by_silhouettes(options: Options, out: Path) -> Figures:
 
 
 def _frames(options: Options) -> "tuple[list[MultiViewFrame], Bounds | None]":
-    """Frames that show a subject to the same cameras, as many as possible; and the capture's bounds."""
+    """Frames with a subject, all with the same cameras, as many as possible; and the capture's bounds."""
     from viewmend.cli.checks import chosen_times
     from viewmend.data.prepare import open_masked, prepare
     from viewmend.preprocess.calibration.silhouettes import LEAST_CAMERAS

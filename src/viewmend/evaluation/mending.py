@@ -119,8 +119,8 @@ class Mender:
     def mend(self, frame: MultiViewFrame, target: Cameras, truth: MultiViewFrame | None) -> "MendStep":
         """Complete and score the next view; several views of the same frame may follow each other.
 
-        Of `truth`, one view at the target's pose, the image is used for scores only, and the mask as the protocol says.
-        There are no scores where neither the frame nor the truth has a subject.
+        `truth`, one view at the target's pose, is what the result is scored against; unless the protocol is `strict`,
+        its mask is used, too. There are no scores where neither the frame nor the truth has a subject.
 
         Raises:
             ValueError: the inpainter does not return a completed view (`Inpainter.step_on`).

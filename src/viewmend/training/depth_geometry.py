@@ -41,7 +41,7 @@ class DepthErrors:
 
     @classmethod
     def draw(cls, random: Random) -> "DepthErrors":
-        """No errors, or some of all kinds."""
+        """No errors, or a random mix of all kinds."""
         if random.random() < EXACT:
             return cls()
 

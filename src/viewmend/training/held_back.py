@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from viewmend.data.errors import CaptureError
@@ -120,16 +119,12 @@ class HeldBackView:
         stream = Stream(model, StreamConfig(memory_mb=None, background=background))
         stream.add_frame(*to_device((self.inputs.frame, self.inputs.proxy), device))
         completed = to_device(stream.view(self.truth.cameras.to(device)).completed, "cpu")
-        rgb, truth = composite(background, completed.rgb, completed.opacity), self.true_image(background)
+        rgb, truth = composite(background, completed.rgb, completed.opacity), camera_image(self.truth, background)
         found = psnr(rgb, truth, torch.ones_like(truth[0], dtype=torch.bool))
         assert found is not None and self.truth.mask is not None, "images have pixels, and captures masks here"
         box = _subject_box(self.truth.mask[0])
         distance = float(metric(rgb[None, :, *box], truth[None, :, *box]))
         return ViewScore(self.camera, self.trained_on, found, distance), completed
-
-    def true_image(self, background: Background) -> Float[Tensor, "3 height width"]:
-        """What the camera saw, on a background."""
-        return camera_image(self.truth, background)
 
 
 @dataclass(frozen=True)
@@ -242,5 +237,5 @@ def _row(view: HeldBackView, completed: Sequence[tuple[str, CompletedView]], bac
     """The view as rendered, as completed, and the truth, cut to the subject."""
     box = _subject_box(view.truth.mask[0])  # pyright: ignore[reportOptionalSubscript]
     images = [("rendered", completed[0][1].view.rgb), *((name, own.rgb) for name, own in completed)]
-    images.append(("truth", view.true_image(background)))
+    images.append(("truth", camera_image(view.truth, background)))
     return [Tile(f"{view.camera}: {name}", picture(image[:, *box])) for name, image in images]

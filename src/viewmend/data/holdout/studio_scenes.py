@@ -29,7 +29,7 @@ LONG_FRAMES = 41
 """Frames of the long sets: the last `FRAMES` are scored, and at the first of these the paper's window is whole."""
 TURN_SEEDS = PROCEDURAL_SEEDS["test"][100:124]
 TURN_RINGS = (8, 7)
-"""Rings in which holes are a few percent of the subject, many of whose pixels only the past shows."""
+"""Rings in which holes are a few percent of the subject, and many of their pixels are seen only in the past."""
 TURNS: tuple[tuple["Tempo", str], ...] = (("calm", "turn"), ("dance", "spin"))
 
 Background = Literal["black", "stage"]
