@@ -64,7 +64,13 @@ def test_fine_tuning_uses_the_objective_of_its_model(start, kind, model):
 
 
 def test_impossible_values_are_refused(tiny):
-    for change in ({"new_per_batch": 0}, {"steps": 0}, {"minutes": float("nan")}, {"learning_rate": 0.0}):
+    for change in (
+        {"new_per_batch": 0},
+        {"steps": 0},
+        {"minutes": float("nan")},
+        {"learning_rate": 0.0},
+        {"microbatch": 0},
+    ):
         with pytest.raises(ValueError, match=f"{next(iter(change))} of"):
             replace(tiny, **change)
 

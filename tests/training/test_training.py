@@ -178,6 +178,24 @@ def test_gradients_are_clipped(tiny, tmp_path, monkeypatch):
     assert moved[1e-12] < 0.01 * moved[1.0]
 
 
+def test_gradients_of_parts_of_a_batch_add_up_to_those_of_the_batch(tiny, tmp_path, monkeypatch):
+    gradients, losses, passes = {}, {}, []
+    forward = PaperObjective.forward
+    monkeypatch.setattr(
+        PaperObjective, "forward", lambda self, batch: passes.append(len(batch)) or forward(self, batch)
+    )
+    for size in (None, 2):
+        config = replace(with_options(tiny, adversarial=0.01), batch=3, new_per_batch=3, microbatch=size)
+        with join_processes() as own:
+            run = Run(config, tmp_path / str(size), None, own)
+            (first,) = islice(run.steps(), 1)
+        gradients[size] = torch.cat([weight.grad.flatten() for weight in run.trained])
+        losses[size] = first.losses
+    assert passes == [3, 2, 1]
+    torch.testing.assert_close(gradients[2], gradients[None], rtol=1e-3, atol=1e-6)
+    assert losses[2] == pytest.approx(losses[None], rel=1e-4)
+
+
 def test_a_run_interrupted_before_its_first_checkpoint_starts_again(tiny, tmp_path):
     def interrupt(progress):
         raise KeyboardInterrupt

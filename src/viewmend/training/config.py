@@ -161,6 +161,8 @@ class TrainConfig:
     """New samples per batch; the others are replayed."""
     replay_size: Annotated[int, HIDDEN] = 600
     """Recent samples kept for replay, per stream."""
+    microbatch: Annotated[int | None, HIDDEN] = None
+    """Samples whose gradients are computed at once, which bounds memory; None: the whole batch."""
     streams: Annotated[int, HIDDEN] = 1
     """Batches whose gradients are averaged in one step; the processes of torchrun share them."""
     warmup: Annotated[int, HIDDEN] = 60
@@ -175,6 +177,7 @@ class TrainConfig:
         least |= {"checkpoint_minutes": 0}
         wrong = [f"{name} of {getattr(self, name)}" for name, low in least.items() if not getattr(self, name) >= low]
         wrong += [f"minutes of {self.minutes}"] if self.minutes is not None and not self.minutes > 0 else []
+        wrong += [f"microbatch of {self.microbatch}"] if self.microbatch is not None and self.microbatch < 1 else []
         wrong += [] if 0 < self.learning_rate < math.inf else [f"learning_rate of {self.learning_rate}"]
         if wrong:
             raise ValueError(

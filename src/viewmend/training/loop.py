@@ -291,33 +291,43 @@ class Run:
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """One step of all weights, by the mean gradient of the streams."""
         self.optimizer.zero_grad(set_to_none=True)
-        losses = []
+        losses, done, total = [], 0, sum(map(len, batches))
         for number, batch in enumerate(batches):
-            batch = [to_device(sample, self.own.device) for sample in batch]
             # Random numbers depend on the stream and the step, not on the process that computes them.
             stream = number * self.own.count + self.own.rank
             torch.manual_seed((self.config.seed * 1_000_003 + step) * 1_009 + stream)
-            last = number + 1 == len(batches)
-            # All gradients but the last accumulate here; they meet those of other processes in the last backward pass.
-            with self.shared.no_sync() if isinstance(self.shared, Ddp) and not last else nullcontext():
-                output = self.shared(batch)
-                assert isinstance(output, StepOutput)
-                total, adversarial, discriminator = output.total, 0.0, 0.0
-                if self.adversary is not None:
-                    assert output.judged is not None, "objectives with an adversary return what it judges"
-                    term, discriminator = self.adversary.losses(output.judged, 1 / len(batches))
-                    total, adversarial = total + self.adversary.weight * term, float(term.detach())
-                self._check_finite(total.detach(), step, batch)
-                (total / len(batches)).backward()
-            terms = [float(term.detach()) for term in (output.image.inside, output.image.outside, total)]
-            losses.append([*terms, adversarial, discriminator])
+            for piece in self._split(batch):
+                share, done = len(piece) / total, done + len(piece)
+                # Gradients accumulate here; they meet those of other processes in the last backward pass.
+                with self.shared.no_sync() if isinstance(self.shared, Ddp) and done < total else nullcontext():
+                    terms = self._add_gradients(step, [to_device(sample, self.own.device) for sample in piece], share)
+                losses.append(share * torch.tensor(terms, device=self.own.device))
         torch.nn.utils.clip_grad_norm_(self.trained, self.objective.max_grad_norm)
         self.optimizer.step()
         self.average.update_parameters(self.model)
         if self.adversary is not None:
             self.adversary.step(self.own.mean)
-        means = self.own.mean(torch.tensor(losses, device=self.own.device).mean(0)).tolist()
+        means = self.own.mean(torch.stack(losses).sum(0)).tolist()
         return dict(zip(("inside", "outside", "total", "adversarial", "discriminator"), means, strict=True))
+
+    def _split(self, batch: list[object]) -> list[list[object]]:
+        """Parts of a batch of at most `microbatch` samples."""
+        size = self.config.microbatch or len(batch)
+        return [batch[first : first + size] for first in range(0, len(batch), size)]
+
+    def _add_gradients(self, step: int, samples: list[object], share: float) -> list[float]:
+        """Add the gradients of these samples' loss times `share`; returns the terms of the loss."""
+        output = self.shared(samples)
+        assert isinstance(output, StepOutput)
+        total, adversarial, discriminator = output.total, 0.0, 0.0
+        if self.adversary is not None:
+            assert output.judged is not None, "objectives with an adversary return what it judges"
+            term, discriminator = self.adversary.losses(output.judged, share)
+            total, adversarial = total + self.adversary.weight * term, float(term.detach())
+        self._check_finite(total.detach(), step, samples)
+        (total * share).backward()
+        image = [float(term.detach()) for term in (output.image.inside, output.image.outside, total)]
+        return [*image, adversarial, discriminator]
 
     def _check_finite(self, total: Tensor, step: int, batch: list[object]) -> None:
         if torch.isfinite(total):

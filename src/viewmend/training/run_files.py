@@ -18,7 +18,7 @@ from viewmend.utils.untrusted_input import InputError
 
 FILE, PREVIOUS = "run.safetensors", "run.previous.safetensors"
 """The last checkpoint and the one before it."""
-MAY_CHANGE = ("steps", "minutes", "workers", "checkpoint_minutes", "validate_every", "validation_views")
+MAY_CHANGE = ("steps", "minutes", "workers", "microbatch", "checkpoint_minutes", "validate_every", "validation_views")
 """Fields of the config that may differ when a run is resumed."""
 
 
