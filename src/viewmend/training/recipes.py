@@ -92,7 +92,7 @@ def paper_small() -> TrainConfig:
         ),
         steps=20_000,
         new_per_batch=1,
-        microbatch=2,
+        microbatch=1,
         learning_rate=6e-4,
         warmup=100,
         ema=0.998,
