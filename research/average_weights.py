@@ -1,6 +1,8 @@
 """The mean of the weights of several models of the same config, as a model.
 
-python research/average_weights.py MODEL... --out FOLDER
+    python research/average_weights.py MODEL... --out FOLDER
+
+Its card contains the cards of these models.
 """
 
 from pathlib import Path

@@ -291,15 +291,15 @@ class Run:
     def _step(self, step: int, batches: list[list[object]]) -> dict[str, float]:
         """One step of all weights, by the mean gradient of the streams."""
         self.optimizer.zero_grad(set_to_none=True)
-        losses, done, total = [], 0, sum(map(len, batches))
+        losses, done, count = [], 0, sum(map(len, batches))
         for number, batch in enumerate(batches):
             # Random numbers depend on the stream and the step, not on the process that computes them.
             stream = number * self.own.count + self.own.rank
             torch.manual_seed((self.config.seed * 1_000_003 + step) * 1_009 + stream)
             for piece in self._split(batch):
-                share, done = len(piece) / total, done + len(piece)
+                share, done = len(piece) / count, done + len(piece)
                 # Gradients accumulate here; they meet those of other processes in the last backward pass.
-                with self.shared.no_sync() if isinstance(self.shared, Ddp) and done < total else nullcontext():
+                with self.shared.no_sync() if isinstance(self.shared, Ddp) and done < count else nullcontext():
                     terms = self._add_gradients(step, [to_device(sample, self.own.device) for sample in piece], share)
                 losses.append(share * torch.tensor(terms, device=self.own.device))
         torch.nn.utils.clip_grad_norm_(self.trained, self.objective.max_grad_norm)
