@@ -7,11 +7,8 @@ measured from a request to its decoded frame. Then 1 to 8 viewers share the same
 import argparse
 import contextlib
 import json
-import os
 import threading
 import time
-
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as in `viewmend serve`; must be set before torch is loaded
 
 from measure import summarise, write
 

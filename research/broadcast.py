@@ -8,15 +8,12 @@ what the server used.
 import argparse
 import http.client
 import json
-import os
 import statistics
 import subprocess
 import sys
 import threading
 import time
 from urllib.parse import urlsplit
-
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as in `viewmend serve`; must be set before torch is loaded
 
 from live import served
 from measure import write

@@ -1,10 +1,13 @@
 """Real-time inpainting of free-viewpoint video.
 
 `viewmend.__all__` lists the public names. Each is imported on first use, so that `import viewmend` is instant.
+Importing the package also lets PyTorch's idle threads sleep (`utils/openmp.py`).
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+from viewmend.utils.openmp import let_idle_threads_sleep
 
 if TYPE_CHECKING:
     from viewmend.data.errors import CaptureError
@@ -27,6 +30,8 @@ if TYPE_CHECKING:
     from viewmend.utils.timing import StageTimes
 
 __version__ = "0.1.0"
+
+let_idle_threads_sleep()
 
 __all__ = [
     "Bounds",

@@ -148,18 +148,31 @@ def test_rays_is_the_ray_fill_of_views():
     assert sum(weight.numel() for weight in own.values()) == 855_886
 
 
-@pytest.mark.parametrize(("speedup", "dtype"), [(4.0, torch.bfloat16), (1.2, torch.float32), (0.25, torch.float32)])
-def test_auto_precision_is_bfloat16_for_models_trained_in_it_if_clearly_faster(
-    monkeypatch, saved, tmp_path, speedup, dtype
+@pytest.mark.parametrize(
+    ("features", "dtype"),
+    [
+        ({"amx_bf16": True, "avx512_bf16": True}, torch.bfloat16),
+        ({"amx_bf16": False, "avx512_bf16": True}, torch.bfloat16),
+        ({"amx_bf16": False, "avx512_bf16": False, "avx512_f": True}, torch.float32),
+        ({}, torch.float32),
+    ],
+)
+def test_auto_precision_is_bfloat16_for_models_trained_in_it_on_processors_with_units_for_it(
+    monkeypatch, saved, tmp_path, features, dtype
 ):
-    measured = []
-    monkeypatch.setattr(network, "bfloat16_speedup", lambda device: measured.append(device.type) or speedup)
-    assert load_inpainter(saved).compute_dtype == torch.float32 and measured == []
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: features)
+    assert load_inpainter(saved).compute_dtype == torch.float32
     save_inpainter(ViewSynthNet(VIEWS), tmp_path / "views", "")
-    assert load_inpainter(tmp_path / "views").compute_dtype == dtype and measured == ["cpu"]
+    assert load_inpainter(tmp_path / "views").compute_dtype == dtype
     assert load_inpainter(tmp_path / "views", precision="float32").compute_dtype == torch.float32
     with pytest.raises(ValueError, match="float32, bfloat16 or auto"):
         load_inpainter(saved, precision="half")
+
+
+def test_this_machine_states_the_features_that_precision_depends_on():
+    if torch.cpu.get_capabilities()["architecture"] != "x86_64":
+        pytest.skip("not an x86 processor")
+    assert set(network.BFLOAT16_UNITS) <= torch.cpu.get_capabilities().keys()
 
 
 @pytest.mark.parametrize(("units", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])

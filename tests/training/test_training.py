@@ -10,7 +10,6 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from training.conftest import log_of
 
-from viewmend.models import network
 from viewmend.models.base import ContextProvider
 from viewmend.models.checkpoint import load_network
 from viewmend.models.classical import Telea
@@ -118,14 +117,14 @@ def test_a_run_resumes_only_with_its_own_config_and_a_whole_file(tiny, tmp_path)
         train(tiny, tmp_path)
 
 
-@pytest.mark.parametrize(("speedup", "precision"), [(4.0, torch.bfloat16), (0.25, torch.float32)])
+@pytest.mark.parametrize(("has_units", "precision"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_automatic_precision_is_the_faster_one_and_a_run_resumes_where_the_other_is(
-    tiny, tmp_path, monkeypatch, speedup, precision
+    tiny, tmp_path, monkeypatch, has_units, precision
 ):
     automatic = replace(tiny, precision="auto", steps=1)
-    monkeypatch.setattr(network, "bfloat16_speedup", lambda device: 1 / speedup)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": not has_units})
     train(automatic, tmp_path)
-    monkeypatch.setattr(network, "bfloat16_speedup", lambda device: speedup)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has_units})
     with join_processes() as own:
         run = Run(automatic, tmp_path, None, own)
     assert run.state.step == 1

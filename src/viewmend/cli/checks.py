@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from viewmend.models.base import Inpainter
     from viewmend.rendering.view import RenderConfig
 
+Precision = Literal["auto", "float32", "bfloat16"]
+"""Number formats in which our networks compute."""
+
 MAX_NAMED = 5
 """Messages name up to this many frames."""
 
@@ -85,7 +88,7 @@ def check_people(performers: Path | None, motions: Path | None) -> None:
             raise ValueError(f"{folder}: expected the folder of --{option}, found nothing; check the path")
 
 
-def load_named(name: str | None, device: str) -> "Inpainter":
+def load_named(name: str | None, device: str, precision: Precision = "auto") -> "Inpainter":
     """Load the method of this name (`make_method`); by default the shipped model, or Telea's fill without one.
 
     Raises:
@@ -96,7 +99,7 @@ def load_named(name: str | None, device: str) -> "Inpainter":
     check_device(device)
     if name is None and (name := default_method()) == "telea":
         say("this version ships no model: holes are filled with OpenCV's Telea inpainting")
-    return make_method(name, device)
+    return make_method(name, device, precision)
 
 
 def chosen_times(text: str | None, count: int) -> range:

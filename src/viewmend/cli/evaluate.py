@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, ViewOptions, check_device, check_least
+from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_device, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -69,8 +69,9 @@ class RunOptions:
     """Address of a Ray cluster that does the work instead: HOST:PORT, auto, or local (needs viewmend[ray])."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of viewmend's own networks."""
+    precision: Precision = "auto"
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
+    same on a machine."""
     shown: int = 12
     """Scenes of each set with images in report.html; sheets/ has all of them."""
 

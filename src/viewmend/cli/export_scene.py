@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, check_least
+from viewmend.cli.checks import Precision, PreparationOptions, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -47,6 +47,9 @@ class Options:
     preparation: Annotated[PreparationOptions, FLAT] = field(default_factory=PreparationOptions)
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
+    precision: Precision = "auto"
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
+    same on a machine."""
 
 
 def run(options: Options) -> int:
@@ -65,7 +68,7 @@ def run(options: Options) -> int:
     check_openexr()
     opened = open_masked(options.capture, format=options.format)
     times = chosen_times(options.frames, len(opened.frame_ids))
-    stream = Stream(load_named(options.model, options.device), bounds=opened.bounds)
+    stream = Stream(load_named(options.model, options.device, options.precision), bounds=opened.bounds)
     with OutputFolder(options.out) as folder:
         folder.check_own_files(*RESULTS)
         prepared, size = asdict(options.preparation), options.max_image_size

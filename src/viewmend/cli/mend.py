@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, ViewOptions, check_least
+from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least
 from viewmend.training.config import FLAT
 
 if TYPE_CHECKING:
@@ -70,6 +70,9 @@ class Options:
     It is the hull's depth if the model predicts none."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
+    precision: Precision = "auto"
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
+    same on a machine."""
     json: bool = False
     """Write the scores to standard output as one JSON object, and nothing else."""
 
@@ -94,7 +97,7 @@ def run(options: Options) -> int:
     opened = _open(options, held)
     times = chosen_times(options.frames, len(opened.frame_ids))
     usable = _usable(opened, times, held)
-    inpainter = load_named(options.model, options.device)
+    inpainter = load_named(options.model, options.device, options.precision)
     inputs = [name for name in opened.cameras.names if name not in held]
     capture = prepare(opened, inputs, **asdict(options.preparation), first=usable[0], last=usable[-1])
     log_preparation(capture)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 
-from viewmend.cli.checks import PreparationOptions, ViewOptions, check_least
+from viewmend.cli.checks import Precision, PreparationOptions, ViewOptions, check_least
 from viewmend.training.config import FLAT
 from viewmend.utils.plugins import import_object
 
@@ -87,6 +87,9 @@ class Options:
     """With 'studio': seed of the scene; by default one that no model was trained with."""
     device: str = "cpu"
     """Device to compute on: cpu or cuda."""
+    precision: Precision = "auto"
+    """Number format of viewmend's own networks. auto is bfloat16 where model and device are made for it, and always the
+    same on a machine."""
     memory_mb: float = 3000.0
     """Memory for frames and what is computed from them; with --ray, half of it is the processes' shared memory."""
 
@@ -94,8 +97,6 @@ class Options:
 def run(options: Options) -> int:
     """Serve until interrupted."""
     _check(options)
-    # Before torch is imported: idle threads must not spin on cores that a browser may need.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**26))  # of a pushed image
     if options.ray is not None:
         _serve_on_ray(options, options.ray)
@@ -113,7 +114,15 @@ def run(options: Options) -> int:
     source = open_source(options)
     inpainter, device = load_inpainter(options), options.device
     errors, in_page = error_model_for(inpainter, device), config.draws_in_page
-    renderer = Renderer(source, inpainter, stream_config(options), device, errors, draws_in_page=in_page)
+    renderer = Renderer(
+        source,
+        inpainter,
+        stream_config(options),
+        device,
+        errors,
+        draws_in_page=in_page,
+        precision=options.precision,
+    )
     live = LiveServer(RenderService(renderer, source), config)
     server = Server(live, config)
     with server.bind() as address:
@@ -183,7 +192,7 @@ def load_inpainter(options: Options) -> "Inpainter":
     """Load the model; with --ray, in each process that renders."""
     from viewmend.cli.checks import load_named
 
-    return load_named(options.model, options.device)
+    return load_named(options.model, options.device, options.precision)
 
 
 def _token(options: Options) -> str | None:

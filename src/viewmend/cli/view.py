@@ -1,6 +1,5 @@
 """`viewmend view`: a capture in the browser, opened at once."""
 
-import os
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +24,6 @@ class Options:
 
 def run(options: Options) -> int:
     """Serve on a free port until interrupted."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported: the browser needs cores, too
     from viewmend.cli.checks import check_least, load_named, log_preparation
     from viewmend.cli.console import say
     from viewmend.data.prepare import open_masked, prepare

@@ -97,13 +97,25 @@ class Renderer:
         device: str = "cpu",
         error_model: Inpainter | None = None,
         draws_in_page: bool = True,
+        precision: str = "auto",
     ) -> None:
-        """Set up; `error_model` as in `Stream`, and whether pages draw moving views by themselves."""
+        """Set up the renderer.
+
+        Args:
+            source: where frames come from.
+            inpainter: the model that completes views, unless a viewer compares another.
+            config: parameters of geometry, rendering and memory.
+            device: cpu or cuda.
+            error_model: as in `Stream`.
+            draws_in_page: whether pages draw moving views by themselves.
+            precision: number format of models that viewers compare, as in `load_inpainter`.
+        """
         self._source = source
         self._inpainter, self._error_model = inpainter, error_model
         self._config = config or StreamConfig()
         self.ladder = ladder_for(inpainter)
         self._device = device
+        self._precision = precision
         self._draws_in_page = draws_in_page
         self._rig: RigInfo | None = None
         self._stream: Stream | None = None
@@ -244,7 +256,7 @@ class Renderer:
             inpainter, errors = self._inpainter, self._error_model
             if model is not None:  # by the error rule that it is made for
                 if model not in self._models:
-                    self._models[model] = load_inpainter(model, self._device)
+                    self._models[model] = load_inpainter(model, self._device, self._precision)
                 inpainter, errors = self._models[model], errors if errors is not None else self._inpainter
                 config = replace(config, render=replace(config.render, error_rule=None))
             self._variants[key] = Stream(inpainter, config, self._stream.bounds, errors)

@@ -51,7 +51,8 @@ def load_inpainter(name_or_path: str | Path, device: torch.device | str = "cpu",
         name_or_path: one of `shipped_models()`, or a folder written by `save_inpainter` (./NAME if both
             exist and the folder is meant).
         device: where it runs.
-        precision: float32, bfloat16 (by autocast), or auto: bfloat16 for models trained in it, if clearly faster here.
+        precision: float32, bfloat16 (by autocast), or auto: bfloat16 for models trained in it, if the device has units
+            for it.
 
     Raises:
         MissingCheckpointError: there is no such folder or name, or a file is missing.

@@ -1,19 +1,16 @@
 """Base class of all networks, and the precision that they compute in."""
 
 from contextlib import AbstractContextManager, nullcontext
-from functools import lru_cache
 
 import torch
 from torch import nn
 
 from viewmend.models.base import Inpainter
 from viewmend.models.compositing import Background
-from viewmend.utils.timing import ms_since, now_s
 
-MIN_SPEEDUP = 1.5
-"""bfloat16 is used where it is at least this many times faster. A smaller difference may be noise, so that images would
-differ from run to run."""
-ROUNDS = 8
+BFLOAT16_UNITS = ("amx_bf16", "avx512_bf16")
+"""Features of x86 processors with which layers are faster in bfloat16 than in float32: 5 to 7 times with matrix units
+(AMX), 1.7 to 1.9 times with vectors of 512 bits. Without either, bfloat16 is up to ten times slower."""
 
 
 class Network(nn.Module, Inpainter):
@@ -40,34 +37,20 @@ def set_compute_dtype(model: nn.Module, dtype: torch.dtype) -> None:
 
 
 def auto_dtype(model: nn.Module) -> torch.dtype:
-    """bfloat16 for a model trained in it, if it is clearly faster on the model's device; else float32."""
+    """bfloat16 for a model trained in it, if it is faster on the model's device; else float32."""
     if not (isinstance(model, Network) and model.trained_in_bfloat16):
         return torch.float32
     return faster_dtype(next(model.parameters()).device)
 
 
 def faster_dtype(device: torch.device) -> torch.dtype:
-    """bfloat16 if it is clearly faster on the device, else float32; on a GPU, bfloat16 if it has units for it."""
-    if device.type == "cuda":  # the convolution that is measured is too small to be limited by computing there
-        return torch.bfloat16 if torch.cuda.is_bf16_supported(including_emulation=False) else torch.float32
-    return torch.bfloat16 if bfloat16_speedup(device) > MIN_SPEEDUP else torch.float32
+    """bfloat16 if the device has units for it, else float32.
 
-
-@lru_cache
-def bfloat16_speedup(device: torch.device) -> float:
-    """How many times faster a convolution of a view's size is in bfloat16 than in float32; measured once, 0.1 s.
-
-    About 5 to 7 on CPUs with matrix units, and as low as 0.1 on those without. The two alternate, and the fastest run
-    of each counts, which makes the result less dependent on other load.
+    Nothing is timed, so that a machine always chooses the same format, whatever else it is doing.
     """
-    layer = nn.Conv2d(48, 48, 3, padding=1, device=device)
-    image = torch.zeros(1, 48, 128, 128, device=device).contiguous(memory_format=torch.channels_last)
-
-    def took_ms(dtype: torch.dtype) -> float:
-        start = now_s(device)
-        with torch.no_grad(), torch.autocast(device.type, dtype, enabled=dtype != torch.float32):
-            layer(image)
-        return ms_since(start, device)
-
-    rounds = [(took_ms(torch.float32), took_ms(torch.bfloat16)) for _ in range(1 + ROUNDS)]
-    return min(float32 for float32, _ in rounds[1:]) / min(bfloat16 for _, bfloat16 in rounds[1:])
+    if device.type == "cuda":
+        has_units = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        features = torch.cpu.get_capabilities()
+        has_units = any(features.get(unit, False) for unit in BFLOAT16_UNITS)
+    return torch.bfloat16 if has_units else torch.float32

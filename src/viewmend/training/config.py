@@ -150,7 +150,8 @@ class TrainConfig:
     workers: int = 1
     """Processes that generate samples, for each training process."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Number format in which the networks compute: bfloat16 by autocast, float32, or whichever is faster here."""
+    """Number format in which the networks compute: bfloat16 by autocast, float32, or auto: bfloat16 if the
+    device has units for it."""
     checkpoint_minutes: float = 5.0
     """Minutes between checkpoints, from which the same command resumes; 0 writes one after every step."""
     validate_every: int = 500
