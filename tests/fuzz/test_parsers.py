@@ -21,7 +21,6 @@ from reference.foreign_images import write_agisoft, write_middlebury
 from reference.foreign_rigs import write_opencv, write_qualisys, write_toml
 from reference.random_rigs import named, random_rig
 
-from viewmend.contrib import riftcast
 from viewmend.data.camera_path import read_camera_path
 from viewmend.data.images import read_mask, read_rgb
 from viewmend.data.native_capture import open_capture
@@ -179,14 +178,6 @@ def test_live_messages():
     fuzz(mutated_json(look).map(to_json), parse_look)
     fuzz(mutated_json(rig).map(to_json), lambda data: read_message(data, RigMessage))
     fuzz(mutated_bytes(binary), lambda data: unpack(data, "images"))
-
-
-def test_riftcast_messages():
-    matrices = [np.eye(4), np.array([[2.0, 0, 0, 0], [0, 2, 0, 0], [0, 0, -1, -0.02], [0, 0, -1, 0]])]
-    body = b"".join(struct.pack(">I", 64) + np.asarray(m, "<f4").T.tobytes() for m in matrices)
-    good = struct.pack("<HHi", 1, 3, 3) + struct.pack(">II", 48, 48) + body
-    assert isinstance(riftcast.parse(good), riftcast.ImageRequest)
-    fuzz(mutated_bytes(good), riftcast.parse)
 
 
 def test_manifests(tmp_path):

@@ -67,8 +67,6 @@ class Options:
     view: Annotated[ViewOptions, FLAT] = field(default_factory=ViewOptions)
     viewers: int = 8
     """Maximum number of viewers; with --ray, per replica."""
-    riftcast_port: int | None = None
-    """Port on this machine for RIFTCast's own clients."""
     broadcast: str | None = None
     """Also broadcast one viewer's view to everyone at /watch, as a video of this size: WIDTHxHEIGHT."""
     ray: str | None = None
@@ -143,14 +141,12 @@ def _check(options: Options) -> None:
     checks = [
         ("fps", options.fps is None or 0 < options.fps <= 240, "above 0 and at most 240"),
         ("port", 0 <= options.port <= 65535, "from 0 to 65535"),
-        ("riftcast_port", 0 <= (options.riftcast_port or 0) <= 65535, "from 0 to 65535"),
     ]
     for name, is_valid, limit in checks:
         if not is_valid:
             raise ValueError(f"--{name.replace('_', '-')} must be {limit}, got {getattr(options, name)}")
-    for flag, value in (("--riftcast-port", options.riftcast_port), ("--broadcast", options.broadcast)):
-        if value is not None and options.ray is not None:
-            raise ValueError(f"expected {flag} or --ray, got both; {flag} needs a server of one process")
+    if options.broadcast is not None and options.ray is not None:
+        raise ValueError("expected --broadcast or --ray, got both; --broadcast needs a server of one process")
     if options.ray is not None and options.source == "live":
         raise ValueError(
             "expected a capture, rig.toml or studio with --ray, got live: a rig would push to one process only; "
@@ -167,7 +163,7 @@ def server_config(options: Options) -> "ServerConfig":
 
     token = _token(options)
     AccessControl(options.host, token, options.public_url)
-    values = {"broadcast": options.broadcast, "riftcast": options.riftcast_port}
+    values = {"broadcast": options.broadcast}
     return ServerConfig(
         host=options.host,
         port=options.port,
