@@ -161,3 +161,20 @@ def test_sigterm_lets_a_command_clean_up(tmp_path):
         process.terminate()
         assert process.wait(20) == 143
     assert (tmp_path / "a").read_text() == "cleaned"
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii", "cp932:strict"])
+def test_letters_that_the_output_cannot_show_are_escaped(encoding):
+    program = (
+        "import sys; from viewmend.cli import check, main; from viewmend.cli.console import say, show\n"
+        "check.run = lambda options: show(str(options.capture)) or say(str(options.capture)) or 0\n"
+        "sys.exit(main(['check', 'カメラ Łódź ü']))"
+    )
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment, check=False)
+    assert done.returncode == 0 and done.stderr.strip() == done.stdout.strip()
+    shown = done.stdout.decode(encoding.partition(":")[0]).strip()
+    assert (
+        shown.encode("ascii", "backslashreplace").decode()
+        == "カメラ Łódź ü".encode("ascii", "backslashreplace").decode()
+    )

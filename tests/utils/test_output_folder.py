@@ -1,6 +1,8 @@
 """One run at a time, and nobody's files are replaced but our own."""
 
 import contextlib
+import errno
+import os
 import shutil
 import signal
 import subprocess
@@ -196,3 +198,36 @@ def test_a_report_that_was_killed_half_way_is_made_again(tmp_path):
     with pytest.raises(ValueError, match=r"report\.csv"), report_folder(out):
         pass
     assert (out / "report.csv").read_text() == "mine"
+
+
+WITHOUT_LOCKS = [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL, errno.EIO]
+
+
+@pytest.mark.parametrize("code", WITHOUT_LOCKS, ids=errno.errorcode.get)
+def test_a_file_system_without_locks_is_used_and_reported(code, tmp_path, monkeypatch, caplog):
+    def flock(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    published(tmp_path / "out")
+    assert seen(tmp_path / "out") == ["pictures/0.png", "pictures/1.png", "sheet.png"]
+    assert [path.name for path in (tmp_path / "out/.viewmend").iterdir()] == ["files.json"]
+    (message,) = (record.message for record in caplog.records)
+    assert str(tmp_path / "out") in message and "no file locks" in message and "local disk" in message
+    with OutputFolder(tmp_path / "out"):
+        in_use = pytest.raises(ValueError, match="in use; wait for that run to finish")
+        with in_use, OutputFolder(tmp_path / "out"):
+            pass
+    published(tmp_path / "out", ("0",))
+
+
+def test_a_killed_run_does_not_block_a_folder_without_locks(tmp_path):
+    program = (
+        "import fcntl, os, sys; from pathlib import Path; from viewmend.utils.output_folder import OutputFolder\n"
+        "def flock(*_): raise OSError(37, 'No locks available')\n"
+        "fcntl.flock = flock; OutputFolder(Path(sys.argv[1])).__enter__()\n"
+        "if sys.argv[2] == 'killed': os.kill(os.getpid(), 9)\n"
+    )
+    for way in ("killed", "again"):
+        done = subprocess.run([sys.executable, "-c", program, str(tmp_path / "out"), way], check=False)
+        assert done.returncode == {"killed": -9, "again": 0}[way]

@@ -1,6 +1,7 @@
 """Messages and progress on standard error, results on standard output, and signals that end a command."""
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -92,6 +93,17 @@ class Heartbeat:
 def say(message: str) -> None:
     """Print a line for the user to standard error."""
     print(printable(message), file=sys.stderr, flush=True)
+
+
+def escape_unencodable() -> None:
+    """Make standard output and error escape the characters that their encoding lacks.
+
+    Names of cameras and folders may have letters of any script, but the encoding of a console or pipe may be as small
+    as cp1252 or ASCII.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def show(*lines: str) -> None:

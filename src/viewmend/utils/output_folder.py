@@ -2,19 +2,25 @@
 
 import contextlib
 import json
+import logging
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 
 import msgspec
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from viewmend.utils.atomic_writes import defer_signals, remove_partial_files, write_text
 from viewmend.utils.untrusted_input import file_sha256
 
 HIDDEN = ".viewmend"
 """Subfolder for the lock, the manifest and unfinished files."""
+LOCK = "lock"
+"""Name of the file that a run locks."""
+MARKER = "in-use"
+"""Name of the file that marks the folder as in use, on a file system without locks."""
 
 
 class _Manifest(msgspec.Struct):
@@ -33,7 +39,7 @@ class OutputFolder:
         self.draft = path / HIDDEN / "draft"
         """Subfolder for unfinished files; empty on entry, removed on exit."""
         self._manifest = path / HIDDEN / "files.json"
-        self._lock = FileLock(path / HIDDEN / "lock")
+        self._lock: BaseFileLock | None = None
         self._new = False
 
     def __enter__(self) -> "OutputFolder":
@@ -41,7 +47,7 @@ class OutputFolder:
 
         Raises:
             ValueError: another run is using it, it is a file, or its hidden subfolder is a link or a file.
-            OSError: it cannot be created.
+            OSError: it cannot be created or written to.
         """
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path}: expected a folder for the results, got a file; choose another --out")
@@ -49,13 +55,7 @@ class OutputFolder:
             raise ValueError(f"{hidden}: expected a folder that a run has made, got something else; move it away")
         self._new = not self.path.exists()
         (self.path / HIDDEN).mkdir(parents=True, exist_ok=True)
-        try:
-            self._lock.acquire(timeout=0)
-        except Timeout:
-            raise ValueError(
-                f"{self.path}: expected a folder that no other run is using, got one in use; wait for that run to "
-                "finish, or choose another folder"
-            ) from None
+        self._lock = _acquire_lock(self.path)
         shutil.rmtree(self.draft, ignore_errors=True)
         remove_partial_files(self.path)
         self.draft.mkdir()
@@ -69,7 +69,9 @@ class OutputFolder:
                 shutil.rmtree(self.path, ignore_errors=True)
             elif not self._manifest.exists():
                 shutil.rmtree(self.path / HIDDEN, ignore_errors=True)
-            self._lock.release()
+            if self._lock is not None:
+                self._lock.release()
+                self._lock = None
 
     @property
     def listed(self) -> bool:
@@ -138,6 +140,45 @@ class OutputFolder:
 
     def _write(self, files: dict[str, list[str]]) -> None:
         write_text(self._manifest, json.dumps({"made by": "viewmend", "files": files}, indent=1, sort_keys=True))
+
+
+def _acquire_lock(folder: Path) -> BaseFileLock:
+    """Lock an output folder; without locks on its file system, a marker file does the same, which is reported once.
+
+    Raises:
+        ValueError: another run is using the folder.
+        OSError: the folder cannot be written to.
+    """
+    in_use = f"{folder}: expected a folder that no other run is using, got one in use; wait for that run to finish"
+    lock = FileLock(folder / HIDDEN / LOCK)
+    try:
+        with warnings.catch_warnings(record=True) as fallback:  # where the call is missing, filelock makes a marker
+            warnings.simplefilter("always")
+            lock.acquire(timeout=0)
+        if fallback:
+            _warn_without_locks(folder, LOCK, "not implemented")
+        return lock
+    except Timeout:
+        raise ValueError(f"{in_use}, or choose another folder") from None
+    except OSError as error:  # network file systems often have no locks
+        reason = error.strerror
+    with contextlib.suppress(OSError):
+        (folder / HIDDEN / LOCK).unlink()
+    marker = SoftFileLock(folder / HIDDEN / MARKER)
+    try:
+        marker.acquire(timeout=0)
+    except Timeout:
+        path = folder / HIDDEN / MARKER
+        raise ValueError(f"{in_use}; if none is running, remove {path}; or choose another folder") from None
+    _warn_without_locks(folder, MARKER, reason)
+    return marker
+
+
+def _warn_without_locks(folder: Path, marker: str, reason: str) -> None:
+    logging.getLogger("viewmend").warning(
+        f"{folder}: its file system has no file locks ({reason}), so the file {HIDDEN}/{marker} marks the folder as in "
+        "use; if other machines write to the same folder at the same time, use a local disk"
+    )
 
 
 def _below(root: Path, names: Iterable[str]) -> Iterator[Path]:
