@@ -17,9 +17,10 @@ from viewmend import serve
 from viewmend.cli import main, view
 from viewmend.data.native_writer import write_capture
 from viewmend.data.synthetic.stage import Studio, StudioConfig
-from viewmend.live.connection import SessionRegistry, ViewerConnection
+from viewmend.live.connection import ViewerConnection
 from viewmend.live.frame_source import SourceStatus, Span
 from viewmend.live.protocol import Limits
+from viewmend.live.registry import SessionRegistry
 from viewmend.live.service import RenderService
 from viewmend.live.viewer import Viewer
 from viewmend.models.smooth_fill import SmoothFill
@@ -80,7 +81,7 @@ async def test_what_is_shown_while_the_first_page_opens_reaches_it():
     source = Mock(span=Span(), status=SourceStatus())
     service = Mock(spec=RenderService, source=source, renderer=Mock(rig_json=None), error=None, now=lambda: 0.0)
     registry, page, shown = SessionRegistry(service, Limits(), None, {}), Mock(spec=ViewerConnection), []
-    page.inform.side_effect = lambda common: shown.append(common[1]) or math.inf
+    page.inform.side_effect = lambda shared: shown.append(shared.show) or math.inf
     registry.join(page)
     registry.shown = {"type": "show", "time": 1}
     end = time.monotonic() + WAIT_S

@@ -21,8 +21,8 @@ from starlette.responses import Response
 
 from viewmend.data.videos import tag_colours
 from viewmend.geometry.threads import light_operations
-from viewmend.live.connection import Extension
 from viewmend.live.encoding import Image, draw_mode
+from viewmend.live.extension import Extension
 from viewmend.live.protocol import Camera, FrameTimes, Limits, Look, Message, OnAir, token_query
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.live.responses import error_response, label, metric
@@ -213,7 +213,8 @@ class BroadcastSession(ViewerSession):
 
     def deliver(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Keep the image, and record its times."""
-        start, look = time.perf_counter(), self._requested[0]
+        start = time.perf_counter()
+        look = self.requested.look
         assert look is not None, "a view is rendered for a look"
         self.viewer: State | None = result.viewer
         completed, extra = next(result.eyes)
@@ -223,7 +224,7 @@ class BroadcastSession(ViewerSession):
             if self._is_open:
                 self.image = image
         times = FrameTimes(**vars(result.times), encode=1000 * (time.perf_counter() - start))
-        self._record(look, times, size_bytes=0)
+        self.record(look, times, size_bytes=0)
         return times
 
 

@@ -1,141 +1,30 @@
-"""One viewer's WebSocket: a task that reads and one that writes; one task for all sends states and statistics."""
+"""One viewer's WebSocket: one task reads its messages, another one sends frames, states and errors."""
 
 import asyncio
 import contextlib
-import itertools
 import json
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from starlette.requests import Request
-from starlette.responses import Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from viewmend.live import protocol
 from viewmend.live.auth import RateLimit
-from viewmend.live.protocol import Ack, Cancel, ClockChange, Hello, Limits, Look, Message, Ping, ProtocolError
-from viewmend.live.service import RenderService
+from viewmend.live.protocol import Ack, Cancel, ClockChange, Hello, Look, Message, Ping, ProtocolError
+from viewmend.live.registry import SessionRegistry, SharedState
 from viewmend.live.sessions import ViewerSession
 from viewmend.rendering.error_mask import ERROR_RULES
 
 HELLO_S = 10.0
-"""Time for a client's first message."""
+"""A client has this many seconds for its first message."""
 ACK_S = 30.0
-"""Time for the acknowledgement of a frame."""
-FAULTS = (1.0, 19.0)
-"""Malformed messages per second, and at once, that do not end a connection."""
-TICK_S, LIVE_TICK_S = 0.25, 0.1
-"""Seconds between checks of what viewers have to know; while a rig pushes frames, it is also checked after each."""
+"""A client has this many seconds to acknowledge a frame."""
+FAULTS_PER_S = 1.0
+"""A client may send this many malformed messages a second on average."""
+FAULTS_AT_ONCE = 19.0
+"""A client may send this many malformed messages at once."""
 STATE_S = 300.0
-"""Time after which a state is sent again though nothing has changed; pages continue its clock by themselves."""
-
-
-Common = tuple[dict[str, Any], dict[str, Any] | None, dict[str, Any] | None, int]
-"""See `SessionRegistry.common`."""
-
-
-class Extension:
-    """An optional part of the live server; by default, every method does nothing."""
-
-    notice: str | None = None
-    """What `viewmend serve` prints after the address; {address} and {query} are replaced."""
-
-    def routes(self) -> Mapping[str, Callable[[Request], Awaitable[Response]]]:
-        """Handlers of GET requests by path; the server checks token and origin."""
-        return {}
-
-    def running(self) -> contextlib.AbstractAsyncContextManager[None]:
-        """A context that the server holds while it serves."""
-        return contextlib.nullcontext()
-
-    def welcome_json(self) -> dict[str, Any]:
-        """Fields of the message `welcome`."""
-        return {}
-
-    def state_json(self, session: ViewerSession) -> dict[str, Any]:
-        """Fields of a viewer's message `state`."""
-        return {}
-
-    def handle(self, session: ViewerSession, message: Message) -> bool:
-        """Use a viewer's message, under the service's lock; False if it is of no use."""
-        return False
-
-    def leave(self, session: ViewerSession) -> None:
-        """Note that a viewer has left, under the service's lock."""
-
-    def metrics(self) -> list[str]:
-        """Lines for /metrics."""
-        return []
-
-
-@dataclass
-class SessionRegistry:
-    """The sessions of all viewers, and what their connections share."""
-
-    service: RenderService
-    limits: Limits
-    budget_ms: float | None
-    about: dict[str, Any]
-    """Fields of the message `welcome` that are the same for all viewers."""
-    extensions: Sequence[Extension] = ()
-    sessions: list[ViewerSession] = field(default_factory=list)
-    connections: "dict[ViewerConnection, float]" = field(default_factory=dict)
-    """Those that have said hello, each with the time before which nothing is due on it unless something changes."""
-    numbers: "itertools.count[int]" = field(default_factory=itertools.count)
-    shown: dict[str, Any] | None = None
-    """The message `show` that moves all pages, also those that will be opened; set on any thread."""
-
-    _informer: "asyncio.Task[None] | None" = None
-
-    def join(self, connection: "ViewerConnection") -> None:
-        """Inform a viewer from now on."""
-        common = self.common()
-        self.connections[connection] = connection.inform(common)
-        if self._informer is None or self._informer.done():
-            self._informer = asyncio.create_task(self._inform(common))
-
-    async def _inform(self, common: Common) -> None:
-        """Let all connections send what is due, while there are any; they have been informed of `common`."""
-        news, loop = asyncio.Event(), asyncio.get_running_loop()
-
-        def note() -> None:
-            with contextlib.suppress(RuntimeError):  # the event loop has ended
-                loop.call_soon_threadsafe(news.set)
-
-        self.service.changed = note
-        while self.connections:
-            news.clear()
-            is_new, now = (newest := self.common()) != common, self.service.now()
-            common = newest if is_new else common
-            for connection in [each for each, due_s in self.connections.items() if is_new or due_s <= now]:
-                try:
-                    self.connections[connection] = connection.inform(common)
-                except Exception as error:  # ends this connection only
-                    connection.fail(error)
-            if self.service.source.span.live:  # a rig's frames are announced at once
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(news.wait(), LIVE_TICK_S)
-            else:
-                await asyncio.sleep(TICK_S)
-
-    def common(self) -> Common:
-        """What is the same for all viewers: their part of `state`, the messages `show` and `rig`, and their number."""
-        return self.source_json(), self.shown, self.service.renderer.rig_json, len(self.sessions)
-
-    def source_json(self) -> dict[str, Any]:
-        """The part of the message `state` that is the same for all viewers."""
-        service, span, status = self.service, self.service.source.span, self.service.source.status
-        return {
-            "source": "loading" if status.state == "ready" and not service.is_ready else status.state,
-            "error": status.error or service.error,
-            "model_error": service.renderer.model_error,
-            "first": span.first,
-            "end": span.end,
-            "total": span.total,
-            "loops": not span.live,
-            "kind": "live" if span.live else "recording",
-        }
+"""A state is sent again after this many seconds though nothing has changed: the clocks of pages drift."""
 
 
 @dataclass
@@ -152,31 +41,67 @@ async def close_with_error(socket: WebSocket, code: int, message: str) -> None:
     await socket.close(code)
 
 
+@dataclass(frozen=True)
+class StateCauses:
+    """What a message `state` follows from; a new one is considered when this has changed."""
+
+    shared: SharedState
+    clock_changes: int
+    buffering: bool
+
+
+@dataclass(frozen=True)
+class StateContent:
+    """What a page cannot predict of a message `state`; one with the same content is not sent."""
+
+    source: dict[str, Any]
+    clock_changes: int
+    own: dict[str, Any]
+    """The viewer's own fields, without those that its running clock changes."""
+
+
+@dataclass
+class SentMessages:
+    """What a viewer was sent last."""
+
+    rig: dict[str, Any] | None = None
+    show: dict[str, Any] | None = None
+    causes: StateCauses | None = None
+    state: StateContent | None = None
+    state_s: float = -STATE_S
+    """The time of the last message `state`."""
+    stats_s: float = -STATE_S
+    """The time of the last message `stats`."""
+    viewers: int = 0
+    """The number of viewers in the last message `stats`."""
+
+
 class ViewerConnection:
     """Reads a viewer's messages, and sends it frames, states and errors."""
 
     def __init__(self, socket: WebSocket, registry: SessionRegistry) -> None:
-        self._socket, self._registry, self._service = socket, registry, registry.service
-        self._now, self._loop = registry.service.now, asyncio.get_running_loop()
+        self._socket = socket
+        self._registry = registry
+        self._service = registry.service
+        self._now = registry.service.now
+        self._loop = asyncio.get_running_loop()
         self._wake_writer = asyncio.Event()
         self._pending: dict[str, dict[str, Any]] = {}
+        """Messages that wait for the writer, by type."""
         self._frame: bytes | None = None
-        rate = registry.limits.messages_per_s
-        self._rate, self._faults = RateLimit(rate, 2 * rate, self._now), RateLimit(*FAULTS, self._now)
-        self._rig: dict[str, Any] | None = None
-        self._shown: dict[str, Any] | None = None
+        """The frame that waits for the writer."""
+        messages_per_s = registry.limits.messages_per_s
+        self._messages = RateLimit(messages_per_s, 2 * messages_per_s, self._now)
+        self._faults = RateLimit(FAULTS_PER_S, FAULTS_AT_ONCE, self._now)
         self._failed: asyncio.Future[None] = self._loop.create_future()
-        self._seen: tuple[Any, ...] = ()
-        self._state: tuple[Any, ...] = ()
-        self._state_at = self._stats_at = -STATE_S
-        self._viewers = 0
-        """Viewers in the last statistics."""
+        self._sent = SentMessages()
         ladder = registry.service.renderer.ladder
         self._session = ViewerSession(self._send_frame, self._report_error, registry.budget_ms, ladder, self._now)
 
     async def run(self) -> None:
         """Serve an accepted socket until it ends."""
-        sessions, limit = self._registry.sessions, self._registry.limits.viewers
+        sessions = self._registry.sessions
+        limit = self._registry.limits.viewers
         try:
             if len(sessions) >= limit:
                 raise ClosingError(4503, f"expected at most {limit} viewers; try again later")
@@ -250,13 +175,12 @@ class ViewerConnection:
         while True:
             try:
                 text = await self._receive()
-                if not self._rate.allow():
-                    await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
-                    self._count_fault(
-                        4429, f"expected at most {self._registry.limits.messages_per_s} messages a second; send fewer"
-                    )
+                if self._messages.allow():
+                    self._handle(protocol.parse(text, self._registry.limits))
                     continue
-                self._handle(protocol.parse(text, self._registry.limits))
+                await asyncio.sleep(0.05)  # nothing is read meanwhile, which slows the client down
+                limit = self._registry.limits.messages_per_s
+                self._count_fault(4429, f"expected at most {limit} messages a second; send fewer")
             except ProtocolError as error:
                 self._count_fault(4400, str(error))
 
@@ -272,26 +196,35 @@ class ViewerConnection:
             return
         if isinstance(message, Hello):
             raise ProtocolError("expected one hello, got a second; send it once")
-        if isinstance(message, Look) and message.codec not in self._registry.about["codecs"]:
-            raise ProtocolError(f"expected a codec among {self._registry.about['codecs']}, got '{message.codec}'")
+        codecs = self._registry.about["codecs"]
+        if isinstance(message, Look) and message.codec not in codecs:
+            raise ProtocolError(f"expected a codec among {codecs}, got '{message.codec}'")
         with self._service.lock:
-            if isinstance(message, Look):
-                self._session.look(message)
-            elif isinstance(message, Cancel):
-                self._session.cancel()
-            elif isinstance(message, Ack):
-                self._session.ack(message.frame)
-            elif isinstance(message, ClockChange):
-                self._session.change_clock(message, self._service.source.span, self._service.edge)
-            used = [extension.handle(self._session, message) for extension in self._registry.extensions]
-            if not any(used) and not isinstance(message, Look | Cancel | Ack | ClockChange):
+            is_known = self._update_session(message)
+            uses = [extension.handle(self._session, message) for extension in self._registry.extensions]
+            if not is_known and not any(uses):
                 raise ProtocolError(
                     "expected a server that broadcasts, got one that does not; start it with --broadcast"
                 )
             self._service.lock.notify_all()
         if isinstance(message, ClockChange):
-            self.inform(self._registry.common())
-        self._registry.connections[self] = 0.0
+            self.inform(self._registry.shared_state())
+        self._registry.connections[self] = 0.0  # a check is due
+
+    def _update_session(self, message: Message) -> bool:
+        """Apply a message to the viewer's session, under the service's lock; False if it is none of the session's."""
+        match message:
+            case Look():
+                self._session.look(message)
+            case Cancel():
+                self._session.cancel()
+            case Ack():
+                self._session.ack(message.frame)
+            case ClockChange():
+                self._session.change_clock(message, self._service.source.span, self._service.edge)
+            case _:
+                return False
+        return True
 
     async def _write(self) -> None:
         while True:
@@ -299,60 +232,77 @@ class ViewerConnection:
             self._wake_writer.clear()
             while self._pending or self._frame is not None:
                 while self._pending:
-                    await self._socket.send_text(json.dumps(self._pending.pop(next(iter(self._pending)))))
+                    oldest = next(iter(self._pending))
+                    message = self._pending.pop(oldest)
+                    await self._socket.send_text(json.dumps(message))
                 if self._frame is not None:
-                    frame, self._frame = self._frame, None
+                    frame = self._frame
+                    self._frame = None  # the render thread may set the next one while this one is sent
                     await self._socket.send_bytes(frame)
 
-    def inform(self, common: Common) -> float:
+    def inform(self, shared: SharedState) -> float:
         """Send rig, state and statistics if they are due, and end a connection that acknowledges no frames.
 
-        `common` is the same object while it is equal. Returns the time before which this need not be called again,
-        unless `common` changes or the viewer sends something.
+        Returns the time before which this need not be called again, unless `shared` changes or the viewer sends a
+        message.
         """
-        session, (shared, shown, _, viewers) = self._session, common
-        span, now = self._service.source.span, self._now()
+        session = self._session
+        now = self._now()
         self._send_new_rig()
-        catches_up = span.live and session.clock.playing and not session.clock.live
-        changing = bool(self._registry.extensions) or catches_up  # at any time
-        seen = (common, session.clock_changes, session.buffering)
-        if seen != self._seen or changing or now - self._state_at >= STATE_S:
-            self._seen = seen
-            self._send_state(shared)
-        if self._rig is not None and shown is not self._shown and shown:
-            self._shown = shown
-            self._send_soon(shown)
-        if now - self._stats_at >= 1 and (viewers != self._viewers or session.sent_since(self._stats_at - 1)):
-            self._stats_at, self._viewers = now, viewers
-            self._send_soon(session.stats_json(viewers))
+
+        # The position of a clock that catches up with a live edge cannot be predicted, nor can states of extensions.
+        catches_up = self._service.source.span.live and session.clock.playing and not session.clock.live
+        always_changes = bool(self._registry.extensions) or catches_up
+        causes = StateCauses(shared, session.clock_changes, session.buffering)
+        if causes != self._sent.causes or always_changes or now - self._sent.state_s >= STATE_S:
+            self._sent.causes = causes
+            self._send_state(causes)
+
+        if self._sent.rig is not None and shared.show and shared.show is not self._sent.show:
+            self._sent.show = shared.show
+            self._send_soon(shared.show)
+        self._send_statistics(shared.viewers)
         if session.in_flight is not None and now - session.in_flight_since > ACK_S:
             self.fail(ClosingError(4408, f"expected an ack within {ACK_S:g} s; reconnect"))
+
         gets_views = session.wants_views or session.in_flight is not None or session.sent_since(now - 2)
-        is_steady = self._viewers == viewers and not changing and not gets_views
-        return self._state_at + STATE_S if is_steady else now
+        is_steady = self._sent.viewers == shared.viewers and not always_changes and not gets_views
+        return self._sent.state_s + STATE_S if is_steady else now
 
     def fail(self, error: Exception) -> None:
         """End the connection."""
         if not self._failed.done():
             self._failed.set_exception(error)
 
-    def _send_state(self, shared: dict[str, Any]) -> None:
-        """Send a state, unless it is what a viewer expects after the last one: clocks run on."""
-        source, now = self._service.source, self._now()
+    def _send_state(self, causes: StateCauses) -> None:
+        """Send a state, unless the page predicts it from the last one: its clock runs on."""
+        source = self._service.source
+        now = self._now()
         with self._service.lock:
             own = self._session.state_json(source.span, self._service.edge)
         for extension in self._registry.extensions:
             own |= extension.state_json(self._session)
-        expected = ("behind",) if source.span.live else ("time", "behind")  # a rig's frames are announced
-        state = (shared, self._seen[1], {key: own[key] for key in own if key not in expected})
-        if state != self._state or now - self._state_at >= STATE_S:
-            self._state, self._state_at = state, now
-            self._send_soon({"type": "state"} | shared | own)
+        predicted = ("behind",) if source.span.live else ("time", "behind")  # a rig's frames are announced
+        unpredicted = {key: value for key, value in own.items() if key not in predicted}
+        content = StateContent(causes.shared.source, causes.clock_changes, unpredicted)
+        if content != self._sent.state or now - self._sent.state_s >= STATE_S:
+            self._sent.state = content
+            self._sent.state_s = now
+            self._send_soon({"type": "state"} | causes.shared.source | own)
+
+    def _send_statistics(self, viewers: int) -> None:
+        """Send statistics at most once a second, if frames were sent or the number of viewers has changed."""
+        now = self._now()
+        has_news = viewers != self._sent.viewers or self._session.sent_since(self._sent.stats_s - 1)
+        if has_news and now - self._sent.stats_s >= 1:
+            self._sent.stats_s = now
+            self._sent.viewers = viewers
+            self._send_soon(self._session.stats_json(viewers))
 
     def _send_new_rig(self) -> None:
         rig = self._service.renderer.rig_json
-        if rig is not self._rig and rig is not None and self._service.is_ready:
-            self._rig = rig
+        if rig is not None and rig is not self._sent.rig and self._service.is_ready:
+            self._sent.rig = rig
             self._send_soon({"type": "rig"} | rig)
 
     def _send_soon(self, message: dict[str, Any]) -> None:

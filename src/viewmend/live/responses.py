@@ -8,8 +8,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
 
 from viewmend.live.assets import Asset
-from viewmend.live.connection import SessionRegistry
 from viewmend.live.protocol import ProtocolError
+from viewmend.live.registry import SessionRegistry
 from viewmend.utils.heap import resident_bytes
 
 MAX_BODY_BYTES, BODY_S = 1_000_000, 10.0

@@ -22,10 +22,12 @@ from viewmend.geometry.orbit import coarse_surface
 from viewmend.live import render_jobs, responses
 from viewmend.live.assets import NOT_IN_TIME, AssetQuery, AssetStore, BusyError, wait_for_frame
 from viewmend.live.auth import AccessControl
-from viewmend.live.connection import Extension, SessionRegistry, ViewerConnection
+from viewmend.live.connection import ViewerConnection
 from viewmend.live.connection_limits import authenticate
+from viewmend.live.extension import Extension
 from viewmend.live.protocol import HEADER_BYTES, Limits, ProtocolError, read_message
 from viewmend.live.push import PushSource, receive_rig
+from viewmend.live.registry import SessionRegistry
 from viewmend.live.render_jobs import ImageQuery, PathJob, RenderJob, Result, SourceImageQuery, TurntableQuery
 from viewmend.live.responses import HEADERS, MAX_BODY_BYTES, asset_response, error_response, page_files
 from viewmend.live.service import RenderService

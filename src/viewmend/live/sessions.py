@@ -16,11 +16,12 @@ from viewmend.live.protocol import EXTRA_MODES, MENDED_MODES, ClockChange, Frame
 from viewmend.live.renderer import RenderRequest, RenderResult
 from viewmend.models.base import RenderQuality, State
 
-STILL_S, FULL_S = 0.25, 0.8
-"""A still view is rendered again after these seconds: first sharp, so that the next movement need not wait long, then
-at full quality."""
+STILL_S = 0.25
+"""A view that has been still for this many seconds is rendered again, sharp and quickly."""
+FULL_S = 0.8
+"""A view that has been still for this many seconds is rendered again at full quality."""
 MAX_AWAITED_S = 10.0
-"""How long playback waits for a frame that its clock has passed."""
+"""Playback waits this many seconds for a frame that its clock has passed."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,24 @@ class SentFrame:
     sent_s: float
     times: FrameTimes
     size_bytes: int
+
+
+@dataclass(frozen=True)
+class RequestedView:
+    """The view of a session's last request."""
+
+    look: Look | None = None
+    index: int = -1
+    """The frame's index; -1 before the first request."""
+
+
+@dataclass(frozen=True)
+class AwaitedFrame:
+    """A frame that is being read for a session."""
+
+    index: int
+    """The frame's index; -1 for none."""
+    since_s: float
 
 
 class ViewerSession:
@@ -78,44 +97,52 @@ class ViewerSession:
         self.rendered_level = FULL
         """The level of the last view, after the limit on its resolution."""
         self._ladder = ladder
-        self._send, self._report_error, self._now = send, report_error, now
+        self._send = send
+        self._report_error = report_error
+        self._now = now
         self._frame_numbers = count()
         self.newest_look: Look | None = None
         """The view to show; None before the first look, and after it was cancelled."""
         self._look_at = 0.0
         self._advanced_at = now()
-        self._requested: tuple[Look | None, int] = (None, -1)
-        """Look and frame of the last request."""
+        self.requested = RequestedView()
         self.is_cancelled = False
         """Whether the view that is being rendered is not needed any more."""
-        self._is_full = self._is_refined = False
-        self._awaited = (-1, 0.0)
-        """The frame that is being read, and since when; -1 for none."""
-        self._level, self._wait_ms = FULL, 0.0
+        self._is_full = False
+        """Whether the requested view has the highest quality."""
+        self._is_refined = False
+        """Whether the requested view replaces one of the same look and frame."""
+        self._awaited = AwaitedFrame(-1, 0.0)
+        self._level = FULL
+        """The level of the requested view, before the limit on its resolution."""
+        self._wait_ms = 0.0
+        """How long the requested look has waited."""
         self._moving_px = 0.0
         """Pixels of the last look that moved or played. The budget counts in these: a view at rest may have more."""
         self._encoders = Encoders()
 
     def look(self, look: Look) -> None:
         """Set the view to show; a look that was not rendered yet is dropped."""
-        if self.newest_look is not self._requested[0]:
+        if self.newest_look is not self.requested.look:
             self.dropped += 1
-        self.newest_look, self._look_at = look, self._now()
+        self.newest_look = look
+        self._look_at = self._now()
         self._cancel_final_view()
         self._encoders.key_frame |= look.key  # kept until a frame is encoded, even if this look is dropped
 
     def cancel(self) -> None:
         """Drop the look, and the view that is being rendered for it."""
-        self.newest_look, self.is_cancelled = None, True
+        self.newest_look = None
+        self.is_cancelled = True
 
     def _cancel_final_view(self) -> None:
         """Give up the view that is being rendered if only a resting viewer has use for it; others show a movement."""
-        look = self._requested[0]
+        look = self.requested.look
         self.is_cancelled |= look is not None and (look.full or self._is_refined)
 
     def give_up(self) -> None:
         """Render the view again if it is asked for again."""
-        self._requested = (None, -1)
+        self.requested = RequestedView()
 
     @property
     def wants_views(self) -> bool:
@@ -124,8 +151,9 @@ class ViewerSession:
 
     def frame(self, span: Span, edge: float) -> int:
         """The index of the frame to show now; -1 while there is none."""
-        elapsed_s, self._advanced_at = self._now() - self._advanced_at, self._now()
-        self.clock.advance(elapsed_s, span, edge)
+        now = self._now()
+        self.clock.advance(now - self._advanced_at, span, edge)
+        self._advanced_at = now
         return self.clock.frame(span)
 
     def change_clock(self, change: ClockChange, span: Span, edge: float) -> None:
@@ -137,8 +165,8 @@ class ViewerSession:
 
     def is_active(self, now: float) -> bool:
         """Whether a frame was sent within the last second, or the newest look waits for its first one."""
-        waits = self.in_flight is None and self.newest_look is not None and self.newest_look is not self._requested[0]
-        return waits or self.sent_since(now - 1)
+        is_new = self.newest_look is not None and self.newest_look is not self.requested.look
+        return (is_new and self.in_flight is None) or self.sent_since(now - 1)
 
     def sent_since(self, since_s: float) -> bool:
         """Whether a frame was sent after this moment."""
@@ -152,43 +180,60 @@ class ViewerSession:
     def next_request(self, now: float, playback: PlaybackState) -> RenderRequest | None:
         """The newest look at the clock's frame, or the same view again at a better level."""
         self.buffering = False
-        if (look := self.newest_look) is None or self.in_flight is not None:
+        look = self.newest_look
+        if look is None or self.in_flight is not None:
             return None
-        if (index := self.frame(playback.span, playback.edge)) < 0:
+        due = self.frame(playback.span, playback.edge)
+        if due < 0:
             return None
-        is_new_look = look is not self._requested[0]  # by identity: a repeated look is answered again
-        is_new = is_new_look or index != self._requested[1]
-        at_rest = not look.moving and not (self.clock.playing and playback.span.fps > 0)
-        if is_new:
-            self._moving_px = self._moving_px if at_rest and self._moving_px else look.pixels
-            level = self._choose_level(look, playback.active_viewers)
-        else:
-            level = self._refine(now - self._look_at) if at_rest else None
+
+        # the quality level; none if the same view was rendered as well already
+        is_new_look = look is not self.requested.look  # by identity: a repeated look is answered again
+        is_new = is_new_look or due != self.requested.index
+        level = self._next_level(look, is_new, now, playback)
         if level is None:
             return None
-        if (index := self._available_frame(index, now, playback)) is None:
+
+        # the frame, or an earlier one that is still being read
+        index = self._available_frame(due, now, playback)
+        if index is None:
             self.buffering = True
             return None
         if is_new and not is_new_look and self.clock.playing:
-            self.dropped += max(0, index - self._requested[1] - 1)
-        self._level, self._is_full, self._is_refined, self.is_cancelled = level, level == FULL, not is_new, False
+            self.dropped += max(0, index - self.requested.index - 1)
+
+        # the state of the new request
+        self._level = level
+        self._is_full = level == FULL
+        self._is_refined = not is_new
+        self.is_cancelled = False
         self.rendered_level = playback.resolution_limit.apply(
             level, look.pixels, playback.active_viewers, playback.has_company
         )
         self._wait_ms = max(0.0, 1000 * (now - self._look_at)) if is_new_look else 0.0
-        self._requested = (look, index)
+        self.requested = RequestedView(look, index)
         return self._request(look, index, playback.home)
 
-    def _available_frame(self, index: int, now: float, playback: PlaybackState) -> int | None:
-        """The clock's frame, or an earlier one that is still being read; None while it is not in memory."""
-        awaited, since = self._awaited
-        if self.clock.playing and playback.span.first <= awaited < index and now - since < MAX_AWAITED_S:
-            index = awaited
+    def _next_level(self, look: Look, is_new: bool, now: float, playback: PlaybackState) -> QualityLevel | None:
+        """The level of a new view, or a better one for a view that is still; None if there is nothing to render."""
+        plays = self.clock.playing and playback.span.fps > 0
+        at_rest = not look.moving and not plays
+        if is_new:
+            if not at_rest or not self._moving_px:
+                self._moving_px = look.pixels
+            return self._choose_level(look, playback.active_viewers)
+        return self._refine(now - self._look_at) if at_rest else None
+
+    def _available_frame(self, due: int, now: float, playback: PlaybackState) -> int | None:
+        """The frame that is due, or an earlier one that is still being read; None while it is not in memory."""
+        awaited = self._awaited
+        keeps_waiting = self.clock.playing and playback.span.first <= awaited.index < due
+        index = awaited.index if keeps_waiting and now - awaited.since_s < MAX_AWAITED_S else due
         if playback.has_frame(index):
-            self._awaited = (-1, now)
+            self._awaited = AwaitedFrame(-1, now)
             return index
-        if index != awaited:
-            self._awaited = (index, now)
+        if index != awaited.index:
+            self._awaited = AwaitedFrame(index, now)
         return None
 
     def _refine(self, still_s: float) -> QualityLevel | None:
@@ -217,18 +262,27 @@ class ViewerSession:
     def _request(self, look: Look, index: int, home: HomeView) -> RenderRequest:
         level = self._level
         top_k = min((k for k in (level.top_k, look.top_k) if k is not None), default=None)
-        mend = not MENDED_MODES.isdisjoint(look.modes)
         quality = RenderQuality(
-            mend=mend, top_k=top_k, context_times=level.context_times, refine_fraction=level.refine_fraction
+            mend=not MENDED_MODES.isdisjoint(look.modes),
+            top_k=top_k,
+            context_times=level.context_times,
+            refine_fraction=level.refine_fraction,
         )
         scale = look.scale * self.rendered_level.scale
         cameras = tuple(view_camera(eye, home, (look.width, look.height), scale) for eye in look.cameras)
-        extra = EXTRA_MODES & {*look.modes}
-        return RenderRequest(index, cameras, quality, look.error_rule, extra, look.without, look.model)
+        return RenderRequest(
+            time=index,
+            cameras=cameras,
+            quality=quality,
+            error_rule=look.error_rule,
+            extra_modes=EXTRA_MODES & {*look.modes},
+            without=look.without,
+            model=look.model,
+        )
 
     def deliver(self, request: RenderRequest, result: RenderResult) -> FrameTimes:
         """Encode and send a frame, and record its times."""
-        look = self._requested[0]
+        look = self.requested.look
         assert look is not None, "a view is rendered for a look"
         self.viewer = result.viewer
         if self.is_cancelled:
@@ -237,12 +291,14 @@ class ViewerSession:
         fields = {"frame": next(self._frame_numbers), "full": self._is_full, "dropped": self.dropped}
         message, times = encode_frame(look, request, result, self._encoders, self._wait_ms, **fields)
         self._encoders.key_frame = False
-        self._record(look, times, len(message))
-        self.in_flight, self.in_flight_since = fields["frame"], self._now()
+        self.record(look, times, len(message))
+        self.in_flight = fields["frame"]
+        self.in_flight_since = self._now()
         self._send(message)
         return times
 
-    def _record(self, look: Look, times: FrameTimes, size_bytes: int) -> None:
+    def record(self, look: Look, times: FrameTimes, size_bytes: int) -> None:
+        """Add a frame's times to the statistics and the budget."""
         self.recent.append(SentFrame(self._now(), times, size_bytes))
         if self.budget is not None:
             level = self.rendered_level
@@ -255,7 +311,8 @@ class ViewerSession:
 
     def state_json(self, span: Span, edge: float) -> dict[str, Any]:
         """This viewer's part of the message `state`, under the service's lock."""
-        clock, index = self.clock, self.frame(span, edge)
+        index = self.frame(span, edge)
+        clock = self.clock
         return {
             "time": index,
             "playing": clock.playing,

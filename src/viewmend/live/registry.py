@@ -1,0 +1,126 @@
+"""The viewers of a server: their sessions, and the task that tells their connections what has changed."""
+
+import asyncio
+import contextlib
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+from viewmend.live.extension import Extension
+from viewmend.live.protocol import Limits
+from viewmend.live.service import RenderService
+from viewmend.live.sessions import ViewerSession
+
+TICK_S = 0.25
+"""The registry checks every this many seconds what its connections have to send."""
+LIVE_TICK_S = 0.1
+"""The interval of these checks while a rig pushes frames, in seconds; a frame that arrives causes one at once."""
+
+
+@dataclass(frozen=True)
+class SharedState:
+    """What is the same for all viewers at one moment."""
+
+    source: dict[str, Any]
+    """The shared fields of the message `state`."""
+    show: dict[str, Any] | None
+    """The message `show` that moves all pages; None if there was none."""
+    rig: dict[str, Any] | None
+    """The message `rig`; None before the first frame."""
+    viewers: int
+    """The number of connected viewers."""
+
+
+@runtime_checkable
+class Listener(Protocol):
+    """A connection, as the registry sees it."""
+
+    def inform(self, shared: SharedState) -> float:
+        """Send what is due; returns the time before which nothing is due, unless the shared state changes."""
+        ...
+
+    def fail(self, error: Exception) -> None:
+        """End the connection."""
+        ...
+
+
+@dataclass
+class SessionRegistry:
+    """The sessions of all viewers, and what their connections share."""
+
+    service: RenderService
+    limits: Limits
+    budget_ms: float | None
+    about: dict[str, Any]
+    """Fields of the message `welcome` that are the same for all viewers."""
+    extensions: Sequence[Extension] = ()
+    sessions: list[ViewerSession] = field(default_factory=list)
+    connections: dict[Listener, float] = field(default_factory=dict)
+    """Each connection after its `hello`, with the time of its next check; a change is sent earlier."""
+    numbers: "itertools.count[int]" = field(default_factory=itertools.count)
+    shown: dict[str, Any] | None = None
+    """The message `show` that moves all pages, also those that are opened later; set on any thread."""
+
+    _informer: "asyncio.Task[None] | None" = None
+
+    def join(self, connection: Listener) -> None:
+        """Inform a viewer from now on."""
+        shared = self.shared_state()
+        self.connections[connection] = connection.inform(shared)
+        if self._informer is None or self._informer.done():
+            self._informer = asyncio.create_task(self._inform_all(shared))
+
+    async def _inform_all(self, shared: SharedState) -> None:
+        """Let all connections send what is due, while there are any; they have been informed of `shared`."""
+        news = asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def note_change() -> None:
+            with contextlib.suppress(RuntimeError):  # the event loop has ended
+                loop.call_soon_threadsafe(news.set)
+
+        self.service.changed = note_change
+        while self.connections:
+            news.clear()
+            newest = self.shared_state()
+            has_changed = newest != shared
+            if has_changed:  # otherwise connections get the same object as before
+                shared = newest
+            now = self.service.now()
+            for connection, due_s in list(self.connections.items()):
+                if has_changed or due_s <= now:
+                    self._inform(connection, shared)
+            if self.service.source.span.live:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(news.wait(), LIVE_TICK_S)
+            else:
+                await asyncio.sleep(TICK_S)
+
+    def _inform(self, connection: Listener, shared: SharedState) -> None:
+        """Inform one connection; an error ends this connection only."""
+        try:
+            self.connections[connection] = connection.inform(shared)
+        except Exception as error:
+            connection.fail(error)
+
+    def shared_state(self) -> SharedState:
+        """What is the same for all viewers now."""
+        return SharedState(self.source_json(), self.shown, self.service.renderer.rig_json, len(self.sessions))
+
+    def source_json(self) -> dict[str, Any]:
+        """The shared fields of the message `state`."""
+        service = self.service
+        span = service.source.span
+        status = service.source.status
+        is_loading = status.state == "ready" and not service.is_ready
+        return {
+            "source": "loading" if is_loading else status.state,
+            "error": status.error or service.error,
+            "model_error": service.renderer.model_error,
+            "first": span.first,
+            "end": span.end,
+            "total": span.total,
+            "loops": not span.live,
+            "kind": "live" if span.live else "recording",
+        }
